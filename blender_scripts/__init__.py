@@ -1,0 +1,1 @@
+"""Runs inside Blender (module or executable): bpy, numpy and the standard library only."""

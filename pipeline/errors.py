@@ -1,0 +1,46 @@
+"""Errors of the orchestrator. Each survives pickling, and its text is fit for the user."""
+
+from __future__ import annotations
+
+
+class PipelineError(Exception):
+    """Base of everything that ends a command with a clear line instead of a traceback.
+
+    Attributes:
+        exit_code: what the command line exits with.
+    """
+
+    exit_code = 1
+
+
+class JobFileError(PipelineError):
+    """The job file is wrong; carries every problem found, one line each."""
+
+    exit_code = 2
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__(problems)
+        self.problems = problems
+
+    def __str__(self) -> str:
+        return "\n".join(self.problems)
+
+
+class StageUnavailableError(PipelineError):
+    """A stage cannot run on this machine; says what is missing and how to get it."""
+
+    exit_code = 3
+
+
+class InvalidArtifactError(PipelineError):
+    """A file is not what its stage promises: truncated, not decodable, or wrong in content."""
+
+
+class StaleAttemptError(PipelineError):
+    """A newer attempt of the same task has committed already; this one must not write."""
+
+
+class JobBusyError(PipelineError):
+    """Another live process is running this job."""
+
+    exit_code = 4

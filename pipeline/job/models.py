@@ -1,0 +1,84 @@
+"""The job file's schema: the scene's physics, and what is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from render.parameters import (
+    CameraParameters,
+    LightParameters,
+    MaterialParameters,
+    MovieParameters,
+    RenderParameters,
+    StageParameters,
+    SurfaceParameters,
+    VolumeParameters,
+)
+from sim.fluid.parameters import FluidParameters
+from sim.rigid.parameters import RigidBodyParameters
+from sim.scene import SceneParameters
+from sim.smoke.parameters import SmokeParameters
+
+DEFAULT_FRAMES = 120
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+
+
+class Job(SceneParameters):
+    """One film: what happens in it, and how it is shown."""
+
+    name: str = Field(pattern=NAME_PATTERN, description="Name of the job and of its folder under renders/.")
+    fps: Annotated[int, Field(ge=1, le=1000)] = Field(default=60, description="Frames per second [1/s].")
+    frames: Annotated[int, Field(ge=1, le=1_000_000)] | None = Field(
+        default=None, description="Number of frames [-]; give this or duration."
+    )
+    duration: Annotated[float, Field(gt=0.0)] | None = Field(
+        default=None, description="Length of the film [s]; give this or frames."
+    )
+    surface: SurfaceParameters = Field(default=SurfaceParameters(), description="Fluid surfaces.")
+    volume: VolumeParameters = Field(default=VolumeParameters(), description="Smoke volumes.")
+    material: dict[str, MaterialParameters] = Field(
+        default_factory=dict, description="What each body looks like, by the body's name: [material.NAME]."
+    )
+    stage: StageParameters = Field(default=StageParameters(), description="Ground, background and their lights.")
+    light: tuple[LightParameters, ...] = Field(default=(), description="Extra lights.")
+    camera: CameraParameters = Field(default=CameraParameters(), description="The camera.")
+    render: RenderParameters = Field(default=RenderParameters(), description="How frames are made.")
+    movie: MovieParameters = Field(default=MovieParameters(), description="How frames become a film.")
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames; frame k shows t = k / fps, and frame 0 the start."""
+        if self.frames is not None:
+            return self.frames
+        if self.duration is not None:
+            return max(1, round(self.duration * self.fps))
+        return DEFAULT_FRAMES
+
+    @property
+    def body_names(self) -> list[str]:
+        """Names of all bodies, in the order of the job file."""
+        return [body.name for body in self._bodies()]
+
+    def material_of(self, body: str) -> MaterialParameters:
+        """The body's look: from the job file, else the usual one of its kind."""
+        if body in self.material:
+            return self.material[body]
+        if any(fluid.name == body for fluid in self.fluid):
+            return MaterialParameters(look="water")
+        if any(smoke.name == body for smoke in self.smoke):
+            return MaterialParameters(look="smoke")
+        return MaterialParameters(look="plastic")
+
+    def _bodies(self) -> Iterator[RigidBodyParameters | FluidParameters | SmokeParameters]:
+        yield from self.rigid
+        yield from self.fluid
+        yield from self.smoke
+
+    @model_validator(mode="after")
+    def _frames_or_duration(self) -> Self:
+        if self.frames is not None and self.duration is not None:
+            raise ValueError("give frames or duration, not both")
+        return self

@@ -1,0 +1,84 @@
+"""Every path of a job, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.task import ArtifactPath, TaskId
+
+
+@dataclass(frozen=True, slots=True)
+class JobLayout:
+    """The folder of a job. Artifact paths are relative to `root`, so the folder can be moved."""
+
+    root: Path
+
+    # --- files of the job itself ---
+    @property
+    def job_file(self) -> Path:
+        """The job as submitted, overrides applied."""
+        return self.root / "job.toml"
+
+    @property
+    def manifest(self) -> Path:
+        """The record of every task."""
+        return self.root / "manifest.db"
+
+    @property
+    def report(self) -> Path:
+        """Timings, plots and a contact sheet."""
+        return self.root / "report.html"
+
+    def log(self, task_id: TaskId, attempt: int) -> Path:
+        """Log of one attempt."""
+        return self.root / "logs" / f"{task_id}.{attempt}.log"
+
+    def receipt(self, artifact: ArtifactPath) -> Path:
+        """Receipt of a committed artifact."""
+        return self.root / ".receipts" / f"{artifact}.json"
+
+    def path(self, artifact: ArtifactPath) -> Path:
+        """Where an artifact lies."""
+        return self.root / artifact
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the simulation's checkpoints."""
+        return self.root / "cache" / "checkpoints"
+
+    # --- artifacts ---
+    @staticmethod
+    def frame_cache(frame: int) -> ArtifactPath:
+        """HDF5 snapshot of every body at one frame."""
+        return ArtifactPath(f"cache/{frame:06d}.h5")
+
+    @staticmethod
+    def body_mesh(body: str) -> ArtifactPath:
+        """PLY mesh of a rigid body in its rest pose."""
+        return ArtifactPath(f"meshes/{body}.ply")
+
+    @staticmethod
+    def surface(body: str, frame: int) -> ArtifactPath:
+        """PLY surface of a fluid at one frame."""
+        return ArtifactPath(f"surfaces/{body}/{frame:06d}.ply")
+
+    @staticmethod
+    def volume(body: str, frame: int) -> ArtifactPath:
+        """OpenVDB volume of a smoke at one frame."""
+        return ArtifactPath(f"volumes/{body}/{frame:06d}.vdb")
+
+    @staticmethod
+    def picture(frame: int) -> ArtifactPath:
+        """Rendered frame."""
+        return ArtifactPath(f"frames/{frame:06d}.png")
+
+    @staticmethod
+    def segment(index: int) -> ArtifactPath:
+        """A piece of the film."""
+        return ArtifactPath(f"movie/{index:04d}.mp4")
+
+    @staticmethod
+    def movie() -> ArtifactPath:
+        """The film."""
+        return ArtifactPath("movie.mp4")

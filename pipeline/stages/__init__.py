@@ -1,0 +1,1 @@
+"""The stages of a job, each with a pure plan() and an idempotent run()."""

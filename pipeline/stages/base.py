@@ -1,0 +1,53 @@
+"""What a stage is, and what it gets to run a task with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from pipeline.layout import JobLayout
+from pipeline.task import ArtifactPath, Task
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+
+
+class TaskContext(Protocol):
+    """What the worker hands to `Stage.run`: the job, and the only way to write an artifact."""
+
+    job: Job
+    layout: JobLayout
+    task: Task
+    attempt: int
+    threads: int
+
+    def committing(self, artifact: ArtifactPath, validate: Callable[[Path], None]) -> AbstractContextManager[Path]:
+        """Yield the path to write to; on leaving, validate, fsync, rename and receipt it.
+
+        `validate` decodes the file and raises InvalidArtifactError. An exception inside the block removes the part.
+        """
+
+    def is_committed(self, artifact: ArtifactPath) -> bool:
+        """Whether this artifact is there, whole, and of this task's fingerprint."""
+
+    def progress(self, done: float, total: float, message: str = "") -> None:
+        """Tell how far the task is; also the sign of life that keeps it from counting as stalled."""
+
+    def stop_requested(self) -> bool:
+        """Whether the task should checkpoint and return."""
+
+
+class Stage(Protocol):
+    """A stage of the pipeline: one file here, one line in STAGES."""
+
+    name: str
+    version: int
+    """Raised when the same parameters and inputs give other outputs; part of the fingerprint."""
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """The tasks of this stage. Pure."""
+
+    def run(self, context: TaskContext) -> None:
+        """Commit the task's outputs. Idempotent; shares no state with other tasks but warm caches."""

@@ -1,0 +1,1 @@
+"""Arrays in, files out: surfaces, volumes, meshes, Blender frames, movies. Knows neither sim nor pipeline."""

@@ -1,0 +1,116 @@
+"""Parameters of surfaces, volumes, pictures and films, as a job file names them. No heavy import."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Vector3 = tuple[float, float, float]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Color = tuple[Fraction, Fraction, Fraction]
+Quality = Literal["draft", "preview", "final"]
+
+
+class Parameters(BaseModel):
+    """Frozen, strict about unknown keys and about NaN; units stand in each field's description."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class SurfaceParameters(Parameters):
+    """How particles become a surface (Löschner et al. 2023, splashsurf)."""
+
+    smoothing_length_in_radii: Positive = Field(default=2.0, description="SPH smoothing length [particle radii].")
+    cube_size_in_radii: Positive = Field(default=0.75, description="Edge of a marching-cubes cell [particle radii].")
+    threshold: Positive = Field(default=0.6, description="Iso-value of the density, relative to the rest density [-].")
+    mesh_smoothing_iterations: int = Field(default=25, ge=0, description="Weighted Laplacian smoothing passes [-].")
+    normals_smoothing_iterations: int = Field(default=10, ge=0, description="Smoothing passes on the normals [-].")
+
+
+class VolumeParameters(Parameters):
+    """How smoke is written to OpenVDB."""
+
+    tolerance: NonNegative = Field(default=1.0e-4, description="Densities below this are empty space [-].")
+    half_precision: bool = Field(default=True, description="Store 16-bit floats.")
+
+
+class CameraParameters(Parameters):
+    """A fixed camera. Without a position it frames the whole domain from the front."""
+
+    position: Vector3 | None = Field(default=None, description="Where it stands [m]; frames the domain if omitted.")
+    look_at: Vector3 | None = Field(default=None, description="What it looks at [m]; the domain's middle if omitted.")
+    focal_length_mm: Positive = Field(default=50.0, description="Focal length on a 36 mm sensor [mm].")
+    f_stop: Positive | None = Field(default=None, description="Aperture; everything is in focus if omitted.")
+
+
+class LightParameters(Parameters):
+    """An extra light."""
+
+    type: Literal["area", "point", "sun"] = Field(default="area", description="Kind of light.")
+    position: Vector3 = Field(description="Where it stands [m].")
+    look_at: Vector3 = Field(default=(0.0, 0.0, 0.0), description="What it shines at [m].")
+    power: Positive = Field(default=100.0, description="Power [W]; for a sun, irradiance [W/m²].")
+    size: Positive = Field(default=0.5, description="Edge of an area light, radius of a point light [m].")
+    color: Color = Field(default=(1.0, 1.0, 1.0), description="Linear RGB.")
+
+
+class StageParameters(Parameters):
+    """Ground, background and the lights that come with them."""
+
+    name: Literal["studio", "outdoor"] = Field(
+        default="studio",
+        description="studio: cyclorama with key, fill and rim lights; outdoor: ground, sky and sun.",
+    )
+    strength: Positive = Field(default=1.0, description="Factor on all of its lights [-].")
+    color: Color = Field(default=(0.78, 0.80, 0.82), description="Colour of the ground and backdrop, linear RGB.")
+    tank: bool = Field(default=False, description="Show the domain's walls as a glass tank.")
+
+
+Look = Literal["water", "smoke", "rubber", "ceramic", "plastic", "metal", "stone", "glass"]
+
+
+class MaterialParameters(Parameters):
+    """What a body looks like."""
+
+    look: Look = Field(description="Name of the look.")
+    color: Color | None = Field(default=None, description="Base colour or tint, linear RGB; the look's own if omitted.")
+    roughness: Fraction | None = Field(default=None, description="Roughness [-]; the look's own if omitted.")
+    density: Positive | None = Field(
+        default=None,
+        description="Smoke: extinction per metre at density 1 [1/m]. Water: factor on its absorption [-].",
+    )
+
+
+class RenderParameters(Parameters):
+    """How frames are made."""
+
+    resolution: tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]] = Field(
+        default=(1280, 720), description="Width and height [pixels]; even numbers, as video needs them."
+    )
+    quality: Quality = Field(default="preview", description="Preset for samples, noise threshold and denoising.")
+    samples: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="Most samples per pixel; the preset's if omitted."
+    )
+    denoise: bool = Field(default=True, description="Denoise with OpenImageDenoise.")
+    motion_blur: bool = Field(default=True, description="Blur what moves while the shutter is open.")
+    shutter: Fraction = Field(default=0.5, description="Time the shutter is open [frames].")
+    exposure: float = Field(default=0.0, description="Exposure [stops].")
+    seed: int = Field(default=0, ge=0, description="Seed of the sampling pattern.")
+    device: Literal["auto", "cpu", "gpu"] = Field(default="auto", description="What Cycles renders on.")
+    blender: str | None = Field(default=None, description="Path of a Blender executable; the bpy module if omitted.")
+
+
+class MovieParameters(Parameters):
+    """How frames become a film."""
+
+    crf: int = Field(default=16, ge=0, le=51, description="H.264 constant rate factor; smaller is better and larger.")
+    preset: Literal["ultrafast", "veryfast", "fast", "medium", "slow", "veryslow"] = Field(
+        default="medium", description="H.264 speed against size."
+    )
+    playback_fps: Positive | None = Field(
+        default=None,
+        description="Frames a second of the film; the job's fps if omitted (less is slow motion).",
+    )

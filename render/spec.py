@@ -1,0 +1,78 @@
+"""RenderSpec: all that Blender needs to draw a job's frames, as a JSON document.
+
+The specification is the boundary between the project and Blender: `blender_scripts/render_frames.py` reads it with
+the standard library alone. Paths are relative to the folder that holds the document; `{frame}` in a path stands for
+the six-digit frame number.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from render.parameters import (
+    CameraParameters,
+    LightParameters,
+    MaterialParameters,
+    Parameters,
+    RenderParameters,
+    StageParameters,
+    Vector3,
+)
+
+SPEC_VERSION: Literal[1] = 1
+
+
+class MeshObject(Parameters):
+    """A mesh that stays: one PLY file, placed once."""
+
+    type: Literal["mesh"] = "mesh"
+    name: str
+    file: str
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: tuple[float, float, float, float] = Field(
+        default=(1.0, 0.0, 0.0, 0.0), description="Unit quaternion w, x, y, z."
+    )
+    material: MaterialParameters
+    shade_smooth_angle_deg: float = Field(default=40.0, description="Edges sharper than this stay sharp [degrees].")
+
+
+class MeshSequenceObject(Parameters):
+    """A mesh that changes every frame: one PLY file a frame with `vx vy vz` [m/s] and `nx ny nz` per vertex."""
+
+    type: Literal["mesh_sequence"] = "mesh_sequence"
+    name: str
+    file: str = Field(description="Path with {frame}.")
+    material: MaterialParameters
+
+
+class VolumeSequenceObject(Parameters):
+    """A volume that changes every frame: one VDB file a frame with `density`, `temperature`, `velocity` [m/s]."""
+
+    type: Literal["volume_sequence"] = "volume_sequence"
+    name: str
+    file: str = Field(description="Path with {frame}.")
+    material: MaterialParameters
+
+
+SceneObject = Annotated[MeshObject | MeshSequenceObject | VolumeSequenceObject, Field(discriminator="type")]
+
+
+class RenderSpec(Parameters):
+    """Everything in front of the camera, and the camera."""
+
+    version: Literal[1] = SPEC_VERSION
+    fps: float = Field(gt=0.0)
+    domain_min: Vector3
+    domain_max: Vector3
+    camera: CameraParameters
+    stage: StageParameters
+    lights: tuple[LightParameters, ...] = ()
+    objects: tuple[SceneObject, ...]
+    render: RenderParameters
+
+    def write(self, path: Path) -> None:
+        """Write the document; the same specification gives the same bytes."""
+        path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")

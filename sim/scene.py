@@ -1,0 +1,65 @@
+"""The physical part of a job: the domain, gravity, and every body in it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from sim.fluid.parameters import FluidParameters
+from sim.parameters import Parameters, Vector3
+from sim.rigid.parameters import RigidBodyParameters
+from sim.smoke.parameters import Face, SmokeParameters
+
+Device = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
+
+
+class DomainParameters(Parameters):
+    """The box that the fluid lives in; its closed faces are walls."""
+
+    min: Vector3 = Field(default=(-0.5, -0.5, 0.0), description="Lower corner [m].")
+    max: Vector3 = Field(default=(0.5, 0.5, 1.0), description="Upper corner [m].")
+    open_faces: tuple[Face, ...] = Field(
+        default=("z+",),
+        description="Faces without a wall; fluid that leaves through them is removed and counted.",
+    )
+
+    @model_validator(mode="after")
+    def _has_volume(self) -> Self:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if high <= low:
+                raise ValueError(f"max must be above min on every axis, got {axis} from {low:g} to {high:g} m")
+        return self
+
+
+def _refuse_cloth(cloth: object) -> object:
+    if cloth:
+        raise ValueError("cloth is not simulated by this version; remove [[cloth]]")
+    return cloth
+
+
+def _refuse_second_fluid(fluid: object) -> object:
+    if isinstance(fluid, list | tuple) and len(fluid) > 1:
+        raise ValueError(
+            f"one fluid per job in this version, got {len(fluid)}; "
+            "put several volumes of the same fluid into [[fluid.block]]"
+        )
+    return fluid
+
+
+class SceneParameters(Parameters):
+    """Everything that decides how the bodies move."""
+
+    gravity: Vector3 = Field(default=(0.0, 0.0, -9.81), description="Gravity [m/s²].")
+    domain: DomainParameters = Field(default=DomainParameters(), description="The box that the fluid lives in.")
+    rigid: tuple[RigidBodyParameters, ...] = Field(default=(), description="Rigid bodies.")
+    fluid: Annotated[tuple[FluidParameters, ...], BeforeValidator(_refuse_second_fluid)] = Field(
+        default=(), description="Particle fluids."
+    )
+    smoke: tuple[SmokeParameters, ...] = Field(default=(), description="Smoke.")
+    cloth: Annotated[tuple[Any, ...], BeforeValidator(_refuse_cloth)] = Field(
+        default=(), description="Reserved: cloth is not simulated by this version.", max_length=0
+    )
+    device: Device = Field(
+        default="auto", description="Where the simulation runs; auto: the fastest device that works."
+    )

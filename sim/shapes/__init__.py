@@ -1,0 +1,1 @@
+"""Shapes: primitives, the procedural duck and bunny, meshes, and their signed distances."""

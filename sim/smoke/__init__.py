@@ -1,0 +1,1 @@
+"""Eulerian smoke on a staggered grid (Fedkiw, Stam & Jensen 2001)."""

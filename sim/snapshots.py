@@ -1,0 +1,33 @@
+"""Snapshots: what rendering needs of a body at one frame, as host arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+BodyKind = Literal["fluid", "rigid", "smoke"]
+Attribute = int | float | str | tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One body at one frame.
+
+    Arrays by kind (SI units, world axes, all float32 unless noted):
+
+    - fluid: `position` (n, 3) [m], `velocity` (n, 3) [m/s], `density` (n,) [kg/m³], `particle_id` (n,) int32.
+      Attributes: `particle_radius` [m], `rest_density` [kg/m³]. Rows are sorted by `particle_id`.
+    - smoke: `density` (nx, ny, nz) [-], `temperature` (nx, ny, nz) [K], `velocity` (nx, ny, nz, 3) [m/s],
+      all at cell centres. Attributes: `origin` (3,) lower corner of the grid [m], `cell_size` [m],
+      `ambient_temperature` [K].
+    - rigid: `position` (3,) [m], `orientation` (4,) unit quaternion w, x, y, z, `velocity` (3,) [m/s],
+      `angular_velocity` (3,) [rad/s]; all float64. The mesh is the body's own, in its rest pose.
+    """
+
+    kind: BodyKind
+    arrays: Mapping[str, NDArray[np.generic]]
+    attributes: Mapping[str, Attribute]

@@ -1,0 +1,77 @@
+"""What a solver and a coupling are to the world that drives them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.snapshots import Snapshot
+
+Arrays = Mapping[str, NDArray[np.generic]]
+Diagnostics = Mapping[str, float]
+"""Numbers about one body at one moment, SI units, by name; a count is a float too.
+
+Common names: `mass`, `momentum_x|y|z`, `kinetic_energy`, `potential_energy`, `particle_count`, `particles_removed`,
+`iterations`, `residual`, `max_speed`, `not_converged` (how many solves of this frame hit their limit).
+"""
+
+
+class SimulationDivergedError(RuntimeError):
+    """The state stopped being physical.
+
+    Attributes:
+        body: name of the body.
+        frame: the frame being computed.
+        time_s: simulated time [s].
+        quantity: the first bad quantity, with its value.
+    """
+
+    def __init__(self, body: str, frame: int, time_s: float, quantity: str, hint: str = "") -> None:
+        super().__init__(body, frame, time_s, quantity, hint)
+        self.body, self.frame, self.time_s, self.quantity, self.hint = body, frame, time_s, quantity, hint
+
+    def __str__(self) -> str:
+        sentence = f'"{self.body}" diverged at frame {self.frame}, t = {self.time_s:.4f} s: {self.quantity}'
+        return f"{sentence}; {self.hint}" if self.hint else sentence
+
+
+class Solver(Protocol):
+    """One family of bodies that steps together. Owns its arrays; knows no file and no other solver."""
+
+    name: str
+
+    def stable_dt(self) -> float:
+        """Largest time step [s] for the current state."""
+
+    def substep(self, dt: float) -> None:
+        """Advance by dt [s]."""
+
+    def snapshots(self) -> dict[str, Snapshot]:
+        """What rendering needs, by body name."""
+
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """All that `restore` needs to continue bit for bit."""
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from a checkpoint of the same parameters. Raises ValueError when it does not fit."""
+
+    def diagnostics(self) -> Diagnostics:
+        """Physics and numerics of the frame just computed; per-frame counters restart with `begin_frame`."""
+
+    def begin_frame(self, time_s: float) -> None:
+        """A frame starts at simulated time `time_s`: reset the counters of the frame."""
+
+    def first_bad_quantity(self) -> str | None:
+        """The first non-finite or runaway quantity of the state, in words, or None."""
+
+
+class Coupling(Protocol):
+    """Exchanges momentum between two solvers."""
+
+    bodies: tuple[str, str]
+
+    def exchange(self, dt: float) -> None:
+        """Apply equal and opposite impulses for a step of dt [s]."""
