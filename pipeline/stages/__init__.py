@@ -1,1 +1,21 @@
 """The stages of a job, each with a pure plan() and an idempotent run()."""
+
+from __future__ import annotations
+
+from pipeline.stages.base import Stage
+from pipeline.stages.bodies import BodiesStage
+from pipeline.stages.movie import MovieStage
+from pipeline.stages.render import RenderStage
+from pipeline.stages.simulate import SimulateStage
+from pipeline.stages.surface import SurfaceStage
+from pipeline.stages.volume import VolumeStage
+
+STAGES: tuple[Stage, ...] = (
+    BodiesStage(),
+    SimulateStage(),
+    SurfaceStage(),
+    VolumeStage(),
+    RenderStage(),
+    MovieStage(),
+)
+"""Every stage, in the order of the pipeline."""

@@ -22,6 +22,8 @@ class TaskContext(Protocol):
     task: Task
     attempt: int
     threads: int
+    fingerprint: str
+    """Fingerprint of the task: what its artifacts are receipted with, and what a checkpoint must match."""
 
     def committing(self, artifact: ArtifactPath, validate: Callable[[Path], None]) -> AbstractContextManager[Path]:
         """Yield the path to write to; on leaving, validate, fsync, rename and receipt it.

@@ -1,0 +1,74 @@
+"""Movie: pictures into segments, segments into the film."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from pipeline.fingerprint import ParameterSet
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.stages.base import TaskContext
+from pipeline.stages.inputs import tool_version
+from pipeline.task import Task, TaskId
+
+SEGMENT_FRAMES = 30
+"""Frames a segment: a changed frame encodes half a second of film again, not all of it."""
+
+
+class MovieStage:
+    """H.264 segments of closed groups of pictures, joined without encoding again."""
+
+    name = "movie"
+    version = 1
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task a segment, and one that joins them."""
+        parameters = ParameterSet.of(
+            stage=self.name,
+            version=self.version,
+            tools={"av": tool_version("av")},
+            movie=job.movie,
+            fps=job.movie.playback_fps or job.fps,
+        )
+        starts = range(0, job.frame_count, SEGMENT_FRAMES)
+        segments = [
+            Task(
+                id=TaskId(f"movie/segment-{index:04d}"),
+                stage=self.name,
+                inputs=tuple(
+                    layout.picture(frame) for frame in range(start, min(start + SEGMENT_FRAMES, job.frame_count))
+                ),
+                outputs=(layout.segment(index),),
+                parameters=parameters,
+                frame=start,
+            )
+            for index, start in enumerate(starts)
+        ]
+        film = Task(
+            id=TaskId("movie/film"),
+            stage=self.name,
+            inputs=tuple(output for segment in segments for output in segment.outputs),
+            outputs=(layout.movie(),),
+            parameters=parameters,
+        )
+        return [*segments, film]
+
+    def run(self, context: TaskContext) -> None:
+        """Encode one segment, or join them all."""
+        from render.movie import encode_segment, join_segments, validate_movie
+
+        task, job = context.task, context.job
+        inputs = [context.layout.path(artifact) for artifact in task.inputs]
+        frames = job.frame_count if task.frame is None else len(inputs)
+        with context.committing(task.outputs[0], partial(validate_movie, frames=frames)) as path:
+            if task.frame is None:
+                join_segments(inputs, path)
+            else:
+                encode_segment(
+                    inputs,
+                    path,
+                    fps=job.movie.playback_fps or job.fps,
+                    parameters=job.movie,
+                    threads=context.threads,
+                )
+        context.progress(1, 1)

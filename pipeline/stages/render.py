@@ -1,0 +1,131 @@
+"""Render: each frame of the job, drawn by Blender's Cycles."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from scipy.spatial.transform import Rotation
+
+from pipeline.fingerprint import ParameterSet, digest_of
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.stages.base import TaskContext
+from pipeline.stages.inputs import tool_version
+from pipeline.task import ArtifactPath, Task, TaskId
+from render.spec import MeshObject, MeshSequenceObject, RenderSpec, SceneObject, VolumeSequenceObject
+
+if TYPE_CHECKING:
+    from render.blender import Renderer
+
+_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"device", "blender"}}
+
+
+class RenderStage:
+    """One PNG a frame. A worker keeps Blender and the scene warm from frame to frame."""
+
+    name = "render"
+    version = 1
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task a frame."""
+        blender = job.render.blender
+        parameters = ParameterSet.of(
+            stage=self.name,
+            version=self.version,
+            tools={"blender": blender} if blender else {"bpy": tool_version("bpy")},
+            **render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS),
+        )
+        static = tuple(layout.body_mesh(body.name) for body in job.rigid)
+        return [
+            Task(
+                id=TaskId(f"render/{frame:06d}"),
+                stage=self.name,
+                inputs=(*static, *_frame_inputs(job, layout, frame)),
+                outputs=(layout.picture(frame),),
+                parameters=parameters,
+                frame=frame,
+            )
+            for frame in range(job.frame_count)
+        ]
+
+    def run(self, context: TaskContext) -> None:
+        """Draw one frame."""
+        from render.pictures import validate_picture
+
+        task, job = context.task, context.job
+        assert task.frame is not None
+        renderer = _warm_renderer(context)
+        with context.committing(task.outputs[0], partial(validate_picture, resolution=job.render.resolution)) as path:
+            renderer.render(task.frame, path)
+        context.progress(1, 1)
+
+
+def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
+    """The job as Blender sees it; paths are relative to the job's folder."""
+    objects: list[SceneObject] = [
+        MeshObject(
+            name=body.name,
+            file=layout.body_mesh(body.name),
+            position=body.position,
+            orientation=_orientation(body.rotation_deg),
+            material=job.material_of(body.name),
+        )
+        for body in job.rigid
+    ]
+    objects += [
+        MeshSequenceObject(
+            name=fluid.name, file=f"surfaces/{fluid.name}/{{frame}}.ply", material=job.material_of(fluid.name)
+        )
+        for fluid in job.fluid
+    ]
+    objects += [
+        VolumeSequenceObject(
+            name=smoke.name, file=f"volumes/{smoke.name}/{{frame}}.vdb", material=job.material_of(smoke.name)
+        )
+        for smoke in job.smoke
+    ]
+    return RenderSpec(
+        fps=job.fps,
+        domain_min=job.domain.min,
+        domain_max=job.domain.max,
+        camera=job.camera,
+        stage=job.stage,
+        lights=job.light,
+        objects=tuple(objects),
+        render=job.render,
+    )
+
+
+def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:
+    surfaces = [layout.surface(fluid.name, frame) for fluid in job.fluid]
+    volumes = [layout.volume(smoke.name, frame) for smoke in job.smoke]
+    return surfaces + volumes or [layout.frame_cache(frame)]
+
+
+def _orientation(rotation_deg: tuple[float, float, float]) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) of rotations about the world's x, then y, then z axis."""
+    x, y, z, w = Rotation.from_euler("xyz", rotation_deg, degrees=True).as_quat()
+    return float(w), float(x), float(y), float(z)
+
+
+_WARM: dict[str, Renderer] = {}
+"""The renderer of this worker process, by the digest of its specification and thread count; at most one."""
+
+
+def _warm_renderer(context: TaskContext) -> Renderer:
+    from render.blender import open_renderer
+
+    spec = render_spec(context.job, context.layout)
+    key = digest_of(f"{context.layout.root} {context.threads} {spec.model_dump_json()}")
+    if key not in _WARM:
+        for renderer in _WARM.values():
+            renderer.close()
+        _WARM.clear()
+        path = context.layout.root / "scene.json"
+        part = context.layout.root / f".scene.json.part.{os.getpid()}"
+        spec.write(part)
+        part.replace(path)
+        _WARM[key] = open_renderer(path, threads=context.threads, blender=context.job.render.blender)
+    return _WARM[key]

@@ -1,0 +1,166 @@
+"""Simulate: the world, frame by frame, into the HDF5 cache, with checkpoints to continue from."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from pipeline.cache import Checkpoint, read_checkpoint, validate_frame, write_checkpoint, write_frame
+from pipeline.errors import InvalidArtifactError, StageUnavailableError
+from pipeline.fingerprint import ParameterSet
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.stages.base import TaskContext
+from pipeline.stages.inputs import mesh_file_hashes, placements, tool_version
+from pipeline.task import Resources, Task, TaskId
+from sim.scene import SceneParameters
+from sim.world import FrameReport, World
+
+CHECKPOINT_INTERVAL_S = 30.0
+"""Wall time between checkpoints: what a crash costs at most, against well under 1 % of the time spent writing."""
+
+CHECKPOINTS_KEPT = 2
+
+
+class SimulateStage:
+    """One task for the whole job: it commits a frame at a time and continues where it stopped."""
+
+    name = "simulate"
+    version = 1
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""
+        scene = {name: getattr(job, name) for name in SceneParameters.model_fields if name != "cloth"}
+        return [
+            Task(
+                id=TaskId("simulate"),
+                stage=self.name,
+                inputs=(),
+                outputs=tuple(layout.frame_cache(frame) for frame in range(job.frame_count)),
+                parameters=ParameterSet.of(
+                    stage=self.name,
+                    version=self.version,
+                    tools={name: tool_version(name) for name in ("taichi", "libigl", "numpy")},
+                    fps=job.fps,
+                    files=mesh_file_hashes(placements(job)),
+                    **scene,
+                ),
+                resources=_resources(job),
+                checkpointed=True,
+            )
+        ]
+
+    def run(self, context: TaskContext) -> None:
+        """Compute the frames that are not committed yet.
+
+        Raises:
+            SimulationDivergedError: the state became unphysical; the last good checkpoint is kept.
+            StageUnavailableError: the frames so far come from another kind of device.
+        """
+        total = len(context.task.outputs)
+        missing = next((k for k, output in enumerate(context.task.outputs) if not context.is_committed(output)), total)
+        if missing == total:
+            return
+        _Simulation(context).run(first_missing=missing, total=total)
+
+
+class _Simulation:
+    """One attempt at the simulation of a job."""
+
+    def __init__(self, context: TaskContext) -> None:
+        from sim.build import build_world
+        from sim.runtime import initialize
+
+        self._context = context
+        self._folder = context.layout.checkpoints
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._device = initialize(context.job.device, threads=context.threads)
+        self._world: World = build_world(context.job, frames_per_second=context.job.fps)
+        self._checkpointed_at = time.monotonic()
+        self._last_checkpoint = -1
+
+    def run(self, *, first_missing: int, total: int) -> None:
+        self._continue_from_checkpoint(first_missing)
+        print(f"device {self._device}, starting at frame {self._world.frame}", flush=True)
+        if self._world.frame == 0 and not self._is_committed(0):
+            self._commit(FrameReport(0, 0.0, {}, {}, self._world.diagnostics()))
+        while self._world.frame + 1 < total:
+            if self._context.stop_requested():
+                self._save_checkpoint()
+                return
+            report = self._world.advance_frame()
+            if not self._is_committed(report.frame):
+                self._commit(report)
+            self._context.progress(report.frame + 1, total, _describe(report))
+            if time.monotonic() - self._checkpointed_at > CHECKPOINT_INTERVAL_S:
+                self._save_checkpoint()
+        self._save_checkpoint()
+
+    def _is_committed(self, frame: int) -> bool:
+        return self._context.is_committed(self._context.task.outputs[frame])
+
+    def _commit(self, report: FrameReport) -> None:
+        with self._context.committing(self._context.task.outputs[report.frame], validate_frame) as path:
+            write_frame(path, self._world.snapshots(), report)
+
+    def _continue_from_checkpoint(self, first_missing: int) -> None:
+        """Restore the newest checkpoint of this fingerprint that leaves no frame out; else start at frame 0."""
+        for path in sorted(self._folder.glob("[0-9]*.h5"), reverse=True):
+            try:
+                checkpoint = read_checkpoint(path)
+            except InvalidArtifactError as error:
+                print(f"ignoring a damaged checkpoint: {error}", flush=True)
+                path.unlink()
+                continue
+            if checkpoint.fingerprint != self._context.fingerprint:
+                path.unlink()
+                continue
+            if checkpoint.device != self._device:
+                raise StageUnavailableError(
+                    f"this job was simulated on {checkpoint.device} so far, and this machine offers {self._device}; "
+                    f'continue where {checkpoint.device} is, or set device = "{self._device}" to start anew'
+                )
+            if checkpoint.frame < first_missing:
+                self._world.restore(checkpoint.frame, checkpoint.arrays)
+                self._last_checkpoint = checkpoint.frame
+                return
+
+    def _save_checkpoint(self) -> None:
+        """Write aside, decode, rename; then drop all but the newest two."""
+        self._checkpointed_at = time.monotonic()
+        frame = self._world.frame
+        if frame in (0, self._last_checkpoint):
+            return
+        path = self._folder / f"{frame:06d}.h5"
+        part = self._folder / f".{path.name}.part.{self._context.attempt}"
+        write_checkpoint(part, Checkpoint(frame, self._context.fingerprint, self._device, self._world.checkpoint()))
+        read_checkpoint(part)
+        _sync(part)
+        part.replace(path)
+        _sync(self._folder)
+        self._last_checkpoint = frame
+        for old in sorted(self._folder.glob("[0-9]*.h5"))[:-CHECKPOINTS_KEPT]:
+            old.unlink()
+
+
+def _resources(job: Job) -> Resources:
+    """All cores where the CPU computes, so that it runs alone; one core and the GPU where that does."""
+    from sim.runtime import resolve_device
+
+    if resolve_device(job.device) == "cpu":
+        return Resources(cores=0)
+    return Resources(cores=1, gpus=1)
+
+
+def _describe(report: FrameReport) -> str:
+    substeps = ", ".join(f"{name} {count} substeps" for name, count in report.substeps.items())
+    return f"frame {report.frame}: {substeps}"
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,58 @@
+"""Surface: the particles of each fluid and frame, as a mesh that carries their velocity."""
+
+from __future__ import annotations
+
+from pipeline.cache import read_frame
+from pipeline.fingerprint import ParameterSet
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.stages.base import TaskContext
+from pipeline.stages.inputs import tool_version
+from pipeline.task import Task, TaskId
+
+
+class SurfaceStage:
+    """One PLY a fluid and frame (splashsurf)."""
+
+    name = "surface"
+    version = 1
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task a fluid and frame."""
+        parameters = ParameterSet.of(
+            stage=self.name,
+            version=self.version,
+            tools={"pysplashsurf": tool_version("pysplashsurf")},
+            surface=job.surface,
+        )
+        return [
+            Task(
+                id=TaskId(f"surface/{fluid.name}/{frame:06d}"),
+                stage=self.name,
+                inputs=(layout.frame_cache(frame),),
+                outputs=(layout.surface(fluid.name, frame),),
+                parameters=parameters,
+                subject=fluid.name,
+                frame=frame,
+            )
+            for fluid in job.fluid
+            for frame in range(job.frame_count)
+        ]
+
+    def run(self, context: TaskContext) -> None:
+        """Mesh one frame of one fluid."""
+        from render.meshes import validate_ply, write_ply
+        from render.surface import reconstruct_surface
+
+        task = context.task
+        fluid = read_frame(context.layout.path(task.inputs[0]), task.subject).bodies[task.subject]
+        surface = reconstruct_surface(
+            fluid.arrays["position"],
+            fluid.arrays["velocity"],
+            particle_radius=float(fluid.attributes["particle_radius"]),  # type: ignore[arg-type]
+            parameters=context.job.surface,
+            threads=context.threads,
+        )
+        with context.committing(task.outputs[0], validate_ply) as path:
+            write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities)
+        context.progress(1, 1)

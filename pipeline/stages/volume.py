@@ -1,0 +1,63 @@
+"""Volume: the cells of each smoke and frame, as OpenVDB grids."""
+
+from __future__ import annotations
+
+from pipeline.cache import read_frame
+from pipeline.fingerprint import ParameterSet
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.stages.base import TaskContext
+from pipeline.stages.inputs import tool_version
+from pipeline.task import Task, TaskId
+
+
+class VolumeStage:
+    """One VDB a smoke and frame, with density, temperature and velocity."""
+
+    name = "volume"
+    version = 1
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task a smoke and frame."""
+        parameters = ParameterSet.of(
+            stage=self.name,
+            version=self.version,
+            tools={"bpy": tool_version("bpy")},
+            volume=job.volume,
+            fps=job.fps,
+            shutter=job.render.shutter,
+        )
+        return [
+            Task(
+                id=TaskId(f"volume/{smoke.name}/{frame:06d}"),
+                stage=self.name,
+                inputs=(layout.frame_cache(frame),),
+                outputs=(layout.volume(smoke.name, frame),),
+                parameters=parameters,
+                subject=smoke.name,
+                frame=frame,
+            )
+            for smoke in job.smoke
+            for frame in range(job.frame_count)
+        ]
+
+    def run(self, context: TaskContext) -> None:
+        """Write one frame of one smoke."""
+        from render.volume import validate_volume, write_volume
+
+        task, job = context.task, context.job
+        smoke = read_frame(context.layout.path(task.inputs[0]), task.subject).bodies[task.subject]
+        with context.committing(task.outputs[0], validate_volume) as path:
+            write_volume(
+                path,
+                density=smoke.arrays["density"],
+                temperature=smoke.arrays["temperature"],
+                velocity=smoke.arrays["velocity"],
+                origin=smoke.attributes["origin"],
+                cell_size=smoke.attributes["cell_size"],
+                ambient_temperature=smoke.attributes["ambient_temperature"],
+                parameters=job.volume,
+                fps=job.fps,
+                shutter=job.render.shutter,
+            )
+        context.progress(1, 1)

@@ -1,0 +1,108 @@
+"""From a scene's parameters to a world of solvers, and to the particles they start with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sim.fluid.parameters import FluidParameters
+from sim.rigid.static import StaticBody
+from sim.scene import DomainParameters, SceneParameters
+from sim.shapes.solid import Solid, build_solid, fill_with_particles, sample_surface
+from sim.world import World
+
+CLEARANCE_IN_SPACINGS = 0.5
+"""A particle's centre keeps half a lattice spacing, its radius, from walls and solids."""
+
+
+@dataclass(frozen=True)
+class FluidFilling:
+    """The particles that a fluid starts with.
+
+    Attributes:
+        positions: (n, 3) float32 [m].
+        velocities: (n, 3) float32 [m/s].
+        in_solids: how many lattice points were left out because they lay inside a solid.
+        in_other_blocks: how many were left out because an earlier block of the fluid filled their place.
+    """
+
+    positions: NDArray[np.float32]
+    velocities: NDArray[np.float32]
+    in_solids: int
+    in_other_blocks: int
+
+
+def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
+    """The solvers of a scene in their initial state; `sim.runtime.initialize` must have run.
+
+    Raises:
+        ShapeError: a shape cannot be built.
+        ValueError: a body cannot start as described.
+    """
+    static_bodies = [StaticBody(parameters) for parameters in scene.rigid]
+    solids = [body.solid for body in static_bodies]
+    solvers = [
+        *(_build_fluid(fluid, scene, solids) for fluid in scene.fluid),
+        *(_build_smoke(scene, solids)),
+    ]
+    return World(solvers, frames_per_second=frames_per_second, static_bodies=static_bodies)
+
+
+def fill_fluid(fluid: FluidParameters, domain: DomainParameters, solids: Sequence[Solid]) -> FluidFilling:
+    """Fill the fluid's blocks on lattices of spacing 2r, clear of walls, solids and each other."""
+    spacing = 2.0 * fluid.particle_radius
+    clearance = CLEARANCE_IN_SPACINGS * spacing
+    lower, upper = np.asarray(domain.min) + clearance, np.asarray(domain.max) - clearance
+    positions: list[NDArray[np.float32]] = []
+    velocities: list[NDArray[np.float32]] = []
+    in_solids = in_other_blocks = 0
+    for block in fluid.block:
+        points = fill_with_particles(build_solid(block), spacing, lower=lower, upper=upper)
+        for solid in solids:
+            outside = solid.signed_distance(points.astype(np.float64)) >= clearance
+            in_solids += int(np.count_nonzero(~outside))
+            points = points[outside]
+        if positions and len(points):
+            distance, _ = cKDTree(np.concatenate(positions)).query(points, distance_upper_bound=0.9 * spacing)
+            free = ~np.isfinite(distance)
+            in_other_blocks += int(np.count_nonzero(~free))
+            points = points[free]
+        positions.append(points)
+        velocities.append(np.broadcast_to(np.float32(block.velocity), points.shape))
+    return FluidFilling(
+        np.concatenate(positions), np.ascontiguousarray(np.concatenate(velocities)), in_solids, in_other_blocks
+    )
+
+
+def _build_fluid(fluid: FluidParameters, scene: SceneParameters, solids: Sequence[Solid]):
+    from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
+    from sim.fluid.wcsph import WCSPHSolver
+
+    spacing = 2.0 * fluid.particle_radius
+    filling = fill_fluid(fluid, scene.domain, solids)
+    if len(filling.positions) == 0:
+        raise ValueError(f'fluid "{fluid.name}" has no particle: its blocks are outside the domain or inside solids')
+    samples = [domain_wall_samples(scene.domain, spacing)]
+    samples += [sample_surface(solid.surface_mesh(max_edge=None), spacing) for solid in solids]
+    boundary = BoundarySamples.of_bodies(samples)
+    return WCSPHSolver(
+        fluid,
+        domain=scene.domain,
+        gravity=scene.gravity,
+        positions=filling.positions,
+        velocities=filling.velocities,
+        boundary=boundary,
+    )
+
+
+def _build_smoke(scene: SceneParameters, solids: Sequence[Solid]):
+    if not scene.smoke:
+        return
+    from sim.smoke.solver import SmokeSolver
+
+    for smoke in scene.smoke:
+        yield SmokeSolver(smoke, domain=scene.domain, gravity=scene.gravity, solids=solids)
