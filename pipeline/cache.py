@@ -1,4 +1,4 @@
-"""The HDF5 cache: one file a frame with every body in it, and checkpoints apart. Format: docs/formats.md.
+"""The HDF5 cache: one file a frame with every body in it, and checkpoints apart. Format: docs/cache-format.md.
 
 The same arrays give the same bytes: HDF5 stores no times here, and groups and attributes are written in a fixed order.
 """

@@ -44,3 +44,17 @@ class JobBusyError(PipelineError):
     """Another live process is running this job."""
 
     exit_code = 4
+
+
+class LeaseLostError(PipelineError):
+    """Another process has taken this job over; this one must stop writing its record."""
+
+    exit_code = 4
+
+
+class ManifestError(PipelineError):
+    """The job's manifest cannot be used; says how to get a good one from the receipts."""
+
+
+class PlanError(PipelineError):
+    """The stages' tasks do not fit together: an artifact without a maker, or with two, or a circle."""

@@ -10,13 +10,20 @@ not in it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from blake3 import blake3
 from pydantic import BaseModel
+
+if TYPE_CHECKING:
+    from pipeline.task import ArtifactPath, Task
+
+_SHOWN_LENGTH = 80
+"""Longest value shown in full when a change is described [characters]."""
 
 
 def digest_of(text: str) -> str:
@@ -36,15 +43,98 @@ class ParameterSet:
         return digest_of(self.canonical)
 
     @classmethod
-    def of(cls, *, stage: str, version: int, tools: Mapping[str, str], **values: Any) -> ParameterSet:
-        """Collect parameters; models and plain JSON values alike, in any order."""
-        document = {
-            "stage": stage,
-            "stage_version": version,
-            "tools": dict(tools),
-            **{name: _plain(value) for name, value in values.items()},
-        }
+    def of(
+        cls,
+        values: Mapping[str, Any] = MappingProxyType({}),
+        /,
+        *,
+        stage: str,
+        version: int,
+        tools: Mapping[str, str],
+        **more: Any,
+    ) -> ParameterSet:
+        """Collect parameters; models and plain JSON values alike, in any order.
+
+        Args:
+            values: parameters by name; here a name may be one of the words below.
+            stage: name of the stage.
+            version: the stage's version.
+            tools: version of each tool that does the work.
+            **more: further parameters.
+
+        Raises:
+            ValueError: two parameters share a name, or a value is not a finite number.
+        """
+        document = {"stage_name": stage, "stage_version": version, "tools": dict(tools)}
+        for name, value in (*values.items(), *more.items()):
+            if name in document:
+                raise ValueError(f"two parameters of stage {stage} are called {name}")
+            document[name] = _plain(value)
         return cls(json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False))
+
+
+def task_fingerprint(task: Task, hashes: Mapping[ArtifactPath, str]) -> str:
+    """Digest of everything that decides what a task's outputs hold.
+
+    Args:
+        task: the task.
+        hashes: content hash of each of its inputs; more may be in it.
+
+    Raises:
+        KeyError: an input has no hash yet.
+    """
+    document = [task.parameters.digest, [[path, hashes[path]] for path in task.inputs]]
+    return digest_of(json.dumps(document, separators=(",", ":")))
+
+
+def explain_difference(old: ParameterSet, new: ParameterSet) -> list[str]:
+    """Name what changed from one parameter set to another, by its path in the job file.
+
+    Returns:
+        One clause a change, such as `camera.position changed from [3, 2, 1] to [4, 2, 1]`; lists of tables are shown
+        by the tables' names, as in `fluid[water].viscosity`. Empty if nothing changed.
+    """
+    return [*_differences("", json.loads(old.canonical), json.loads(new.canonical))]
+
+
+def _differences(path: str, old: Any, new: Any) -> Iterator[str]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted(old.keys() | new.keys()):
+            yield from _member_differences(f"{path}.{key}" if path else key, key, old, new)
+    elif _is_list_of_tables(old) and _is_list_of_tables(new):
+        old_tables, new_tables = _by_name(old), _by_name(new)
+        for name in dict.fromkeys([*old_tables, *new_tables]):
+            yield from _member_differences(f"{path}[{name}]", name, old_tables, new_tables)
+        if sorted(old_tables) == sorted(new_tables) and list(old_tables) != list(new_tables):
+            yield f"{path} changed its order"
+    elif json.dumps(old) != json.dumps(new):  # as the digest sees it: 1 and 1.0 differ
+        yield f"{path} changed from {_show(old)} to {_show(new)}"
+
+
+def _member_differences(path: str, key: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    if key not in old:
+        yield f"{path} was added: {_show(new[key])}"
+    elif key not in new:
+        yield f"{path} was removed: {_show(old[key])}"
+    else:
+        yield from _differences(path, old[key], new[key])
+
+
+def _is_list_of_tables(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, dict) for item in value)
+
+
+def _by_name(tables: list[dict[str, Any]]) -> dict[str, Any]:
+    """Tables under their names where all have one of their own, else under their positions."""
+    names = [str(table.get("name", "")) for table in tables]
+    if "" in names or len(set(names)) < len(names):
+        names = [str(index) for index in range(len(tables))]
+    return dict(zip(names, tables, strict=True))
+
+
+def _show(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= _SHOWN_LENGTH else f"{text[: _SHOWN_LENGTH - 3]}..."
 
 
 def _plain(value: Any) -> Any:

@@ -26,6 +26,16 @@ class JobLayout:
         return self.root / "manifest.db"
 
     @property
+    def lease(self) -> Path:
+        """Who runs this job right now."""
+        return self.root / "runner.lease"
+
+    @property
+    def receipts(self) -> Path:
+        """Folder of all receipts."""
+        return self.root / ".receipts"
+
+    @property
     def report(self) -> Path:
         """Timings, plots and a contact sheet."""
         return self.root / "report.html"
@@ -36,7 +46,7 @@ class JobLayout:
 
     def receipt(self, artifact: ArtifactPath) -> Path:
         """Receipt of a committed artifact."""
-        return self.root / ".receipts" / f"{artifact}.json"
+        return self.receipts / f"{artifact}.json"
 
     def path(self, artifact: ArtifactPath) -> Path:
         """Where an artifact lies."""

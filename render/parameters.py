@@ -65,7 +65,7 @@ class StageParameters(Parameters):
         description="studio: cyclorama with key, fill and rim lights; outdoor: ground, sky and sun.",
     )
     strength: Positive = Field(default=1.0, description="Factor on all of its lights [-].")
-    color: Color = Field(default=(0.78, 0.80, 0.82), description="Colour of the ground and backdrop, linear RGB.")
+    color: Color = Field(default=(0.22, 0.25, 0.29), description="Colour of the ground and backdrop, linear RGB.")
     tank: bool = Field(default=False, description="Show the domain's walls as a glass tank.")
 
 

@@ -12,7 +12,11 @@ from scipy.spatial import cKDTree
 from sim.fluid.parameters import FluidParameters
 from sim.rigid.static import StaticBody
 from sim.scene import DomainParameters, SceneParameters
-from sim.shapes.solid import Solid, build_solid, fill_with_particles, sample_surface
+from sim.shapes.placement import build_solid
+from sim.shapes.sampling import fill_with_particles
+from sim.shapes.solid import Solid
+from sim.smoke.parameters import SmokeParameters
+from sim.solver import Solver
 from sim.world import World
 
 CLEARANCE_IN_SPACINGS = 0.5
@@ -43,13 +47,10 @@ def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
         ShapeError: a shape cannot be built.
         ValueError: a body cannot start as described.
     """
-    static_bodies = [StaticBody(parameters) for parameters in scene.rigid]
-    solids = [body.solid for body in static_bodies]
-    solvers = [
-        *(_build_fluid(fluid, scene, solids) for fluid in scene.fluid),
-        *(_build_smoke(scene, solids)),
-    ]
-    return World(solvers, frames_per_second=frames_per_second, static_bodies=static_bodies)
+    bodies = [StaticBody(parameters) for parameters in scene.rigid]
+    fluids = [_build_fluid(fluid, scene, bodies) for fluid in scene.fluid]
+    smokes = [_build_smoke(smoke, scene, bodies) for smoke in scene.smoke]
+    return World([*fluids, *smokes], frames_per_second=frames_per_second, static_bodies=bodies)
 
 
 def fill_fluid(fluid: FluidParameters, domain: DomainParameters, solids: Sequence[Solid]) -> FluidFilling:
@@ -78,17 +79,17 @@ def fill_fluid(fluid: FluidParameters, domain: DomainParameters, solids: Sequenc
     )
 
 
-def _build_fluid(fluid: FluidParameters, scene: SceneParameters, solids: Sequence[Solid]):
+def _build_fluid(fluid: FluidParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
     from sim.fluid.wcsph import WCSPHSolver
 
     spacing = 2.0 * fluid.particle_radius
-    filling = fill_fluid(fluid, scene.domain, solids)
+    filling = fill_fluid(fluid, scene.domain, [body.solid for body in bodies])
     if len(filling.positions) == 0:
         raise ValueError(f'fluid "{fluid.name}" has no particle: its blocks are outside the domain or inside solids')
-    samples = [domain_wall_samples(scene.domain, spacing)]
-    samples += [sample_surface(solid.surface_mesh(max_edge=None), spacing) for solid in solids]
-    boundary = BoundarySamples.of_bodies(samples)
+    boundary = BoundarySamples.of_bodies(
+        domain_wall_samples(scene.domain, spacing), *(body.boundary_samples(spacing) for body in bodies)
+    )
     return WCSPHSolver(
         fluid,
         domain=scene.domain,
@@ -99,10 +100,7 @@ def _build_fluid(fluid: FluidParameters, scene: SceneParameters, solids: Sequenc
     )
 
 
-def _build_smoke(scene: SceneParameters, solids: Sequence[Solid]):
-    if not scene.smoke:
-        return
+def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:
     from sim.smoke.solver import SmokeSolver
 
-    for smoke in scene.smoke:
-        yield SmokeSolver(smoke, domain=scene.domain, gravity=scene.gravity, solids=solids)
+    return SmokeSolver(smoke, domain=scene.domain, gravity=scene.gravity, solids=[body.solid for body in bodies])

@@ -31,3 +31,17 @@ class Snapshot:
     kind: BodyKind
     arrays: Mapping[str, NDArray[np.generic]]
     attributes: Mapping[str, Attribute]
+
+    def number(self, attribute: str) -> float:
+        """A scalar attribute. Raises KeyError when there is none, TypeError when it is not a number."""
+        value = self.attributes[attribute]
+        if not isinstance(value, int | float):
+            raise TypeError(f"{attribute} is not a number: {value!r}")
+        return float(value)
+
+    def vector(self, attribute: str) -> tuple[float, ...]:
+        """A vector attribute. Raises KeyError when there is none, TypeError when it is not a vector."""
+        value = self.attributes[attribute]
+        if not isinstance(value, tuple):
+            raise TypeError(f"{attribute} is not a vector: {value!r}")
+        return value

@@ -23,6 +23,7 @@ from sim.scene import SceneParameters
 from sim.smoke.parameters import SmokeParameters
 
 DEFAULT_FRAMES = 120
+MAX_FRAMES = 1_000_000
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 
 
@@ -31,7 +32,7 @@ class Job(SceneParameters):
 
     name: str = Field(pattern=NAME_PATTERN, description="Name of the job and of its folder under renders/.")
     fps: Annotated[int, Field(ge=1, le=1000)] = Field(default=60, description="Frames per second [1/s].")
-    frames: Annotated[int, Field(ge=1, le=1_000_000)] | None = Field(
+    frames: Annotated[int, Field(ge=1, le=MAX_FRAMES)] | None = Field(
         default=None, description="Number of frames [-]; give this or duration."
     )
     duration: Annotated[float, Field(gt=0.0)] | None = Field(
@@ -81,4 +82,6 @@ class Job(SceneParameters):
     def _frames_or_duration(self) -> Self:
         if self.frames is not None and self.duration is not None:
             raise ValueError("give frames or duration, not both")
+        if self.duration is not None and self.duration * self.fps > MAX_FRAMES:
+            raise ValueError(f"duration of {self.duration:g} s at {self.fps} fps is more than {MAX_FRAMES:,} frames")
         return self

@@ -51,5 +51,8 @@ class Stage(Protocol):
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The tasks of this stage. Pure."""
 
+    def obstacles(self, job: Job) -> list[str]:
+        """Why this machine cannot run this stage of this job, a sentence each with a remedy; empty if it can."""
+
     def run(self, context: TaskContext) -> None:
         """Commit the task's outputs. Idempotent; shares no state with other tasks but warm caches."""

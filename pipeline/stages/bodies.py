@@ -37,6 +37,10 @@ class BodiesStage:
             for body in job.rigid
         ]
 
+    def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
+        """None: its packages are always there."""
+        return []
+
     def run(self, context: TaskContext) -> None:
         """Mesh one body."""
         from render.meshes import validate_ply, write_ply

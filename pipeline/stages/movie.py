@@ -10,9 +10,7 @@ from pipeline.layout import JobLayout
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import tool_version
 from pipeline.task import Task, TaskId
-
-SEGMENT_FRAMES = 30
-"""Frames a segment: a changed frame encodes half a second of film again, not all of it."""
+from render.movie import SEGMENT_FRAMES
 
 
 class MovieStage:
@@ -52,6 +50,10 @@ class MovieStage:
             parameters=parameters,
         )
         return [*segments, film]
+
+    def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
+        """None: its packages are always there."""
+        return []
 
     def run(self, context: TaskContext) -> None:
         """Encode one segment, or join them all."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scipy.spatial.transform import Rotation
@@ -32,10 +32,10 @@ class RenderStage:
         """One task a frame."""
         blender = job.render.blender
         parameters = ParameterSet.of(
+            render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS),
             stage=self.name,
             version=self.version,
             tools={"blender": blender} if blender else {"bpy": tool_version("bpy")},
-            **render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS),
         )
         static = tuple(layout.body_mesh(body.name) for body in job.rigid)
         return [
@@ -50,6 +50,19 @@ class RenderStage:
             for frame in range(job.frame_count)
         ]
 
+    def obstacles(self, job: Job) -> list[str]:
+        """No Blender, one that is too old, or one that lacks a shared library."""
+        from render.blender import BlenderUnavailableError, require_bpy, require_supported_executable
+
+        try:
+            if job.render.blender is None:
+                require_bpy()
+            else:
+                require_supported_executable(job.render.blender)
+        except BlenderUnavailableError as error:
+            return [str(error)]
+        return []
+
     def run(self, context: TaskContext) -> None:
         """Draw one frame."""
         from render.pictures import validate_picture
@@ -57,7 +70,11 @@ class RenderStage:
         task, job = context.task, context.job
         assert task.frame is not None
         renderer = _warm_renderer(context)
-        with context.committing(task.outputs[0], partial(validate_picture, resolution=job.render.resolution)) as path:
+
+        def validate(path: Path) -> None:
+            validate_picture(path, job.render.resolution)
+
+        with context.committing(task.outputs[0], validate) as path:
             renderer.render(task.frame, path)
         context.progress(1, 1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.cache import Checkpoint, read_checkpoint, validate_frame, write_checkpoint, write_frame
@@ -51,6 +52,16 @@ class SimulateStage:
             )
         ]
 
+    def obstacles(self, job: Job) -> list[str]:
+        """A device that does not work here."""
+        from sim.runtime import DeviceUnavailableError, resolve_device
+
+        try:
+            resolve_device(job.device)
+        except DeviceUnavailableError as error:
+            return [str(error)]
+        return []
+
     def run(self, context: TaskContext) -> None:
         """Compute the frames that are not committed yet.
 
@@ -58,11 +69,9 @@ class SimulateStage:
             SimulationDivergedError: the state became unphysical; the last good checkpoint is kept.
             StageUnavailableError: the frames so far come from another kind of device.
         """
-        total = len(context.task.outputs)
-        missing = next((k for k, output in enumerate(context.task.outputs) if not context.is_committed(output)), total)
-        if missing == total:
-            return
-        _Simulation(context).run(first_missing=missing, total=total)
+        missing = [k for k, output in enumerate(context.task.outputs) if not context.is_committed(output)]
+        if missing:
+            _Simulation(context).run(missing)
 
 
 class _Simulation:
@@ -80,32 +89,31 @@ class _Simulation:
         self._checkpointed_at = time.monotonic()
         self._last_checkpoint = -1
 
-    def run(self, *, first_missing: int, total: int) -> None:
-        self._continue_from_checkpoint(first_missing)
+    def run(self, missing: Sequence[int]) -> None:
+        """Advance to the last missing frame, and commit those that are missing on the way."""
+        wanted, last = frozenset(missing), missing[-1]
+        self._continue_from_checkpoint(before=missing[0])
         print(f"device {self._device}, starting at frame {self._world.frame}", flush=True)
-        if self._world.frame == 0 and not self._is_committed(0):
+        if self._world.frame in wanted:
             self._commit(FrameReport(0, 0.0, {}, {}, self._world.diagnostics()))
-        while self._world.frame + 1 < total:
+        while self._world.frame < last:
             if self._context.stop_requested():
                 self._save_checkpoint()
                 return
             report = self._world.advance_frame()
-            if not self._is_committed(report.frame):
+            if report.frame in wanted:
                 self._commit(report)
-            self._context.progress(report.frame + 1, total, _describe(report))
+            self._context.progress(report.frame + 1, last + 1, _describe(report))
             if time.monotonic() - self._checkpointed_at > CHECKPOINT_INTERVAL_S:
                 self._save_checkpoint()
         self._save_checkpoint()
-
-    def _is_committed(self, frame: int) -> bool:
-        return self._context.is_committed(self._context.task.outputs[frame])
 
     def _commit(self, report: FrameReport) -> None:
         with self._context.committing(self._context.task.outputs[report.frame], validate_frame) as path:
             write_frame(path, self._world.snapshots(), report)
 
-    def _continue_from_checkpoint(self, first_missing: int) -> None:
-        """Restore the newest checkpoint of this fingerprint that leaves no frame out; else start at frame 0."""
+    def _continue_from_checkpoint(self, *, before: int) -> None:
+        """Restore the newest checkpoint of this fingerprint from before a frame; else start at frame 0."""
         for path in sorted(self._folder.glob("[0-9]*.h5"), reverse=True):
             try:
                 checkpoint = read_checkpoint(path)
@@ -121,13 +129,16 @@ class _Simulation:
                     f"this job was simulated on {checkpoint.device} so far, and this machine offers {self._device}; "
                     f'continue where {checkpoint.device} is, or set device = "{self._device}" to start anew'
                 )
-            if checkpoint.frame < first_missing:
+            if checkpoint.frame < before:
                 self._world.restore(checkpoint.frame, checkpoint.arrays)
                 self._last_checkpoint = checkpoint.frame
                 return
 
     def _save_checkpoint(self) -> None:
-        """Write aside, decode, rename; then drop all but the newest two."""
+        """Write aside, decode, rename; then drop older ones but the newest two.
+
+        Later ones, left by a run that had come further, stay: they are of the same fingerprint.
+        """
         self._checkpointed_at = time.monotonic()
         frame = self._world.frame
         if frame in (0, self._last_checkpoint):
@@ -140,7 +151,8 @@ class _Simulation:
         part.replace(path)
         _sync(self._folder)
         self._last_checkpoint = frame
-        for old in sorted(self._folder.glob("[0-9]*.h5"))[:-CHECKPOINTS_KEPT]:
+        so_far = sorted(each for each in self._folder.glob("[0-9]*.h5") if each.name <= path.name)
+        for old in so_far[:-CHECKPOINTS_KEPT]:
             old.unlink()
 
 

@@ -39,6 +39,10 @@ class SurfaceStage:
             for frame in range(job.frame_count)
         ]
 
+    def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
+        """None: its packages are always there."""
+        return []
+
     def run(self, context: TaskContext) -> None:
         """Mesh one frame of one fluid."""
         from render.meshes import validate_ply, write_ply
@@ -49,7 +53,7 @@ class SurfaceStage:
         surface = reconstruct_surface(
             fluid.arrays["position"],
             fluid.arrays["velocity"],
-            particle_radius=float(fluid.attributes["particle_radius"]),  # type: ignore[arg-type]
+            particle_radius=fluid.number("particle_radius"),
             parameters=context.job.surface,
             threads=context.threads,
         )

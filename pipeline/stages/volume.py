@@ -41,6 +41,19 @@ class VolumeStage:
             for frame in range(job.frame_count)
         ]
 
+    def obstacles(self, job: Job) -> list[str]:
+        """No OpenVDB."""
+        from render.errors import VolumeUnavailableError
+        from render.volume import import_openvdb
+
+        if not job.smoke:
+            return []
+        try:
+            import_openvdb()
+        except VolumeUnavailableError as error:
+            return [str(error)]
+        return []
+
     def run(self, context: TaskContext) -> None:
         """Write one frame of one smoke."""
         from render.volume import validate_volume, write_volume
@@ -53,9 +66,9 @@ class VolumeStage:
                 density=smoke.arrays["density"],
                 temperature=smoke.arrays["temperature"],
                 velocity=smoke.arrays["velocity"],
-                origin=smoke.attributes["origin"],
-                cell_size=smoke.attributes["cell_size"],
-                ambient_temperature=smoke.attributes["ambient_temperature"],
+                origin=smoke.vector("origin"),
+                cell_size=smoke.number("cell_size"),
+                ambient_temperature=smoke.number("ambient_temperature"),
                 parameters=job.volume,
                 fps=job.fps,
                 shutter=job.render.shutter,

@@ -29,6 +29,10 @@ class SmokeSourceParameters(Placement):
             raise ValueError(f"end_s must be after start_s = {self.start_s:g} s, got {self.end_s:g} s")
         return self
 
+    def emits_at(self, time_s: float) -> bool:
+        """Whether it emits at a simulated time [s]; its end is excluded."""
+        return self.start_s <= time_s and (self.end_s is None or time_s < self.end_s)
+
 
 class SmokeParameters(Parameters):
     """Hot smoke in a box of cells: its sources, its physics and its numerics."""

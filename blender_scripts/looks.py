@@ -1,0 +1,276 @@
+"""Looks: what a body is made of, as a registry from names to functions that build shader nodes.
+
+A new look is one function here and its name in LOOKS (and in `render.parameters.Look`, which checks job files).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import bpy
+
+from blender_scripts.compatibility import node_tree_of
+
+Color = tuple[float, float, float]
+Value = TypeVar("Value")
+
+WATER_IOR = 1.333
+WATER_ABSORPTION_PER_M: Color = (0.30, 0.055, 0.009)
+"""Absorption of pure water for red, green and blue light [1/m] (Pope & Fry 1997, rounded)."""
+_WATER_ABSORPTION_BY_SIZE = 7.0
+"""A domain this many metres across needs no exaggeration to look like deep water."""
+_SMOKE_OPTICAL_SIZE = 22.0
+"""Optical depth of smoke of density 1 across the whole domain."""
+
+
+@dataclass(frozen=True)
+class LookContext:
+    """What a look may depend on.
+
+    Attributes:
+        domain_size: diagonal of the domain [m].
+        color: base colour or tint from the job, linear RGB, or None.
+        roughness: from the job [-], or None.
+        density: from the job, or None; see `render.parameters.MaterialParameters`.
+    """
+
+    domain_size: float
+    color: Color | None
+    roughness: float | None
+    density: float | None
+
+
+class NodeBuilder:
+    """A material's node tree, with the two steps that every look takes made short."""
+
+    def __init__(self, material: Any) -> None:
+        self.tree = node_tree_of(material)
+        self.output = self.tree.nodes.new("ShaderNodeOutputMaterial")
+
+    def node(self, kind: str, **inputs: float | Color) -> Any:
+        """A new node; inputs by socket name with underscores for blanks, colours as three numbers."""
+        node = self.tree.nodes.new(kind)
+        for name, value in inputs.items():
+            socket = node.inputs[name.replace("_", " ")]
+            socket.default_value = (*value, 1.0) if isinstance(value, tuple) and socket.type == "RGBA" else value
+        return node
+
+    def link(self, source: Any, target: Any) -> None:
+        """Connect an output socket to an input socket."""
+        self.tree.links.new(source, target)
+
+    def surface(self, shader: Any) -> None:
+        """Use a node's first output as the surface."""
+        self.link(shader.outputs[0], self.output.inputs["Surface"])
+
+    def volume(self, shader: Any) -> None:
+        """Use a node's first output as the inside."""
+        self.link(shader.outputs[0], self.output.inputs["Volume"])
+
+
+def new_material(name: str, parameters: dict[str, Any], *, domain_size: float) -> Any:
+    """The material for a body.
+
+    Args:
+        name: of the body.
+        parameters: `look`, `color`, `roughness` and `density` of the specification.
+        domain_size: diagonal of the domain [m].
+
+    Returns:
+        A Blender material.
+    """
+    color = parameters["color"]
+    context = LookContext(
+        domain_size, None if color is None else tuple(color), parameters["roughness"], parameters["density"]
+    )
+    material = bpy.data.materials.new(name)
+    LOOKS[parameters["look"]](NodeBuilder(material), context)
+    return material
+
+
+def _water(builder: NodeBuilder, context: LookContext) -> None:
+    """Clear water that absorbs red first, and lets light through to what lies under it."""
+    shader = builder.node(
+        "ShaderNodeBsdfPrincipled",
+        Base_Color=(1.0, 1.0, 1.0),
+        Roughness=_or(context.roughness, 0.0),
+        IOR=WATER_IOR,
+        Transmission_Weight=1.0,
+    )
+    builder.surface(_with_clear_shadow(builder, shader, tint=(0.94, 0.975, 1.0)))
+    # Given explicitly, the factor is on the real absorption; by default a small tank is as blue as a deep pool.
+    factor = _or(context.density, _WATER_ABSORPTION_BY_SIZE / context.domain_size)
+    coefficients = WATER_ABSORPTION_PER_M if context.color is None else _absorption_of_tint(context.color)
+    _homogeneous_absorption(builder, tuple(factor * value for value in coefficients))
+
+
+def _glass(builder: NodeBuilder, context: LookContext) -> None:
+    shader = builder.node(
+        "ShaderNodeBsdfPrincipled",
+        Base_Color=_or(context.color, (0.97, 0.99, 0.98)),
+        Roughness=_or(context.roughness, 0.0),
+        IOR=1.5,
+        Transmission_Weight=1.0,
+    )
+    builder.surface(_with_clear_shadow(builder, shader, tint=_or(context.color, (0.90, 0.93, 0.92))))
+
+
+def _smoke(builder: NodeBuilder, context: LookContext) -> None:
+    """Light smoke that scatters forwards a little; extinction follows the `density` grid."""
+    shader = builder.node(
+        "ShaderNodeVolumePrincipled",
+        Color=_or(context.color, (0.86, 0.88, 0.90)),
+        Density=_or(context.density, _SMOKE_OPTICAL_SIZE / context.domain_size),
+        Anisotropy=0.3,
+    )
+    builder.volume(shader)
+
+
+def _rubber(builder: NodeBuilder, context: LookContext) -> None:
+    builder.surface(
+        builder.node(
+            "ShaderNodeBsdfPrincipled",
+            Base_Color=_or(context.color, (0.95, 0.56, 0.02)),
+            Roughness=_or(context.roughness, 0.42),
+            Specular_IOR_Level=0.45,
+        )
+    )
+
+
+def _ceramic(builder: NodeBuilder, context: LookContext) -> None:
+    builder.surface(
+        builder.node(
+            "ShaderNodeBsdfPrincipled",
+            Base_Color=_or(context.color, (0.82, 0.79, 0.74)),
+            Roughness=_or(context.roughness, 0.35),
+            Coat_Weight=0.6,
+            Coat_Roughness=0.06,
+        )
+    )
+
+
+def _plastic(builder: NodeBuilder, context: LookContext) -> None:
+    builder.surface(
+        builder.node(
+            "ShaderNodeBsdfPrincipled",
+            Base_Color=_or(context.color, (0.62, 0.06, 0.05)),
+            Roughness=_or(context.roughness, 0.25),
+            IOR=1.46,
+        )
+    )
+
+
+def _metal(builder: NodeBuilder, context: LookContext) -> None:
+    builder.surface(
+        builder.node(
+            "ShaderNodeBsdfPrincipled",
+            Base_Color=_or(context.color, (0.62, 0.61, 0.60)),
+            Roughness=_or(context.roughness, 0.28),
+            Metallic=1.0,
+        )
+    )
+
+
+def _stone(builder: NodeBuilder, context: LookContext) -> None:
+    """Grey rock: mottled colour and a rough surface from noise in the body's own coordinates, so it does not swim."""
+    base = _or(context.color, (0.32, 0.30, 0.28))
+    coordinates = builder.node("ShaderNodeTexCoord")
+    # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box.
+    noise = builder.node("ShaderNodeTexNoise", Scale=7.0, Detail=6.0, Roughness=0.62)
+    builder.link(coordinates.outputs["Generated"], noise.inputs["Vector"])
+    ramp = builder.node("ShaderNodeValToRGB")
+    ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.3, 0.72
+    ramp.color_ramp.elements[0].color = (*(0.55 * channel for channel in base), 1.0)
+    ramp.color_ramp.elements[1].color = (*(min(1.0, 1.35 * channel) for channel in base), 1.0)
+    builder.link(noise.outputs[0], ramp.inputs[0])
+    bump = builder.node("ShaderNodeBump", Strength=0.35, Distance=0.006 * context.domain_size)
+    builder.link(noise.outputs[0], bump.inputs["Height"])
+    shader = builder.node("ShaderNodeBsdfPrincipled", Roughness=_or(context.roughness, 0.8), Specular_IOR_Level=0.3)
+    builder.link(ramp.outputs["Color"], shader.inputs["Base Color"])
+    builder.link(bump.outputs["Normal"], shader.inputs["Normal"])
+    builder.surface(shader)
+
+
+def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
+    """Thin glass: reflects as glass does, and lets everything else straight through, so that it costs no bounces."""
+    fresnel = builder.node("ShaderNodeFresnel", IOR=1.35)
+    reflection = builder.node("ShaderNodeBsdfGlossy", Roughness=_or(context.roughness, 0.0))
+    through = builder.node("ShaderNodeBsdfTransparent", Color=_or(context.color, (0.975, 0.99, 0.985)))
+    light_path = builder.node("ShaderNodeLightPath")
+    seen = builder.node("ShaderNodeMath")
+    seen.operation = "MULTIPLY"
+    builder.link(fresnel.outputs[0], seen.inputs[0])
+    builder.link(light_path.outputs["Is Camera Ray"], seen.inputs[1])
+    builder.surface(_mix(builder, seen.outputs[0], through, reflection))
+
+
+def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
+    """The cut edge of a pane, where glass shows its green."""
+    builder.surface(
+        builder.node(
+            "ShaderNodeBsdfPrincipled",
+            Base_Color=_or(context.color, (0.50, 0.72, 0.66)),
+            Roughness=_or(context.roughness, 0.15),
+            Specular_IOR_Level=0.6,
+        )
+    )
+
+
+LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
+    "water": _water,
+    "smoke": _smoke,
+    "rubber": _rubber,
+    "ceramic": _ceramic,
+    "plastic": _plastic,
+    "metal": _metal,
+    "stone": _stone,
+    "glass": _glass,
+    "tank_glass": _tank_glass,
+    "tank_edge": _tank_edge,
+}
+"""How each look is built, by the name that a specification uses."""
+
+
+def _or(value: Value | None, default: Value) -> Value:
+    return default if value is None else value
+
+
+def _mix(builder: NodeBuilder, factor: Any, first: Any, second: Any) -> Any:
+    mix = builder.node("ShaderNodeMixShader")
+    builder.link(factor, mix.inputs[0])
+    builder.link(first.outputs[0], mix.inputs[1])
+    builder.link(second.outputs[0], mix.inputs[2])
+    return mix
+
+
+def _with_clear_shadow(builder: NodeBuilder, shader: Any, *, tint: Color) -> Any:
+    """Refract for the eye, but let light straight through to what lies behind.
+
+    Without caustics, refractive things cast black shadows: no light sampled from behind them arrives. Rays that ask
+    for light (shadow rays, and bounces off matt surfaces and smoke) therefore meet a clear, slightly tinted surface.
+    """
+    light_path = builder.node("ShaderNodeLightPath")
+    asks_for_light = light_path.outputs["Is Shadow Ray"]
+    for kind in ("Is Diffuse Ray", "Is Volume Scatter Ray"):
+        maximum = builder.node("ShaderNodeMath")
+        maximum.operation = "MAXIMUM"
+        builder.link(asks_for_light, maximum.inputs[0])
+        builder.link(light_path.outputs[kind], maximum.inputs[1])
+        asks_for_light = maximum.outputs[0]
+    clear = builder.node("ShaderNodeBsdfTransparent", Color=tint)
+    return _mix(builder, asks_for_light, shader, clear)
+
+
+def _homogeneous_absorption(builder: NodeBuilder, coefficients: Color) -> None:
+    """Beer-Lambert absorption [1/m] inside the body. Cycles' node absorbs density (1 - colour)."""
+    density = max(coefficients)
+    color = tuple(1.0 - value / density for value in coefficients)
+    builder.volume(builder.node("ShaderNodeVolumeAbsorption", Color=color, Density=density))
+
+
+def _absorption_of_tint(tint: Color) -> Color:
+    """Absorption that turns white into `tint` over one metre of water ten times exaggerated [1/m]."""
+    return tuple(-math.log(min(max(channel, 0.02), 0.999)) / 10.0 for channel in tint)

@@ -1,0 +1,203 @@
+"""Draw frames of a RenderSpec with Cycles: as a class inside the bpy module, as a script of a Blender executable.
+
+    blender --background --factory-startup --python render_frames.py -- SPEC --frames 1-10 --output '{frame:06d}.png'
+    blender --background --factory-startup --python render_frames.py -- SPEC --serve
+
+Both forms write one line per frame to standard output, `FRAME_DONE 12 /path` or `FRAME_FAILED 12 reason`, among the
+lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line,
+after a line `RENDERER_READY version device`; the process ends with its input, so it cannot outlive who started it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import queue
+import sys
+import threading
+from pathlib import Path
+from typing import Any, TextIO
+
+if __package__ in (None, ""):
+    # Run by a Blender executable: the package is not on its path.
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import bpy
+
+from blender_scripts import camera, geometry, lights, looks, png, settings, tank, volumes
+from blender_scripts.compatibility import blender_version, require_supported_version
+from blender_scripts.errors import RenderFailedError, RenderInputError
+
+SPEC_VERSION = 1
+EXIT_FRAME_FAILED = 1
+
+
+class SceneRenderer:
+    """A scene built once from a specification; draws one frame after the other.
+
+    Blender has one scene per process, so a second SceneRenderer takes the place of the first.
+
+    Attributes:
+        device: what Cycles renders on, e.g. `CPU`.
+    """
+
+    _current: SceneRenderer | None = None
+
+    def __init__(self, spec_path: Path, *, threads: int) -> None:
+        """Build the scene.
+
+        Args:
+            spec_path: the RenderSpec document; paths in it are relative to its folder.
+            threads: CPU threads to render with.
+
+        Raises:
+            RenderInputError: the document, or a mesh that stays the same in all frames, cannot be used.
+            RuntimeError: Blender is too old, or the wanted device is missing.
+        """
+        require_supported_version()
+        self._folder = spec_path.resolve().parent
+        spec = _read_spec(spec_path)
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        SceneRenderer._current = self
+        settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
+        self.device = settings.choose_device(spec["render"]["device"])
+        view = camera.choose_view(spec)
+        camera.add_camera(spec, view)
+        lights.build_stage(spec, view)
+        if spec["stage"]["tank"]:
+            tank.add_tank(spec)
+        self._sequences: list[tuple[dict[str, Any], Any]] = []
+        for description in spec["objects"]:
+            self._add_object(description, spec)
+
+    def render(self, frame: int, output_path: Path) -> None:
+        """Draw one frame into a PNG file of any name. The same input gives the same bytes.
+
+        Raises:
+            RenderInputError: a file of this frame is missing or unfit.
+            RenderFailedError: Blender did not finish.
+        """
+        if SceneRenderer._current is not self:
+            raise RenderFailedError("another scene was opened in this process; this renderer is closed")
+        for description, blender_object in self._sequences:
+            path = self._folder / description["file"].replace("{frame}", f"{frame:06d}")
+            if description["type"] == "volume_sequence":
+                volumes.load_volume(blender_object.data, path)
+            else:
+                geometry.fill_mesh(blender_object.data, geometry.read_ply(path))
+        bpy.context.scene.frame_set(frame)
+        outcome = bpy.ops.render.render()
+        if "FINISHED" not in outcome:
+            raise RenderFailedError(f"Blender ended the render with {sorted(outcome)}")
+        # save_render writes to exactly this path; the scene's own output path would expand '#', '{' and add suffixes.
+        bpy.data.images["Render Result"].save_render(str(output_path.resolve()), scene=bpy.context.scene)
+        png.strip_metadata(output_path)
+
+    def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> None:
+        name, kind = description["name"], description["type"]
+        material = looks.new_material(name, description["material"], domain_size=_domain_size(spec))
+        if kind == "mesh":
+            blender_object = geometry.new_mesh_object(name, geometry.read_ply(self._folder / description["file"]))
+            blender_object.location = description["position"]
+            blender_object.rotation_mode = "QUATERNION"
+            blender_object.rotation_quaternion = description["orientation"]
+            geometry.keep_sharp_edges(blender_object.data, description["shade_smooth_angle_deg"])
+        elif kind == "mesh_sequence":
+            blender_object = geometry.new_mesh_object(name, geometry.EMPTY_MESH)
+            self._sequences.append((description, blender_object))
+        else:
+            blender_object = volumes.new_volume_object(name)
+            self._sequences.append((description, blender_object))
+        blender_object.data.materials.append(material)
+
+
+def _domain_size(spec: dict[str, Any]) -> float:
+    return sum((high - low) ** 2 for low, high in zip(spec["domain_min"], spec["domain_max"], strict=True)) ** 0.5
+
+
+def _read_spec(path: Path) -> dict[str, Any]:
+    try:
+        spec = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RenderInputError(f"cannot read the render specification {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise RenderInputError(f"the render specification {path} is not JSON: {error}") from error
+    version = spec.get("version") if isinstance(spec, dict) else None
+    if version != SPEC_VERSION:
+        raise RenderInputError(f"the render specification {path} has version {version}; {SPEC_VERSION} is needed")
+    return spec
+
+
+def _parse_frames(text: str) -> list[int]:
+    """Frames of `3`, `1-10` or `1-4,8`."""
+    frames: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        frames.extend(range(int(first), int(last or first) + 1))
+    return frames
+
+
+def _parse_arguments(arguments: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="render_frames.py", description="Draw frames of a RenderSpec.")
+    parser.add_argument("spec", type=Path, help="the RenderSpec document")
+    parser.add_argument("--frames", type=_parse_frames, help="which frames, e.g. 3 or 1-10 or 1-4,8")
+    parser.add_argument("--output", help="path of a picture, with {frame} or {frame:06d}")
+    parser.add_argument("--serve", action="store_true", help="read `frame path` lines from standard input instead")
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="CPU threads (default: all)")
+    parsed = parser.parse_args(arguments)
+    if not parsed.serve and (parsed.frames is None or parsed.output is None):
+        parser.error("give --frames and --output, or --serve")
+    return parsed
+
+
+def _report(line: str) -> None:
+    sys.stdout.write(line.replace("\n", " ") + "\n")
+    sys.stdout.flush()
+
+
+def _render_and_report(renderer: SceneRenderer, frame: int, output_path: Path) -> bool:
+    try:
+        renderer.render(frame, output_path)
+    except (RenderInputError, RenderFailedError, OSError, RuntimeError) as error:
+        _report(f"FRAME_FAILED {frame} {error}")
+        return False
+    _report(f"FRAME_DONE {frame} {output_path}")
+    return True
+
+
+def _follow(stream: TextIO, requests: queue.SimpleQueue[str | None]) -> None:
+    """Pass on lines, and end the process with its input, even in the middle of a frame: nobody waits for it."""
+    for line in stream:
+        requests.put(line)
+    os._exit(0)
+
+
+def _serve(renderer: SceneRenderer) -> None:
+    requests: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    threading.Thread(target=_follow, args=(sys.stdin, requests), daemon=True).start()
+    _report(f"RENDERER_READY {blender_version()} {renderer.device}")
+    while True:
+        frame, _, output_path = requests.get().rstrip("\n").partition(" ")
+        _render_and_report(renderer, int(frame), Path(output_path))
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line; returns the exit code."""
+    options = _parse_arguments(arguments)
+    try:
+        renderer = SceneRenderer(options.spec, threads=options.threads)
+    except (RenderInputError, RuntimeError) as error:
+        _report(f"RENDERER_FAILED {error}")
+        return EXIT_FRAME_FAILED
+    if options.serve:
+        _serve(renderer)
+    succeeded = [
+        _render_and_report(renderer, frame, Path(options.output.format(frame=frame))) for frame in options.frames
+    ]
+    return 0 if all(succeeded) else EXIT_FRAME_FAILED
+
+
+if __name__ == "__main__":
+    # A Blender executable leaves its own arguments before the `--`.
+    sys.exit(main(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]))

@@ -1,0 +1,154 @@
+"""Cycles settings: what each quality preset means, and which device renders."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+
+
+@dataclass(frozen=True)
+class QualityPreset:
+    """The knobs that trade time for quality; docs/rendering.md has what each was measured to give.
+
+    Attributes:
+        samples: most samples per pixel.
+        noise_threshold: a pixel whose estimated error is below this gets no more samples.
+        denoising_quality: of OpenImageDenoise.
+        denoising_prefilter: how the albedo and normal guides are cleaned; at few samples noisy guides print their
+            noise into the picture, and cleaning them is cheap.
+        light_tree: choose lights by what they contribute; pays for itself from some dozen samples on.
+        volume_biased: march rays through volumes in steps (faster) instead of unbiased tracking.
+        volume_step_rate: length of these steps, as a factor on the voxel size.
+        volume_bounces: scattering events inside volumes after the first.
+        max_bounces: of all kinds together.
+        diffuse_bounces: off matt surfaces.
+        transmission_bounces: through refracting surfaces.
+    """
+
+    samples: int
+    noise_threshold: float
+    denoising_quality: str
+    denoising_prefilter: str
+    light_tree: bool
+    volume_biased: bool
+    volume_step_rate: float
+    volume_bounces: int
+    max_bounces: int
+    diffuse_bounces: int
+    transmission_bounces: int
+
+
+QUALITY_PRESETS = {
+    "draft": QualityPreset(8, 0.1, "FAST", "ACCURATE", False, True, 2.0, 0, 6, 1, 6),
+    "preview": QualityPreset(48, 0.05, "BALANCED", "ACCURATE", True, True, 1.0, 1, 10, 2, 10),
+    "final": QualityPreset(256, 0.02, "HIGH", "ACCURATE", True, False, 1.0, 3, 24, 4, 16),
+}
+
+_GPU_BACKENDS = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
+"""In order of preference."""
+
+
+def apply_render_settings(parameters: dict[str, Any], *, fps: float, threads: int) -> None:
+    """Set resolution, time, motion blur, film, colour management and Cycles for the current scene.
+
+    Args:
+        parameters: `render` of the specification.
+        fps: frames per second; shutter times and velocities depend on it.
+        threads: CPU threads to render with.
+    """
+    scene = bpy.context.scene
+    render = scene.render
+    render.engine = "CYCLES"
+    render.resolution_x, render.resolution_y = parameters["resolution"]
+    render.resolution_percentage = 100
+    # Blender's fps is a whole number over a real base.
+    render.fps = math.ceil(fps)
+    render.fps_base = math.ceil(fps) / fps
+    render.threads_mode = "FIXED"
+    render.threads = threads
+    render.use_motion_blur = parameters["motion_blur"]
+    render.motion_blur_shutter = parameters["shutter"]
+    render.motion_blur_position = "CENTER"
+    render.use_compositing = False
+    render.use_sequencer = False
+    render.image_settings.file_format = "PNG"
+    render.image_settings.color_mode = "RGB"
+    render.image_settings.color_depth = "8"
+    render.image_settings.compression = 15
+    scene.display_settings.display_device = "sRGB"
+    scene.view_settings.view_transform = "AgX"
+    scene.view_settings.look = "AgX - Medium High Contrast"
+    scene.view_settings.exposure = parameters["exposure"]
+    _apply_cycles_settings(scene.cycles, parameters)
+
+
+def _apply_cycles_settings(cycles: Any, parameters: dict[str, Any]) -> None:
+    preset = QUALITY_PRESETS[parameters["quality"]]
+    cycles.samples = preset.samples if parameters["samples"] is None else parameters["samples"]
+    cycles.use_adaptive_sampling = True
+    cycles.adaptive_threshold = preset.noise_threshold
+    # The same pattern in every frame: with a still camera, what noise is left stands still instead of boiling.
+    cycles.seed = parameters["seed"]
+    cycles.use_animated_seed = False
+    cycles.use_denoising = parameters["denoise"]
+    cycles.denoiser = "OPENIMAGEDENOISE"
+    cycles.denoising_quality = preset.denoising_quality
+    cycles.denoising_prefilter = preset.denoising_prefilter
+    cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+    cycles.use_light_tree = preset.light_tree
+    cycles.volume_biased = preset.volume_biased
+    cycles.volume_step_rate = preset.volume_step_rate
+    cycles.volume_bounces = preset.volume_bounces
+    cycles.max_bounces = preset.max_bounces
+    cycles.diffuse_bounces = preset.diffuse_bounces
+    cycles.glossy_bounces = 4
+    cycles.transmission_bounces = preset.transmission_bounces
+    cycles.transparent_max_bounces = 16
+    # Looks let light through refracting bodies themselves; sampled caustics would only add fireflies.
+    cycles.caustics_reflective = False
+    cycles.caustics_refractive = False
+    cycles.blur_glossy = 1.0
+    cycles.sample_clamp_direct = 0.0
+    cycles.sample_clamp_indirect = 6.0
+
+
+def choose_device(wanted: str) -> str:
+    """Select what Cycles renders on, and say what it is, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`.
+
+    Blender accepts a back end without a device behind it and silently renders on the CPU; so the devices are counted.
+
+    Args:
+        wanted: `auto`, `cpu` or `gpu`.
+
+    Raises:
+        RuntimeError: a GPU is wanted and there is none.
+    """
+    cycles = bpy.context.scene.cycles
+    cycles.device = "CPU"
+    if wanted == "cpu":
+        return "CPU"
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    for backend in _GPU_BACKENDS:
+        names = _enable_gpus(preferences, backend)
+        if names:
+            cycles.device = "GPU"
+            return f"{backend}: {', '.join(names)}"
+    if wanted == "gpu":
+        raise RuntimeError('render.device is "gpu", but Cycles finds none; use "auto" or "cpu"')
+    return "CPU"
+
+
+def _enable_gpus(preferences: Any, backend: str) -> list[str]:
+    try:
+        preferences.compute_device_type = backend
+    except TypeError:
+        # This build of Blender does not know the back end.
+        return []
+    preferences.get_devices()
+    gpus = [device for device in preferences.devices if device.type == backend]
+    for device in preferences.devices:
+        device.use = device.type == backend
+    return [device.name for device in gpus]

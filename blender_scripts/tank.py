@@ -1,0 +1,55 @@
+"""The domain's walls as a glass tank, open at the top."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from blender_scripts.geometry import TriangleMesh, new_mesh_object
+from blender_scripts.looks import new_material
+
+_WALL_THICKNESS = 0.008
+"""In domain diagonals."""
+_GAP = 0.002
+"""Between water and glass, in domain diagonals: coinciding surfaces would shade each other at random."""
+_OWN_MATERIAL = {"color": None, "roughness": None, "density": None}
+
+
+def add_tank(spec: dict[str, Any]) -> None:
+    """Put four panes around the domain; their rims and corners are solid, so that the tank can be seen."""
+    low, high = np.array(spec["domain_min"], dtype=np.float64), np.array(spec["domain_max"], dtype=np.float64)
+    size = float(np.linalg.norm(high - low))
+    inner_low, inner_high = low - _GAP * size, high + _GAP * size
+    inner_low[2] = low[2]
+    inner_high[2] = high[2]
+    thickness = _WALL_THICKNESS * size
+    sideways = np.array((thickness, thickness, 0.0))
+    outer_low, outer_high = inner_low - sideways, inner_high + sideways
+
+    panes, edges = [], []
+    for x_low, x_high, y_low, y_high in (
+        (inner_low[0], inner_high[0], outer_low[1], inner_low[1]),
+        (inner_low[0], inner_high[0], inner_high[1], outer_high[1]),
+        (outer_low[0], inner_low[0], inner_low[1], inner_high[1]),
+        (inner_high[0], outer_high[0], inner_low[1], inner_high[1]),
+    ):
+        panes.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2] - thickness / 2)))
+        edges.append(((x_low, y_low, inner_high[2] - thickness / 2), (x_high, y_high, inner_high[2])))
+    for x_low, x_high in ((outer_low[0], inner_low[0]), (inner_high[0], outer_high[0])):
+        for y_low, y_high in ((outer_low[1], inner_low[1]), (inner_high[1], outer_high[1])):
+            edges.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2])))
+    for name, boxes in (("tank_glass", panes), ("tank_edge", edges)):
+        tank = new_mesh_object(name, _boxes(boxes))
+        tank.data.materials.append(new_material(name, {"look": name, **_OWN_MATERIAL}, domain_size=size))
+        tank.data.shade_flat()
+
+
+def _boxes(extents: list[tuple[tuple[float, ...], tuple[float, ...]]]) -> TriangleMesh:
+    """Axis-aligned boxes as one mesh, faces outwards."""
+    unit = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
+    quads = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
+    triangles = np.concatenate([quads[:, (0, 1, 2)], quads[:, (0, 2, 3)]])
+    positions = [np.array(low) + unit * (np.array(high) - np.array(low)) for low, high in extents]
+    indices = [triangles + 8 * number for number in range(len(extents))]
+    return TriangleMesh(np.concatenate(positions).astype(np.float32), np.concatenate(indices).astype(np.int32))

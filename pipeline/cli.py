@@ -1,0 +1,136 @@
+"""The command line: parse, call, print. Importing this module loads neither the physics nor Blender."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pipeline.commands.arguments import job_options
+from pipeline.commands.inspecting import explain, logs, plan, status
+from pipeline.commands.keeping import clean, verify
+from pipeline.commands.running import rerun, resume, submit
+from pipeline.errors import PipelineError
+
+TEMPLATES = ("dam-break", "drop", "smoke")
+"""As in `pipeline.job.starter`, which is too heavy to be imported for `--help`."""
+
+
+class PipelineGroup(click.Group):
+    """Prints the errors that are meant for people as lines, without a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; a `PipelineError` decides the exit code."""
+        try:
+            return super().invoke(ctx)
+        except PipelineError as error:
+            for line in str(error).splitlines():
+                click.secho(f"error: {line}", err=True, fg="red")
+            ctx.exit(error.exit_code)
+
+
+@click.group(
+    cls=PipelineGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Start with: pipeline new my-film, then: pipeline submit my-film.toml",
+)
+@click.version_option(package_name=None, version="0.1.0", prog_name="pipeline")
+def main() -> None:
+    """From a job file to a film of simulated physics, resumable after any crash."""
+
+
+for command in (submit, plan, status, rerun, resume, logs, explain, verify, clean):
+    main.add_command(command)
+
+
+@main.command()
+@click.argument("name", type=click.Path(path_type=Path))
+@click.option("--template", type=click.Choice(TEMPLATES), default="dam-break", show_default=True, help="What happens.")
+def new(name: Path, template: str) -> None:
+    """Write a commented job file NAME.toml to start from.
+
+    \b
+    pipeline new my-film
+    pipeline new jobs/plume --template smoke
+    """
+    from pipeline.job.starter import write_starter
+
+    path = write_starter(name, template)
+    click.echo(f"wrote {path}; next: pipeline submit {path} --preview")
+
+
+@main.command()
+@job_options
+@click.option("--json", "as_json", is_flag=True, help="Print the whole job, defaults included, as JSON.")
+def check(job_file: Path, overrides: tuple[str, ...], preview: bool, as_json: bool) -> None:
+    """Say what is wrong with a job file, and how large the job is; runs nothing.
+
+    \b
+    pipeline check jobs/quickstart.toml
+    pipeline check dam.toml --set fluid.water.particle_radius=0.005
+    """
+    from pipeline.job.checks import load_checked_job
+
+    loaded, findings = load_checked_job(job_file, overrides, preview=preview)
+    print_warnings(loaded.warnings)
+    if as_json:
+        click.echo(loaded.job.model_dump_json(indent=2))
+        return
+    job = loaded.job
+    width, height = job.render.resolution
+    click.echo(f"{job_file}: ok")
+    click.echo(f"  {job.name}: {job.frame_count} frames, {job.frame_count / job.fps:.3g} s at {job.fps} fps")
+    if job.fluid:
+        click.echo(f"  about {findings.particles:,} particles")
+    if job.smoke:
+        click.echo(f"  {findings.cells:,} smoke cells")
+    click.echo(f"  {width} x {height} pixels, {job.render.quality} quality")
+
+
+@main.command()
+def schema() -> None:
+    """Print the JSON Schema of the job file; editors complete and check TOML with it.
+
+    \b
+    pipeline schema > job.schema.json      then, as a job file's first line:   #:schema job.schema.json
+    """
+    from pipeline.job.schema import job_schema
+
+    click.echo(json.dumps(job_schema(), indent=2, ensure_ascii=False))
+
+
+@main.command()
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("renders"),
+    show_default=True,
+    help="Folder that results go to.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
+def doctor(output: Path, as_json: bool) -> None:
+    """Look at this machine: devices, libraries, Blender, memory, disk.
+
+    Exits with 1 if something that every job needs is missing.
+
+    \b
+    pipeline doctor
+    pipeline doctor --output /data/renders --json
+    """
+    from pipeline.doctor import examine, print_report
+
+    examinations = examine(output)
+    if as_json:
+        click.echo(json.dumps([each.as_json() for each in examinations], indent=2, ensure_ascii=False))
+    else:
+        print_report(examinations)
+    sys.exit(int(any(each.status == "failed" for each in examinations)))
+
+
+def print_warnings(warnings: tuple[str, ...]) -> None:
+    """Warnings go to the error stream, so that output stays fit for a pipe."""
+    for warning in warnings:
+        click.secho(f"warning: {warning}", err=True, fg="yellow")

@@ -1,0 +1,296 @@
+"""Commands that only look: plan, status, logs, explain."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pipeline.commands.arguments import (
+    find_job,
+    job_options,
+    json_option,
+    output_option,
+    submitted_job_argument,
+)
+from pipeline.errors import PipelineError
+from pipeline.layout import JobLayout
+from pipeline.task import TaskId, TaskState
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+    from pipeline.manifest_reader import AttemptRow, ManifestReader, StageSummary
+    from pipeline.plan import Assessment
+
+FOLLOW_INTERVAL_S = 0.5
+
+
+@click.command()
+@job_options
+@output_option
+@json_option
+def plan(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path, as_json: bool) -> None:
+    """Say what submitting a job would run, and why; runs nothing.
+
+    \b
+    pipeline plan jobs/quickstart.toml
+    pipeline plan dam.toml --set 'camera.position=[0, -3, 1]'
+    """
+    from pipeline.job.checks import load_checked_job
+    from pipeline.plan import Verdict, estimate, summarize
+
+    loaded, _ = load_checked_job(job_file, overrides, preview=preview)
+    layout = JobLayout(output / loaded.job.name)
+    assessments, estimates = _assess(loaded.job, layout)
+    if as_json:
+        click.echo(json.dumps([_assessment_as_json(each) for each in assessments], indent=1))
+        return
+    for warning in loaded.warnings:
+        click.secho(f"warning: {warning}", err=True, fg="yellow")
+    for line in summarize(assessments):
+        click.echo(line)
+    for each in estimate(assessments, estimates):
+        if each.seconds is not None and each.bytes is not None:
+            click.echo(f"{each.stage}: about {_seconds(each.seconds)} of work, {_bytes(each.bytes)}")
+    todo = sum(len(each.rebuilds) for each in assessments if each.verdict is not Verdict.UP_TO_DATE)
+    click.echo(f"{todo} of {sum(len(each.task.outputs) for each in assessments)} files to make")
+
+
+@click.command()
+@submitted_job_argument
+@json_option
+def status(job: str, output: Path, as_json: bool) -> None:
+    """Say how far a job is, whether it runs, and what failed.
+
+    \b
+    pipeline status quickstart
+    pipeline status quickstart --json
+    """
+    from pipeline.lease import live_holder
+    from pipeline.manifest_reader import ManifestReader
+
+    layout = find_job(job, output)
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        summary, failures, events = manifest.summary(), manifest.failures(), manifest.events(limit=5)
+    holder = live_holder(layout.lease)
+    if as_json:
+        click.echo(
+            json.dumps(
+                {
+                    "folder": str(layout.root),
+                    "runner": None if holder is None else asdict(holder),
+                    "stages": {stage.stage: dict(stage.counts) for stage in summary},
+                    "failures": [_attempt_as_json(attempt) for attempt in failures],
+                    "events": [event._asdict() for event in events],
+                },
+                indent=1,
+            )
+        )
+        return
+    click.echo(f"{layout.root}: {_activity(holder.pid if holder else None, summary)}")
+    for stage in summary:
+        counts = ", ".join(f"{count} {state}" for state, count in stage.counts.items())
+        click.echo(f"  {stage.stage:>9}  {counts}")
+    for attempt in failures[:10]:
+        click.secho(f"  {attempt.task} {attempt.outcome}: {attempt.message}", fg="red")
+    if len(failures) > 10:
+        click.echo(f"  ... and {len(failures) - 10} more")
+
+
+@click.command()
+@submitted_job_argument
+@click.argument("task", required=False)
+@click.option("--attempt", type=click.IntRange(min=1), help="Number of the attempt; the last one if omitted.")
+@click.option("--follow", "-f", is_flag=True, help="Keep printing as the log grows.")
+def logs(job: str, output: Path, task: str | None, attempt: int | None, follow: bool) -> None:
+    """Print the log of a task's attempt; without a task, list the tasks that have one.
+
+    \b
+    pipeline logs quickstart
+    pipeline logs quickstart simulate --follow
+    pipeline logs quickstart render/000012 --attempt 1
+    """
+    layout = find_job(job, output)
+    folder = layout.root / "logs"
+    if task is None:
+        for path in sorted(folder.rglob("*.log")):
+            name, _, number = path.relative_to(folder).as_posix().removesuffix(".log").rpartition(".")
+            click.echo(f"{name}  attempt {number}  {path.stat().st_size:,} bytes")
+        return
+    attempts = _attempts_with_log(layout, TaskId(task))
+    if not attempts:
+        raise PipelineError(f'no log of a task "{task}" in {folder}; the tasks that have one: pipeline logs {job}')
+    chosen = max(attempts) if attempt is None else attempt
+    if chosen not in attempts:
+        raise PipelineError(f"no log of attempt {chosen}; there are {', '.join(map(str, sorted(attempts)))}")
+    _print_log(attempts[chosen], follow=follow)
+
+
+@click.command()
+@submitted_job_argument
+@click.argument("task")
+@json_option
+def explain(job: str, output: Path, task: str, as_json: bool) -> None:
+    """Tell the whole story of one task: its inputs, its outputs, every attempt, and what it is waiting for.
+
+    \b
+    pipeline explain quickstart render/000012
+    pipeline explain quickstart simulate --json
+    """
+    from pipeline.artifacts import read_receipt, verify_artifact
+    from pipeline.job.loading import load_job
+    from pipeline.manifest_reader import ManifestReader
+
+    layout = find_job(job, output)
+    assessments, _ = _assess(load_job(layout.job_file), layout)
+    found = next((each for each in assessments if each.task.id == task), None)
+    if found is None:
+        raise PipelineError(f'the job has no task "{task}"{_nearest(task, [each.task.id for each in assessments])}')
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        state, history = _state(manifest, found.task.id), manifest.history(found.task.id)
+        events = manifest.events(task=found.task.id)
+    receipts = [(output_path, read_receipt(layout, output_path)) for output_path in found.task.outputs]
+    if as_json:
+        story = {
+            **_assessment_as_json(found),
+            "state": state,
+            "parameters": json.loads(found.task.parameters.canonical),
+            "inputs": list(found.task.inputs),
+            "receipts": [json.loads(receipt.to_json()) for _, receipt in receipts if receipt is not None],
+            "attempts": [_attempt_as_json(attempt) for attempt in history],
+        }
+        click.echo(json.dumps(story, indent=1))
+        return
+    click.echo(f"{task}: {state or 'not planned yet'}, {found.verdict.value}")
+    for reason in found.reasons:
+        click.echo(f"  {reason.text}")
+    click.echo(f"reads   {_shortened(found.task.inputs) or 'the job file only'}")
+    for path, receipt in receipts[:3]:
+        if receipt is None:
+            click.echo(f"makes   {path}: not there yet")
+        else:
+            flaw = verify_artifact(layout, receipt, deep=False)
+            click.echo(f"makes   {path}: {_bytes(receipt.size)}, attempt {receipt.attempt}, {flaw or 'as committed'}")
+    if len(receipts) > 3:
+        there = sum(receipt is not None for _, receipt in receipts)
+        click.echo(f"        ... {there} of {len(receipts)} files are there")
+    click.echo(f"key     {found.task.parameters.digest[:16]} (its parameters: pipeline explain ... --json)")
+    for attempt in history:
+        click.echo(_attempt_line(attempt))
+    for event in events:
+        click.echo(f"  {_when(event.time)}  {event.kind}: {event.message}")
+
+
+def _assess(job: Job, layout: JobLayout) -> tuple[list[Assessment], dict[str, Any]]:
+    """What would run, and what the stages have taken so far."""
+    from pipeline.manifest_reader import ManifestReader
+    from pipeline.plan import assess, plan_job
+    from pipeline.reconcile import inspect_files
+    from pipeline.stages import STAGES
+
+    tasks = plan_job(job, layout, STAGES)
+    if not layout.manifest.exists():
+        return assess(tasks, {}, {}, parameters=lambda _: None), {}
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        rows = manifest.artifacts()
+        problems = inspect_files(layout, rows).problems
+        return assess(tasks, rows, problems, parameters=manifest.parameters), dict(manifest.stage_costs())
+
+
+def _state(manifest: ManifestReader, task: TaskId) -> TaskState | None:
+    return manifest.states().get(task)
+
+
+def _activity(pid: int | None, summary: Sequence[StageSummary]) -> str:
+    if pid is not None:
+        return f"running, process {pid}"
+    done = sum(
+        count
+        for stage in summary
+        for state, count in stage.counts.items()
+        if state in (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
+    )
+    total = sum(stage.total for stage in summary)
+    return "done" if done == total else f"not running, {done} of {total} tasks done"
+
+
+def _attempts_with_log(layout: JobLayout, task: TaskId) -> dict[int, Path]:
+    first = layout.log(task, 1)
+    stem = first.name.removesuffix(".1.log")
+    logs = first.parent.glob(f"{stem}.*.log") if first.is_relative_to(layout.root / "logs") else iter(())
+    return {int(path.name.split(".")[-2]): path for path in logs if path.name.split(".")[-2].isdigit()}
+
+
+def _print_log(path: Path, *, follow: bool) -> None:
+    with path.open("r", encoding="utf-8", errors="replace") as log:
+        for chunk in _chunks(log, follow=follow):
+            click.echo(chunk, nl=False)
+
+
+def _chunks(log: Any, *, follow: bool) -> Iterator[str]:
+    while True:
+        text = log.read(1 << 16)
+        if text:
+            yield text
+        elif follow:
+            time.sleep(FOLLOW_INTERVAL_S)
+        else:
+            return
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    from difflib import get_close_matches
+
+    close = get_close_matches(name, names, n=1)
+    return f'; did you mean "{close[0]}"?' if close else ""
+
+
+def _assessment_as_json(assessment: Assessment) -> dict[str, Any]:
+    return {
+        "task": assessment.task.id,
+        "stage": assessment.task.stage,
+        "frame": assessment.task.frame,
+        "verdict": assessment.verdict.value,
+        "reasons": [reason.text for reason in assessment.reasons],
+        "rebuilds": list(assessment.rebuilds),
+    }
+
+
+def _attempt_as_json(attempt: AttemptRow) -> dict[str, Any]:
+    return attempt._asdict()
+
+
+def _attempt_line(attempt: AttemptRow) -> str:
+    if attempt.finished is None:
+        how = "running"
+    else:
+        how = f"{attempt.outcome}" + (f" in {_seconds(attempt.seconds)}" if attempt.seconds is not None else "")
+        how += f", peak {_bytes(attempt.peak_memory_bytes)}" if attempt.peak_memory_bytes else ""
+        how += f": {attempt.message}" if attempt.message else ""
+    return f"  {_when(attempt.started)}  attempt {attempt.number} on {attempt.host}: {how}"
+
+
+def _shortened(paths: Sequence[str]) -> str:
+    return ", ".join(paths) if len(paths) <= 4 else f"{paths[0]} ... {paths[-1]} ({len(paths)} files)"
+
+
+def _when(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _seconds(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def _bytes(size: float) -> str:
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if size < 1024 or unit == "GiB":
+            return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"
+        size /= 1024
+    raise AssertionError

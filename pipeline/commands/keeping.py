@@ -1,0 +1,134 @@
+"""Commands that look after a job's files: verify, clean."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import click
+
+from pipeline.commands.arguments import find_job, json_option, submitted_job_argument
+from pipeline.errors import PipelineError
+from pipeline.layout import JobLayout
+from pipeline.task import ArtifactPath
+
+
+@click.command()
+@submitted_job_argument
+@click.option("--deep", is_flag=True, help="Read every file and compare its hash; finds any flipped bit.")
+@click.option("--rebuild", is_flag=True, help="Make a new manifest of the receipts; the old one is kept aside.")
+@json_option
+def verify(job: str, output: Path, deep: bool, rebuild: bool, as_json: bool) -> None:
+    """Check that every finished file is as it was committed. Submitting the job again makes anew what is not.
+
+    Exits with 1 if something is wrong.
+
+    \b
+    pipeline verify quickstart
+    pipeline verify quickstart --deep
+    """
+    from pipeline.artifacts import verify_artifact
+    from pipeline.lease import Lease
+    from pipeline.reconcile import rebuild_manifest, receipts
+
+    layout = find_job(job, output)
+    if rebuild:
+        with Lease.acquire(layout.lease):
+            kept, count = rebuild_manifest(layout)
+        aside = f"; the old one is {kept}" if kept else ""
+        click.echo(f"{layout.manifest}: made of {count} receipts{aside}", err=as_json)
+    checked = 0
+    flaws: dict[str, str] = {}
+    for receipt in receipts(layout):
+        checked += 1
+        flaw = verify_artifact(layout, receipt, deep=deep)
+        if flaw is not None:
+            flaws[receipt.artifact] = flaw
+    if as_json:
+        click.echo(json.dumps({"checked": checked, "deep": deep, "flaws": flaws}, indent=1))
+    else:
+        for artifact, flaw in sorted(flaws.items()):
+            click.secho(f"{artifact}: {flaw}", fg="red")
+        how = "by content" if deep else "by size and time (--deep compares contents)"
+        click.echo(f"{checked} files checked {how}, {len(flaws)} not as committed")
+        if flaws:
+            click.echo(f"heal with: pipeline resume {layout.root}")
+    sys.exit(int(bool(flaws)))
+
+
+@click.command()
+@submitted_job_argument
+@click.option("--stage", "stages", multiple=True, help="Remove the files of this stage; may be given several times.")
+@click.option("--all", "everything", is_flag=True, help="Remove the job's whole folder.")
+@click.option("--yes", is_flag=True, help="Really remove; without it, only say what would go.")
+def clean(job: str, output: Path, stages: tuple[str, ...], everything: bool, yes: bool) -> None:
+    """Remove a job's files, by stage or all of them. Without --yes it only says what would go.
+
+    \b
+    pipeline clean quickstart --stage surface --stage volume
+    pipeline clean quickstart --all --yes
+    """
+    from pipeline.lease import Lease
+
+    if not stages and not everything:
+        raise click.UsageError("say what to remove: --stage or --all")
+    layout = find_job(job, output)
+    with Lease.acquire(layout.lease):
+        if everything:
+            _remove_everything(layout, really=yes)
+        else:
+            _remove_stages(layout, frozenset(stages), really=yes)
+
+
+def _remove_everything(layout: JobLayout, *, really: bool) -> None:
+    files = [path for path in layout.root.rglob("*") if path.is_file()]
+    _announce(layout.root, files, really=really)
+    if really:
+        shutil.rmtree(layout.root)
+
+
+def _remove_stages(layout: JobLayout, stages: frozenset[str], *, really: bool) -> None:
+    from pipeline.job.loading import load_job
+    from pipeline.manifest import Manifest
+    from pipeline.plan import plan_job
+    from pipeline.stages import STAGES
+
+    known = [stage.name for stage in STAGES]
+    unknown = sorted(stages - set(known))
+    if unknown:
+        raise PipelineError(f'no stage "{unknown[0]}"; the stages are {", ".join(known)}')
+    planned = {task.id for task in plan_job(load_job(layout.job_file), layout, STAGES) if task.stage in stages}
+    with Manifest(layout.manifest) as manifest:
+        artifacts = [
+            artifact
+            for artifact, row in manifest.artifacts().items()
+            if row.task in planned or row.task.split("/")[0] in stages
+        ]
+        files = [layout.path(artifact) for artifact in artifacts]
+        if "simulate" in stages:
+            files += sorted(layout.checkpoints.glob("*.h5"))
+        _announce(layout.root, files, really=really)
+        if not really:
+            return
+        _remove(layout, artifacts)
+        for path in files:
+            path.unlink(missing_ok=True)
+        manifest.forget_artifacts(artifacts)
+
+
+def _remove(layout: JobLayout, artifacts: Iterable[ArtifactPath]) -> None:
+    """The receipt goes first: a file without one does not count, a receipt without its file would be a claim."""
+    for artifact in artifacts:
+        layout.receipt(artifact).unlink(missing_ok=True)
+        layout.path(artifact).unlink(missing_ok=True)
+
+
+def _announce(folder: Path, files: list[Path], *, really: bool) -> None:
+    size = sum(path.stat().st_size for path in files if path.exists())
+    verb = "removed" if really else "would remove"
+    click.echo(f"{verb} {len(files)} files, {size / 2**20:.1f} MiB, in {folder}")
+    if not really and files:
+        click.echo("nothing was removed; add --yes to do it")

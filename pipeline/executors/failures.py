@@ -1,0 +1,57 @@
+"""Whose fault a failure is: the task's, the machine's, or a full disk's."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+
+from pipeline.errors import PipelineError
+from pipeline.task import FailureKind
+
+_DISK_FULL_CODES = {errno.ENOSPC, errno.EDQUOT}
+_DISK_FULL_TEXT = os.strerror(errno.ENOSPC)
+_DIVERGED = "SimulationDivergedError"
+
+
+def classify(error: BaseException) -> FailureKind:
+    """What kind of failure an exception is, going by it and by the exceptions behind it."""
+    for link in _chain(error):
+        if isinstance(link, MemoryError):
+            return FailureKind.OUT_OF_MEMORY
+        if _means_disk_full(link):
+            return FailureKind.DISK_FULL
+        if _is_divergence(link):
+            return FailureKind.DIVERGED
+    return FailureKind.FAILED
+
+
+def describe(error: BaseException) -> str:
+    """One line for the user: our own errors are sentences already, others need their type's name."""
+    if isinstance(error, PipelineError) or _is_divergence(error):
+        return str(error)
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+def is_disk_full(error: BaseException) -> bool:
+    """Whether an exception comes of a full disk or an exhausted quota."""
+    return any(map(_means_disk_full, _chain(error)))
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    link: BaseException | None = error
+    while link is not None:
+        yield link
+        link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
+
+
+def _means_disk_full(error: BaseException) -> bool:
+    if isinstance(error, OSError) and error.errno in _DISK_FULL_CODES:
+        return True
+    # Some libraries, HDF5 among them, pass the text on and lose the code.
+    return isinstance(error, OSError | RuntimeError) and _DISK_FULL_TEXT in str(error)
+
+
+def _is_divergence(error: BaseException) -> bool:
+    """By name: asking isinstance would import the simulation into every process."""
+    return any(base.__name__ == _DIVERGED for base in type(error).__mro__)

@@ -1,0 +1,68 @@
+"""The executor for looking into a stage: runs each assignment here and now, where a debugger can follow it."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from contextlib import ExitStack, redirect_stderr, redirect_stdout
+from types import TracebackType
+from typing import Self
+
+from pipeline.executors.attempt import run_attempt
+from pipeline.executors.base import Assignment, Failed, TaskEvent
+from pipeline.task import FailureKind, TaskId
+
+
+class InlineExecutor:
+    """Runs one assignment per `wait`, in the calling process; what it prints goes into the attempt's log.
+
+    Nothing interrupts a running task here, so `cancel` and timeouts act only on tasks that have not begun, and what a
+    C library prints stays on the terminal.
+    """
+
+    def __init__(self) -> None:
+        self._queue: deque[Assignment] = deque()
+        self._events: list[TaskEvent] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.shutdown()
+
+    def submit(self, assignment: Assignment) -> None:
+        """Put the attempt into the queue."""
+        self._queue.append(assignment)
+
+    def wait(self, timeout_s: float) -> list[TaskEvent]:
+        """Run the next assignment to its end, however long that takes."""
+        if not self._events and self._queue:
+            self._run(self._queue.popleft())
+        elif not self._events:
+            time.sleep(timeout_s)
+        events, self._events = self._events, []
+        return events
+
+    def cancel(self, task_id: TaskId, *, grace_s: float) -> None:  # noqa: ARG002 - nothing that runs can be here
+        """Take a task out of the queue."""
+        for assignment in [assignment for assignment in self._queue if assignment.task.id == task_id]:
+            self._queue.remove(assignment)
+            self._events.append(Failed(task_id, assignment.attempt, FailureKind.CANCELLED, "cancelled"))
+
+    def shutdown(self) -> None:
+        """Take everything out of the queue."""
+        for assignment in list(self._queue):
+            self.cancel(assignment.task.id, grace_s=0.0)
+
+    def _run(self, assignment: Assignment) -> None:
+        with ExitStack() as output:
+
+            def open_log() -> None:
+                assignment.log.parent.mkdir(parents=True, exist_ok=True)
+                log = output.enter_context(assignment.log.open("a", encoding="utf-8"))
+                output.enter_context(redirect_stdout(log))
+                output.enter_context(redirect_stderr(log))
+
+            run_attempt(assignment, self._events.append, stop_requested=lambda: False, prepare=open_log)

@@ -1,0 +1,240 @@
+"""The default executor: worker processes on this machine, under a supervisor of our own.
+
+Each worker is a fresh interpreter (never a fork: Taichi and Blender survive none), runs one task at a time, and is
+kept for the next task of the same stage: Blender stays imported and the scene stays built. A worker that dies takes
+its own task with it and nothing else, and a supervisor that dies takes all of its workers with it.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import time
+from dataclasses import dataclass
+from math import inf
+from types import TracebackType
+from typing import Self
+
+import psutil
+
+from pipeline.executors.base import Assignment, Failed, Finished, TaskEvent
+from pipeline.executors.channel import Channel
+from pipeline.executors.failures import is_disk_full
+from pipeline.executors.worker_process import WorkerProcess, log_tail
+from pipeline.task import FailureKind, TaskId
+from pipeline.worker import STACK_DUMP_SIGNAL, Stop, Vitals
+
+_STACK_DUMP_S = 1.0
+"""Time a stalled worker gets to write its stacks before it is killed [s]."""
+_RETIRE_GRACE_S = 20.0
+"""Time a worker gets to leave by itself, writing its kernel cache for instance, before it is killed [s]."""
+_POLL_S = 0.2
+"""How often exits are looked for where the system has no pidfd [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerLimits:
+    """When a worker is replaced, and when a task is ended.
+
+    Attributes:
+        tasks_per_worker: a worker is replaced after this many tasks.
+        resident_memory_bytes: a worker larger than this after a task is replaced; None: a quarter of the machine's.
+        workers: idle workers are let go when there would be more in all; None: one a core.
+        stall_timeout_s: a task that shows no sign of life for so long is ended as stalled [s].
+    """
+
+    tasks_per_worker: int = 50
+    resident_memory_bytes: int | None = None
+    workers: int | None = None
+    stall_timeout_s: float = 900.0
+
+
+class ProcessExecutor:
+    """Runs assignments in worker processes of this machine; see `Executor` for what it promises.
+
+    Workers die with the thread that submits to this executor (that is how Linux's PR_SET_PDEATHSIG counts), so use it
+    from one that lives as long as the run; the main one is best.
+    """
+
+    def __init__(self, limits: WorkerLimits | None = None) -> None:
+        self._limits = limits or WorkerLimits()
+        self._memory_limit = self._limits.resident_memory_bytes or psutil.virtual_memory().total // 4
+        self._worker_limit = self._limits.workers or os.cpu_count() or 1
+        self._workers: list[WorkerProcess] = []
+        self._selector = selectors.DefaultSelector()
+        self._events: list[TaskEvent] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.shutdown()
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process ids of all workers, idle ones too."""
+        return [worker.pid for worker in self._workers]
+
+    def submit(self, assignment: Assignment) -> None:
+        """Give the attempt to a warm worker of its stage, or to a new one."""
+        key = (assignment.task.stage, assignment.threads)
+        worker = next((worker for worker in self._workers if worker.idle and worker.key == key), None)
+        if worker is None:
+            self._make_room()
+            try:
+                worker = WorkerProcess(key, assignment)
+            except OSError as error:  # too many processes or files, no memory, a full disk: the task may try again
+                kind = FailureKind.DISK_FULL if is_disk_full(error) else FailureKind.WORKER_LOST
+                sentence = f"no worker could be started: {error}"
+                self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence))
+                return
+            self._workers.append(worker)
+            self._selector.register(worker.channel, selectors.EVENT_READ, worker)
+            if worker.exit_descriptor is not None:
+                self._selector.register(worker.exit_descriptor, selectors.EVENT_READ, worker)
+        worker.assign(assignment)
+
+    def wait(self, timeout_s: float) -> list[TaskEvent]:
+        """What happened since the last call."""
+        until = time.monotonic() + timeout_s
+        while True:
+            remaining = 0.0 if self._events else until - time.monotonic()
+            self._turn(remaining)
+            if self._events or remaining <= 0:
+                break
+        events, self._events = self._events, []
+        return events
+
+    def cancel(self, task_id: TaskId, *, grace_s: float) -> None:
+        """Ask the task to stop; its worker's whole process group is killed after `grace_s` [s]."""
+        for worker in self._workers:
+            if worker.assignment is not None and worker.assignment.task.id == task_id:
+                sentence = "cancelled"
+                if grace_s > 0:
+                    worker.channel.send(Stop(task_id, worker.assignment.attempt))
+                    sentence = f"cancelled; it did not stop by itself within {grace_s:g} s"
+                worker.end_by(time.monotonic() + grace_s, FailureKind.CANCELLED, sentence)
+
+    def shutdown(self) -> None:
+        """Let idle workers go, kill busy ones, and wait until every process is gone."""
+        for worker in self._workers:
+            if worker.assignment is None:
+                self._retire(worker)
+            else:
+                worker.end_by(time.monotonic(), FailureKind.CANCELLED, "the executor was shut down")
+        while self._workers:
+            self._turn(_POLL_S)
+
+    # --- the life of a worker ---
+
+    def _make_room(self) -> None:
+        """Let the longest idle worker go when a new one would be one too many."""
+        staying = [worker for worker in self._workers if worker.idle or worker.assignment is not None]
+        idle = [worker for worker in staying if worker.idle]
+        if idle and len(staying) >= self._worker_limit:
+            self._retire(min(idle, key=lambda worker: worker.last_sign))
+
+    def _retire(self, worker: WorkerProcess) -> None:
+        """Close its channel: it leaves by itself, and is killed if it does not."""
+        worker.idle = False
+        if worker.kill_at is None:
+            worker.kill_at = time.monotonic() + _RETIRE_GRACE_S
+        self._close_channel(worker)
+
+    def _close_channel(self, worker: WorkerProcess) -> None:
+        if not worker.channel.closed:
+            self._selector.unregister(worker.channel)
+            worker.channel.close()
+
+    def _bury(self, worker: WorkerProcess) -> None:
+        """The process is gone: read its last words, and report its task if they did not."""
+        self._read(worker)
+        assignment = worker.assignment
+        if assignment is not None:
+            kind, sentence = worker.explain_exit()
+            seconds = time.monotonic() - worker.began
+            details = log_tail(assignment.log)
+            self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence, details, seconds))
+        self._workers.remove(worker)
+        self._close_channel(worker)
+        if worker.exit_descriptor is not None:
+            self._selector.unregister(worker.exit_descriptor)
+        worker.close()
+
+    # --- one turn of the loop ---
+
+    def _turn(self, timeout_s: float) -> None:
+        """Wait for a message, an exit or a deadline, for `timeout_s` [s] at most, and act on it."""
+        for worker in self._workers:
+            if not worker.channel.closed:
+                events = selectors.EVENT_READ | (selectors.EVENT_WRITE if worker.channel.has_unsent else 0)
+                if self._selector.get_key(worker.channel).events != events:
+                    self._selector.modify(worker.channel, events, worker)
+        for key, events in self._selector.select(max(0.0, min(timeout_s, self._seconds_to_next_deadline()))):
+            if isinstance(key.fileobj, Channel):
+                if events & selectors.EVENT_WRITE:
+                    key.fileobj.flush()
+                if events & selectors.EVENT_READ:
+                    self._read(key.data)
+        for worker in [worker for worker in self._workers if worker.has_exited()]:
+            self._bury(worker)
+        now = time.monotonic()
+        for worker in self._workers:
+            self._enforce_deadlines(worker, now)
+
+    def _read(self, worker: WorkerProcess) -> None:
+        if worker.channel.closed:
+            return
+        for message in worker.channel.receive():
+            worker.last_sign = time.monotonic()
+            if isinstance(message, Vitals):
+                worker.resident_memory_bytes = message.resident_memory_bytes
+                continue
+            self._events.append(message)
+            if isinstance(message, Finished | Failed):
+                worker.end_assignment(failed=isinstance(message, Failed))
+                if self._is_worn_out(worker):
+                    self._retire(worker)
+                    return
+                worker.idle = True
+        if worker.channel.at_end:
+            self._retire(worker)
+
+    def _is_worn_out(self, worker: WorkerProcess) -> bool:
+        return (
+            worker.single_use
+            or worker.tasks_done >= self._limits.tasks_per_worker
+            or worker.resident_memory_bytes > self._memory_limit
+        )
+
+    def _seconds_to_next_deadline(self) -> float:
+        now = time.monotonic()
+        deadlines = [now + _POLL_S for worker in self._workers if worker.exit_descriptor is None]
+        for worker in self._workers:
+            if worker.kill_at is not None:
+                deadlines.append(worker.kill_at)
+            elif worker.assignment is not None:
+                deadlines.append(worker.last_sign + self._limits.stall_timeout_s)
+                deadlines.append(worker.began + (worker.assignment.timeout_s or inf))
+        return min(deadlines, default=inf) - now
+
+    def _enforce_deadlines(self, worker: WorkerProcess, now: float) -> None:
+        if worker.kill_at is not None:
+            if worker.kill_at <= now:
+                worker.kill()
+                worker.kill_at = inf  # once is enough; its exit comes through the selector
+            return
+        if worker.assignment is None:
+            return
+        stall_timeout_s, timeout_s = self._limits.stall_timeout_s, worker.assignment.timeout_s
+        if now - worker.last_sign >= stall_timeout_s:
+            sentence = f"no sign of life for {stall_timeout_s:g} s; the log shows where it hung"
+            worker.end_by(now + _STACK_DUMP_S, FailureKind.STALLED, sentence)
+        elif timeout_s is not None and now - worker.began >= timeout_s:
+            sentence = f"not done after {timeout_s:g} s; the log shows where it was"
+            worker.end_by(now + _STACK_DUMP_S, FailureKind.TIMED_OUT, sentence)
+        else:
+            return
+        worker.signal(STACK_DUMP_SIGNAL)

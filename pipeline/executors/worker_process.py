@@ -1,0 +1,168 @@
+"""One worker process as its supervisor sees it: how it is started, watched and ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+from pipeline.executors.base import Assignment
+from pipeline.executors.channel import Channel
+from pipeline.executors.memory import out_of_memory_kills
+from pipeline.task import FailureKind
+
+_BOOT = "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from pipeline.worker import main; main()"
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+_LOG_TAIL_LINES = 20
+_LOG_TAIL_BYTES = 16_384
+
+
+class WorkerProcess:
+    """A process that runs one assignment after another, in a session and process group of its own.
+
+    Attributes:
+        key: stage and thread count that it is warm for.
+        assignment: what it runs, or None.
+        idle: it waits for an assignment.
+        single_use: it is to be replaced after the task that it ended last.
+        resident_memory_bytes: how large it was when its last task ended.
+        tasks_done: how many tasks it has ended.
+        began: when its assignment was given to it, monotonic [s].
+        last_sign: when it last said anything, monotonic [s].
+        kill_at: when its process group is killed, monotonic [s], or None.
+        verdict: what its task fails of, when it is us who end it.
+    """
+
+    def __init__(self, key: tuple[str, int], first: Assignment) -> None:
+        self.key = key
+        self.assignment: Assignment | None = None
+        self.idle = False
+        self.single_use = False
+        self.resident_memory_bytes = 0
+        self.tasks_done = 0
+        self.began = self.last_sign = time.monotonic()
+        self.kill_at: float | None = None
+        self.verdict: tuple[FailureKind, str] | None = None
+        self._out_of_memory_kills = 0
+        self._process, self.channel = _spawn(first)
+        self.exit_descriptor = _open_exit_descriptor(self._process.pid)
+
+    @property
+    def pid(self) -> int:
+        """Process id; that of its group as well."""
+        return self._process.pid
+
+    def assign(self, assignment: Assignment) -> None:
+        """Hand over an attempt."""
+        self.idle = False
+        self.assignment = assignment
+        self.verdict = None
+        self.began = self.last_sign = time.monotonic()
+        self._out_of_memory_kills = out_of_memory_kills()
+        self.channel.send(assignment)
+
+    def end_assignment(self, *, failed: bool) -> None:
+        """The attempt is over; what was planned against it is off.
+
+        A worker is not used again after a failure, whose traces it may carry, nor after a long task: there is no other
+        like it to be warm for, and its memory is wanted by the stages that follow.
+        """
+        assert self.assignment is not None
+        self.single_use = failed or self.assignment.task.checkpointed
+        self.assignment = None
+        self.verdict = None
+        self.kill_at = None
+        self.tasks_done += 1
+
+    def end_by(self, deadline: float, kind: FailureKind, sentence: str) -> None:
+        """Kill it at `deadline`, monotonic [s], unless that was to happen earlier already."""
+        if self.kill_at is None or deadline < self.kill_at:
+            self.kill_at = deadline
+        self.verdict = self.verdict or (kind, sentence)
+
+    def signal(self, number: int) -> None:
+        """Send a signal to the worker alone."""
+        self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """Kill it with everything that it started."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+
+    def has_exited(self) -> bool:
+        """Whether the process is gone."""
+        return self._process.poll() is not None
+
+    def explain_exit(self) -> tuple[FailureKind, str]:
+        """What its task failed of, now that the process is gone."""
+        if self.verdict is not None:
+            return self.verdict
+        code = self._process.returncode
+        if code == -signal.SIGKILL and out_of_memory_kills() > self._out_of_memory_kills:
+            return (
+                FailureKind.OUT_OF_MEMORY,
+                f"the kernel killed worker {self._process.pid}: the machine is out of memory",
+            )
+        how = f"died of {_signal_name(-code)}" if code < 0 else f"exited with code {code}"
+        return FailureKind.WORKER_LOST, f"worker {self._process.pid} {how} in the middle of its task"
+
+    def close(self) -> None:
+        """Give its descriptors back."""
+        self.channel.close()
+        if self.exit_descriptor is not None:
+            os.close(self.exit_descriptor)
+
+
+def log_tail(log: Path) -> str:
+    """The last lines of a log; empty if there is none."""
+    try:
+        with log.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - _LOG_TAIL_BYTES))
+            text = file.read().decode(errors="replace")
+    except FileNotFoundError:
+        return ""
+    return "\n".join(text.splitlines()[-_LOG_TAIL_LINES:])
+
+
+def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel]:
+    """Start a fresh interpreter; what it prints before its first task goes into that task's log."""
+    first.log.parent.mkdir(parents=True, exist_ok=True)
+    ours, theirs = socket.socketpair()
+    search_path = json.dumps([str(Path(entry).absolute()) for entry in sys.path])
+    with ExitStack() as on_failure, theirs, first.log.open("ab") as log:
+        on_failure.enter_context(ours)
+        process = subprocess.Popen(
+            [sys.executable, "-c", _BOOT, str(theirs.fileno()), str(os.getpid()), search_path],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+            env={**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(first.threads))},
+        )
+        on_failure.pop_all()
+    return process, Channel(ours)
+
+
+def _open_exit_descriptor(pid: int) -> int | None:
+    """A descriptor that becomes readable when the process ends, where the system has such."""
+    if not hasattr(os, "pidfd_open"):
+        return None
+    try:
+        return os.pidfd_open(pid)
+    except OSError:  # a kernel before 5.3, or a sandbox that forbids it: exits are then polled for
+        return None
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -1,0 +1,131 @@
+"""What a valid job may still have wrong: names, looks, pictures and the camera. Its geometry is in `scene_checks`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.errors import JobFileError
+from pipeline.job.loading import LoadedJob, read_job
+from pipeline.job.magnitudes import check_magnitudes
+from pipeline.job.models import Job
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings, format_path, suggestion
+from pipeline.job.scene_checks import check_scene
+
+MANY_FRAMES = 100_000
+
+
+def check_job(job: Job, *, memory_bytes: int | None = None) -> Findings:
+    """Look at the whole job: everything that can be known before any work starts.
+
+    Reads the mesh files and fills the fluid's blocks, so it takes a second or two for a large scene.
+
+    Args:
+        job: a job as `read_job` returns it, with absolute mesh paths.
+        memory_bytes: what the simulation may use; this machine's if omitted.
+    """
+    findings = Findings()
+    _check_bodies(job, findings)
+    _check_materials(job, findings)
+    _check_faces(job, findings)
+    _check_time(job, findings)
+    _check_pictures(job, findings)
+    if check_magnitudes(job, findings):
+        check_scene(job, findings, memory_bytes)
+    return findings
+
+
+def named_bodies(job: Job) -> Iterator[tuple[KeyPath, str, str]]:
+    """Path, kind and name of every body."""
+    for kind in ("rigid", "fluid", "smoke"):
+        for index, body in enumerate(getattr(job, kind)):
+            yield (kind, index), kind, body.name
+
+
+def _check_bodies(job: Job, findings: Findings) -> None:
+    if not job.body_names:
+        findings.error((), "has no body; add [[fluid]], [[smoke]] or [[rigid]]")
+    elif not job.fluid and not job.smoke:
+        findings.warn((), "has neither fluid nor smoke, so nothing will move")
+    if job.fluid and job.smoke:
+        findings.warn((), "fluid and smoke do not act on each other in this version")
+    # Names become file names, and some file systems do not tell upper from lower case.
+    taken: dict[str, KeyPath] = {}
+    for path, _, name in named_bodies(job):
+        if other := taken.get(name.casefold()):
+            findings.error((*path, "name"), f'"{name}" is taken by {format_path(other)}; names are unique in a job')
+        taken.setdefault(name.casefold(), path)
+
+
+def _check_materials(job: Job, findings: Findings) -> None:
+    kinds = {name: kind for _, kind, name in named_bodies(job)}
+    for name, material in job.material.items():
+        path: KeyPath = ("material", name)
+        if name not in kinds:
+            hint = suggestion(name, kinds) or (f"; bodies are {', '.join(kinds)}" if kinds else "")
+            findings.error(path, f'no body is named "{name}"{hint}')
+        elif kinds[name] == "smoke" and material.look != "smoke":
+            findings.error((*path, "look"), f'smoke can only look like "smoke", got "{material.look}"')
+        elif kinds[name] != "smoke" and material.look == "smoke":
+            findings.error((*path, "look"), f'"smoke" is a look for [[smoke]]; "{name}" is in [[{kinds[name]}]]')
+        if material.density is not None and material.look not in ("smoke", "water"):
+            findings.warn((*path, "density"), f'has no effect on the look "{material.look}"')
+
+
+def _check_faces(job: Job, findings: Findings) -> None:
+    lists: list[tuple[KeyPath, tuple[str, ...]]] = [(("domain", "open_faces"), job.domain.open_faces)]
+    lists += [(("smoke", index, "open_faces"), smoke.open_faces) for index, smoke in enumerate(job.smoke)]
+    for path, faces in lists:
+        for face in dict.fromkeys(face for face in faces if faces.count(face) > 1):
+            findings.error(path, f'names "{face}" more than once')
+
+
+def _check_time(job: Job, findings: Findings) -> None:
+    length = job.frame_count / job.fps
+    if job.duration is not None and job.duration * job.fps < 0.5:
+        findings.warn(("duration",), f"{job.duration:g} s are less than a frame at {job.fps} fps; the film has one")
+    if job.frame_count > MANY_FRAMES:
+        findings.warn(
+            ("frames",) if job.frames else ("duration",),
+            f"{job.frame_count} frames are {length / 60:.0f} minutes of film; is the number meant?",
+        )
+    for index, smoke in enumerate(job.smoke):
+        for number, source in enumerate(smoke.source):
+            if source.start_s >= length:
+                findings.warn(
+                    ("smoke", index, "source", number, "start_s"),
+                    f"starts at {source.start_s:g} s, after the film's end at {length:g} s",
+                )
+
+
+def _check_pictures(job: Job, findings: Findings) -> None:
+    width, height = job.render.resolution
+    if width % 2 or height % 2:
+        even = f"{width + width % 2} x {height + height % 2}"
+        findings.error(
+            ("render", "resolution"), f"must be even numbers, as H.264 needs them, got {width} x {height}; use {even}"
+        )
+    if job.render.blender is not None and not Path(job.render.blender).is_file():
+        findings.error(("render", "blender"), f"no such file: {job.render.blender}; omit it to use the bpy module")
+    if job.camera.position is not None and job.camera.position == job.camera.look_at:
+        findings.error(("camera", "look_at"), "is where the camera stands; it must be somewhere else")
+    for index, light in enumerate(job.light):
+        if light.position == light.look_at and light.type != "point":
+            findings.error(("light", index, "look_at"), "is where the light stands; it must be somewhere else")
+
+
+def load_checked_job(
+    path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False
+) -> tuple[LoadedJob, Findings]:
+    """Read a job file as `read_job` does, and look at the whole job; its warnings are in place.
+
+    Raises:
+        JobFileError: carries every problem found.
+    """
+    loaded = read_job(path, overrides, preview=preview)
+    findings = check_job(loaded.job)
+    if findings.errors:
+        raise JobFileError(loaded.source.describe_all(findings.errors))
+    return replace(loaded, warnings=tuple(loaded.source.describe_all(findings.warnings))), findings

@@ -1,0 +1,188 @@
+"""A job file becomes a Job: read, changed by options, validated; every problem at once."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pipeline.errors import JobFileError
+from pipeline.job.messages import explain
+from pipeline.job.models import Job
+from pipeline.job.overrides import Override, OverrideError, apply_overrides, parse_override
+from pipeline.job.placements import mesh_shapes
+from pipeline.job.presets import preview_overrides
+from pipeline.job.problems import JobSource
+
+MAX_BYTES = 16 * 2**20
+"""No person writes a larger job file; a film given by mistake is refused before it is read."""
+MAX_DEPTH = 32
+"""Four times what any job needs; keeps recursive code far from Python's limit."""
+
+_SYNTAX_POSITION = re.compile(
+    r"(?P<what>.*) \(at (?:line (?P<line>\d+), column (?P<column>\d+)|end of document)\)", re.DOTALL
+)
+
+
+@dataclass(frozen=True)
+class LoadedJob:
+    """A valid job, and the text to keep of it.
+
+    Attributes:
+        job: the job; mesh files are absolute paths.
+        text: self-contained TOML: overrides applied, mesh files absolute. Loading it anywhere gives the same job.
+        path: the file it was read from.
+        source: turns a problem into a line with its place.
+        warnings: what is worth a look, one line each.
+    """
+
+    job: Job
+    text: str
+    path: Path
+    source: JobSource
+    warnings: tuple[str, ...] = ()
+
+
+def load_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False) -> Job:
+    """The job in a file. See `read_job`."""
+    return read_job(path, overrides, preview=preview).job
+
+
+def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False) -> LoadedJob:
+    """Read and validate a job file; the scene itself is looked at by `check_job`.
+
+    Args:
+        path: the TOML file.
+        overrides: arguments of `--set`, applied in order.
+        preview: make the fast, small version of the job.
+
+    Raises:
+        JobFileError: carries every problem found.
+    """
+    path = Path(path)
+    text = _read_text(path)
+    document = _parse(path, text)
+    changes = _parse_overrides(overrides, document)
+    source = JobSource(path.name, text, {change.path: change.origin for change in changes})
+    if changes:
+        text = _changed(text, changes)
+    job = _validate(_parse(path, text), source)
+    if preview:
+        preview_changes = preview_overrides(job)
+        source.options.update({change.path: change.origin for change in preview_changes})
+        text = _changed(text, preview_changes)
+    text = _with_absolute_meshes(text, job, path)
+    return LoadedJob(job=_validate(_parse(path, text), source), text=text, path=path, source=source)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        if path.is_dir():
+            raise JobFileError([f"{path}: is a folder, not a job file"])
+        if path.stat().st_size > MAX_BYTES:
+            raise JobFileError([f"{path}: {path.stat().st_size / 1e6:.0f} MB is not a job file; a few KB are usual"])
+        return path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+    except FileNotFoundError:
+        raise JobFileError([f"{path}: no such file; `pipeline new NAME` writes a starter"]) from None
+    except UnicodeDecodeError as error:
+        byte = f"byte {error.start} is 0x{error.object[error.start]:02x}"
+        raise JobFileError([f"{path}: not UTF-8 text ({byte})"]) from None
+    except (OSError, ValueError) as error:
+        raise JobFileError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from None
+
+
+def _parse(path: Path, text: str) -> dict[str, Any]:
+    try:
+        document = tomllib.loads(text)
+        if _depth(document) > MAX_DEPTH:
+            raise JobFileError([f"{path.name}: nested too deeply"])
+    except tomllib.TOMLDecodeError as error:
+        raise JobFileError([_syntax_error(path, text, str(error))]) from None
+    except RecursionError:
+        raise JobFileError([f"{path.name}: nested too deeply"]) from None
+    return document
+
+
+def _depth(document: Any) -> int:
+    """Levels of tables and lists; without recursion, as the answer may be large."""
+    depth, level = 0, [document]
+    while level := [
+        child
+        for each in level
+        if isinstance(each, dict | list)
+        for child in (each.values() if isinstance(each, dict) else each)
+    ]:
+        depth += 1
+    return depth
+
+
+def _syntax_error(path: Path, text: str, message: str) -> str:
+    match = _SYNTAX_POSITION.fullmatch(message)
+    if match is None:
+        return f"{path.name}: {message}"
+    lines = text.split("\n")
+    line = int(match["line"]) if match["line"] else len(lines)
+    column = int(match["column"]) if match["column"] else len(lines[-1]) + 1
+    written = lines[line - 1].strip()
+    shown = f": {written}" if written else ""
+    what = f"{match['what'][:1].lower()}{match['what'][1:]}"
+    return f"{path.name}:{line}:{column} {what}{shown}{_syntax_hint(match['what'], written)}"
+
+
+def _syntax_hint(what: str, written: str) -> str:
+    """The usual cause of a syntax error: a key given twice, or a text without quotes."""
+    if what == "Cannot overwrite a value":
+        return "; this key has a value already"
+    key, equals, value = (part.strip() for part in written.partition("="))
+    if equals and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./+-]*", value) and value not in ("true", "false", "inf", "nan"):
+        return f'; a text needs quotes: {key} = "{value}"'
+    return ""
+
+
+def _parse_overrides(arguments: Sequence[str], document: Mapping[str, Any]) -> list[Override]:
+    changes, problems = [], []
+    for argument in arguments:
+        try:
+            changes.append(parse_override(argument, document))
+        except OverrideError as error:
+            problems.append(str(error))
+    if problems:
+        raise JobFileError(problems)
+    return changes
+
+
+def _changed(text: str, changes: Sequence[Override]) -> str:
+    try:
+        return apply_overrides(text, changes)
+    except OverrideError as error:
+        raise JobFileError([str(error)]) from None
+
+
+def _validate(document: Mapping[str, Any], source: JobSource) -> Job:
+    """Strict validation: "60" is no number, and 60.0 is no whole number."""
+    try:
+        return Job.model_validate(_with_tuples(document), strict=True)
+    except ValidationError as error:
+        raise JobFileError(source.describe_all(explain(error, document))) from None
+
+
+def _with_tuples(value: Any) -> Any:
+    """The document with tuples for lists: the models hold tuples, and strict validation converts nothing."""
+    if isinstance(value, Mapping):
+        return {key: _with_tuples(child) for key, child in value.items()}
+    return tuple(_with_tuples(child) for child in value) if isinstance(value, list) else value
+
+
+def _with_absolute_meshes(text: str, job: Job, path: Path) -> str:
+    folder = path.resolve().parent
+    changes = [
+        Override((*place, "file"), (folder / shape.file).as_posix(), path.name)
+        for place, shape in mesh_shapes(job)
+        if not Path(shape.file).is_absolute()
+    ]
+    return _changed(text, changes) if changes else text

@@ -1,0 +1,46 @@
+"""Numbers that no film can mean, told before they overflow something."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from pipeline.job import schema
+from pipeline.job.models import Job
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings
+
+SMALLEST_LENGTH = 1.0e-6
+LARGEST_LENGTH = 1.0e6
+"""A micrometre to a thousand kilometres [m]; single precision ends well within."""
+LARGEST_NUMBER = 1.0e9
+"""Of any other kind, in SI units."""
+
+
+def check_magnitudes(job: Job, findings: Findings) -> bool:
+    """Whether every number of the scene is of a size that can be computed with; notes those that are not."""
+    ok = True
+    for path, value in _numbers(job.model_dump(include={"domain", "gravity", "rigid", "fluid", "smoke"})):
+        node = schema.node_at(path)
+        unit = node.unit if node is not None else ""
+        is_size = unit == "m" and node is not None and node.is_positive
+        largest = LARGEST_LENGTH if unit == "m" else LARGEST_NUMBER
+        shown = f" {unit}" if unit else ""
+        if abs(value) > largest:
+            findings.error(path, f"must be within ±{largest:g}{shown}, got {value:g}; units are SI")
+            ok = False
+        elif is_size and value < SMALLEST_LENGTH:
+            findings.error(path, f"must be at least {SMALLEST_LENGTH:g} m, got {value:g}; units are SI")
+            ok = False
+    return ok
+
+
+def _numbers(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, float]]:
+    if isinstance(value, dict):
+        for key, child in value.items():
+            yield from _numbers(child, (*path, key))
+    elif isinstance(value, list | tuple):
+        for index, child in enumerate(value):
+            yield from _numbers(child, (*path, index))
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield path, float(value)

@@ -1,0 +1,28 @@
+"""The shapes of a job, each with its place in the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from pipeline.job.models import Job
+from pipeline.job.positions import KeyPath
+from sim.shapes.parameters import MeshShape, Placement
+
+
+def placements(job: Job) -> Iterator[tuple[KeyPath, Placement]]:
+    """Every shape that stands in the scene, with the path of its table."""
+    for index, body in enumerate(job.rigid):
+        yield ("rigid", index), body
+    for index, fluid in enumerate(job.fluid):
+        for number, block in enumerate(fluid.block):
+            yield ("fluid", index, "block", number), block
+    for index, smoke in enumerate(job.smoke):
+        for number, emitter in enumerate(smoke.source):
+            yield ("smoke", index, "source", number), emitter
+
+
+def mesh_shapes(job: Job) -> Iterator[tuple[KeyPath, MeshShape]]:
+    """Every mesh of the job, with the path of its shape's table."""
+    for place, placement in placements(job):
+        if isinstance(placement.shape, MeshShape):
+            yield (*place, "shape"), placement.shape

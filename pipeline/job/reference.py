@@ -1,0 +1,144 @@
+"""The reference of every key in docs/job-file.md, made from the schema.
+
+    python -m pipeline.job.reference docs/job-file.md
+
+writes it between the file's two markers; a test asserts that it is current.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pipeline.job import schema
+from pipeline.job.problems import quoted_list
+
+BEGIN = "<!-- reference: begin; written by `python -m pipeline.job.reference docs/job-file.md` -->"
+END = "<!-- reference: end -->"
+
+_SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+
+
+def reference() -> str:
+    """Markdown: a section with a table of keys for every table of the job file."""
+    return "\n".join(line for heading, about, node in _tables() for line in _section(heading, about, node))
+
+
+def with_reference(document: str) -> str:
+    """The document with the current reference between its markers. Raises ValueError where they are missing."""
+    before, begin, rest = document.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"the document lacks a marker: {BEGIN if not begin else END}")
+    return f"{before}{BEGIN}\n\n{reference()}\n{END}{after}"
+
+
+def _tables() -> Iterator[tuple[str, str, schema.Node]]:
+    """Heading, description and schema of every table, in reading order; shapes once, at the end."""
+    definitions = schema.job_schema()["$defs"]
+    yield "Top of the file", "", schema.job_schema()
+    for key, property_ in schema.job_schema()["properties"].items():
+        yield from _nested_tables(key, property_)
+    for name, definition in definitions.items():
+        if name.endswith("Shape"):
+            type_ = definition["properties"]["type"]["const"]
+            yield f'shape = {{ type = "{type_}", ... }}', definition["description"], definition
+
+
+def _nested_tables(path: str, property_: schema.Node) -> Iterator[tuple[str, str, schema.Node]]:
+    target, heading = _table_of(path, property_)
+    if target is None:
+        return
+    yield heading, target.get("description", ""), target
+    for key, child in target["properties"].items():
+        if key != "shape":
+            yield from _nested_tables(f"{path}.{key}", child)
+
+
+def _table_of(path: str, property_: schema.Node) -> tuple[schema.Node | None, str]:
+    """The table that a property holds, one or many, and how its header is written."""
+    if "$ref" in property_:
+        return _definition(property_), f"[{path}]"
+    items = property_.get("items")
+    if isinstance(items, dict) and "$ref" in items:
+        return _definition(items), f"[[{path}]]"
+    extra = property_.get("additionalProperties")
+    if isinstance(extra, dict) and "$ref" in extra:
+        return _definition(extra), f"[{path}.NAME]"
+    return None, ""
+
+
+def _definition(node: schema.Node) -> schema.Node:
+    definition: schema.Node = schema.job_schema()["$defs"][node["$ref"].rpartition("/")[2]]
+    return definition
+
+
+def _section(heading: str, about: str, node: schema.Node) -> Iterator[str]:
+    rows = list(_rows(node))
+    yield f"### `{heading}`" if heading.startswith(("[", "shape")) else f"### {heading}"
+    yield ""
+    if about:
+        yield from (" ".join(about.split()), "")
+    yield "| key | value | default | meaning |"
+    yield "|---|---|---|---|"
+    yield from rows
+    yield ""
+
+
+def _rows(node: schema.Node) -> Iterator[str]:
+    required = node.get("required", [])
+    for key, property_ in node["properties"].items():
+        table, _ = _table_of(key, property_)
+        if (
+            table is not None
+            or (key == "type" and "const" in property_)
+            or "Reserved" in property_.get("description", "")
+        ):
+            continue
+        default = "required" if key in required else _written(property_.get("default"))
+        cells = (f"`{key}`", _kind(property_), default, property_.get("description", ""))
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def _kind(node: schema.Node) -> str:
+    """What may be written there, in words."""
+    if "anyOf" in node:
+        options = [option for option in node["anyOf"] if option.get("type") != "null"]
+        return " or ".join(_kind(option) for option in options)
+    if "oneOf" in node:
+        return "a shape, see below"
+    if "enum" in node:
+        return quoted_list(node["enum"])
+    if "const" in node:
+        return f'"{node["const"]}"'
+    if node["type"] == "array":
+        prefix = node.get("prefixItems")
+        return f"{len(prefix)} of: {_kind(prefix[0])}" if prefix else f"list of {_kind(node['items'])}"
+    word = {"number": "number", "integer": "whole number", "boolean": "true or false", "string": "text"}[node["type"]]
+    bounds = " and ".join(f"{sign} {node[key]:g}" for key, sign in _SIGNS.items() if key in node)
+    return f"{word} {bounds}".strip()
+
+
+def _written(default: Any) -> str:
+    """A default as it would stand in TOML; what is left out by default has none."""
+    if default is None:
+        return "–"
+    if isinstance(default, bool):
+        return f"`{str(default).lower()}`"
+    if isinstance(default, str):
+        return f'`"{default}"`'
+    if isinstance(default, list):
+        return "`[" + ", ".join(_written(each).strip("`") for each in default) + "]`"
+    return f"`{default:.6g}`" if isinstance(default, float) else f"`{default}`"
+
+
+def main(arguments: list[str]) -> None:
+    """Rewrite the reference in the given Markdown file."""
+    path = Path(arguments[0])
+    path.write_text(with_reference(path.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,299 @@
+"""The scene's geometry before any work: do the shapes exist, where do they lie, and does it all fit into memory?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.job.models import Job
+from pipeline.job.placements import placements
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings, suggestion
+from pipeline.resources import machine_capacity
+from sim.fluid.parameters import FluidParameters
+from sim.scene import DomainParameters
+from sim.shapes.parameters import MeshShape, Placement
+from sim.smoke.parameters import SmokeParameters
+
+if TYPE_CHECKING:
+    from sim.shapes import Solid
+
+Box = NDArray[np.float64]
+"""Lower and upper corner [m], (2, 3)."""
+
+BYTES_PER_PARTICLE = 1024
+"""Upper bound of what the fluid solvers take, neighbour search and snapshot included."""
+BYTES_PER_CELL = 200
+"""Upper bound of what the smoke solver takes, multigrid levels and snapshot included."""
+COUNTED_PARTICLES = 200_000
+"""Up to so many particles a fluid is filled as the simulation fills it; beyond, a coarser lattice is scaled up."""
+ALL = 1.0 - 1e-6
+"""Share of a box that counts as all of it: sizes and positions written in decimal do not add up exactly."""
+SPEED_OF_SOUND_IN_SPEEDS = 10.0
+"""The numerical speed of sound over the largest expected speed, for less than 1 % compression."""
+
+
+def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -> None:
+    """Note what is wrong with shapes, places and sizes, and how large it all is; `memory_bytes` as in `check_job`."""
+    solids = _build_solids(job, findings)
+    _check_rigid_bodies(job, solids, findings)
+    _check_camera(job, solids, findings)
+    budget = machine_capacity().memory_bytes if memory_bytes is None else memory_bytes
+    findings.particles = sum(_check_fluid(job, index, solids, budget, findings) for index in range(len(job.fluid)))
+    findings.cells = sum(_check_smoke(job, index, solids, budget, findings) for index in range(len(job.smoke)))
+
+
+# --- shapes --------------------------------------------------------------------------------------------------------
+
+
+def _build_solids(job: Job, findings: Findings) -> Mapping[KeyPath, Solid]:
+    """Every shape that can be built, by its path."""
+    from sim.shapes import ShapeError, build_solid
+
+    solids = {}
+    for path, placement in placements(job):
+        if not _mesh_exists(placement, (*path, "shape", "file"), findings):
+            continue
+        try:
+            solid = build_solid(placement)
+        except ShapeError as error:
+            findings.error((*path, "shape"), str(error))
+        else:
+            solids[path] = solid
+            for warning in solid.warnings:
+                findings.warn((*path, "shape"), warning)
+    return solids
+
+
+def _mesh_exists(placement: Placement, path: KeyPath, findings: Findings) -> bool:
+    if not isinstance(placement.shape, MeshShape):
+        return True
+    file = Path(placement.shape.file)
+    if file.is_file():
+        return True
+    if file.is_dir():
+        findings.error(path, f"{file} is a folder, not a mesh")
+    elif not file.parent.is_dir():
+        findings.error(path, f"no such file: {file}; there is no folder {file.parent}")
+    else:
+        neighbours = [each.name for each in file.parent.iterdir()]
+        findings.error(path, f"no such file: {file}{suggestion(file.name, neighbours)}")
+    return False
+
+
+# --- places --------------------------------------------------------------------------------------------------------
+
+
+def _domain_box(domain: DomainParameters) -> Box:
+    return np.array([domain.min, domain.max])
+
+
+def _smoke_box(smoke: SmokeParameters, domain: DomainParameters) -> Box:
+    return np.array([smoke.min or domain.min, smoke.max or domain.max])
+
+
+def _overlap(a: Box, b: Box) -> float:
+    """Share of box `a` that lies in box `b` [-]."""
+    sides = np.minimum(a[1], b[1]) - np.maximum(a[0], b[0])
+    return float(np.prod(np.clip(sides, 0.0, None)) / np.prod(a[1] - a[0]))
+
+
+def _touch(a: Box, b: Box, *, margin: float) -> bool:
+    """Whether two boxes come closer than a margin [m]; far cheaper than signed distances of a mesh."""
+    return bool(np.all((a[0] - margin <= b[1]) & (b[0] - margin <= a[1])))
+
+
+def _span(box: Box) -> str:
+    return " ".join(f"{axis} {low:.4g}..{high:.4g}" for axis, low, high in zip("xyz", *box, strict=True)) + " m"
+
+
+def _check_rigid_bodies(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+    domain = _domain_box(job.domain)
+    regions = [domain, *(_smoke_box(smoke, job.domain) for smoke in job.smoke)]
+    for path, solid in solids.items():
+        if path[0] == "rigid" and not any(_overlap(solid.bounds, region) for region in regions):
+            findings.error(path, f"is wholly outside the domain: it spans {_span(solid.bounds)}, not {_span(domain)}")
+
+
+def _check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+    if job.camera.position is None:
+        return
+    eye = np.array([job.camera.position])
+    for path, solid in solids.items():
+        if path[0] == "smoke" or not _touch(solid.bounds, np.repeat(eye, 2, axis=0), margin=0.0):
+            continue
+        if solid.signed_distance(eye)[0] < 0.0:
+            name = getattr(job, str(path[0]))[path[1]].name
+            findings.error(("camera", "position"), f'is inside "{name}"; move it out')
+
+
+# --- fluid ---------------------------------------------------------------------------------------------------------
+
+
+def _check_fluid(job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: int, findings: Findings) -> int:
+    """Particles that the fluid will have, about."""
+    fluid = job.fluid[index]
+    blocks = {path: solid for path, solid in solids.items() if path[:3] == ("fluid", index, "block")}
+    obstacles = [solid for path, solid in solids.items() if path[0] == "rigid"]
+    spacing = 2.0 * fluid.particle_radius
+    expected = sum(solid.volume for solid in blocks.values()) / spacing**3
+    if expected * BYTES_PER_PARTICLE > budget:
+        possible = budget // BYTES_PER_PARTICLE
+        radius = fluid.particle_radius * (expected / possible) ** (1.0 / 3.0)
+        findings.error(
+            ("fluid", index, "particle_radius"),
+            f"{_count(expected)} particles need {_gigabytes(expected * BYTES_PER_PARTICLE)}, this machine has "
+            f"{_gigabytes(budget)}; at most {_count(possible)} fit: use {_rounded_up(radius):g} m or more",
+        )
+        return int(expected)
+    _check_time_step(job, index, findings)
+    lattice = _Lattice(_domain_box(job.domain), obstacles, spacing, max(1.0, (expected / COUNTED_PARTICLES) ** (1 / 3)))
+    return sum(_check_block(path, solid, lattice, findings) for path, solid in blocks.items())
+
+
+@dataclass(frozen=True)
+class _Lattice:
+    """What blocks are filled with, and where not.
+
+    Attributes:
+        box: the domain.
+        obstacles: solid bodies.
+        spacing: of the particles [m].
+        coarsening: the checks' lattice is coarser by this factor [-].
+    """
+
+    box: Box
+    obstacles: list[Solid]
+    spacing: float
+    coarsening: float
+
+    def fill(self, solid: Solid) -> tuple[int, int]:
+        """How many particles find a free place in the solid, and how many are kept out by obstacles."""
+        from sim.shapes import fill_with_particles
+
+        step = self.spacing * self.coarsening
+        points = fill_with_particles(solid, step, lower=self.box[0] + step / 2, upper=self.box[1] - step / 2)
+        free = np.ones(len(points), dtype=bool)
+        for obstacle in self.obstacles:
+            if not _touch(obstacle.bounds, solid.bounds, margin=step):
+                continue
+            free &= obstacle.signed_distance(points.astype(np.float64)) >= step / 2
+        left = int(np.count_nonzero(free))
+        scale = self.coarsening**3
+        return round(left * scale), round((len(points) - left) * scale)
+
+
+def _check_block(path: KeyPath, solid: Solid, lattice: _Lattice, findings: Findings) -> int:
+    """Particles in a block, about."""
+    inside = _overlap(solid.bounds, lattice.box)
+    if inside == 0.0:
+        spans = f"it spans {_span(solid.bounds)}, not {_span(lattice.box)}"
+        findings.error(path, f"is wholly outside the domain: {spans}")
+        return 0
+    if inside < ALL:
+        findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the domain and are clipped")
+    left, kept_out = lattice.fill(solid)
+    if kept_out and not left:
+        findings.error(path, "lies wholly inside solid bodies, so it holds no particle; move it")
+    elif kept_out:
+        filled = _count(left + kept_out)
+        findings.warn(path, f"overlaps a solid body: {_count(kept_out)} of its {filled} particles are left out")
+    elif not left and lattice.coarsening == 1.0:
+        thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
+        findings.error(
+            path,
+            f"holds no particle: it is {thinnest:.3g} m thin and particles are {lattice.spacing:.3g} m apart; "
+            "enlarge it or use a smaller particle_radius",
+        )
+    return left
+
+
+def _check_time_step(job: Job, index: int, findings: Findings) -> None:
+    """Warn of a fixed step beyond the CFL bound at the speed that a fall through the domain gives."""
+    fluid = job.fluid[index]
+    if fluid.dt == "adaptive":
+        return
+    stable = _expected_stable_dt(job, fluid)
+    if fluid.dt > stable:
+        findings.warn(
+            ("fluid", index, "dt"),
+            f'{fluid.dt:g} s is above the stable step of about {stable:.2g} s and may blow up; use "adaptive"',
+        )
+
+
+def _expected_stable_dt(job: Job, fluid: FluidParameters) -> float:
+    """CFL bound [s]: cfl 0.4 d / (c_s + v), with v from the initial speed and a fall through the domain."""
+    diagonal = math.dist(job.domain.min, job.domain.max)
+    fall = 2.0 * math.hypot(*job.gravity) * diagonal
+    speed = math.sqrt(fall + max(math.hypot(*block.velocity) for block in fluid.block) ** 2)
+    sound = fluid.sound_speed or SPEED_OF_SOUND_IN_SPEEDS * speed
+    return fluid.cfl * 0.4 * 2.0 * fluid.particle_radius / (sound + speed) if sound + speed > 0.0 else math.inf
+
+
+# --- smoke ---------------------------------------------------------------------------------------------------------
+
+
+def _check_smoke(job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: int, findings: Findings) -> int:
+    """Cells of the smoke's grid."""
+    smoke = job.smoke[index]
+    box = _smoke_box(smoke, job.domain)
+    extent = box[1] - box[0]
+    if np.any(extent <= 0.0):
+        corner = "max" if smoke.max is not None else "min"
+        findings.error(("smoke", index, corner), f"max must be above min on every axis, got {_span(box)}")
+        return 0
+    if np.any(extent < 4.0 * smoke.cell_size):
+        findings.error(
+            ("smoke", index, "cell_size"),
+            f"{smoke.cell_size:g} m leaves fewer than 4 cells along an edge of {extent.min():.3g} m; "
+            f"use {extent.min() / 4.0:.3g} m or less",
+        )
+    cells = float(np.prod(np.ceil(extent / smoke.cell_size)))
+    if cells * BYTES_PER_CELL > budget:
+        possible = budget // BYTES_PER_CELL
+        size = smoke.cell_size * (cells / possible) ** (1.0 / 3.0)
+        findings.error(
+            ("smoke", index, "cell_size"),
+            f"{_count(cells)} cells need {_gigabytes(cells * BYTES_PER_CELL)}, this machine has {_gigabytes(budget)}; "
+            f"at most {_count(possible)} fit: use {_rounded_up(size):g} m or more",
+        )
+    for path, solid in solids.items():
+        if path[:3] == ("smoke", index, "source"):
+            _check_source(path, solid, box, smoke.cell_size, findings)
+    return int(cells)
+
+
+def _check_source(path: KeyPath, solid: Solid, grid: Box, cell_size: float, findings: Findings) -> None:
+    inside = _overlap(solid.bounds, grid)
+    if inside == 0.0:
+        findings.error(path, f"is wholly outside the smoke's grid: it spans {_span(solid.bounds)}, not {_span(grid)}")
+    elif inside < ALL:
+        findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the smoke's grid and emit nothing")
+    if np.min(solid.bounds[1] - solid.bounds[0]) < cell_size:
+        findings.warn(path, f"is thinner than a cell of {cell_size:g} m and may emit nothing; enlarge it")
+
+
+# --- numbers in words ----------------------------------------------------------------------------------------------
+
+
+def _count(number: float) -> str:
+    for limit, unit in ((1e9, "billion"), (1e6, "million")):
+        if number >= limit:
+            return f"{number / limit:.3g} {unit}"
+    return f"{number:.0f}"
+
+
+def _gigabytes(size_bytes: float) -> str:
+    return f"{size_bytes / 1e9:.3g} GB"
+
+
+def _rounded_up(value: float) -> float:
+    """To two significant digits, upwards, so that the number is short and still fits."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / step) * step:.2g}")

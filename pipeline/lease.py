@@ -1,0 +1,238 @@
+"""The lease: which process runs a job's folder right now.
+
+The holder is named in a small file: machine, boot, process and the process's start time, so that a number that was
+given to another process later is not mistaken for it. The file's modification time is the heartbeat. Whoever changes
+the file holds a `flock` on a guard file beside it meanwhile, so of two that race one finds the other's name. Nothing
+here has to be deleted by a person: the kernel drops the guard with its process, and a dead holder is taken over.
+
+On the same machine the process itself is looked for, so a holder that is stopped or slow keeps its lease and a dead
+one loses it at once. On another machine (or in another container) only the heartbeat can be seen. Its age is taken
+between two times of the same file system, the heartbeat's and that of touching the guard, so clocks of machines that
+do not agree do not matter.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+import time
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Self
+
+import psutil
+
+from pipeline.errors import JobBusyError, LeaseLostError
+
+HEARTBEAT_INTERVAL_S = 5.0
+"""How often a runner should call `Lease.heartbeat`."""
+
+EXPIRY_S = 60.0
+"""Age of the heartbeat at which a holder on another machine counts as dead: a dozen heartbeats missed in a row."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseHolder:
+    """The process that holds a lease.
+
+    Attributes:
+        host: name of its machine.
+        boot_id: identifies that machine's last start.
+        pid_namespace: identifies the set of processes in which `pid` means something; containers have their own.
+        pid: its process number.
+        process_start: when it started, as the kernel counts; with `pid` it identifies the process.
+        token: unique to this lease.
+        acquired: wall time [s since the epoch].
+    """
+
+    host: str
+    boot_id: str
+    pid_namespace: str
+    pid: int
+    process_start: str
+    token: str
+    acquired: float
+
+    @classmethod
+    def this_process(cls) -> LeaseHolder:
+        """A new lease of the calling process."""
+        pid = os.getpid()
+        process_start = _process_start(pid)
+        assert process_start is not None
+        return cls(
+            host=platform.node(),
+            boot_id=_boot_id(),
+            pid_namespace=_pid_namespace(),
+            pid=pid,
+            process_start=process_start,
+            token=uuid.uuid4().hex,
+            acquired=time.time(),
+        )
+
+
+class Lease:
+    """A lease that this process holds; a context manager that gives it back.
+
+    Attributes:
+        holder: this process.
+        takeover: a sentence, if the lease of a dead holder was taken over; else None.
+    """
+
+    def __init__(self, path: Path, holder: LeaseHolder, takeover: str | None) -> None:
+        self._path = path
+        self.holder = holder
+        self.takeover = takeover
+
+    @classmethod
+    def acquire(cls, path: Path, *, expiry_s: float = EXPIRY_S) -> Self:
+        """Take the lease.
+
+        Args:
+            path: the lease's file, such as `JobLayout.lease`; its folder is there.
+            expiry_s: age of the heartbeat at which a holder on another machine counts as dead [s].
+
+        Raises:
+            JobBusyError: a live process holds it.
+        """
+        with _guard(path) as now_s:
+            takeover = None
+            if path.exists():
+                holder = read_holder(path)
+                evidence = _evidence_of_death(holder, age_s=now_s - path.stat().st_mtime, expiry_s=expiry_s)
+                if evidence is None:
+                    assert holder is not None
+                    raise JobBusyError(
+                        f"{path.parent} is being run already, by process {holder.pid} on {holder.host} "
+                        f"since {_clock(holder.acquired)}"
+                    )
+                takeover = f"taking over from {_describe(holder)}: {evidence}"
+            mine = LeaseHolder.this_process()
+            part = path.with_name(f".{path.name}.part.{mine.pid}")
+            part.write_text(json.dumps(asdict(mine), indent=1) + "\n")
+            part.replace(path)
+        return cls(path, mine, takeover)
+
+    def heartbeat(self) -> None:
+        """Say that the holder is alive; call it every HEARTBEAT_INTERVAL_S.
+
+        Raises:
+            LeaseLostError: somebody has taken the job over. Stop at once, and write no record any more.
+        """
+        with _guard(self._path):
+            if not self._is_mine():
+                raise LeaseLostError(
+                    f"{self._path.parent} was taken over by {_describe(read_holder(self._path))} "
+                    "while this process did not answer"
+                )
+            os.utime(self._path)
+
+    def release(self) -> None:
+        """Give the lease back; one that somebody else has taken over is left alone."""
+        with _guard(self._path):
+            if self._is_mine():
+                self._path.unlink()
+
+    def _is_mine(self) -> bool:
+        holder = read_holder(self._path)
+        return holder is not None and holder.token == self.holder.token
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
+def read_holder(path: Path) -> LeaseHolder | None:
+    """Who is named in a lease's file, dead or alive; None if nobody is, or not legibly."""
+    try:
+        return LeaseHolder(**json.loads(path.read_text()))
+    except (FileNotFoundError, ValueError, TypeError):
+        return None
+
+
+def live_holder(path: Path, *, expiry_s: float = EXPIRY_S) -> LeaseHolder | None:
+    """The live process that holds a lease, or None: for `status`, which changes nothing.
+
+    The heartbeat's age is taken by this machine's clock here.
+    """
+    holder = read_holder(path)
+    try:
+        age_s = time.time() - path.stat().st_mtime
+    except FileNotFoundError:
+        return None
+    return holder if _evidence_of_death(holder, age_s=age_s, expiry_s=expiry_s) is None else None
+
+
+def _evidence_of_death(holder: LeaseHolder | None, *, age_s: float, expiry_s: float) -> str | None:
+    """Why the holder counts as dead, or None if it may be alive."""
+    if holder is None:
+        return "its name is not legible"
+    if holder.host == platform.node() and holder.boot_id != _boot_id() and age_s > _uptime_s():
+        # Its last heartbeat is older than this boot. (A live one of another machine that has the same name is not.)
+        return "the machine was started anew since"
+    if (holder.boot_id, holder.pid_namespace) == (_boot_id(), _pid_namespace()):
+        process_start = _process_start(holder.pid)
+        if process_start is None:
+            return "the process is gone"
+        return None if process_start == holder.process_start else "its number belongs to another process now"
+    return f"it has not been heard of for {age_s:.0f} s" if age_s > expiry_s else None
+
+
+@contextmanager
+def _guard(path: Path) -> Iterator[float]:
+    """Exclude all others that read and change this lease; yields the file system's present time [s]."""
+    guard = path.with_name(f".{path.name}.guard")
+    descriptor = os.open(guard, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        os.utime(guard)
+        yield os.fstat(descriptor).st_mtime
+    finally:
+        os.close(descriptor)
+
+
+def _process_start(pid: int) -> str | None:
+    """When a process started, in a form that stays the same for its life; None if there is no such process any more.
+
+    Linux counts ticks since the machine's start. Elsewhere it is wall time, rounded, for it may be derived anew.
+    """
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        if Path("/proc/self/stat").exists():
+            return None
+    else:
+        state, start_ticks = fields[0], fields[19]  # man proc_pid_stat: fields 3 and 22
+        return None if state in "ZX" else start_ticks
+    try:
+        return str(round(psutil.Process(pid).create_time()))
+    except psutil.NoSuchProcess:
+        return None
+
+
+def _boot_id() -> str:
+    path = Path("/proc/sys/kernel/random/boot_id")
+    return path.read_text().strip() if path.exists() else str(round(psutil.boot_time()))
+
+
+def _uptime_s() -> float:
+    return time.time() - psutil.boot_time()
+
+
+def _pid_namespace() -> str:
+    path = Path("/proc/self/ns/pid")
+    return str(path.readlink()) if path.is_symlink() else platform.node()
+
+
+def _describe(holder: LeaseHolder | None) -> str:
+    return "an unknown process" if holder is None else f"process {holder.pid} on {holder.host}"
+
+
+def _clock(time_s: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(time_s))

@@ -1,0 +1,451 @@
+"""Running a job: the loop between scheduler, executor and manifest.
+
+    lease -> manifest -> reconcile -> plan, assess -> [ executor's events -> record -> scheduler -> start ] -> outcome
+
+Killed at any point, it leaves a folder that the next run continues from: what is committed has its receipt, the workers
+die with it, and the lease of a dead process counts for nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+from pipeline.artifacts import Receipt, read_receipt, sweep_parts
+from pipeline.errors import PlanError
+from pipeline.executors.attempt import load_stages
+from pipeline.executors.base import Assignment, Committed, Executor, Failed, Finished, TaskEvent
+from pipeline.executors.failures import is_disk_full
+from pipeline.fingerprint import task_fingerprint
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.lease import HEARTBEAT_INTERVAL_S, Lease
+from pipeline.manifest import Manifest, artifact_row
+from pipeline.plan import Assessment, Verdict, assess, input_hashes, plan_job
+from pipeline.reconcile import Reconciliation, reconcile
+from pipeline.resources import machine_capacity
+from pipeline.run_events import Notice, Observer, Outcome, RunEnded, RunStarted, SilentObserver, StateChanged
+from pipeline.scheduler import (
+    ArtifactCommitted,
+    CancelRequested,
+    DrainRequested,
+    Finish,
+    Instruction,
+    JobOutcome,
+    Kill,
+    Policy,
+    Scheduler,
+    Start,
+    Stop,
+    TaskFailed,
+    TaskSkipped,
+    TaskSucceeded,
+    Tick,
+)
+from pipeline.task import ArtifactPath, FailureKind, Resources, Task, TaskId, TaskState
+
+STAGES_REFERENCE = "pipeline.stages:STAGES"
+
+_TURN_S = 0.25
+"""Longest time that the loop sleeps [s]; so soon it answers Ctrl-C."""
+_STOP_GRACE_S = 120.0
+"""Time a long task gets to write its checkpoint when the run is drained [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Tasks to run again although they are up to date.
+
+    Attributes:
+        stages: names of the stages; empty: of all.
+        frames: their frames; None: all. Tasks about the whole job have no frame, and are not selected by one.
+    """
+
+    stages: frozenset[str] = frozenset()
+    frames: frozenset[int] | None = None
+
+    def of(self, tasks: Sequence[Task]) -> frozenset[TaskId]:
+        """The selected ones of these tasks.
+
+        Raises:
+            PlanError: there are none.
+        """
+        chosen = frozenset(
+            task.id
+            for task in tasks
+            if (not self.stages or task.stage in self.stages) and (self.frames is None or task.frame in self.frames)
+        )
+        if not chosen:
+            known = ", ".join(dict.fromkeys(task.stage for task in tasks))
+            raise PlanError(f"nothing to run again: no task has such a stage and frame; the stages are {known}")
+        return chosen
+
+
+class RunControl:
+    """How a person stops a run; safe to call from signal handlers and other threads."""
+
+    def __init__(self) -> None:
+        self._interruptions = 0
+
+    def interrupt(self) -> None:
+        """Once: finish what runs, and stop. Twice: stop at once. Either way the next run continues."""
+        self._interruptions += 1
+
+    @property
+    def interruptions(self) -> int:
+        """How often it was interrupted."""
+        return self._interruptions
+
+    @contextmanager
+    def on_signals(self) -> Iterator[None]:
+        """Take SIGINT and SIGTERM for interruptions, inside the block; only the main thread can."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def interrupt(_number: int, _frame: FrameType | None) -> None:
+            self.interrupt()
+
+        before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def run_job(
+    job: Job,
+    layout: JobLayout,
+    *,
+    executor: Executor,
+    job_text: str | None = None,
+    stages: str = STAGES_REFERENCE,
+    observer: Observer | None = None,
+    control: RunControl | None = None,
+    rerun: Selection | None = None,
+    capacity: Resources | None = None,
+    policy: Policy | None = None,
+    task_timeout_s: float | None = None,
+) -> Outcome:
+    """Run a job until nothing is left to do, or somebody stops it.
+
+    Args:
+        job: the job.
+        layout: its folder; made if it is not there.
+        executor: runs the tasks; shut down by the caller.
+        job_text: the job file, kept in the folder for the workers; None: it is there already.
+        stages: where the stages are, as `module:ATTRIBUTE`.
+        observer: is told what happens.
+        control: how the caller stops the run; SIGINT and SIGTERM do in any case.
+        rerun: tasks to run again although they are up to date.
+        capacity: what tasks may use at a time; this machine by default.
+        policy: when failed tasks are tried again, and when the job gives up.
+        task_timeout_s: longest time that a task with a frame may take [s].
+
+    Raises:
+        JobBusyError: another live process runs this job.
+        LeaseLostError: another process took the job over, because this one did not answer for long.
+        ManifestError: the record is damaged; the text says what to do.
+        PlanError: the stages' tasks do not fit together.
+    """
+    observer = observer or SilentObserver()
+    control = control or RunControl()
+    began = time.monotonic()
+    layout.root.mkdir(parents=True, exist_ok=True)
+    with Lease.acquire(layout.lease) as lease, Manifest(layout.manifest) as manifest, control.on_signals():
+        if job_text is not None:
+            _write_job_file(layout, job_text)
+        clean = manifest.begin_run(job.name)
+        if lease.takeover is not None:
+            manifest.log_event("takeover", lease.takeover)
+            observer.notify(Notice(lease.takeover))
+        tasks = plan_job(job, layout, load_stages(stages))
+        reconciliation = reconcile(manifest, layout, clean=clean)
+        for sentence in reconciliation.sentences:
+            observer.notify(Notice(sentence))
+        forced = frozenset[TaskId]() if rerun is None else rerun.of(tasks)
+        assessments = assess(
+            tasks, reconciliation.rows, reconciliation.problems, parameters=manifest.parameters, forced=forced
+        )
+        observer.notify(RunStarted(assessments))
+        run = _Run(
+            layout,
+            assessments,
+            reconciliation,
+            forced,
+            lease=lease,
+            manifest=manifest,
+            executor=executor,
+            observer=observer,
+            control=control,
+            stages=stages,
+            capacity=capacity or machine_capacity(gpus=max((task.resources.gpus for task in tasks), default=0)),
+            policy=policy,
+            task_timeout_s=task_timeout_s,
+        )
+        outcome = run.outcome(run.loop(), time.monotonic() - began)
+    observer.notify(RunEnded(outcome))
+    return outcome
+
+
+class _Run:
+    """One run of a job, holding its lease and its manifest."""
+
+    def __init__(
+        self,
+        layout: JobLayout,
+        assessments: Sequence[Assessment],
+        reconciliation: Reconciliation,
+        forced: frozenset[TaskId],
+        *,
+        lease: Lease,
+        manifest: Manifest,
+        executor: Executor,
+        observer: Observer,
+        control: RunControl,
+        stages: str,
+        capacity: Resources,
+        policy: Policy | None,
+        task_timeout_s: float | None,
+    ) -> None:
+        self._layout = layout
+        self._lease = lease
+        self._manifest = manifest
+        self._executor = executor
+        self._observer = observer
+        self._control = control
+        self._stages = stages
+        self._task_timeout_s = task_timeout_s
+        self._forced = forced
+        self._rows = reconciliation.valid_rows
+        self._last_failures: dict[TaskId, Failed] = {}
+        self._obeyed = 0
+        self._parts_left = False
+        self._outcome: JobOutcome | None = None
+        self._tasks = {assessment.task.id: assessment.task for assessment in assessments}
+        self._invalidate_forced()
+        up_to_date = {each.task.id for each in assessments if each.verdict is Verdict.UP_TO_DATE}
+        # What a long task has committed of its present fingerprint stays; its readers need not wait for it.
+        kept = {
+            artifact
+            for each in assessments
+            if each.task.checkpointed and each.verdict is Verdict.STALE
+            for artifact in set(each.task.outputs) - set(each.rebuilds)
+        }
+        self._scheduler = Scheduler(
+            [assessment.task for assessment in assessments],
+            up_to_date=up_to_date,
+            committed=kept,
+            capacity=capacity,
+            policy=policy,
+        )
+        self._scheduler.drain_changes()  # the initial states are recorded as a whole
+        self._manifest.record_plan(
+            [*self._tasks.values()], {task_id: self._scheduler.state(task_id) for task_id in self._tasks}
+        )
+
+    def loop(self) -> JobOutcome:
+        """Run until the scheduler says that it is over."""
+        try:
+            self._turn([], self._scheduler.start())
+            beat = time.monotonic()
+            while self._outcome is None:
+                events = self._executor.wait(self._sleep_s())
+                now = time.monotonic()
+                if now - beat >= HEARTBEAT_INTERVAL_S:
+                    self._lease.heartbeat()
+                    beat = now
+                self._turn(events, self._obey_control() + self._scheduler.handle(Tick(now)))
+            if self._parts_left:
+                sweep_parts(self._layout)
+            self._manifest.end_run()
+        except OSError as error:
+            if not is_disk_full(error):
+                raise
+            # Our own record could not be written. The receipts can tell all of it, so nothing is lost; the run does
+            # not count as ended cleanly, and the next one reads them.
+            self._executor.shutdown()
+            self._notice(f"the disk is full ({self._layout.root}); free some space and submit the job again")
+            return JobOutcome.DISK_FULL
+        return self._outcome
+
+    def outcome(self, kind: JobOutcome, seconds: float) -> Outcome:
+        """The run in figures."""
+        counts = self._scheduler.counts()
+        return Outcome(
+            kind=kind,
+            ran=sum(count for (_, state), count in counts.items() if state is TaskState.SUCCEEDED),
+            failures=tuple(
+                failed
+                for task_id, failed in self._last_failures.items()
+                if self._scheduler.state(task_id) is TaskState.FAILED
+            ),
+            counts=counts,
+            seconds=seconds,
+        )
+
+    # --- one turn ---
+
+    def _sleep_s(self) -> float:
+        wakeup = self._scheduler.next_wakeup
+        return _TURN_S if wakeup is None else min(_TURN_S, max(0.0, wakeup - time.monotonic()))
+
+    def _obey_control(self) -> list[Instruction]:
+        instructions: list[Instruction] = []
+        while self._obeyed < min(2, self._control.interruptions):
+            self._obeyed += 1
+            if self._obeyed == 1:
+                self._notice("stopping: what runs is finished or checkpointed; once more stops at once")
+                instructions += self._scheduler.handle(DrainRequested())
+            else:
+                self._notice("stopping at once")
+                instructions += self._scheduler.handle(CancelRequested())
+        return instructions
+
+    def _turn(self, events: Sequence[TaskEvent], instructions: Sequence[Instruction]) -> None:
+        """Take in what happened, in one commit to the manifest, and do what follows from it.
+
+        The commit is not synced to the disk, which would cost a task more than everything else here: a killed process
+        loses nothing by that, and after a power cut the receipts tell what is missing, for those are synced. Attempts
+        are given out only when their numbers are on record, so that no number is used twice.
+        """
+        if not events and not instructions:
+            return
+        todo = deque(instructions)
+        assignments: list[Assignment] = []
+        cancellations: list[tuple[TaskId, float]] = []
+        with self._manifest.transaction(durable=False):
+            for event in events:
+                self._observer.notify(event)
+                todo += self._take(event)
+            while todo:
+                match todo.popleft():
+                    case Start(task, threads):
+                        if self._is_up_to_date(task):
+                            todo += self._scheduler.handle(TaskSkipped(task.id))
+                        else:
+                            assignments.append(self._open_attempt(task, threads))
+                    case Stop(task_id):
+                        cancellations.append((task_id, _STOP_GRACE_S))
+                    case Kill(task_id):
+                        cancellations.append((task_id, 0.0))
+                    case Finish(outcome):
+                        self._outcome = outcome
+            self._record_states()
+        for assignment in assignments:
+            self._executor.submit(assignment)
+        for task_id, grace_s in cancellations:
+            self._executor.cancel(task_id, grace_s=grace_s)
+
+    def _record_states(self) -> None:
+        states = dict(self._scheduler.drain_changes())
+        if states:
+            self._manifest.set_states(states)
+            for task_id, state in states.items():
+                self._observer.notify(StateChanged(task_id, self._tasks[task_id].stage, state))
+
+    # --- starting ---
+
+    def _is_up_to_date(self, task: Task) -> bool:
+        """Early cutoff: what was made anew upstream turned out the same."""
+        if task.id in self._forced:
+            return False
+        fingerprint = task_fingerprint(task, input_hashes(task, self._rows))
+        return all(output in self._rows and self._rows[output].fingerprint == fingerprint for output in task.outputs)
+
+    def _open_attempt(self, task: Task, threads: int) -> Assignment:
+        attempt = self._manifest.start_attempt(task.id)
+        inputs = input_hashes(task, self._rows)
+        return Assignment(
+            task=task,
+            attempt=attempt,
+            fingerprint=task_fingerprint(task, inputs),
+            inputs=inputs,
+            threads=threads,
+            job_file=self._layout.job_file,
+            root=self._layout.root,
+            stages=self._stages,
+            timeout_s=None if task.frame is None else self._task_timeout_s,
+        )
+
+    def _invalidate_forced(self) -> None:
+        """Drop the receipts of what is to run again, so that its stage finds nothing to reuse.
+
+        A file that was edited by hand keeps its receipt: that is how the commit knows to keep the edited one aside.
+        """
+        artifacts = [
+            output for task_id in self._forced for output in self._tasks[task_id].outputs if output in self._rows
+        ]
+        for artifact in artifacts:
+            self._layout.receipt(artifact).unlink(missing_ok=True)
+            del self._rows[artifact]
+        if artifacts:
+            self._manifest.forget_artifacts(artifacts)
+
+    # --- taking in events ---
+
+    def _take(self, event: TaskEvent) -> list[Instruction]:
+        match event:
+            case Committed(task_id, _, receipt):
+                return self._take_receipt(task_id, receipt)
+            case Finished(task_id, attempt, seconds, peak_memory_bytes):
+                instructions = self._adopt_lacking(task_id)
+                self._manifest.finish_attempt(task_id, attempt, seconds=seconds, peak_memory_bytes=peak_memory_bytes)
+                return instructions + self._scheduler.handle(TaskSucceeded(task_id))
+            case Failed():
+                return self._take_failure(event)
+            case _:
+                return []
+
+    def _take_receipt(self, task_id: TaskId, receipt: Receipt) -> list[Instruction]:
+        self._manifest.record_artifact(receipt)
+        self._rows[receipt.artifact] = artifact_row(receipt)
+        return self._scheduler.handle(ArtifactCommitted(task_id, receipt.artifact))
+
+    def _take_failure(self, failed: Failed) -> list[Instruction]:
+        self._manifest.finish_attempt(
+            failed.task_id,
+            failed.attempt,
+            failure=failed.kind,
+            message=failed.message,
+            seconds=failed.seconds,
+            peak_memory_bytes=failed.peak_memory_bytes or None,
+        )
+        self._last_failures[failed.task_id] = failed
+        # A process that was killed could not remove what it was writing.
+        self._parts_left = True
+        if failed.kind is FailureKind.DISK_FULL:
+            self._notice(f"the disk is full ({self._layout.root}): the job pauses; free some space and submit it again")
+        return self._scheduler.handle(TaskFailed(failed.task_id, failed.kind, time.monotonic()))
+
+    def _adopt_lacking(self, task_id: TaskId) -> list[Instruction]:
+        """Outputs that the stage found committed already, though the record did not know them."""
+        instructions: list[Instruction] = []
+        for artifact in self._scheduler.lacking(task_id):
+            receipt = read_receipt(self._layout, ArtifactPath(artifact))
+            assert receipt is not None, f"{artifact} was there when its task ended"
+            instructions += self._take_receipt(task_id, receipt)
+        return instructions
+
+    def _notice(self, sentence: str) -> None:
+        self._observer.notify(Notice(sentence))
+
+
+def _write_job_file(layout: JobLayout, text: str) -> None:
+    """Replace the job's own copy of its file, at once as a whole; left alone if nothing changed."""
+    if layout.job_file.exists() and layout.job_file.read_text(encoding="utf-8") == text:
+        return
+    part = layout.root / f".job.toml.part.{os.getpid()}"
+    with part.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(layout.job_file)

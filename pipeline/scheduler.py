@@ -1,0 +1,504 @@
+"""Which task runs when: a pure state machine, `handle(event) -> [instruction]`.
+
+It does no input or output and has no clock: whoever drives it (the runner, or a test) tells it what happened and when,
+and does what it is told. Tasks wait for artifacts, so each commit of a long task sets its readers free at once.
+
+    PENDING --inputs committed--> READY --Start--> RUNNING --> SUCCEEDED | UP_TO_DATE | FAILED | CANCELLED
+       |                            ^                 |
+       |                            +--- machine's fault, attempts left (after a pause)
+       +--an input will never come--> UPSTREAM_FAILED
+
+Costs O(log n) an event plus the readers of what it committed, whatever the number of tasks.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from pipeline.errors import PipelineError
+from pipeline.resources import claim, fits, minus, plus, whole_machine
+from pipeline.task import ArtifactPath, FailureKind, Resources, Task, TaskId, TaskState
+
+TERMINAL_STATES = frozenset(
+    {
+        TaskState.SUCCEEDED,
+        TaskState.UP_TO_DATE,
+        TaskState.FAILED,
+        TaskState.UPSTREAM_FAILED,
+        TaskState.CANCELLED,
+    }
+)
+_TRANSITIONS: Mapping[TaskState, frozenset[TaskState]] = {
+    TaskState.PENDING: frozenset({TaskState.READY, TaskState.UPSTREAM_FAILED, TaskState.CANCELLED}),
+    TaskState.READY: frozenset({TaskState.RUNNING, TaskState.CANCELLED}),
+    TaskState.RUNNING: frozenset(
+        {TaskState.SUCCEEDED, TaskState.UP_TO_DATE, TaskState.FAILED, TaskState.READY, TaskState.CANCELLED}
+    ),
+}
+
+OWN_FAILURES = frozenset({FailureKind.FAILED, FailureKind.DIVERGED})
+"""The task's own: it would fail the same way again."""
+
+
+class InvalidTransitionError(PipelineError):
+    """An event that cannot happen in the task's state; carries the states it went through."""
+
+    def __init__(self, task_id: TaskId, event: str, history: Sequence[TaskState]) -> None:
+        super().__init__(task_id, event, list(history))
+        self.task_id, self.event, self.history = task_id, event, list(history)
+
+    def __str__(self) -> str:
+        return f"{self.task_id}: {self.event} cannot happen after {' -> '.join(self.history)}"
+
+
+class JobOutcome(StrEnum):
+    """How a run of the job ended."""
+
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    TOO_MANY_FAILURES = "too many failures"
+    DISK_FULL = "disk full"
+    DRAINED = "drained"
+    CANCELLED = "cancelled"
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """When to try again, and when to give up.
+
+    Attributes:
+        attempts: how often a task is tried when the machine is at fault.
+        out_of_memory_attempts: the same, when memory ran out; every retry has the machine for itself.
+        backoff_s: pause before the second attempt [s]; doubles with each further one.
+        failure_share: a stage in which this share of the ended tasks failed stops the job ...
+        failure_count: ... once this many of its tasks failed.
+    """
+
+    attempts: int = 3
+    out_of_memory_attempts: int = 2
+    backoff_s: float = 2.0
+    failure_share: float = 0.25
+    failure_count: int = 10
+
+
+# --- events ---
+
+
+@dataclass(frozen=True, slots=True)
+class ArtifactCommitted:
+    """A running task committed one of its outputs."""
+
+    task_id: TaskId
+    artifact: ArtifactPath
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSucceeded:
+    """A running task ended with all of its outputs committed."""
+
+    task_id: TaskId
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSkipped:
+    """A started task turned out to need no run: its outputs have the fingerprint they should have."""
+
+    task_id: TaskId
+
+
+@dataclass(frozen=True, slots=True)
+class TaskFailed:
+    """A running task ended without success, at monotonic time `now` [s]."""
+
+    task_id: TaskId
+    kind: FailureKind
+    now: float
+
+
+@dataclass(frozen=True, slots=True)
+class DrainRequested:
+    """Start nothing more; long tasks checkpoint and stop, short ones finish."""
+
+
+@dataclass(frozen=True, slots=True)
+class CancelRequested:
+    """End everything now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """It is `now` [s] on the monotonic clock."""
+
+    now: float
+
+
+Event = ArtifactCommitted | TaskSucceeded | TaskSkipped | TaskFailed | DrainRequested | CancelRequested | Tick
+
+
+# --- instructions ---
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Run this task now, on this many threads; its resources are taken."""
+
+    task: Task
+    threads: int
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Ask this running task to checkpoint and return."""
+
+    task_id: TaskId
+
+
+@dataclass(frozen=True, slots=True)
+class Kill:
+    """End this running task at once."""
+
+    task_id: TaskId
+
+
+@dataclass(frozen=True, slots=True)
+class Finish:
+    """Nothing is running and nothing will: the run is over."""
+
+    outcome: JobOutcome
+
+
+Instruction = Start | Stop | Kill | Finish
+
+
+@dataclass(slots=True)
+class _Entry:
+    task: Task
+    need: Resources
+    priority: tuple[int, int, int]
+    state: TaskState = TaskState.PENDING
+    missing: int = 0
+    failures: int = 0
+    runs_alone: bool = False
+    history: list[TaskState] = field(default_factory=lambda: [TaskState.PENDING])
+
+
+class Scheduler:
+    """Decides what runs next.
+
+    Lower frames go first, and of one frame the later stage, so that the film shows early and few intermediate files
+    wait for their reader. Tasks about the whole job go before any frame.
+
+    Args:
+        tasks: all tasks of the job; stages in the order of their first task.
+        up_to_date: tasks that need no run; their outputs count as committed.
+        committed: further artifacts that are valid already, as those of a simulation that stopped half-way.
+        capacity: what the machine offers; `memory_bytes` 0 when memory is not to be counted.
+        policy: retries and limits.
+
+    Raises:
+        ValueError: a task needs what nobody makes, or more GPUs than there are.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[Task],
+        *,
+        up_to_date: Collection[TaskId] = frozenset(),
+        committed: Iterable[ArtifactPath] = (),
+        capacity: Resources,
+        policy: Policy | None = None,
+    ) -> None:
+        self.capacity = capacity
+        self.policy = policy or Policy()
+        self._committed = set(committed)
+        self._entries: dict[TaskId, _Entry] = {}
+        self._readers: defaultdict[ArtifactPath, list[_Entry]] = defaultdict(list)
+        self._ready: defaultdict[Resources, list[tuple[tuple[int, int, int], TaskId]]] = defaultdict(list)
+        self._waiting: list[tuple[float, TaskId]] = []
+        self._running: dict[TaskId, _Entry] = {}
+        self._free = capacity
+        self._blocked: TaskId | None = None
+        self._overtakers: set[TaskId] = set()
+        self._counts: Counter[tuple[str, TaskState]] = Counter()
+        self._changes: list[tuple[TaskId, TaskState]] = []
+        self._ending: JobOutcome | None = None
+        self._finished = False
+
+        stages: dict[str, int] = {}
+        for index, task in enumerate(tasks):
+            rank = stages.setdefault(task.stage, len(stages))
+            try:
+                need = claim(task.resources, capacity)
+            except ValueError as error:
+                raise ValueError(f"{task.id} {error}") from None
+            priority = (-1 if task.frame is None else task.frame, -rank, index)
+            entry = _Entry(task, need, priority)
+            self._entries[task.id] = entry
+            self._counts[task.stage, TaskState.PENDING] += 1
+            if task.id in up_to_date:
+                self._committed.update(task.outputs)
+        self._check_inputs_have_producers(tasks)
+        for entry in self._entries.values():
+            if entry.task.id in up_to_date:
+                # Not a transition of this run: it ended in an earlier one.
+                self._set_state(entry, TaskState.UP_TO_DATE, check=False)
+                continue
+            for artifact in entry.task.inputs:
+                if artifact not in self._committed:
+                    entry.missing += 1
+                    self._readers[artifact].append(entry)
+            if entry.missing == 0:
+                self._make_ready(entry)
+
+    # --- what the driver asks ---
+
+    @property
+    def next_wakeup(self) -> float | None:
+        """Monotonic time [s] at which a `Tick` will set a retry free, if one waits."""
+        return self._waiting[0][0] if self._waiting and self._ending is None else None
+
+    @property
+    def running(self) -> list[TaskId]:
+        """Tasks started and not ended."""
+        return list(self._running)
+
+    @property
+    def free(self) -> Resources:
+        """What no running task occupies."""
+        return self._free
+
+    @property
+    def ending(self) -> JobOutcome | None:
+        """Why nothing more is started, or None while the job goes on."""
+        return self._ending
+
+    def state(self, task_id: TaskId) -> TaskState:
+        """Where a task stands."""
+        return self._entries[task_id].state
+
+    def history(self, task_id: TaskId) -> list[TaskState]:
+        """The states that a task went through in this run."""
+        return list(self._entries[task_id].history)
+
+    def lacking(self, task_id: TaskId) -> list[ArtifactPath]:
+        """Outputs of a task that are not committed."""
+        return [artifact for artifact in self._entries[task_id].task.outputs if artifact not in self._committed]
+
+    def counts(self) -> dict[tuple[str, TaskState], int]:
+        """Number of tasks by stage and state."""
+        return {key: count for key, count in self._counts.items() if count}
+
+    def drain_changes(self) -> list[tuple[TaskId, TaskState]]:
+        """State changes since the last call, in order."""
+        changes, self._changes = self._changes, []
+        return changes
+
+    # --- the machine ---
+
+    def start(self) -> list[Instruction]:
+        """The first instructions; call once, before any event."""
+        return self._next_instructions()
+
+    def handle(self, event: Event) -> list[Instruction]:
+        """Take in what happened and say what to do.
+
+        Raises:
+            InvalidTransitionError: this cannot happen to a task in that state.
+        """
+        instructions: list[Instruction] = []
+        match event:
+            case ArtifactCommitted(task_id, artifact):
+                entry = self._running_entry(task_id, f"commit of {artifact}")
+                if artifact not in entry.task.outputs:
+                    raise InvalidTransitionError(task_id, f"commit of {artifact}, not its output,", entry.history)
+                self._commit(artifact)
+            case TaskSucceeded(task_id):
+                entry = self._running_entry(task_id, "success")
+                if lacking := self.lacking(task_id):
+                    raise InvalidTransitionError(task_id, f"success without {lacking[0]}", entry.history)
+                self._end(entry, TaskState.SUCCEEDED)
+            case TaskSkipped(task_id):
+                entry = self._running_entry(task_id, "skip")
+                for artifact in entry.task.outputs:
+                    self._commit(artifact)
+                self._end(entry, TaskState.UP_TO_DATE)
+            case TaskFailed(task_id, kind, now):
+                instructions += self._fail(self._running_entry(task_id, kind), kind, now)
+            case DrainRequested():
+                instructions += self._drain(JobOutcome.DRAINED)
+            case CancelRequested():
+                self._ending = JobOutcome.CANCELLED
+                instructions += [Kill(task_id) for task_id in self._running]
+            case Tick(now):
+                while self._waiting and self._waiting[0][0] <= now:
+                    _, task_id = heapq.heappop(self._waiting)
+                    self._enqueue(self._entries[task_id])
+        return instructions + self._next_instructions()
+
+    # --- transitions ---
+
+    def _running_entry(self, task_id: TaskId, event: str) -> _Entry:
+        entry = self._entries[task_id]
+        if entry.state is not TaskState.RUNNING:
+            raise InvalidTransitionError(task_id, event, entry.history)
+        return entry
+
+    def _set_state(self, entry: _Entry, state: TaskState, *, check: bool = True) -> None:
+        if check and state not in _TRANSITIONS.get(entry.state, frozenset()):
+            raise InvalidTransitionError(entry.task.id, f"becoming {state}", entry.history)
+        self._counts[entry.task.stage, entry.state] -= 1
+        self._counts[entry.task.stage, state] += 1
+        entry.state = state
+        entry.history.append(state)
+        self._changes.append((entry.task.id, state))
+
+    def _make_ready(self, entry: _Entry) -> None:
+        self._set_state(entry, TaskState.READY)
+        self._enqueue(entry)
+
+    def _enqueue(self, entry: _Entry) -> None:
+        heapq.heappush(self._ready[entry.need], (entry.priority, entry.task.id))
+
+    def _commit(self, artifact: ArtifactPath) -> None:
+        if artifact in self._committed:
+            return
+        self._committed.add(artifact)
+        for reader in self._readers.pop(artifact, ()):
+            reader.missing -= 1
+            if reader.missing == 0 and reader.state is TaskState.PENDING:
+                self._make_ready(reader)
+
+    def _release(self, entry: _Entry) -> None:
+        del self._running[entry.task.id]
+        self._overtakers.discard(entry.task.id)
+        self._free = plus(self._free, entry.need)
+
+    def _end(self, entry: _Entry, state: TaskState) -> None:
+        self._release(entry)
+        self._set_state(entry, state)
+        if state in {TaskState.FAILED, TaskState.CANCELLED}:
+            self._give_up_readers_of(entry, TaskState.UPSTREAM_FAILED if state is TaskState.FAILED else state)
+
+    def _give_up_readers_of(self, entry: _Entry, state: TaskState) -> None:
+        """Descendants that wait for something this task will not make any more."""
+        lost = self.lacking(entry.task.id)
+        while lost:
+            for reader in self._readers.pop(lost.pop(), ()):
+                if reader.state is TaskState.PENDING:
+                    self._set_state(reader, state)
+                    lost += self.lacking(reader.task.id)
+
+    def _fail(self, entry: _Entry, kind: FailureKind, now: float) -> list[Instruction]:
+        if kind in OWN_FAILURES:
+            return self._fail_for_good(entry)
+        if kind is FailureKind.DISK_FULL:
+            self._end(entry, TaskState.CANCELLED)
+            return self._drain(JobOutcome.DISK_FULL)
+        if kind is FailureKind.CANCELLED and self._ending is not None:
+            self._end(entry, TaskState.CANCELLED)
+            return []
+        # The machine's fault; a task stopped by somebody else than us counts as that, too.
+        entry.failures += 1
+        out_of_memory = kind is FailureKind.OUT_OF_MEMORY
+        if entry.failures >= (self.policy.out_of_memory_attempts if out_of_memory else self.policy.attempts):
+            return self._fail_for_good(entry)
+        self._release(entry)
+        self._set_state(entry, TaskState.READY)
+        if out_of_memory:
+            entry.need = whole_machine(entry.need, self.capacity)
+        pause = self.policy.backoff_s * 2.0 ** (entry.failures - 1)
+        heapq.heappush(self._waiting, (now + pause, entry.task.id))
+        return []
+
+    def _fail_for_good(self, entry: _Entry) -> list[Instruction]:
+        self._end(entry, TaskState.FAILED)
+        stage = entry.task.stage
+        failed = self._counts[stage, TaskState.FAILED]
+        ended = failed + self._counts[stage, TaskState.SUCCEEDED]
+        if failed >= self.policy.failure_count and failed >= self.policy.failure_share * ended:
+            return self._drain(JobOutcome.TOO_MANY_FAILURES)
+        return []
+
+    def _drain(self, outcome: JobOutcome) -> list[Instruction]:
+        if self._ending is not None:
+            return []
+        self._ending = outcome
+        return [Stop(task_id) for task_id, entry in self._running.items() if entry.task.checkpointed]
+
+    # --- packing ---
+
+    def _next_instructions(self) -> list[Instruction]:
+        instructions: list[Instruction] = []
+        if self._ending is None:
+            while (entry := self._pick()) is not None:
+                instructions.append(self._start(entry))
+        if not self._running and not self._finished and (self._ending is not None or not self._startable):
+            self._finished = True
+            instructions.append(Finish(self._close()))
+        return instructions
+
+    @property
+    def _startable(self) -> bool:
+        return bool(self._waiting) or any(self._ready.values())
+
+    def _pick(self) -> _Entry | None:
+        """Take the most urgent task that fits, without starving a bigger one that is more urgent.
+
+        When the most urgent task does not fit, others may overtake it only as long as it would fit beside all who did:
+        once those end that ran before it was blocked, it starts.
+        """
+        for position, heap in enumerate(sorted((heap for heap in self._ready.values() if heap), key=lambda h: h[0])):
+            entry = self._entries[heap[0][1]]
+            if position == 0 and self._blocked not in {None, entry.task.id}:
+                self._blocked = None
+            if not fits(entry.need, self._free):
+                if position == 0 and self._blocked is None:
+                    self._blocked = entry.task.id
+                    self._overtakers = set()
+                continue
+            if self._blocked is not None and entry.task.id != self._blocked and self._would_delay_blocked(entry):
+                continue
+            heapq.heappop(heap)
+            if entry.task.id == self._blocked:
+                self._blocked = None
+            elif self._blocked is not None:
+                self._overtakers.add(entry.task.id)
+            return entry
+        return None
+
+    def _would_delay_blocked(self, entry: _Entry) -> bool:
+        assert self._blocked is not None
+        left = minus(self.capacity, self._entries[self._blocked].need)
+        for task_id in self._overtakers:
+            left = minus(left, self._entries[task_id].need)
+        return not fits(entry.need, left)
+
+    def _start(self, entry: _Entry) -> Start:
+        self._set_state(entry, TaskState.RUNNING)
+        self._running[entry.task.id] = entry
+        self._free = minus(self._free, entry.need)
+        return Start(entry.task, threads=claim(entry.task.resources, self.capacity).cores)
+
+    def _close(self) -> JobOutcome:
+        """Settle what never ran, and say how the job ended."""
+        unsettled = [entry for entry in self._entries.values() if entry.state not in TERMINAL_STATES]
+        if unsettled and self._ending is None:
+            names = ", ".join(entry.task.id for entry in unsettled[:3])
+            raise ValueError(f"tasks wait for each other in a circle: {names}")
+        for entry in unsettled:
+            self._set_state(entry, TaskState.CANCELLED)
+        if self._ending is not None:
+            return self._ending
+        failed = sum(count for (_, state), count in self._counts.items() if state is TaskState.FAILED)
+        return JobOutcome.FAILED if failed else JobOutcome.SUCCEEDED
+
+    def _check_inputs_have_producers(self, tasks: Sequence[Task]) -> None:
+        produced = {artifact for task in tasks for artifact in task.outputs} | self._committed
+        for task in tasks:
+            for artifact in task.inputs:
+                if artifact not in produced:
+                    raise ValueError(f"{task.id} reads {artifact}, which no task makes")

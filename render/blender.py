@@ -1,0 +1,279 @@
+"""Blender as a renderer: the bpy module in this process, or a Blender executable as a child process.
+
+Both draw with `blender_scripts`; the executable is started once and asked for frame after frame.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import re
+import subprocess
+import sys
+from collections import deque
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Protocol
+
+logger = logging.getLogger(__name__)
+
+MINIMUM_BLENDER_VERSION = (4, 5)
+_STARTUP_VERSION_TIMEOUT_S = 120.0
+_TERMINATE_TIMEOUT_S = 10.0
+_LOG_TAIL_LINES = 30
+
+_SHARED_LIBRARIES = {
+    "libX11.so.6": "libx11-6",
+    "libXrender.so.1": "libxrender1",
+    "libXfixes.so.3": "libxfixes3",
+    "libXi.so.6": "libxi6",
+    "libxkbcommon.so.0": "libxkbcommon0",
+    "libSM.so.6": "libsm6",
+    "libICE.so.6": "libice6",
+    "libGL.so.1": "libgl1",
+}
+"""What the bpy module needs of a Linux system beyond a minimal Debian: library -> Debian package."""
+
+
+class BlenderUnavailableError(RuntimeError):
+    """Blender cannot be used on this machine; says what is missing and how to get it."""
+
+
+class FrameRenderError(RuntimeError):
+    """A frame could not be drawn.
+
+    Attributes:
+        frame: which.
+        reason: why, with the last lines of the child's output where there is a child.
+    """
+
+    def __init__(self, frame: int, reason: str) -> None:
+        super().__init__(frame, reason)
+        self.frame, self.reason = frame, reason
+
+    def __str__(self) -> str:
+        return f"frame {self.frame}: {self.reason}"
+
+
+class Renderer(Protocol):
+    """Draws frames of one RenderSpec."""
+
+    device: str
+    """What Cycles renders on, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`."""
+
+    def render(self, frame: int, output_path: Path) -> None:
+        """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
+
+    def close(self) -> None:
+        """Let go of Blender; idempotent."""
+
+
+def open_renderer(spec_path: Path, *, threads: int, blender: str | None) -> Renderer:
+    """Open a renderer for many frames of one specification.
+
+    Args:
+        spec_path: the RenderSpec document.
+        threads: CPU threads to render with.
+        blender: path of a Blender executable, or None for the bpy module.
+
+    Raises:
+        BlenderUnavailableError: there is no usable Blender, or it refuses the specification.
+    """
+    if blender is None:
+        return ModuleRenderer(spec_path, threads=threads)
+    return ExecutableRenderer(spec_path, threads=threads, blender=blender)
+
+
+def missing_libraries() -> list[tuple[str, str]]:
+    """Shared libraries that the bpy module needs and this system lacks, as (library, Debian package)."""
+    if sys.platform != "linux":
+        return []
+    return [(library, package) for library, package in _SHARED_LIBRARIES.items() if not _can_load(library)]
+
+
+def require_bpy() -> None:
+    """Raise BlenderUnavailableError, with the remedy, when the bpy module cannot be imported here.
+
+    The libraries are looked for first: without them the import ends in an obscure loader error.
+    """
+    if find_spec("bpy") is None:
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        raise BlenderUnavailableError(
+            f"there is no bpy module for this Python {version}; use Python 3.11 or 3.13, "
+            'or name a Blender executable: [render] blender = "/path/to/blender"'
+        )
+    missing = missing_libraries()
+    if missing:
+        raise BlenderUnavailableError(
+            f"Blender needs shared libraries that this system lacks: {', '.join(library for library, _ in missing)}; "
+            f"install them: apt-get install {' '.join(package for _, package in missing)}"
+        )
+
+
+class ModuleRenderer:
+    """Draws with the bpy module in this process. Blender has one scene per process: a new one closes the last."""
+
+    def __init__(self, spec_path: Path, *, threads: int) -> None:
+        require_bpy()
+        from blender_scripts.errors import RenderInputError
+        from blender_scripts.render_frames import SceneRenderer
+
+        try:
+            self._scene = SceneRenderer(spec_path, threads=threads)
+        except (RenderInputError, RuntimeError) as error:
+            raise BlenderUnavailableError(str(error)) from error
+        self.device: str = self._scene.device
+
+    def render(self, frame: int, output_path: Path) -> None:
+        """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
+        from blender_scripts.errors import RenderFailedError, RenderInputError
+
+        try:
+            self._scene.render(frame, output_path)
+        except (RenderInputError, RenderFailedError, RuntimeError) as error:
+            raise FrameRenderError(frame, str(error)) from error
+
+    def close(self) -> None:
+        """Nothing to do: the module stays loaded, and the next scene replaces this one."""
+
+
+class ExecutableRenderer:
+    """Draws with a Blender executable, started once; asks it for frames over its standard input."""
+
+    def __init__(self, spec_path: Path, *, threads: int, blender: str) -> None:
+        require_supported_executable(blender)
+        self._log_tail: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
+        self._argv = build_argv(blender, spec_path.resolve(), threads=threads)
+        self._process = subprocess.Popen(
+            self._argv,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            encoding="utf-8",
+            errors="replace",
+        )
+        try:
+            answer = self._read_answer(("RENDERER_READY", "RENDERER_FAILED"))
+            if answer is None:
+                raise BlenderUnavailableError(f"Blender did not start: {self._describe_end()}")
+            if answer.startswith("RENDERER_FAILED"):
+                raise BlenderUnavailableError(answer.partition(" ")[2])
+        except BaseException:
+            self.close()
+            raise
+        _, self.version, self.device = answer.split(" ", 2)
+
+    def render(self, frame: int, output_path: Path) -> None:
+        """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
+        stdin = self._process.stdin
+        assert stdin is not None
+        try:
+            stdin.write(f"{frame} {output_path.resolve()}\n")
+            stdin.flush()
+        except (BrokenPipeError, ValueError) as error:
+            raise FrameRenderError(frame, f"Blender is gone: {self._describe_end()}") from error
+        answer = self._read_answer((f"FRAME_DONE {frame} ", f"FRAME_FAILED {frame} "))
+        if answer is None:
+            raise FrameRenderError(frame, f"Blender ended while drawing: {self._describe_end()}")
+        if answer.startswith("FRAME_FAILED"):
+            raise FrameRenderError(frame, answer.split(" ", 2)[2])
+
+    def close(self) -> None:
+        """End the child: ask it to, then insist."""
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                # What is still buffered for a dead child cannot be flushed, and need not be.
+                with contextlib.suppress(BrokenPipeError):
+                    stream.close()
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(_TERMINATE_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+
+    def _read_answer(self, prefixes: tuple[str, ...]) -> str | None:
+        """The next line of the protocol, or None when the child has closed its output; other lines are logged."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            text = line.rstrip("\n")
+            if text.startswith(prefixes):
+                return text
+            self._log_tail.append(text)
+            logger.debug("blender: %s", text)
+        return None
+
+    def _describe_end(self) -> str:
+        self.close()
+        exit_code = self._process.returncode
+        last_lines = "\n".join(self._log_tail) or "(it wrote nothing)"
+        return f"exit code {exit_code} of {' '.join(self._argv)}; its last lines:\n{last_lines}"
+
+
+def build_argv(blender: str, spec_path: Path, *, threads: int) -> list[str]:
+    """Arguments that make a Blender executable serve frames of a specification. Pure.
+
+    `--factory-startup` keeps the user's preferences and add-ons out of the pictures.
+    """
+    return [
+        blender,
+        "--background",
+        "--factory-startup",
+        "--threads",
+        str(threads),
+        "--python",
+        str(_render_script()),
+        "--",
+        str(spec_path),
+        "--serve",
+        "--threads",
+        str(threads),
+    ]
+
+
+def parse_blender_version(text: str) -> tuple[int, int, int] | None:
+    """The version in the first lines that `blender --version` prints, or None. Pure."""
+    match = re.search(r"^Blender (\d+)\.(\d+)\.(\d+)", text, flags=re.MULTILINE)
+    return (int(match[1]), int(match[2]), int(match[3])) if match else None
+
+
+def require_supported_executable(blender: str) -> tuple[int, int, int]:
+    """Version of a Blender executable.
+
+    Raises:
+        BlenderUnavailableError: it cannot be started, is no Blender, or is too old.
+    """
+    try:
+        completed = subprocess.run(
+            [blender, "--version"], capture_output=True, text=True, timeout=_STARTUP_VERSION_TIMEOUT_S, check=False
+        )
+    except OSError as error:
+        raise BlenderUnavailableError(f"cannot start the Blender executable {blender}: {error.strerror}") from error
+    except subprocess.TimeoutExpired as error:
+        raise BlenderUnavailableError(f"{blender} --version did not answer in {error.timeout:g} s") from error
+    version = parse_blender_version(completed.stdout)
+    if version is None:
+        raise BlenderUnavailableError(
+            f"{blender} is not a Blender executable: --version exited with {completed.returncode} and printed "
+            f"{(completed.stdout + completed.stderr)[:200]!r}"
+        )
+    if version[:2] < MINIMUM_BLENDER_VERSION:
+        raise BlenderUnavailableError(f"{blender} is Blender {'.'.join(map(str, version))}; 4.5 LTS or newer is needed")
+    return version
+
+
+def _render_script() -> Path:
+    package = find_spec("blender_scripts")
+    if package is None or package.origin is None:
+        raise BlenderUnavailableError("the folder blender_scripts of this project is not on Python's path")
+    return Path(package.origin).with_name("render_frames.py")
+
+
+def _can_load(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,68 @@
+"""Contact sheets: many frames in one picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont
+
+from render.pictures import read_rgb8
+
+_GAP = 4
+_BACKGROUND = (24, 24, 26)
+_INK = (235, 235, 235)
+_SHADE = (0, 0, 0)
+
+
+def contact_sheet(
+    pictures: Sequence[Path],
+    output: Path,
+    *,
+    columns: int = 6,
+    width: int = 1440,
+    labels: Sequence[str] | None = None,
+) -> None:
+    """Draw pictures side by side, each with its label in the lower left corner.
+
+    Args:
+        pictures: PNG files, row by row; each is fitted into a cell of the first one's proportions.
+        output: the picture to write; its suffix names the format.
+        columns: how many in a row; fewer when there are fewer pictures.
+        width: of the sheet [pixels].
+        labels: one a picture; the frame number from the file's name if omitted.
+
+    Raises:
+        InvalidFileError: a picture is damaged.
+        ValueError: there are no pictures, too little room, or another number of labels.
+    """
+    if not pictures:
+        raise ValueError("a contact sheet needs at least one picture")
+    names = [frame_label(path) for path in pictures] if labels is None else list(labels)
+    if len(names) != len(pictures):
+        raise ValueError(f"{len(pictures)} pictures need as many labels, got {len(names)}")
+    columns = min(columns, len(pictures))
+    cell_width = (width - (columns + 1) * _GAP) // columns if columns > 0 else 0
+    if cell_width < 8:
+        raise ValueError(f"{columns} columns do not fit into {width} pixels")
+
+    first_height, first_width, _ = read_rgb8(pictures[0]).shape
+    cell_height = max(1, round(cell_width * first_height / first_width))
+    rows = math.ceil(len(pictures) / columns)
+    sheet = Image.new("RGB", (width, rows * (cell_height + _GAP) + _GAP), _BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=max(9, min(18, cell_height // 9)))
+    for index, (path, name) in enumerate(zip(pictures, names, strict=True)):
+        row, column = divmod(index, columns)
+        x, y = _GAP + column * (cell_width + _GAP), _GAP + row * (cell_height + _GAP)
+        thumbnail = Image.fromarray(read_rgb8(path))
+        thumbnail.thumbnail((cell_width, cell_height), Image.Resampling.LANCZOS)
+        sheet.paste(thumbnail, (x, y))
+        draw.text((x + _GAP, y + cell_height - _GAP), name, _INK, font, anchor="ls", stroke_width=1, stroke_fill=_SHADE)
+    sheet.save(output)
+
+
+def frame_label(path: Path) -> str:
+    """Label of a picture: its frame number without leading zeros, or its name where that is not a number."""
+    return str(int(path.stem)) if path.stem.isdecimal() else path.stem

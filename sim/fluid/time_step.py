@@ -1,0 +1,46 @@
+"""How long a step may be."""
+
+import math
+
+CFL_NUMBER = 0.4
+"""Fraction of the particle spacing that a signal may cross in a step (Monaghan 1992)."""
+
+FORCE_NUMBER = 0.25
+"""Fraction of sqrt(d / |a|) (Monaghan 1992, section 10.3)."""
+
+VISCOUS_NUMBER = 0.125
+"""Fraction of d² / nu (Morris, Fox & Zhu 1997, eq. 20)."""
+
+COHESION_NUMBER = 0.25
+"""Fraction of the inverse frequency of a particle on the spring that its neighbours' cohesion is."""
+
+
+def stable_time_step(
+    *,
+    spacing: float,
+    signal_speed: float,
+    acceleration: float,
+    viscosity: float,
+    cohesion_rate: float,
+    cfl: float,
+) -> float:
+    """Largest stable step [s]: the smallest of the limits by signals, forces, viscosity and cohesion.
+
+    Args:
+        spacing: particle spacing d [m].
+        signal_speed: speed of sound plus largest speed; the largest speed alone where pressure is implicit [m/s].
+        acceleration: largest acceleration [m/s²].
+        viscosity: kinematic viscosity, the artificial one included [m²/s].
+        cohesion_rate: kappa sigma [1/s²]; 0 without surface tension.
+        cfl: the user's factor on the limit by signals [-].
+    """
+    limits = [math.inf]
+    if signal_speed > 0.0:
+        limits.append(cfl * CFL_NUMBER * spacing / signal_speed)
+    if acceleration > 0.0:
+        limits.append(FORCE_NUMBER * math.sqrt(spacing / acceleration))
+    if viscosity > 0.0:
+        limits.append(VISCOUS_NUMBER * spacing * spacing / viscosity)
+    if cohesion_rate > 0.0:
+        limits.append(COHESION_NUMBER / math.sqrt(cohesion_rate))
+    return min(limits)

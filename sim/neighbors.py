@@ -1,0 +1,318 @@
+"""Neighbours within a fixed radius: a counting sort into cells, then one compact list for all particles.
+
+The cells are cubes as wide as the search radius, numbered along x first, so that the three cells of a row are one
+contiguous range of the sorted particles. The list is a compressed sparse row array: it is counted before it is
+filled and grows when it must, so no particle and no cell has a limit of its own.
+
+The list reaches a skin farther than the kernel's support (Verlet 1967), and stays valid until a particle has moved
+half of that skin. The order of the particles, and so of every sum over neighbours, changes only when it is rebuilt;
+within a cell it is the order of the particle ids, whatever the number of threads.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
+Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Vectors = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
+Cells = ti.types.vector(3, ti.i32)
+
+SCAN_BLOCK = 1024
+GROWTH = 1.25
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """Cubic cells that cover a box, with one more layer of cells around it.
+
+    Attributes:
+        origin: lower corner of the outermost cells [m].
+        cell_size: edge of a cell, at least the search radius [m].
+        shape: number of cells along x, y, z.
+    """
+
+    origin: tuple[float, float, float]
+    cell_size: float
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def covering(cls, low: NDArray[np.floating], high: NDArray[np.floating], cell_size: float) -> "CellGrid":
+        """The grid for a box from `low` to `high` [m]."""
+        inner = np.maximum(np.ceil((np.asarray(high) - np.asarray(low)) / cell_size), 1).astype(int)
+        origin = np.asarray(low, dtype=np.float64) - cell_size
+        return cls(tuple(origin.tolist()), cell_size, tuple((inner + 2).tolist()))
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells, the outer layer included."""
+        nx, ny, nz = self.shape
+        return nx * ny * nz
+
+
+class CellSort:
+    """Sorts points by cell, then by id; drops those outside the box that they must stay in.
+
+    Attributes:
+        cell_start: first sorted point of each cell; entry `cell_count` is the number of points kept, (cells + 2,).
+        order: index before the sort of each sorted point, (capacity,).
+    """
+
+    def __init__(self, grid: CellGrid, capacity: int) -> None:
+        self.grid = grid
+        # One cell more than the grid has takes the points that are dropped.
+        self.cell_start = ti.ndarray(ti.i32, grid.cell_count + 2)
+        self._cursor = ti.ndarray(ti.i32, grid.cell_count + 1)
+        self._block_sums = ti.ndarray(ti.i32, _block_count(grid.cell_count + 1))
+        self._cell_of = ti.ndarray(ti.i32, max(capacity, 1))
+        self.order = ti.ndarray(ti.i32, max(capacity, 1))
+
+    def sort(
+        self,
+        positions: ti.Ndarray,
+        ids: ti.Ndarray,
+        count: int,
+        keep_low: tuple[float, float, float],
+        keep_high: tuple[float, float, float],
+    ) -> int:
+        """Order the first `count` points; returns how many of them are kept.
+
+        Args:
+            positions: points [m], at least (count,) of 3-vectors.
+            ids: distinct numbers that decide the order within a cell, at least (count,).
+            count: number of points.
+            keep_low: points below this on any axis are dropped [m].
+            keep_high: points above this on any axis are dropped [m].
+        """
+        grid = self.grid
+        dropped = count_points_per_cell(
+            positions,
+            count,
+            ti.math.vec3(*grid.origin),
+            1.0 / grid.cell_size,
+            Cells(*grid.shape),
+            ti.math.vec3(*keep_low),
+            ti.math.vec3(*keep_high),
+            self._cell_of,
+            self._cursor,
+        )
+        exclusive_scan(self._cursor, grid.cell_count + 1, self._block_sums, self.cell_start)
+        order_points_by_cell(self._cell_of, ids, count, grid.cell_count, self.cell_start, self._cursor, self.order)
+        return count - int(dropped)
+
+
+class NeighborList:
+    """For every particle the fluid particles, then the boundary samples, within a radius.
+
+    Attributes:
+        start: first entry of each particle in `indices`, (capacity + 1,).
+        boundary_start: first entry that is a boundary sample, (capacity,).
+        indices: indices into the sorted particles or the sorted boundary samples.
+    """
+
+    def __init__(self, grid: CellGrid, capacity: int, expected_neighbors: int) -> None:
+        self.grid = grid
+        self.start = ti.ndarray(ti.i32, capacity + 1)
+        self.boundary_start = ti.ndarray(ti.i32, max(capacity, 1))
+        self.indices = ti.ndarray(ti.i32, max(capacity * expected_neighbors, 1))
+        self.length = 0
+        self._counts = ti.ndarray(ti.i32, max(capacity, 1))
+        self._block_sums = ti.ndarray(ti.i32, _block_count(capacity))
+
+    def build(
+        self,
+        radius: float,
+        points: tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray],
+        cell_start: ti.Ndarray,
+        count: int,
+        boundary_points: tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray],
+        boundary_cell_start: ti.Ndarray,
+    ) -> None:
+        """Find all neighbours of the first `count` particles, themselves excluded.
+
+        Args:
+            radius: search radius, at most the cell size [m].
+            points: x, y and z of the particles, sorted by cell [m].
+            cell_start: their cell ranges.
+            count: number of particles.
+            boundary_points: x, y and z of the boundary samples, sorted by cell [m].
+            boundary_cell_start: their cell ranges.
+        """
+        grid = self.grid
+        origin, inverse_cell_size = ti.math.vec3(*grid.origin), 1.0 / grid.cell_size
+        shape = Cells(*grid.shape)
+        count_neighbors(
+            *points, *boundary_points, cell_start, boundary_cell_start, count, origin, inverse_cell_size, shape,
+            radius, self._counts, self.boundary_start,
+        )  # fmt: skip
+        self.length = int(exclusive_scan(self._counts, count, self._block_sums, self.start))
+        if self.length > self.indices.shape[0]:
+            self.indices = ti.ndarray(ti.i32, int(self.length * GROWTH))
+        list_neighbors(
+            *points, *boundary_points, cell_start, boundary_cell_start, count, origin, inverse_cell_size, shape,
+            radius, self.start, self.boundary_start, self.indices,
+        )  # fmt: skip
+
+
+def _block_count(length: int) -> int:
+    return max((length + SCAN_BLOCK - 1) // SCAN_BLOCK, 1)
+
+
+@ti.func
+def cell_of_point(point: ti.math.vec3, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells) -> Cells:
+    """Cell of a point, moved inside the outer layer, so that all 27 cells around it exist; a NaN lands there too."""
+    cell = ti.cast(ti.floor((point - origin) * inverse_cell_size), ti.i32)
+    return ti.max(ti.min(cell, shape - 2), 1)
+
+
+@ti.func
+def row_of_cell(cell: Cells, dy: ti.i32, dz: ti.i32, shape: Cells) -> ti.i32:
+    """Index of the cell next to `cell` by (0, dy, dz)."""
+    return ((cell[2] + dz) * shape[1] + cell[1] + dy) * shape[0] + cell[0]
+
+
+@ti.kernel
+def count_points_per_cell(
+    positions: Vectors,
+    count: ti.i32,
+    origin: ti.math.vec3,
+    inverse_cell_size: ti.f32,
+    shape: Cells,
+    keep_low: ti.math.vec3,
+    keep_high: ti.math.vec3,
+    cell_of: Integers,
+    points_in_cell: Integers,
+) -> ti.i32:
+    """Cell of each point and number of points per cell; the last cell counts, and the result is, the dropped ones."""
+    cell_count = shape[0] * shape[1] * shape[2]
+    for cell in range(cell_count + 1):
+        points_in_cell[cell] = 0
+    dropped = 0
+    for i in range(count):
+        x_i = positions[i]
+        cell = row_of_cell(cell_of_point(x_i, origin, inverse_cell_size, shape), 0, 0, shape)
+        if (x_i < keep_low).any() or (x_i > keep_high).any():
+            cell = cell_count
+            dropped += 1
+        cell_of[i] = cell
+        ti.atomic_add(points_in_cell[cell], 1)
+    return dropped
+
+
+@ti.kernel
+def exclusive_scan(values: Integers, length: ti.i32, block_sums: Integers, result: Integers) -> ti.i32:
+    """result[k] = sum of values[:k] for k = 0 ... length; returns the last of them."""
+    block_count = (length + SCAN_BLOCK - 1) // SCAN_BLOCK
+    for block in range(block_count):
+        block_sum = 0
+        for k in range(block * SCAN_BLOCK, ti.min((block + 1) * SCAN_BLOCK, length)):
+            block_sum += values[k]
+        block_sums[block] = block_sum
+    total = 0
+    ti.loop_config(serialize=True)
+    for block in range(block_count):
+        block_sum = block_sums[block]
+        block_sums[block] = total
+        total += block_sum
+    for block in range(block_count):
+        running = block_sums[block]
+        for k in range(block * SCAN_BLOCK, ti.min((block + 1) * SCAN_BLOCK, length)):
+            result[k] = running
+            running += values[k]
+    result[length] = total
+    return total
+
+
+@ti.kernel
+def order_points_by_cell(
+    cell_of: Integers,
+    ids: Integers,
+    count: ti.i32,
+    cell_count: ti.i32,
+    cell_start: Integers,
+    cursor: Integers,
+    order: Integers,
+):
+    """Put the points of a cell next to each other, by id: threads race for the slots, the insertion sort settles it."""
+    for cell in range(cell_count + 1):
+        cursor[cell] = cell_start[cell]
+    for i in range(count):
+        slot = ti.atomic_add(cursor[cell_of[i]], 1)
+        order[slot] = i
+    for cell in range(cell_count):
+        first = cell_start[cell]
+        for k in range(first + 1, cell_start[cell + 1]):
+            point = order[k]
+            slot = k
+            while slot > first and ids[order[slot - 1]] > ids[point]:
+                order[slot] = order[slot - 1]
+                slot -= 1
+            order[slot] = point
+
+
+@ti.kernel
+def count_neighbors(
+    x: Floats, y: Floats, z: Floats,
+    boundary_x: Floats, boundary_y: Floats, boundary_z: Floats,
+    cell_start: Integers, boundary_cell_start: Integers,
+    count: ti.i32, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, radius: ti.f32,
+    neighbor_count: Integers, fluid_neighbor_count: Integers,
+):  # fmt: skip
+    """Number of neighbours of each particle, in all and of fluid only.
+
+    Coordinates are separate arrays and the loops have no branch, so that compilers turn them into vector code.
+    """
+    radius_squared = radius * radius
+    ti.loop_config(block_dim=256)
+    for i in range(count):
+        x_i, y_i, z_i = x[i], y[i], z[i]
+        cell = cell_of_point(ti.math.vec3(x_i, y_i, z_i), origin, inverse_cell_size, shape)
+        fluid_count = -1  # the particle itself
+        boundary_count = 0
+        for dz in ti.static(range(-1, 2)):
+            for dy in ti.static(range(-1, 2)):
+                row = row_of_cell(cell, dy, dz, shape)
+                for j in range(cell_start[row - 1], cell_start[row + 2]):
+                    dx_ij, dy_ij, dz_ij = x_i - x[j], y_i - y[j], z_i - z[j]
+                    inside = dx_ij * dx_ij + dy_ij * dy_ij + dz_ij * dz_ij < radius_squared
+                    fluid_count += ti.cast(inside, ti.i32)
+                for b in range(boundary_cell_start[row - 1], boundary_cell_start[row + 2]):
+                    dx_ib, dy_ib, dz_ib = x_i - boundary_x[b], y_i - boundary_y[b], z_i - boundary_z[b]
+                    inside = dx_ib * dx_ib + dy_ib * dy_ib + dz_ib * dz_ib < radius_squared
+                    boundary_count += ti.cast(inside, ti.i32)
+        neighbor_count[i] = fluid_count + boundary_count
+        fluid_neighbor_count[i] = fluid_count
+
+
+@ti.kernel
+def list_neighbors(
+    x: Floats, y: Floats, z: Floats,
+    boundary_x: Floats, boundary_y: Floats, boundary_z: Floats,
+    cell_start: Integers, boundary_cell_start: Integers,
+    count: ti.i32, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, radius: ti.f32,
+    start: Integers, boundary_start: Integers, indices: Integers,
+):  # fmt: skip
+    """Write the neighbours of each particle; `boundary_start` holds fluid counts before and positions after."""
+    radius_squared = radius * radius
+    ti.loop_config(block_dim=256)
+    for i in range(count):
+        x_i, y_i, z_i = x[i], y[i], z[i]
+        cell = cell_of_point(ti.math.vec3(x_i, y_i, z_i), origin, inverse_cell_size, shape)
+        slot = start[i]
+        boundary_slot = slot + boundary_start[i]
+        boundary_start[i] = boundary_slot
+        for dz in ti.static(range(-1, 2)):
+            for dy in ti.static(range(-1, 2)):
+                row = row_of_cell(cell, dy, dz, shape)
+                for j in range(cell_start[row - 1], cell_start[row + 2]):
+                    dx_ij, dy_ij, dz_ij = x_i - x[j], y_i - y[j], z_i - z[j]
+                    if dx_ij * dx_ij + dy_ij * dy_ij + dz_ij * dz_ij < radius_squared and j != i:
+                        indices[slot] = j
+                        slot += 1
+                for b in range(boundary_cell_start[row - 1], boundary_cell_start[row + 2]):
+                    dx_ib, dy_ib, dz_ib = x_i - boundary_x[b], y_i - boundary_y[b], z_i - boundary_z[b]
+                    if dx_ib * dx_ib + dy_ib * dy_ib + dz_ib * dz_ib < radius_squared:
+                        indices[boundary_slot] = b
+                        boundary_slot += 1

@@ -1,0 +1,83 @@
+"""A signed distance sampled on a grid, for the places that ask for it millions of times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from sim.shapes.solid import Points, ShapeError, Solid
+
+_QUERY_POINTS = 2**20
+_LARGEST_GRID = 2**29
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSet:
+    """Signed distances at the nodes of a cubic grid, interpolated trilinearly.
+
+    Accuracy inside the grid: below spacing²/(4 R) where the surface has radius of curvature R and no medial axis
+    crosses the cell, at most 0.87 spacings (half a cell's diagonal) beside edges and medial axes. Outside of the grid
+    the distance is that of the nearest grid point plus the way to it: an upper bound.
+
+    Attributes:
+        origin: position of node (0, 0, 0) [m], (3,).
+        spacing: edge of a cell [m].
+        values: distances [m], negative inside, (nx, ny, nz), float32.
+    """
+
+    origin: NDArray[np.float64]
+    spacing: float
+    values: NDArray[np.float32]
+
+    @classmethod
+    def sample(cls, solid: Solid, spacing: float, *, padding: float | None = None) -> LevelSet:
+        """Sample a solid's exact distance.
+
+        Args:
+            solid: what to sample.
+            spacing: edge of a cell [m].
+            padding: how far the grid reaches past the solid's bounds [m]; two cells if omitted.
+
+        Raises:
+            ShapeError: the grid would take more than 2 GiB.
+        """
+        margin = 2.0 * spacing if padding is None else padding
+        lower, upper = solid.bounds
+        counts = np.ceil((upper - lower + 2.0 * margin) / spacing).astype(np.int64) + 1
+        if np.prod(counts.astype(np.float64)) > _LARGEST_GRID:
+            raise ShapeError(
+                f"a distance grid of {' x '.join(map(str, counts))} nodes at a spacing of {spacing:g} m is too large; "
+                "use a larger spacing"
+            )
+        origin = 0.5 * (lower + upper) - 0.5 * spacing * (counts - 1)
+        x, y, z = (start + spacing * np.arange(count) for start, count in zip(origin, counts, strict=True))
+        values = np.empty(tuple(counts), dtype=np.float32)
+        layers = max(1, _QUERY_POINTS // (len(y) * len(z)))
+        for start in range(0, len(x), layers):
+            stop = min(start + layers, len(x))
+            points = np.stack(np.meshgrid(x[start:stop], y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+            values[start:stop] = solid.signed_distance(points).reshape(stop - start, len(y), len(z))
+        return cls(origin, spacing, values)
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lower and upper corner of the grid [m], (2, 3)."""
+        return np.stack([self.origin, self.origin + self.spacing * (np.array(self.values.shape) - 1)])
+
+    def signed_distance(self, points: Points) -> NDArray[np.float64]:
+        """Distance to the surface [m], negative inside, (n,), of positions (n, 3)."""
+        lower, upper = self.bounds
+        nearest = np.clip(points, lower, upper)
+        inside_grid = map_coordinates(
+            self.values, ((nearest - lower) / self.spacing).T, output=np.float64, order=1, mode="nearest"
+        )
+        return inside_grid + np.linalg.norm(points - nearest, axis=1)
+
+    def gradient(self, points: Points) -> NDArray[np.float64]:
+        """Gradient of the distance [-], (n, 3): central differences over one cell, not normalized."""
+        steps = 0.5 * self.spacing * np.eye(3)
+        columns = [self.signed_distance(points + step) - self.signed_distance(points - step) for step in steps]
+        return np.stack(columns, axis=1) / self.spacing

@@ -1,0 +1,62 @@
+"""Mesh files: OBJ, PLY, STL, GLB and whatever else trimesh reads, as one solid about the origin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.shapes.mesh_solid import MeshSolid, solid_from_triangles
+from sim.shapes.parameters import MeshShape
+from sim.shapes.solid import Points, ShapeError
+
+_Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def load_mesh_solid(shape: MeshShape) -> MeshSolid:
+    """The solid in a mesh file: upright, its bounding box centred on the origin, scaled to `size`.
+
+    Raises:
+        ShapeError: the file is missing or unreadable, or its mesh is no solid; see `solid_from_triangles`.
+    """
+    path = Path(shape.file)
+    vertices, faces = read_triangles(path)
+    if shape.up == "y":
+        vertices = vertices @ _Y_UP_TO_Z_UP.T
+    used = vertices[np.unique(faces)] if len(faces) else vertices
+    if len(faces) and np.isfinite(used).all():
+        lower, upper = used.min(axis=0), used.max(axis=0)
+        extent = float((upper - lower).max())
+        scale = shape.size / extent if shape.size is not None and extent > 0.0 else 1.0
+        vertices = scale * (vertices - 0.5 * (lower + upper))
+    return solid_from_triangles(vertices, faces, label=path.name)
+
+
+def read_triangles(path: Path) -> tuple[Points, NDArray[np.int64]]:
+    """Vertices (n, 3) and faces (m, 3) of a file, all of its objects in one mesh, as the file has them.
+
+    Raises:
+        ShapeError: the file is missing, of an unknown kind, or unreadable.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise ShapeError(f'shape.file: must be a mesh file, "{path}" does not exist; check the path')
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in trimesh.available_formats():
+        raise ShapeError(
+            f'shape.file: must be a mesh trimesh can read, got "{path.name}"; convert it to OBJ, PLY, STL or GLB'
+        )
+    try:
+        mesh = trimesh.load_scene(path, process=False).to_mesh()
+    except Exception as error:  # a parser of foreign bytes raises anything: struct.error, IndexError, KeyError...
+        raise ShapeError(
+            f'shape.file: "{path}" is not a readable {kind.upper()} file '
+            f"({type(error).__name__}: {error}); export it again, or convert it to PLY"
+        ) from error
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ShapeError(f'shape.file: "{path}" has faces that name vertices it does not have; export it again')
+    return vertices, faces

@@ -1,0 +1,224 @@
+"""The inside of a triangle mesh, closed or not, by its generalized winding number."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim.shapes.mesh_repair import (
+    boundary_edges,
+    boundary_loops,
+    cap_holes,
+    drop_collapsed_and_repeated_faces,
+    merge_vertices,
+    orient_outward,
+)
+from sim.shapes.moments import integrate_moments
+from sim.shapes.sampling import stratified_points
+from sim.shapes.solid import Points, ShapeError, TriangleMesh
+from sim.shapes.tessellation import longest_edge, subdivide
+
+_DECIDED_WITHIN = 0.1
+"""A winding number is decided when this close to an integer; beside an open hemisphere it is off by 0.15 to 0.25."""
+
+_LARGEST_UNDECIDED = 0.2
+"""Largest fraction of the surface beside which the inside may be undecided."""
+
+_PROBES = 4096
+_PROBE_OFFSET = 1.0e-4
+"""How far from the surface the probes are, in bounding-box diagonals: above float32 round-off, below any wall."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshSolid:
+    """A solid bounded by a triangle mesh about its own origin; implements `sim.shapes.solid.RestShape`.
+
+    A point is inside where the generalized winding number of the mesh (Jacobson et al. 2013, evaluated as by Barill et
+    al. 2018) exceeds 1/2: overlapping parts unite, and holes are spanned smoothly. Its distance is that to the nearest
+    triangle that is not buried in another part, caps over the holes included, exact to round-off. Two exceptions: at a
+    hole with an uneven rim the surface of the sign and the cap differ, by about the unevenness of the rim; and along
+    the seam of two overlapping parts the triangles that cross it still count with their buried ends.
+
+    Attributes:
+        mesh: outward-oriented triangles, the caps last.
+        cap_count: how many of the last faces are caps.
+        warnings: what was repaired or assumed.
+    """
+
+    mesh: TriangleMesh
+    cap_count: int = 0
+    warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def volume(self) -> float:
+        """Volume [m³]: exact for closed (or capped) parts that do not overlap, else within about 0.5 %."""
+        if self.encloses_simply:
+            return self.mesh.signed_volume
+        return integrate_moments(self).volume
+
+    @cached_property
+    def parts_overlap(self) -> bool:
+        """Whether some of the surface is buried in the solid, as its parts overlap."""
+        return bool(np.any(self.winding_beside_surface()[:, 1] > 0.5))
+
+    @cached_property
+    def encloses_simply(self) -> bool:
+        """Whether surface integrals over the mesh are integrals over its inside."""
+        return self.mesh.is_closed and not self.parts_overlap
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lower and upper corner [m], (2, 3)."""
+        return self.mesh.bounds
+
+    def support(self, directions: Points) -> NDArray[np.float64]:
+        """Largest x·d over the mesh [m]."""
+        return (self.mesh.vertices @ directions.T).max(axis=0)
+
+    def signed_distance(self, points: Points) -> NDArray[np.float64]:
+        """Distance to the nearest triangle [m], negative inside, (n,)."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        if not len(points):
+            return np.empty(0)
+        # igl.signed_distance with the fast winding number scales the distance by 1 - 2|w|, so that it is no distance
+        # near holes: sign and distance are asked for apart. The trees are kept, too.
+        squared, _, _ = self._distance_tree.squared_distance(self.mesh.vertices, self._bounding_faces, points)
+        return np.where(self.winding_number(points) > 0.5, -1.0, 1.0) * np.sqrt(squared)
+
+    def winding_number(self, points: Points) -> NDArray[np.float64]:
+        """Generalized winding number [-] of the mesh without its caps, (n,)."""
+        return self._winding_tree.winding_number(np.ascontiguousarray(points, dtype=np.float64), 2.0)
+
+    def winding_beside_surface(self) -> NDArray[np.float64]:
+        """Winding number just inside and just outside of the mesh without its caps, (k, 2), evenly by area."""
+        mesh = TriangleMesh(self.mesh.vertices, self.mesh.faces[: len(self.mesh.faces) - self.cap_count])
+        points, face = stratified_points(mesh, _PROBES)
+        step = self._probe_step(mesh.area_vectors[face])
+        return np.stack([self.winding_number(points - step), self.winding_number(points + step)], axis=1)
+
+    def surface_mesh(self, max_edge: float | None) -> TriangleMesh:
+        """The mesh with its caps; every triangle cut into four until no edge is longer than `max_edge` [m]."""
+        mesh = self.mesh
+        while max_edge is not None and longest_edge(mesh) > max_edge:
+            mesh = subdivide(mesh)
+        return mesh
+
+    @cached_property
+    def _bounding_faces(self) -> NDArray[np.int64]:
+        """Faces between inside and outside: all of them, unless parts overlap and bury some."""
+        faces = self.mesh.faces.astype(np.int64)
+        if not self.parts_overlap:
+            return faces
+        towards_corners = np.vstack([0.98 * np.eye(3) + 0.02 / 3.0, np.full((1, 3), 1.0 / 3.0)])
+        points = np.einsum("pc,fcx->fpx", towards_corners, self.mesh.corners)
+        outer = points + self._probe_step(self.mesh.area_vectors)[:, None]
+        buried = np.all(self.winding_number(outer.reshape(-1, 3)).reshape(points.shape[:2]) > 0.5, axis=1)
+        return faces[~buried]
+
+    def _probe_step(self, area_vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        length = np.linalg.norm(area_vectors, axis=1, keepdims=True)
+        diagonal = np.linalg.norm(np.ptp(self.mesh.vertices, axis=0))
+        return _PROBE_OFFSET * diagonal * area_vectors / np.maximum(length, np.finfo(np.float64).tiny)
+
+    @cached_property
+    def _distance_tree(self) -> Any:
+        import igl
+
+        tree = igl.AABB()
+        tree.init(self.mesh.vertices, self._bounding_faces)
+        return tree
+
+    @cached_property
+    def _winding_tree(self) -> Any:
+        import igl
+
+        tree = igl.FastWindingNumberBVH()
+        uncapped = self.mesh.faces[: len(self.mesh.faces) - self.cap_count].astype(np.int64)
+        tree.init(self.mesh.vertices, uncapped, 2)
+        return tree
+
+
+def solid_from_triangles(vertices: ArrayLike, faces: ArrayLike, *, label: str) -> MeshSolid:
+    """Repair a mesh and make sure that it has an inside.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices.
+        label: what messages call it, such as "bunny.obj".
+
+    Raises:
+        ShapeError: no faces, no extent, non-finite vertices, or an inside that cannot be determined: a fifth of the
+            surface or more has a winding number that is not within 0.1 of an integer on both sides, or is not inside
+            on its inner side.
+    """
+    vertices, faces = _checked_arrays(vertices, faces, label)
+    warnings = []
+    faces, turned = orient_outward(vertices, faces)
+    if turned == len(faces):
+        warnings.append(f"{label} was inside out; all of its {turned} faces were turned")
+    elif turned:
+        warnings.append(f"{turned} of the {len(faces)} faces of {label} pointed the wrong way and were turned")
+
+    open_edges = boundary_edges(faces)
+    loops = boundary_loops(faces)
+    capped_vertices, caps = cap_holes(vertices, faces, loops)
+    mesh = TriangleMesh(capped_vertices, np.concatenate([faces, caps]).astype(np.int32))
+    solid = MeshSolid(mesh, len(caps))
+
+    undecided = _undecided_fraction(solid)
+    if undecided > _LARGEST_UNDECIDED:
+        raise ShapeError(_no_inside(label, undecided, len(loops), len(open_edges)))
+    if loops:
+        holes = "a hole" if len(loops) == 1 else f"{len(loops)} holes"
+        warnings.append(
+            f"{label} has {holes} ({len(open_edges)} boundary edges); its inside is taken from the generalized "
+            f"winding number, decided beside {100.0 * (1.0 - undecided):.1f} % of the surface, and flat caps close it"
+        )
+    if solid.parts_overlap:
+        warnings.append(f"{label} has parts that overlap; they are united")
+    return MeshSolid(mesh, len(caps), tuple(warnings))
+
+
+def _checked_arrays(vertices: ArrayLike, faces: ArrayLike, label: str) -> tuple[Points, NDArray[np.int64]]:
+    vertices = np.asarray(vertices, dtype=np.float64).reshape(-1, 3)
+    faces = np.asarray(faces, dtype=np.int64).reshape(-1, 3)
+    if not len(faces):
+        raise ShapeError(f"{label} has no faces; a solid needs a surface, so export it as a triangle mesh")
+    vertices, faces = vertices[np.unique(faces)], np.unique(faces, return_inverse=True)[1].reshape(-1, 3)
+    bad = np.count_nonzero(~np.isfinite(vertices).all(axis=1))
+    if bad:
+        raise ShapeError(f"{label} has {bad} vertices that are not finite numbers; export it again")
+    extent = np.ptp(vertices, axis=0)
+    if not np.any(extent > 0.0):
+        raise ShapeError(f"{label} has no extent: all of its vertices are in one place; check its export")
+    vertices, faces = merge_vertices(vertices, faces)
+    faces = drop_collapsed_and_repeated_faces(faces)
+    if not len(faces) or not np.all(np.ptp(vertices, axis=0) > 1.0e-9 * extent.max()):
+        raise ShapeError(
+            f"{label} is flat: its extent is {' x '.join(f'{edge:g}' for edge in extent)} m; "
+            "a solid needs thickness, so give the sheet some in a modelling program"
+        )
+    return vertices, faces
+
+
+def _undecided_fraction(solid: MeshSolid) -> float:
+    winding = solid.winding_beside_surface()
+    decided = np.all(np.abs(winding - np.round(winding)) < _DECIDED_WITHIN, axis=1)
+    return 1.0 - float(np.mean(decided & (winding[:, 0] > 0.5)))
+
+
+def _no_inside(label: str, undecided: float, holes: int, open_edges: int) -> str:
+    share = f"beside {100.0 * undecided:.0f} % of its surface the winding number is undecided"
+    if holes:
+        return (
+            f"{label} has no clear inside: {share} (at most {100.0 * _LARGEST_UNDECIDED:.0f} % may be), {open_edges} "
+            "edges being open; close its holes, or give the sheet a thickness, in a modelling program"
+        )
+    return (
+        f"{label} has no clear inside: {share} (at most {100.0 * _LARGEST_UNDECIDED:.0f} % may be), although it has no "
+        "holes: it folds over or into itself; rebuild it in a modelling program (Blender: Remesh modifier)"
+    )

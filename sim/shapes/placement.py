@@ -1,0 +1,137 @@
+"""From a placement in the job to a solid in the world: scaled, then rotated, then moved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sim.parameters import Parameters
+from sim.shapes.parameters import (
+    BoxShape,
+    BunnyShape,
+    CapsuleShape,
+    ConeShape,
+    CylinderShape,
+    DuckShape,
+    MeshShape,
+    Placement,
+    SphereShape,
+    TorusShape,
+)
+from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
+from sim.shapes.solid import Points, RestShape, ShapeError, TriangleMesh
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSolid:
+    """A rest shape in the world; implements `sim.shapes.Solid`.
+
+    Attributes:
+        shape: the shape about its own origin.
+        scale: uniform factor [-].
+        rotation: (3, 3) rotation matrix, rest axes to world axes.
+        position: (3,) world position of the shape's origin [m].
+    """
+
+    shape: RestShape
+    scale: float
+    rotation: NDArray[np.float64]
+    position: NDArray[np.float64]
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lower and upper corner of its tight axis-aligned box [m], (2, 3)."""
+        upper = self.scale * self.shape.support(self.rotation)  # row k is the world axis k in rest axes
+        lower = -self.scale * self.shape.support(-self.rotation)
+        return self.position + np.stack([lower, upper])
+
+    @property
+    def volume(self) -> float:
+        """Volume [m³]."""
+        return self.shape.volume * self.scale**3
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was repaired or assumed to build it, one sentence each."""
+        return self.shape.warnings
+
+    @property
+    def orientation(self) -> NDArray[np.float64]:
+        """Unit quaternion w, x, y, z with w >= 0, (4,)."""
+        return Rotation.from_matrix(self.rotation).as_quat(canonical=True, scalar_first=True)
+
+    def signed_distance(self, points: Points) -> NDArray[np.float64]:
+        """Distance to the surface [m], negative inside, (n,), of world positions (n, 3)."""
+        rest_points = (np.asarray(points, dtype=np.float64) - self.position) @ self.rotation / self.scale
+        return self.scale * self.shape.signed_distance(rest_points)
+
+    def surface_mesh(self, max_edge: float | None = None) -> TriangleMesh:
+        """Closed outward-oriented surface in world coordinates; edges no longer than `max_edge` [m] if given."""
+        return self._mesh(max_edge).transformed(self.scale, self.rotation, self.position)
+
+    def rest_mesh(self, max_edge: float | None = None) -> TriangleMesh:
+        """The surface scaled, but neither rotated nor moved."""
+        return self._mesh(max_edge).transformed(self.scale, np.eye(3), np.zeros(3))
+
+    def _mesh(self, max_edge: float | None) -> TriangleMesh:
+        return self.shape.surface_mesh(None if max_edge is None else max_edge / self.scale)
+
+
+def build_solid(placement: Placement) -> PlacedSolid:
+    """The solid that a placement describes.
+
+    A relative mesh path counts from the working directory: whoever reads the job file resolves it against the file.
+
+    Raises:
+        ShapeError: the shape cannot be built; the text gives place, rule, value and remedy.
+    """
+    # Lower-case "xyz" are rotations about fixed world axes: R = Rz Ry Rx.
+    rotation = Rotation.from_euler("xyz", placement.rotation_deg, degrees=True).as_matrix()
+    position = np.asarray(placement.position, dtype=np.float64)
+    return PlacedSolid(_BUILDERS[type(placement.shape)](placement.shape), placement.scale, rotation, position)
+
+
+def _build_torus(shape: TorusShape) -> Torus:
+    if shape.minor_radius >= shape.major_radius:
+        raise ShapeError(
+            f"shape.minor_radius: must be less than major_radius = {shape.major_radius:g} m, "
+            f"got {shape.minor_radius:g} m; use a sphere or a cylinder for a ring without a hole"
+        )
+    return Torus(shape.major_radius, shape.minor_radius)
+
+
+def _build_duck(shape: DuckShape) -> RestShape:
+    from sim.shapes.duck import build_duck
+
+    return build_duck(shape.length)
+
+
+def _build_bunny(shape: BunnyShape) -> RestShape:
+    from sim.shapes.bunny import build_bunny
+
+    return build_bunny(shape.height)
+
+
+def _build_mesh(shape: MeshShape) -> RestShape:
+    from sim.shapes.mesh_file import load_mesh_solid
+
+    return load_mesh_solid(shape)
+
+
+_BUILDERS: Mapping[type[Parameters], Callable[..., RestShape]] = {
+    BoxShape: lambda shape: Box(shape.size),
+    SphereShape: lambda shape: Sphere(shape.radius),
+    CylinderShape: lambda shape: Cylinder(shape.radius, shape.height),
+    CapsuleShape: lambda shape: Capsule(shape.radius, shape.height),
+    TorusShape: _build_torus,
+    ConeShape: lambda shape: Cone(shape.radius, shape.height),
+    DuckShape: _build_duck,
+    BunnyShape: _build_bunny,
+    MeshShape: _build_mesh,
+}
+"""How each type of shape is built: one line for a new shape."""

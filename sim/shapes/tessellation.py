@@ -1,0 +1,118 @@
+"""Closed, outward-oriented triangle meshes of boxes, spheres and bodies of revolution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.shapes.solid import Points, TriangleMesh
+
+SMOOTH_SUBDIVISIONS = 5
+"""Subdivisions of an icosahedron that look round: 10 242 vertices, off by 0.03 % of the radius."""
+
+
+def subdivide_polyline(points: Sequence[tuple[float, float]] | NDArray[np.float64], max_edge: float) -> Points:
+    """A polyline (n, 2) with its segments cut evenly until none is longer than `max_edge`."""
+    corners = np.asarray(points, dtype=np.float64)
+    pieces = [corners[:1]]
+    for start, end in pairwise(corners):
+        count = max(1, int(np.ceil(np.linalg.norm(end - start) / max_edge - 1.0e-9)))
+        fraction = np.arange(1, count + 1)[:, None] / count
+        pieces.append(start + fraction * (end - start))
+    return np.concatenate(pieces)
+
+
+def _quads_as_triangles(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray[np.int32]:
+    """Two triangles for each quad with corners a, b, c, d counter-clockwise seen from outside."""
+    return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)]).astype(
+        np.int32
+    )
+
+
+def revolve(profile: Points, segments: int) -> TriangleMesh:
+    """A profile (n, 2) of radius and z, from the axis at the bottom to the axis at the top, turned around z."""
+    rings = profile[1:-1]
+    angle = np.arange(segments) * (2.0 * np.pi / segments)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ring_vertices = np.concatenate(
+        [
+            rings[:, None, :1] * around[None],
+            np.broadcast_to(rings[:, None, 1:], (len(rings), segments, 1)),
+        ],
+        axis=2,
+    ).reshape(-1, 3)
+    bottom, top = len(ring_vertices), len(ring_vertices) + 1
+    vertices = np.concatenate([ring_vertices, [(0.0, 0.0, profile[0, 1]), (0.0, 0.0, profile[-1, 1])]])
+
+    index = np.arange(len(rings) * segments).reshape(len(rings), segments)
+    following = np.roll(index, -1, axis=1)
+    sides = _quads_as_triangles(index[:-1], following[:-1], following[1:], index[1:])
+    floor = np.stack([np.full(segments, bottom), following[0], index[0]], axis=1)
+    ceiling = np.stack([np.full(segments, top), index[-1], following[-1]], axis=1)
+    return TriangleMesh(vertices, np.concatenate([sides, floor, ceiling]).astype(np.int32))
+
+
+def revolve_ring(profile: Points, segments: int) -> TriangleMesh:
+    """A closed counter-clockwise profile (n, 2) of radius > 0 and z, turned around z."""
+    angle = np.arange(segments) * (2.0 * np.pi / segments)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    vertices = np.concatenate(
+        [profile[:, None, :1] * around[None], np.broadcast_to(profile[:, None, 1:], (len(profile), segments, 1))],
+        axis=2,
+    ).reshape(-1, 3)
+    index = np.arange(len(vertices)).reshape(len(profile), segments)
+    following, above = np.roll(index, -1, axis=1), np.roll(index, -1, axis=0)
+    return TriangleMesh(vertices, _quads_as_triangles(index, following, np.roll(following, -1, axis=0), above))
+
+
+def icosphere(radius: float, max_edge: float) -> TriangleMesh:
+    """A subdivided icosahedron with all vertices at `radius`."""
+    import trimesh
+
+    # An edge of the icosahedron is 1.0515 radii; each subdivision halves it, projection stretches it by < 1.2.
+    needed = np.log2(1.0515 * 1.2 * radius / max_edge) if np.isfinite(max_edge) else 0.0
+    mesh = trimesh.creation.icosphere(subdivisions=max(SMOOTH_SUBDIVISIONS, int(np.ceil(needed))), radius=radius)
+    return TriangleMesh(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
+
+
+def grid_box(size: Sequence[float], max_edge: float) -> TriangleMesh:
+    """A box centred on the origin, every face a grid of rectangles with edges of at most `max_edge`."""
+    size = np.asarray(size, dtype=np.float64)
+    cells = np.maximum(1, np.ceil(size / max_edge - 1.0e-9)).astype(int)
+    ticks = [np.linspace(-0.5 * extent, 0.5 * extent, count + 1) for extent, count in zip(size, cells, strict=True)]
+    lattice_index = np.arange(np.prod(cells + 1)).reshape(cells + 1)
+
+    faces = []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        index = lattice_index.transpose(axis, u, v)  # u x v points along +axis
+        for side, outward in ((index[0], False), (index[-1], True)):
+            a, b, c, d = side[:-1, :-1], side[1:, :-1], side[1:, 1:], side[:-1, 1:]
+            faces.append(_quads_as_triangles(a, b, c, d) if outward else _quads_as_triangles(a, d, c, b))
+
+    used, compact = np.unique(np.concatenate(faces), return_inverse=True)
+    i, j, k = np.unravel_index(used, cells + 1)
+    vertices = np.stack([ticks[0][i], ticks[1][j], ticks[2][k]], axis=1)
+    return TriangleMesh(vertices, compact.reshape(-1, 3).astype(np.int32))
+
+
+def longest_edge(mesh: TriangleMesh) -> float:
+    """Length of the longest edge [m]."""
+    corners = mesh.corners
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+
+
+def subdivide(mesh: TriangleMesh) -> TriangleMesh:
+    """The same surface with every triangle cut into four at the midpoints of its edges; parts are kept."""
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    unique_edges, edge = np.unique(edges, axis=0, return_inverse=True)
+    ab, bc, ca = (edge.reshape(-1, 3) + len(mesh.vertices)).T
+    a, b, c = mesh.faces.T
+    quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    faces = np.stack([np.stack(quarter, axis=1) for quarter in quarters], axis=1).reshape(-1, 3).astype(np.int32)
+    vertices = np.concatenate([mesh.vertices, mesh.vertices[unique_edges].mean(axis=1)])
+    part = None if mesh.part is None else np.repeat(mesh.part, 4)
+    return TriangleMesh(vertices, faces, part, mesh.part_names)

@@ -1,0 +1,147 @@
+"""Buoyancy and vorticity confinement (Fedkiw, Stam & Jensen 2001, eq. 8-11)."""
+
+import math
+
+import numpy as np
+import taichi as ti
+
+from sim.parameters import Vector3
+from sim.smoke.grid import SmokeGrid
+
+TINY_GRADIENT = 1.0e-6
+"""Keeps N = eta / (|eta| + tiny) finite where the vorticity is even [1/(m s)]."""
+
+
+def upward(gravity: Vector3) -> tuple[float, float, float]:
+    """Unit vector against gravity; zero without gravity, where nothing rises."""
+    strength = math.sqrt(sum(g * g for g in gravity))
+    x, y, z = (-g / strength if strength > 0.0 else 0.0 for g in gravity)
+    return x, y, z
+
+
+@ti.data_oriented
+class Forces:
+    """Accelerates the air: f = (-alpha rho + beta (T - T_air)) up + epsilon h (N x omega).
+
+    The confinement is evaluated at cell centres, three cells and more away from the sides of the box, where the
+    gradient of the vorticity is not made up by the boundary, and averaged onto faces.
+
+    Args:
+        grid: where the fields live.
+        openness: by axis, positive on faces that air passes, flat fields; the others are set to velocity 0.
+        velocity: the three face velocities [m/s], flat fields.
+        cell_fields: density and temperature excess, flat fields.
+        work: four flat fields to work in.
+        gravity: [m/s²]; only its direction matters.
+        buoyancy_density: alpha [m/s²].
+        buoyancy_temperature: beta [m/(s² K)].
+        confinement: epsilon [-].
+    """
+
+    def __init__(
+        self,
+        grid: SmokeGrid,
+        *,
+        openness: tuple,
+        velocity: tuple,
+        cell_fields: tuple,
+        work: tuple,
+        gravity: Vector3,
+        buoyancy_density: float,
+        buoyancy_temperature: float,
+        confinement: float,
+    ) -> None:
+        self._nx, self._ny, self._nz = grid.cells
+        self._step_x, self._step_y = grid.padded[1] * grid.padded[2], grid.padded[2]
+        self._size = grid.size
+        self._open_x, self._open_y, self._open_z = openness
+        self._u, self._v, self._w = velocity
+        self._density, self._excess = cell_fields
+        self._f_x, self._f_y, self._f_z, self._vorticity = work
+        up = np.asarray(upward(gravity))
+        self._sink = tuple((-buoyancy_density * up).tolist())
+        self._lift = tuple((buoyancy_temperature * up).tolist())
+        self._half_per_cell = 0.5 / grid.cell_size
+        self._strength = confinement * grid.cell_size
+
+    def accelerate(self, dt: float) -> None:
+        """Add dt [s] times the acceleration to open faces, and stop the air on closed ones."""
+        self._clear_confinement()
+        if self._strength > 0.0:
+            self._compute_vorticity()
+            self._compute_confinement()
+        self._apply(dt)
+
+    @ti.func
+    def _centre(self, face: ti.template(), step: ti.template(), at: ti.i32):
+        return 0.5 * (face[at] + face[at + step])
+
+    @ti.kernel
+    def _clear_confinement(self):
+        for at in range(self._size):
+            self._f_x[at] = 0.0
+            self._f_y[at] = 0.0
+            self._f_z[at] = 0.0
+            self._vorticity[at] = 0.0
+
+    @ti.kernel
+    def _compute_vorticity(self):
+        """omega = curl u by central differences of cell-centred velocities [1/s]."""
+        for i, j in ti.ndrange((2, self._nx), (2, self._ny)):
+            row = i * self._step_x + j * self._step_y
+            for k in range(2, self._nz):
+                at = row + k
+                x, y, z = ti.static(self._step_x, self._step_y, 1)
+                omega_x = (self._centre(self._w, z, at + y) - self._centre(self._w, z, at - y)) - (
+                    self._centre(self._v, y, at + z) - self._centre(self._v, y, at - z)
+                )
+                omega_y = (self._centre(self._u, x, at + z) - self._centre(self._u, x, at - z)) - (
+                    self._centre(self._w, z, at + x) - self._centre(self._w, z, at - x)
+                )
+                omega_z = (self._centre(self._v, y, at + x) - self._centre(self._v, y, at - x)) - (
+                    self._centre(self._u, x, at + y) - self._centre(self._u, x, at - y)
+                )
+                omega_x *= self._half_per_cell
+                omega_y *= self._half_per_cell
+                omega_z *= self._half_per_cell
+                self._f_x[at] = omega_x
+                self._f_y[at] = omega_y
+                self._f_z[at] = omega_z
+                self._vorticity[at] = ti.sqrt(omega_x * omega_x + omega_y * omega_y + omega_z * omega_z)
+
+    @ti.kernel
+    def _compute_confinement(self):
+        """Replace omega by epsilon h (N x omega), N = eta / |eta|, eta = grad |omega| [m/s²]."""
+        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+            row = i * self._step_x + j * self._step_y
+            inner_row = 2 < i < self._nx - 1 and 2 < j < self._ny - 1
+            for k in range(1, self._nz + 1):
+                at = row + k
+                x, y, z = ti.static(self._step_x, self._step_y, 1)
+                eta_x = self._half_per_cell * (self._vorticity[at + x] - self._vorticity[at - x])
+                eta_y = self._half_per_cell * (self._vorticity[at + y] - self._vorticity[at - y])
+                eta_z = self._half_per_cell * (self._vorticity[at + z] - self._vorticity[at - z])
+                length = ti.sqrt(eta_x * eta_x + eta_y * eta_y + eta_z * eta_z)
+                scale = ti.select(inner_row and 2 < k < self._nz - 1, self._strength / (length + TINY_GRADIENT), 0.0)
+                omega_x, omega_y, omega_z = self._f_x[at], self._f_y[at], self._f_z[at]
+                self._f_x[at] = scale * (eta_y * omega_z - eta_z * omega_y)
+                self._f_y[at] = scale * (eta_z * omega_x - eta_x * omega_z)
+                self._f_z[at] = scale * (eta_x * omega_y - eta_y * omega_x)
+
+    @ti.kernel
+    def _apply(self, dt: ti.f32):
+        # Ghost cells have no density, no excess and no confinement: half of what the cell inside has acts on a side.
+        for i, j in ti.ndrange((1, self._nx + 2), (1, self._ny + 2)):
+            row = i * self._step_x + j * self._step_y
+            for k in range(1, self._nz + 2):
+                at = row + k
+                f_x = self._force(self._f_x, 0, at) + self._force(self._f_x, 0, at - self._step_x)
+                f_y = self._force(self._f_y, 1, at) + self._force(self._f_y, 1, at - self._step_y)
+                f_z = self._force(self._f_z, 2, at) + self._force(self._f_z, 2, at - 1)
+                self._u[at] = ti.select(self._open_x[at] > 0.0, self._u[at] + 0.5 * dt * f_x, 0.0)
+                self._v[at] = ti.select(self._open_y[at] > 0.0, self._v[at] + 0.5 * dt * f_y, 0.0)
+                self._w[at] = ti.select(self._open_z[at] > 0.0, self._w[at] + 0.5 * dt * f_z, 0.0)
+
+    @ti.func
+    def _force(self, confinement: ti.template(), axis: ti.template(), at: ti.i32):
+        return confinement[at] + self._sink[axis] * self._density[at] + self._lift[axis] * self._excess[at]

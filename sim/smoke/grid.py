@@ -1,0 +1,196 @@
+"""The staggered grid of a smoke: where its values live, which cells are solid and which faces are open.
+
+Every array is stored flat with one layer of ghost cells around it, C order, so that a value of cell (i, j, k),
+counted from 1, stands at index (i * (ny + 2) + j) * (nz + 2) + k. A face has the index of the cell on its upper side:
+`u_face_x` at (i, j, k) lies between the cells (i - 1, j, k) and (i, j, k), for i = 1 .. nx + 1. Ghosts make every
+stencil the same everywhere; which face lets air pass is decided by its conductance alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sim.scene import DomainParameters
+from sim.smoke.parameters import Face, SmokeParameters
+
+Index3 = tuple[int, int, int]
+
+DIRICHLET_CONDUCTANCE = 2.0
+"""Conductance of an open side: pressure is 0 on the face itself, half a cell from the centre."""
+
+
+class SolidRegion(Protocol):
+    """A region of space that smoke cannot enter, or that a source fills."""
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lower and upper corner of a box around it [m], (2, 3)."""
+
+    def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance [m] of points (n, 3) from the surface, negative inside, (n,)."""
+
+
+@dataclass(frozen=True)
+class SmokeGrid:
+    """A box of cubic cells, its open sides and the solid cells in it.
+
+    Solids are voxelized: a cell is solid if its centre lies inside a solid, and a face of a solid cell is closed. The
+    surface is thus a staircase, wrong by up to half a cell; flow along it slips.
+
+    Attributes:
+        origin: lower corner [m].
+        cell_size: edge of a cell [m].
+        cells: how many cells along x, y, z.
+        open_faces: sides of the box that air passes; the others are walls.
+        solid: (nx, ny, nz) bool, which cells are solid.
+    """
+
+    origin: tuple[float, float, float]
+    cell_size: float
+    cells: Index3
+    open_faces: frozenset[Face]
+    solid: NDArray[np.bool_]
+
+    @classmethod
+    def build(
+        cls, parameters: SmokeParameters, domain: DomainParameters, solids: Sequence[SolidRegion] = ()
+    ) -> SmokeGrid:
+        """The grid of a smoke: its own box, or the domain's where it names none.
+
+        A box that is no whole number of cells long is rounded up, keeping its lower corner.
+
+        Raises:
+            ValueError: the box is empty, or solids fill it.
+        """
+        lower = parameters.min if parameters.min is not None else domain.min
+        upper = parameters.max if parameters.max is not None else domain.max
+        for axis, low, high in zip("xyz", lower, upper, strict=True):
+            if high <= low:
+                raise ValueError(
+                    f'smoke "{parameters.name}": max must be above min on every axis, '
+                    f"got {axis} from {low:g} to {high:g} m"
+                )
+        # The slack keeps 1 m / 0.02 m at 50 cells where the quotient is 50.00000000000001.
+        nx, ny, nz = (
+            max(1, math.ceil((high - low) / parameters.cell_size - 1.0e-6))
+            for low, high in zip(lower, upper, strict=True)
+        )
+        empty = cls(
+            lower, parameters.cell_size, (nx, ny, nz), frozenset(parameters.open_faces), np.zeros((nx, ny, nz), bool)
+        )
+        if not solids:
+            return empty
+        solid = np.any([empty.cells_inside(region) for region in solids], axis=0)
+        if solid.all():
+            raise ValueError(f'smoke "{parameters.name}": solids fill its whole box; there is no air to move')
+        return cls(empty.origin, empty.cell_size, empty.cells, empty.open_faces, solid)
+
+    @property
+    def padded(self) -> Index3:
+        """Shape of every array, ghosts included."""
+        nx, ny, nz = self.cells
+        return nx + 2, ny + 2, nz + 2
+
+    @property
+    def size(self) -> int:
+        """Length of every flat array."""
+        return math.prod(self.padded)
+
+    @property
+    def upper(self) -> tuple[float, float, float]:
+        """Upper corner [m]."""
+        x, y, z = (low + n * self.cell_size for low, n in zip(self.origin, self.cells, strict=True))
+        return x, y, z
+
+    def is_open(self, axis: int, side: int) -> bool:
+        """Whether air passes the lower (side 0) or upper (side 1) side of the box along an axis."""
+        return f"{'xyz'[axis]}{'-+'[side]}" in self.open_faces
+
+    def cell_centres(self) -> NDArray[np.float64]:
+        """Positions [m], (nx * ny * nz, 3)."""
+        return self._positions(self.cells, (0.5, 0.5, 0.5))
+
+    def face_centres(self, axis: int) -> NDArray[np.float64]:
+        """Positions [m] of the faces across an axis, (n, 3), in the order of `face_shape`."""
+        offset = [0.5, 0.5, 0.5]
+        offset[axis] = 0.0
+        return self._positions(self.face_shape(axis), offset)
+
+    def face_shape(self, axis: int) -> Index3:
+        """How many faces across an axis there are along x, y, z."""
+        nx, ny, nz = (n + (a == axis) for a, n in enumerate(self.cells))
+        return nx, ny, nz
+
+    def cells_inside(self, region: SolidRegion) -> NDArray[np.bool_]:
+        """Cells whose centre lies in a region, (nx, ny, nz)."""
+        return _inside(region, self.cell_centres()).reshape(self.cells)
+
+    def faces_inside(self, region: SolidRegion, axis: int) -> NDArray[np.bool_]:
+        """Faces whose centre lies in a region, `face_shape(axis)`."""
+        return _inside(region, self.face_centres(axis)).reshape(self.face_shape(axis))
+
+    @cached_property
+    def open_area(self) -> tuple[NDArray[np.float64], ...]:
+        """Part of each face that air passes, 0 or 1, by axis, `face_shape(axis)`."""
+        return tuple(self._open_area(axis) for axis in range(3))
+
+    @cached_property
+    def closed_regions(self) -> list[NDArray[np.int32]]:
+        """Connected regions of air without an open side: flat indices of their cells, ascending.
+
+        Pressure is known there up to a constant only. Single cells shut in on all sides have no equation at all and
+        are left out.
+        """
+        labels, count = ndimage.label(~self.solid)
+        touches_outside = set()
+        for axis in range(3):
+            for side in (0, 1):
+                if self.is_open(axis, side):
+                    touches_outside.update(np.unique(np.take(labels, -side, axis=axis)).tolist())
+        flat_labels = self.pad(labels).ravel()
+        order = np.argsort(flat_labels, kind="stable").astype(np.int32)
+        bounds = np.searchsorted(flat_labels[order], np.arange(1, count + 2))
+        regions = [order[bounds[n - 1] : bounds[n]] for n in range(1, count + 1) if n not in touches_outside]
+        return [region for region in regions if len(region) > 1]
+
+    def pad(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
+        """Cell or face values with their ghosts, `padded`, zero where there were none."""
+        padded = np.zeros(self.padded, values.dtype)
+        padded[tuple(slice(1, 1 + n) for n in values.shape)] = values
+        return padded
+
+    def trim(self, values: NDArray[np.generic], shape: Index3) -> NDArray[np.generic]:
+        """The inner part, of a given shape, of a flat or padded array."""
+        return values.reshape(self.padded)[tuple(slice(1, 1 + n) for n in shape)]
+
+    def _positions(self, shape: Index3, offset: Sequence[float]) -> NDArray[np.float64]:
+        axes = [
+            low + (np.arange(n) + shift) * self.cell_size
+            for low, n, shift in zip(self.origin, shape, offset, strict=True)
+        ]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+    def _open_area(self, axis: int) -> NDArray[np.float64]:
+        air = np.moveaxis(~self.solid, axis, 0)
+        area = np.zeros((air.shape[0] + 1, *air.shape[1:]))
+        area[1:-1] = air[1:] & air[:-1]
+        area[0] = air[0] & self.is_open(axis, 0)
+        area[-1] = air[-1] & self.is_open(axis, 1)
+        return np.moveaxis(area, 0, axis)
+
+
+def _inside(region: SolidRegion, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points lie inside a region; distances, which are dear for meshes, are asked for near it only."""
+    lower, upper = region.bounds
+    inside = ((points >= lower) & (points <= upper)).all(axis=1)
+    if inside.any():
+        inside[inside] = region.signed_distance(points[inside]) < 0.0
+    return inside

@@ -1,0 +1,224 @@
+"""A multigrid V-cycle for the pressure equation, as a preconditioner (McAdams, Sifakis & Teran 2010).
+
+As in the paper, nothing is assembled: each level applies its stencil to arrays. Different from it: finite-volume
+coefficients instead of cell types (see `multigrid_levels`), a polynomial smoother instead of damped Jacobi with extra
+sweeps along the boundary, and cell-centred transfers: restriction adds up the children, prolongation is trilinear.
+These are not each other's transpose, so the conjugate gradients around it must be the flexible ones.
+"""
+
+import math
+
+import numpy as np
+import taichi as ti
+
+from sim.smoke.grid import SmokeGrid
+from sim.smoke.multigrid_levels import Level, build_levels
+
+SMOOTHED_SPECTRUM = (0.4, 2.0)
+"""Eigenvalues of D^-1 A that the smoother has to damp: 2 is the largest that a stencil of this kind has; modes below
+1/3 to 1/2 are smooth enough for the coarse grid. The lower end was chosen by counting iterations."""
+
+
+def chebyshev_weights(count: int, spectrum: tuple[float, float]) -> tuple[float, ...]:
+    """Damping factors of `count` Jacobi sweeps whose error polynomial is smallest over a spectrum (Young 1954)."""
+    low, high = spectrum
+    centre, radius = 0.5 * (high + low), 0.5 * (high - low)
+    return tuple(1.0 / (centre + radius * math.cos(math.pi * (n + 0.5) / count)) for n in range(count))
+
+
+@ti.data_oriented
+class MultigridVCycle:
+    """One V-cycle: an approximate solution of A z = r, from z = 0.
+
+    All levels of an array stand one after another in one flat field, so that each kernel is compiled once.
+
+    Attributes:
+        right_hand_side: r, flat, float32; its finest level is set by the caller, 0 in solid cells and ghosts.
+        solution: z, flat, float32.
+        spare: holds iterates and residuals in between.
+        conductance_x, conductance_y, conductance_z, inverse_diagonal: the levels' coefficients.
+        levels: sizes and offsets.
+    """
+
+    def __init__(self, grid: SmokeGrid) -> None:
+        levels = build_levels(grid)
+        self._cells = [level.cells for level in levels]
+        sizes = [level.size for level in levels]
+        self._offsets = [sum(sizes[:n]) for n in range(len(levels))]
+        total = sum(sizes)
+        self.right_hand_side = ti.field(ti.f32, shape=total)
+        self.solution = ti.field(ti.f32, shape=total)
+        self.spare = ti.field(ti.f32, shape=total)
+        self.conductance_x = ti.field(ti.f32, shape=total)
+        self.conductance_y = ti.field(ti.f32, shape=total)
+        self.conductance_z = ti.field(ti.f32, shape=total)
+        self.inverse_diagonal = ti.field(ti.f32, shape=total)
+        self._coarsest_count = math.prod(levels[-1].cells)
+        self._coarsest_inverse = ti.field(ti.f32, shape=(self._coarsest_count, self._coarsest_count))
+        self._upload(levels)
+        self._first_weight, self._second_weight = chebyshev_weights(2, SMOOTHED_SPECTRUM)
+
+    @property
+    def level_count(self) -> int:
+        """How many grids there are."""
+        return len(self._cells)
+
+    def apply(self) -> None:
+        """Set `solution` to the V-cycle's answer for `right_hand_side`."""
+        self._descend(0)
+
+    def _descend(self, number: int) -> None:
+        offset, (nx, ny, nz) = self._offsets[number], self._cells[number]
+        if number == self.level_count - 1:
+            self._solve_coarsest(offset, ny, nz)
+            return
+        fine = (offset, nx, ny, nz)
+        coarse_offset, (coarse_nx, coarse_ny, coarse_nz) = self._offsets[number + 1], self._cells[number + 1]
+        self._smooth_from_zero(*fine, self._first_weight)
+        self._smooth(self.spare, self.solution, *fine, self._second_weight)
+        self._compute_residual(*fine)
+        self._restrict_residual(offset, ny, nz, coarse_offset, coarse_nx, coarse_ny, coarse_nz)
+        self._descend(number + 1)
+        self._prolong_correction(*fine, coarse_offset, coarse_ny, coarse_nz)
+        self._smooth(self.solution, self.spare, *fine, self._second_weight)
+        self._smooth(self.spare, self.solution, *fine, self._first_weight)
+
+    def _upload(self, levels: list[Level]) -> None:
+        fields = (self.conductance_x, self.conductance_y, self.conductance_z)
+        for axis, field in enumerate(fields):
+            field.from_numpy(np.concatenate([level.conductance[axis].ravel() for level in levels]))
+        self.inverse_diagonal.from_numpy(np.concatenate([level.inverse_diagonal.ravel() for level in levels]))
+        # The pseudo-inverse also serves regions without an open side, where A has the constants as its null space.
+        inverse = np.linalg.pinv(levels[-1].matrix(), rcond=1.0e-10, hermitian=True)
+        self._coarsest_inverse.from_numpy(inverse.astype(np.float32))
+
+    @ti.func
+    def laplacian(self, x: ti.template(), at: ti.i32, step_x: ti.i32, step_y: ti.i32):
+        """(A x) at a cell; the steps lead to the next cell along x and y."""
+        here = x[at]
+        return (
+            self.conductance_x[at] * (here - x[at - step_x])
+            + self.conductance_x[at + step_x] * (here - x[at + step_x])
+            + self.conductance_y[at] * (here - x[at - step_y])
+            + self.conductance_y[at + step_y] * (here - x[at + step_y])
+            + self.conductance_z[at] * (here - x[at - 1])
+            + self.conductance_z[at + 1] * (here - x[at + 1])
+        )
+
+    @ti.kernel
+    def _smooth_from_zero(self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32, weight: ti.f32):
+        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
+            row = offset + (i * (ny + 2) + j) * (nz + 2)
+            for k in range(1, nz + 1):
+                at = row + k
+                self.spare[at] = weight * self.inverse_diagonal[at] * self.right_hand_side[at]
+
+    @ti.kernel
+    def _smooth(
+        self,
+        x: ti.template(),
+        improved: ti.template(),
+        offset: ti.i32,
+        nx: ti.i32,
+        ny: ti.i32,
+        nz: ti.i32,
+        weight: ti.f32,
+    ):
+        step_x, step_y = (ny + 2) * (nz + 2), nz + 2
+        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
+            row = offset + i * step_x + j * step_y
+            for k in range(1, nz + 1):
+                at = row + k
+                residual = self.right_hand_side[at] - self.laplacian(x, at, step_x, step_y)
+                improved[at] = x[at] + weight * self.inverse_diagonal[at] * residual
+
+    @ti.kernel
+    def _compute_residual(self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
+        step_x, step_y = (ny + 2) * (nz + 2), nz + 2
+        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
+            row = offset + i * step_x + j * step_y
+            for k in range(1, nz + 1):
+                at = row + k
+                self.spare[at] = self.right_hand_side[at] - self.laplacian(self.solution, at, step_x, step_y)
+
+    @ti.kernel
+    def _restrict_residual(
+        self,
+        fine_offset: ti.i32,
+        fine_ny: ti.i32,
+        fine_nz: ti.i32,
+        offset: ti.i32,
+        nx: ti.i32,
+        ny: ti.i32,
+        nz: ti.i32,
+    ):
+        step_x, step_y = (fine_ny + 2) * (fine_nz + 2), fine_nz + 2
+        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
+            row = offset + (i * (ny + 2) + j) * (nz + 2)
+            fine_row = fine_offset + (2 * i - 1) * step_x + (2 * j - 1) * step_y
+            # Children beyond an odd end are ghosts, which hold 0 in `spare`.
+            for k in range(1, nz + 1):
+                child = fine_row + 2 * k - 1
+                total = 0.0
+                for di, dj, dk in ti.static(ti.ndrange(2, 2, 2)):
+                    total += self.spare[child + di * step_x + dj * step_y + dk]
+                self.right_hand_side[row + k] = total
+
+    @ti.kernel
+    def _prolong_correction(
+        self,
+        fine_offset: ti.i32,
+        fine_nx: ti.i32,
+        fine_ny: ti.i32,
+        fine_nz: ti.i32,
+        offset: ti.i32,
+        ny: ti.i32,
+        nz: ti.i32,
+    ):
+        """Add the coarse solution, interpolated between cell centres: per axis 3/4 parent + 1/4 its neighbour.
+
+        Where the neighbour is a wall or a solid it counts as equal to the parent (no flux), beyond an open side as its
+        opposite (zero pressure on the face).
+        """
+        step_x, step_y = (ny + 2) * (nz + 2), nz + 2
+        for fine_i, fine_j in ti.ndrange((1, fine_nx + 1), (1, fine_ny + 1)):
+            i, j = (fine_i + 1) // 2, (fine_j + 1) // 2
+            row = offset + i * step_x + j * step_y
+            # An odd index is the lower child, whose neighbour lies below.
+            beside_x = ti.select(fine_i % 2 == 1, -step_x, step_x)
+            beside_y = ti.select(fine_j % 2 == 1, -step_y, step_y)
+            fine_row = fine_offset + (fine_i * (fine_ny + 2) + fine_j) * (fine_nz + 2)
+            for k in range(1, nz + 1):
+                at = row + k
+                parent = self.solution[at]
+                planes = ti.Vector([0.0, 0.0, 0.0])
+                for dk in ti.static(range(3)):
+                    there = at + dk - 1
+                    planes[dk] = (
+                        9.0 * self._value_or_mirror(there, parent)
+                        + 3.0 * self._value_or_mirror(there + beside_x, parent)
+                        + 3.0 * self._value_or_mirror(there + beside_y, parent)
+                        + self._value_or_mirror(there + beside_x + beside_y, parent)
+                    ) / 16.0
+                child = fine_row + 2 * k - 1
+                if self.inverse_diagonal[at] > 0.0:
+                    self.solution[child] += 0.75 * planes[1] + 0.25 * planes[0]
+                    if 2 * k <= fine_nz:
+                        self.solution[child + 1] += 0.75 * planes[1] + 0.25 * planes[2]
+
+    @ti.func
+    def _value_or_mirror(self, at: ti.i32, parent: ti.f32):
+        inverse = self.inverse_diagonal[at]
+        mirrored = ti.select(inverse < 0.0, -parent, parent)
+        return ti.select(inverse > 0.0, self.solution[at], mirrored)
+
+    @ti.kernel
+    def _solve_coarsest(self, offset: ti.i32, ny: ti.i32, nz: ti.i32):
+        for cell in range(self._coarsest_count):
+            total = 0.0
+            for other in range(self._coarsest_count):
+                i, j, k = other // (ny * nz), other // nz % ny, other % nz
+                at = offset + ((i + 1) * (ny + 2) + j + 1) * (nz + 2) + k + 1
+                total += self._coarsest_inverse[cell, other] * self.right_hand_side[at]
+            i, j, k = cell // (ny * nz), cell // nz % ny, cell % nz
+            self.solution[offset + ((i + 1) * (ny + 2) + j + 1) * (nz + 2) + k + 1] = total

@@ -1,0 +1,121 @@
+"""Sources: regions that set smoke, heat and velocity to at least given values."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.shapes import build_solid
+from sim.smoke.grid import SmokeGrid
+from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
+
+BLOCK = 256
+"""Cells whose emission one thread adds up."""
+
+
+@ti.data_oriented
+class Source:
+    """One source on one grid: the open cells and faces whose centres lie inside it.
+
+    Velocity is imposed before the projection, which may change it: a source drives the flow, it is no inlet. So it
+    never creates volume, and also blows in a closed box.
+
+    Attributes:
+        target_density, target_excess: what cells inside are raised to [-], [K above the air].
+        speed: largest component of the imposed velocity [m/s].
+        cell_count: how many open cells lie inside.
+    """
+
+    def __init__(
+        self,
+        parameters: SmokeSourceParameters,
+        grid: SmokeGrid,
+        *,
+        ambient_temperature: float,
+        velocity: tuple,
+        cell_fields: tuple,
+    ) -> None:
+        self.parameters = parameters
+        self.target_density = parameters.density
+        self.target_excess = parameters.temperature - ambient_temperature
+        self.speed = max(map(abs, parameters.velocity)) if parameters.velocity is not None else 0.0
+        self._density, self._excess = cell_fields
+        self._velocity = velocity
+        region = build_solid(parameters)
+        cells = grid.cells_inside(region) & ~grid.solid
+        self.cell_count = int(np.count_nonzero(cells))
+        self._cells = _index_field(_flat_indices(grid, cells))
+        self._block_count = -(-max(1, self.cell_count) // BLOCK)
+        self._emitted = ti.field(ti.f32, shape=self._block_count)
+        faces = [
+            _flat_indices(grid, grid.faces_inside(region, axis) & (grid.open_area[axis] > 0.0)) for axis in range(3)
+        ]
+        self._face_counts = [len(indices) for indices in faces]
+        self._faces = [_index_field(indices) for indices in faces]
+
+    def emit(self) -> float:
+        """Raise the fields to the source's values; returns the density added, summed over cells [-]."""
+        self._raise_cells()
+        if self.parameters.velocity is not None:
+            for axis, speed in enumerate(self.parameters.velocity):
+                self._set_faces(self._faces[axis], self._velocity[axis], self._face_counts[axis], speed)
+        return float(self._emitted.to_numpy().sum(dtype=np.float64))
+
+    @ti.kernel
+    def _raise_cells(self):
+        for block in range(self._block_count):
+            emitted = 0.0
+            for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.cell_count)):
+                at = self._cells[n]
+                before = self._density[at]
+                after = ti.max(before, self.target_density)
+                self._density[at] = after
+                emitted += after - before
+                self._excess[at] = ti.max(self._excess[at], self.target_excess)
+            self._emitted[block] = emitted
+
+    @ti.kernel
+    def _set_faces(self, faces: ti.template(), field: ti.template(), count: ti.i32, speed: ti.f32):
+        for n in range(count):
+            field[faces[n]] = speed
+
+
+def build_sources(
+    parameters: SmokeParameters, grid: SmokeGrid, *, velocity: tuple, cell_fields: tuple
+) -> Sequence[Source]:
+    """The sources of a smoke.
+
+    Raises:
+        ValueError: a source contains no open cell: it lies outside the box, in a solid, or is smaller than a cell.
+    """
+    sources = [
+        Source(
+            source,
+            grid,
+            ambient_temperature=parameters.ambient_temperature,
+            velocity=velocity,
+            cell_fields=cell_fields,
+        )
+        for source in parameters.source
+    ]
+    for number, source in enumerate(sources):
+        if source.cell_count == 0:
+            raise ValueError(
+                f'smoke "{parameters.name}", source {number}: no cell centre lies inside it; move it into the box '
+                f"from {grid.origin} to {grid.upper} m, out of solids, or make it larger than a cell "
+                f"of {grid.cell_size:g} m"
+            )
+    return sources
+
+
+def _flat_indices(grid: SmokeGrid, mask: NDArray[np.bool_]) -> NDArray[np.int32]:
+    return np.flatnonzero(grid.pad(mask)).astype(np.int32)
+
+
+def _index_field(indices: NDArray[np.int32]) -> ti.Field:
+    """A field of at least one entry, as Taichi knows no empty ones."""
+    field = ti.field(ti.i32, shape=max(1, len(indices)))
+    if len(indices):
+        field.from_numpy(indices)
+    return field

@@ -1,0 +1,23 @@
+"""A runner in a process of its own, to be killed: `run_synthetic.py FOLDER FRAMES`; exits with the run's code."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from synthetic_jobs import job_text, run_synthetic
+
+from pipeline.executors.processes import ProcessExecutor
+from pipeline.run_events import Notice, RunEvent
+
+
+class Printer:
+    def notify(self, event: RunEvent) -> None:
+        if isinstance(event, Notice):
+            print(event.message, flush=True)
+
+
+if __name__ == "__main__":
+    with ProcessExecutor() as executor:
+        text = job_text(frames=int(sys.argv[2]))
+        sys.exit(run_synthetic(Path(sys.argv[1]), executor, text, observer=Printer()).exit_code)

@@ -1,0 +1,98 @@
+"""Commands as a user calls them: what they print, where, and with which exit code."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from pipeline.cli import TEMPLATES, main
+from pipeline.job import starter
+
+
+def pipeline(*arguments: object) -> Result:
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture
+def in_tmp_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_help_of_every_command_shows_an_example():
+    assert pipeline("--help").exit_code == 0
+    for name in main.commands:
+        result = pipeline(name, "--help")
+        assert result.exit_code == 0
+        assert f"pipeline {name}" in result.stdout.split("Options:")[0].partition("\n")[2], name
+
+
+def test_new_writes_a_file_that_check_accepts(in_tmp_path):
+    result = pipeline("new", "films/my-film", "--template", "smoke")
+    assert result.exit_code == 0
+    assert result.stdout == "wrote films/my-film.toml; next: pipeline submit films/my-film.toml --preview\n"
+    checked = pipeline("check", "films/my-film.toml")
+    assert checked.exit_code == 0
+    assert checked.stderr == ""
+    assert checked.stdout.splitlines() == [
+        "films/my-film.toml: ok",
+        "  my-film: 180 frames, 3 s at 60 fps",
+        "  393,216 smoke cells",
+        "  960 x 540 pixels, preview quality",
+    ]
+
+
+def test_new_never_overwrites(in_tmp_path):
+    (in_tmp_path / "film.toml").write_text("mine")
+    result = pipeline("new", "film")
+    assert result.exit_code == 2
+    assert result.stderr == "error: film.toml: exists already; choose another name\n"
+    assert (in_tmp_path / "film.toml").read_text() == "mine"
+
+
+def test_new_refuses_a_name_that_no_job_can_have(in_tmp_path):
+    result = pipeline("new", "my film")
+    assert result.exit_code == 2
+    assert result.stderr.startswith('error: "my film": a name holds letters')
+    assert list(in_tmp_path.iterdir()) == []
+
+
+def test_templates_of_the_command_line_are_those_that_exist():
+    assert set(TEMPLATES) == set(starter.TEMPLATES)
+
+
+def test_check_prints_every_problem_on_a_line_of_its_own_and_exits_with_2(in_tmp_path):
+    (in_tmp_path / "dam.toml").write_text('name = "dam"\nfps = 0\nframs = 3\n')
+    result = pipeline("check", "dam.toml")
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.splitlines() == [
+        "error: dam.toml:2 fps: must be >= 1, got 0",
+        'error: dam.toml:3 frams: unknown key "frams"; did you mean "frames"?',
+    ]
+
+
+def test_check_applies_overrides_and_preview_and_prints_the_whole_job_as_json(in_tmp_path):
+    pipeline("new", "film")
+    result = pipeline("check", "film.toml", "--preview", "--set", "fps=30", "--json")
+    assert result.exit_code == 0
+    job = json.loads(result.stdout)
+    assert (job["name"], job["fps"], job["render"]["quality"]) == ("film-preview", 30, "draft")
+
+
+def test_warnings_go_to_the_error_stream(in_tmp_path):
+    (in_tmp_path / "still.toml").write_text(
+        'name = "still"\n[[rigid]]\nname = "r"\nposition = [0, 0, 0.5]\nshape = { type = "sphere", radius = 0.1 }\n'
+    )
+    result = pipeline("check", "still.toml")
+    assert result.exit_code == 0
+    assert result.stderr == "warning: still.toml: has neither fluid nor smoke, so nothing will move\n"
+    assert result.stdout.startswith("still.toml: ok\n")
+
+
+def test_schema_is_json():
+    assert json.loads(pipeline("schema").stdout)["title"] == "Job file"

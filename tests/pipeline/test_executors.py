@@ -1,0 +1,359 @@
+"""What every executor promises, over each of them; and what the one with processes promises besides."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import synthetic_stages
+from synthetic_stages import write_faults
+
+from pipeline.errors import InvalidArtifactError, StageUnavailableError
+from pipeline.executors.base import Assignment, Committed, Executor, Failed, Finished, Progress, Started, TaskEvent
+from pipeline.executors.failures import classify
+from pipeline.executors.inline import InlineExecutor
+from pipeline.executors.memory import read_oom_kills
+from pipeline.executors.processes import ProcessExecutor, WorkerLimits
+from pipeline.job.loading import load_job
+from pipeline.layout import JobLayout
+from pipeline.task import FailureKind, Task, TaskId
+
+JOB = """
+name = "synthetic"
+frames = 6
+
+[[smoke]]
+name = "plume"
+source = [{ shape = { type = "sphere", radius = 0.1 }, position = [0.0, 0.0, 0.2] }]
+"""
+PATIENCE_S = 30.0  # far above the second that anything here takes, so that only a hang gets there
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> JobLayout:
+    layout = JobLayout(tmp_path / "job")
+    layout.root.mkdir()
+    layout.job_file.write_text(JOB)
+    return layout
+
+
+def tasks_of(layout: JobLayout) -> dict[TaskId, Task]:
+    job = load_job(layout.job_file)
+    return {task.id: task for stage in synthetic_stages.STAGES for task in stage.plan(job, layout)}
+
+
+def assign(
+    layout: JobLayout, name: str, *, attempt: int = 1, threads: int = 1, timeout_s: float | None = None
+) -> Assignment:
+    return Assignment(
+        task=tasks_of(layout)[TaskId(name)],
+        attempt=attempt,
+        fingerprint=f"fingerprint of {name}",
+        inputs={},
+        threads=threads,
+        job_file=layout.job_file,
+        root=layout.root,
+        stages=synthetic_stages.REFERENCE,
+        timeout_s=timeout_s,
+    )
+
+
+def events_until_end(executor: Executor, count: int = 1) -> list[TaskEvent]:
+    """All events up to the end of `count` attempts."""
+    events: list[TaskEvent] = []
+    until = time.monotonic() + PATIENCE_S
+    while sum(isinstance(event, Finished | Failed) for event in events) < count:
+        assert time.monotonic() < until, f"no end; so far {events}"
+        events += executor.wait(0.5)
+    return events
+
+
+def run(executor: Executor, assignment: Assignment) -> list[TaskEvent]:
+    executor.submit(assignment)
+    return events_until_end(executor)
+
+
+def failure(events: list[TaskEvent]) -> Failed:
+    assert isinstance(events[-1], Failed), events[-1]
+    return events[-1]
+
+
+class ExecutorContract:
+    """What the runner relies on; every executor's test class inherits these tests."""
+
+    @pytest.fixture
+    def executor(self) -> Iterator[Executor]:
+        raise NotImplementedError("each executor's class gives its own")
+
+    def test_an_attempt_starts_commits_and_finishes(self, executor: Executor, layout: JobLayout) -> None:
+        events = run(executor, assign(layout, "steps"))
+        assert isinstance(events[0], Started)
+        assert isinstance(events[-1], Finished)
+        assert events[-1].peak_memory_bytes > 10e6  # no Python with these imports is smaller
+        receipts = [event.receipt for event in events if isinstance(event, Committed)]
+        assert [receipt.artifact for receipt in receipts] == [f"steps/{k:06d}.bin" for k in range(6)]
+        assert all(layout.path(receipt.artifact).stat().st_size == receipt.size for receipt in receipts)
+        assert {receipt.fingerprint for receipt in receipts} == {"fingerprint of steps"}
+        assert [event for event in events if isinstance(event, Progress)][-1].done == 6
+
+    def test_tasks_run_one_after_another(self, executor: Executor, layout: JobLayout) -> None:
+        run(executor, assign(layout, "steps"))
+        for frame in range(3):
+            assert isinstance(run(executor, assign(layout, f"double/{frame:06d}"))[-1], Finished)
+
+    def test_an_exception_becomes_a_failure_with_its_traceback(self, executor: Executor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"steps": ["fail@2"]})
+        failed = failure(run(executor, assign(layout, "steps")))
+        assert (failed.kind, failed.message) == (FailureKind.FAILED, "ValueError: a fault of the task's own")
+        assert "in _fail" in failed.details
+        assert "in _fail" in layout.log(TaskId("steps"), 1).read_text()
+
+    @pytest.mark.parametrize(
+        ("fault", "kind"),
+        [
+            ("disk full", FailureKind.DISK_FULL),
+            ("memory error", FailureKind.OUT_OF_MEMORY),
+            ("diverge", FailureKind.DIVERGED),
+        ],
+    )
+    def test_failures_are_told_apart(
+        self, executor: Executor, layout: JobLayout, fault: str, kind: FailureKind
+    ) -> None:
+        write_faults(layout.root, {"steps": [fault]})
+        assert failure(run(executor, assign(layout, "steps"))).kind is kind
+
+    def test_a_failed_attempt_leaves_no_artifact_and_the_next_one_makes_it(
+        self, executor: Executor, layout: JobLayout
+    ) -> None:
+        run(executor, assign(layout, "steps"))
+        write_faults(layout.root, {"double/000000": ["fail"]})
+        failure(run(executor, assign(layout, "double/000000")))
+        assert list((layout.root / "double").iterdir()) == []
+        assert isinstance(run(executor, assign(layout, "double/000000", attempt=2))[-1], Finished)
+
+    def test_an_unknown_stage_is_a_failure_and_not_a_crash(self, executor: Executor, layout: JobLayout) -> None:
+        broken = assign(layout, "steps")
+        object.__setattr__(broken, "stages", "synthetic_stages:ABSENT")
+        assert "ABSENT" in failure(run(executor, broken)).message
+
+    def test_the_log_has_what_the_task_printed(self, executor: Executor, layout: JobLayout) -> None:
+        run(executor, assign(layout, "steps", attempt=3))
+        assert layout.log(TaskId("steps"), 3).read_text().startswith("steps, attempt 3, on ")
+
+    def test_shutdown_reports_what_it_ended_and_may_be_repeated(self, executor: Executor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"steps": ["hang"]})
+        executor.submit(assign(layout, "steps"))
+        executor.shutdown()
+        executor.shutdown()
+        assert failure(executor.wait(0.0)).kind is FailureKind.CANCELLED
+        assert executor.wait(0.0) == []
+
+
+class TestInline(ExecutorContract):
+    @pytest.fixture
+    def executor(self) -> Iterator[Executor]:
+        with InlineExecutor() as executor:
+            yield executor
+
+    def test_a_cancelled_task_does_not_run(self, executor: Executor, layout: JobLayout) -> None:
+        executor.submit(assign(layout, "steps"))
+        executor.cancel(TaskId("steps"), grace_s=1.0)
+        assert failure(events_until_end(executor)).kind is FailureKind.CANCELLED
+        assert not (layout.root / "steps").exists()
+
+
+class TestProcesses(ExecutorContract):
+    @pytest.fixture
+    def executor(self) -> Iterator[ProcessExecutor]:
+        executor = ProcessExecutor()
+        yield executor
+        pids = executor.worker_pids
+        executor.shutdown()
+        assert executor.worker_pids == []
+        assert not any(psutil.pid_exists(pid) for pid in pids)
+
+    @pytest.mark.parametrize(
+        ("fault", "sentence"),
+        [
+            ("half a message", "exited with code 1"),
+            pytest.param("kill", "died of SIGKILL", marks=pytest.mark.slow),
+            pytest.param("exit", "exited with code 7", marks=pytest.mark.slow),
+        ],
+    )
+    def test_a_lost_worker_costs_its_own_task_only(
+        self, executor: ProcessExecutor, layout: JobLayout, fault: str, sentence: str
+    ) -> None:
+        write_faults(layout.root, {"steps": [f"{fault}@2"]})
+        failed = failure(run(executor, assign(layout, "steps")))
+        assert failed.kind is FailureKind.WORKER_LOST
+        assert sentence in failed.message
+        assert isinstance(run(executor, assign(layout, "steps", attempt=2))[-1], Finished)
+
+    def test_a_segfault_leaves_its_stack_in_the_log(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"steps": ["segfault"]})
+        failed = failure(run(executor, assign(layout, "steps")))
+        assert "died of SIGSEGV" in failed.message
+        assert "in _segfault" in failed.details
+
+    def test_a_lost_worker_leaves_its_neighbour_alone(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+        run(executor, assign(layout, "steps"))
+        write_faults(layout.root, {"double/000000": ["kill"]}, pause_s=0.2)
+        executor.submit(assign(layout, "double/000000"))
+        executor.submit(assign(layout, "double/000001"))
+        ends = {
+            event.task_id: type(event)
+            for event in events_until_end(executor, 2)
+            if isinstance(event, Finished | Failed)
+        }
+        assert ends == {"double/000000": Failed, "double/000001": Finished}
+
+    def test_what_c_prints_is_in_the_log(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"steps": ["puts"]})
+        run(executor, assign(layout, "steps"))
+        executor.shutdown()
+        assert "a line from C" in layout.log(TaskId("steps"), 1).read_text()
+
+    def test_a_warm_worker_is_kept_for_its_stage_and_replaced_when_worn_out(self, layout: JobLayout) -> None:
+        with ProcessExecutor(WorkerLimits(tasks_per_worker=2)) as executor:
+            run(executor, assign(layout, "steps"))
+            starts = [run(executor, assign(layout, f"double/{frame:06d}"))[0] for frame in range(4)]
+        pids = [event.pid for event in starts if isinstance(event, Started)]
+        assert pids[0] == pids[1] != pids[2] == pids[3]
+
+    @pytest.mark.slow
+    def test_a_worker_that_grew_too_large_is_replaced(self, layout: JobLayout) -> None:
+        with ProcessExecutor(WorkerLimits(resident_memory_bytes=1)) as executor:
+            run(executor, assign(layout, "steps"))
+            starts = [run(executor, assign(layout, f"double/{frame:06d}"))[0] for frame in range(2)]
+        pids = [event.pid for event in starts if isinstance(event, Started)]
+        assert pids[0] != pids[1]
+
+    def test_idle_workers_make_room_for_another_stage(self, layout: JobLayout) -> None:
+        with ProcessExecutor(WorkerLimits(workers=1)) as executor:
+            run(executor, assign(layout, "steps"))
+            run(executor, assign(layout, "double/000000"))
+            run(executor, assign(layout, "double/000001", threads=2))
+            staying = [pid for pid in executor.worker_pids if psutil.Process(pid).status() != psutil.STATUS_ZOMBIE]
+            assert len(staying) <= 2  # the new one, and perhaps one that is on its way out
+
+    def test_a_cancelled_task_may_stop_by_itself(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"steps": ["wait for stop@3"]})
+        executor.submit(assign(layout, "steps"))
+        events: list[TaskEvent] = []
+        while not any(isinstance(event, Committed) and "000002" in event.receipt.artifact for event in events):
+            events += executor.wait(0.5)
+        executor.cancel(TaskId("steps"), grace_s=PATIENCE_S)
+        failed = failure(events_until_end(executor))
+        assert (failed.kind, failed.message) == (FailureKind.CANCELLED, "stopped after 4 of 6 outputs")
+
+    def test_a_task_that_does_not_stop_is_killed_with_all_it_started(
+        self, executor: ProcessExecutor, layout: JobLayout
+    ) -> None:
+        write_faults(layout.root, {"film": ["child"]})
+        executor.submit(assign(layout, "film"))
+        child = _wait_for_pid(executor, layout.root / "child.pid")
+        executor.cancel(TaskId("film"), grace_s=0.1)
+        assert failure(events_until_end(executor)).kind is FailureKind.CANCELLED
+        _assert_gone(child)
+
+    def test_what_a_task_left_running_ends_with_its_worker(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"steps": ["leave child@0"]})
+        assert isinstance(run(executor, assign(layout, "steps"))[-1], Finished)
+        executor.shutdown()
+        _assert_gone(_wait_for_pid(executor, layout.root / "child.pid"))
+
+    def test_what_a_lost_worker_had_started_dies_with_it(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"film": ["child"]})
+        executor.submit(assign(layout, "film"))
+        child = _wait_for_pid(executor, layout.root / "child.pid")
+        os.kill(executor.worker_pids[0], signal.SIGKILL)
+        assert failure(events_until_end(executor)).kind is FailureKind.WORKER_LOST
+        _assert_gone(child)
+
+    @pytest.mark.slow
+    def test_a_stalled_task_is_ended_and_its_stack_is_in_the_log(self, layout: JobLayout) -> None:
+        write_faults(layout.root, {"film": ["hang"]})
+        # Longer than a worker takes to start on a busy machine, which shows no sign of life.
+        with ProcessExecutor(WorkerLimits(stall_timeout_s=5.0)) as executor:
+            failed = failure(run(executor, assign(layout, "film")))
+        assert failed.kind is FailureKind.STALLED
+        assert "in _hang" in failed.details
+
+    def test_a_task_has_a_time_limit(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"film": ["hang"]})
+        failed = failure(run(executor, assign(layout, "film", timeout_s=2.0)))
+        assert (failed.kind, failed.message) == (
+            FailureKind.TIMED_OUT,
+            "not done after 2 s; the log shows where it was",
+        )
+
+    @pytest.mark.slow
+    def test_sigterm_from_outside_lets_the_task_stop_and_the_worker_leave(
+        self, executor: ProcessExecutor, layout: JobLayout
+    ) -> None:
+        write_faults(layout.root, {"steps": ["wait for stop@1"]})
+        executor.submit(assign(layout, "steps"))
+        while not any(isinstance(event, Committed) for event in executor.wait(0.5)):
+            pass
+        os.kill(executor.worker_pids[0], signal.SIGTERM)
+        assert failure(events_until_end(executor)).kind is FailureKind.CANCELLED
+
+    def test_threads_of_native_libraries_are_limited(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+        write_faults(layout.root, {"film": ["hang"]})
+        executor.submit(assign(layout, "film", threads=3))
+        assert any(isinstance(event, Started) for event in executor.wait(PATIENCE_S))
+        assert psutil.Process(executor.worker_pids[0]).environ()["OMP_NUM_THREADS"] == "3"
+
+    def test_a_long_assignment_does_not_block_the_supervisor(
+        self, executor: ProcessExecutor, layout: JobLayout
+    ) -> None:
+        """Larger than any socket buffer, to a worker that has not begun to read."""
+        large = assign(layout, "steps")
+        object.__setattr__(large, "inputs", {f"double/{k:06d}.bin": "0" * 64 for k in range(50_000)})
+        assert isinstance(run(executor, large)[-1], Finished)
+
+
+def test_kills_for_want_of_memory_are_counted(tmp_path: Path) -> None:
+    events = tmp_path / "memory.events"
+    events.write_text("low 0\nhigh 3\nmax 12\noom 2\noom_kill 1\noom_group_kill 0\n")
+    assert read_oom_kills(events) == 1
+    assert read_oom_kills(tmp_path / "absent") is None
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (OSError(errno.EDQUOT, "quota"), FailureKind.DISK_FULL),
+        (OSError("unable to write: error message = 'No space left on device'"), FailureKind.DISK_FULL),
+        (FileNotFoundError(errno.ENOENT, "absent"), FailureKind.FAILED),
+        (StageUnavailableError("no Blender"), FailureKind.FAILED),
+    ],
+)
+def test_exceptions_are_classified_with_what_is_behind_them(error: Exception, kind: FailureKind) -> None:
+    assert classify(error) is kind
+    try:
+        raise InvalidArtifactError("not written") from error
+    except InvalidArtifactError as outer:
+        assert classify(outer) is kind
+
+
+def _wait_for_pid(executor: Executor, path: Path) -> int:
+    until = time.monotonic() + PATIENCE_S
+    while not (path.exists() and path.read_text()):
+        assert time.monotonic() < until
+        executor.wait(0.05)
+    return int(path.read_text())
+
+
+def _assert_gone(pid: int) -> None:
+    """The kernel delivers a kill in its own time, and a zombie that nobody has collected yet is gone, too."""
+    until = time.monotonic() + PATIENCE_S
+    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < until, f"{pid} is still there"
+        time.sleep(0.02)

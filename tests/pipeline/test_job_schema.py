@@ -1,0 +1,65 @@
+"""The schema that editors use, and the reference that is made of it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pipeline.job.reference import with_reference
+from pipeline.job.schema import job_schema, node_at
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def properties(schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for table in (schema, *schema["$defs"].values()):
+        for key, node in table.get("properties", {}).items():
+            yield f"{table.get('title')}.{key}", node
+
+
+def test_schema_is_of_a_dialect_that_editors_read_and_refuses_unknown_keys():
+    schema = job_schema()
+    assert schema["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+    assert schema["required"] == ["name"]
+    assert schema["additionalProperties"] is False
+    assert all(table["additionalProperties"] is False for table in schema["$defs"].values())
+
+
+def test_every_key_says_what_it_means():
+    # A table whose key is described in the words of the table itself has them there only; a constant says itself.
+    silent = [key for key, node in properties(job_schema()) if not {"description", "const", "$ref"} & set(node)]
+    assert silent == []
+
+
+def test_every_number_has_a_unit():
+    """Counts, seeds and encoder settings excepted, whose names say all."""
+    plain = {"f_stop", "seed", "samples", "crf", "playback_fps"}
+    kinds = {"number", "integer"}
+    lacking = [
+        key
+        for key, node in properties(job_schema())
+        if {node.get("type"), *(option.get("type") for option in node.get("anyOf", []))} & kinds
+        and "[" not in node["description"]
+        and key.rpartition(".")[2] not in plain
+    ]
+    assert lacking == []
+
+
+def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
+    for path, unit in {
+        ("fluid", 3, "rest_density"): "kg/m³",
+        ("fluid", 0, "dt"): "s",
+        ("rigid", 0, "position", 2): "m",
+        ("fluid", 0, "block", 1, "shape", "radius"): "m",
+        ("material", "anything", "density"): "",
+        ("fps",): "",
+    }.items():
+        node = node_at(path)
+        assert node is not None
+        assert node.unit == unit
+    assert node_at(("fluid", 0, "no_such_key")) is None
+    assert node_at(("gravity", 3)) is None
+
+
+def test_reference_in_the_documentation_is_current():
+    document = (ROOT / "docs" / "job-file.md").read_text(encoding="utf-8")
+    assert with_reference(document) == document, "run: python -m pipeline.job.reference docs/job-file.md"

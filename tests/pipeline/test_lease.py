@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import JobBusyError, LeaseLostError
+from pipeline.lease import EXPIRY_S, Lease, LeaseHolder, live_holder, read_holder
+
+ONE_DAY_S = 86_400.0
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "runner.lease"
+
+
+def write_holder(path: Path, *, age_s: float = 0.0, **changes: Any) -> LeaseHolder:
+    """Leave a lease behind as another process would have."""
+    holder = dataclasses.replace(LeaseHolder.this_process(), **changes)
+    path.write_text(json.dumps(asdict(holder)))
+    os.utime(path, (time.time() - age_s,) * 2)
+    return holder
+
+
+def ended_process() -> int:
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+        return process.pid
+
+
+def test_a_lease_names_its_holder_and_leaves_nothing_when_given_back(path: Path) -> None:
+    with Lease.acquire(path) as lease:
+        assert lease.takeover is None
+        holder = read_holder(path)
+        assert holder == lease.holder == live_holder(path)
+        assert holder.pid == os.getpid()
+    assert not path.exists()
+    assert live_holder(path) is None
+
+
+def test_a_live_holder_is_busy_and_named(path: Path) -> None:
+    with Lease.acquire(path), pytest.raises(JobBusyError, match=rf"run already, by process {os.getpid()} on \S+ since"):
+        Lease.acquire(path)
+
+
+def test_a_live_but_silent_holder_of_this_machine_keeps_its_lease(path: Path) -> None:
+    write_holder(path, age_s=ONE_DAY_S)
+    with pytest.raises(JobBusyError):
+        Lease.acquire(path)
+
+
+def test_a_holder_that_is_gone_is_taken_over_aloud(path: Path) -> None:
+    pid = ended_process()
+    write_holder(path, pid=pid)
+    assert live_holder(path) is None
+    with Lease.acquire(path) as lease:
+        assert lease.takeover == f"taking over from process {pid} on {lease.holder.host}: the process is gone"
+
+
+def test_a_zombie_counts_as_gone(path: Path) -> None:
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)  # ended, and not yet reaped
+    write_holder(path, pid=child)
+    try:
+        Lease.acquire(path).release()
+    finally:
+        os.waitpid(child, 0)
+
+
+def test_a_process_number_that_was_given_to_another_is_not_the_holder(path: Path) -> None:
+    write_holder(path, process_start="1")
+    with Lease.acquire(path) as lease:
+        assert lease.takeover is not None
+        assert "its number belongs to another process now" in lease.takeover
+
+
+def test_a_holder_from_before_the_restart_is_taken_over(path: Path) -> None:
+    write_holder(path, boot_id="an earlier one", age_s=3650 * ONE_DAY_S)
+    with Lease.acquire(path) as lease:
+        assert lease.takeover is not None
+        assert "started anew" in lease.takeover
+
+
+@pytest.mark.parametrize(
+    "elsewhere",
+    [
+        {"host": "another", "boot_id": "another"},
+        {"pid_namespace": "another container of this machine"},
+        {"boot_id": "another machine of the same name"},
+    ],
+    ids=["another host", "another container", "another host of the same name"],
+)
+def test_a_holder_elsewhere_is_judged_by_its_heartbeat(path: Path, elsewhere: dict[str, str]) -> None:
+    write_holder(path, pid=1, **elsewhere)
+    with pytest.raises(JobBusyError):
+        Lease.acquire(path)
+    write_holder(path, pid=1, age_s=EXPIRY_S + 30, **elsewhere)
+    with Lease.acquire(path) as lease:
+        assert lease.takeover is not None
+        assert "it has not been heard of for 90 s" in lease.takeover
+
+
+def test_an_illegible_lease_never_needs_a_person(path: Path) -> None:
+    path.write_text("")
+    with Lease.acquire(path) as lease:
+        assert lease.takeover == "taking over from an unknown process: its name is not legible"
+
+
+def test_a_heartbeat_renews_the_lease(path: Path) -> None:
+    with Lease.acquire(path) as lease:
+        os.utime(path, (0, 0))
+        lease.heartbeat()
+        assert abs(path.stat().st_mtime - time.time()) < EXPIRY_S
+
+
+def test_a_holder_that_was_taken_over_learns_it_and_leaves_the_new_lease_alone(path: Path) -> None:
+    with Lease.acquire(path) as old:
+        newer = write_holder(path, token="another")
+        with pytest.raises(LeaseLostError, match="was taken over by process"):
+            old.heartbeat()
+    assert read_holder(path) == newer
+
+
+def compete(path: str, barrier: Any, answers: Any) -> None:
+    barrier.wait()
+    try:
+        Lease.acquire(Path(path))
+    except JobBusyError:
+        answers.put("busy")
+    else:
+        answers.put("won")
+    barrier.wait()  # alive until all have tried
+
+
+def test_of_processes_that_race_for_a_dead_lease_exactly_one_wins(path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    racers = 4
+    write_holder(path, pid=ended_process())
+    barrier, answers = context.Barrier(racers), context.Queue()
+    processes = [context.Process(target=compete, args=(str(path), barrier, answers)) for _ in range(racers)]
+    for process in processes:
+        process.start()
+    outcomes = sorted(answers.get(timeout=60) for _ in processes)
+    for process in processes:
+        process.join(timeout=60)
+    assert outcomes == ["busy", "busy", "busy", "won"]

@@ -1,0 +1,357 @@
+"""Real pictures by the real Cycles: tiny, few samples, in child processes, as Blender has one scene per process."""
+
+from __future__ import annotations
+
+import stat
+import subprocess
+import sys
+import textwrap
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from render.blender import (
+    BlenderUnavailableError,
+    ExecutableRenderer,
+    FrameRenderError,
+    build_argv,
+    missing_libraries,
+    open_renderer,
+    parse_blender_version,
+    require_supported_executable,
+)
+from render.parameters import CameraParameters, MaterialParameters, RenderParameters, StageParameters
+from render.spec import MeshObject, MeshSequenceObject, RenderSpec, VolumeSequenceObject
+
+RESOLUTION = (64, 36)
+PROJECT = Path(__file__).resolve().parents[2]
+
+pytestmark = pytest.mark.skipif(
+    find_spec("bpy") is None or bool(missing_libraries()),
+    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
+)
+
+
+def sphere(center: tuple[float, float, float], radius: float, *, rings: int = 24, segments: int = 48):
+    """A closed sphere: positions (n, 3) and outward triangles (m, 3)."""
+    theta = np.linspace(0, np.pi, rings + 1)[1:-1]
+    phi = np.linspace(0, 2 * np.pi, segments, endpoint=False)
+    ring = np.stack(
+        [
+            np.outer(np.sin(theta), np.cos(phi)),
+            np.outer(np.sin(theta), np.sin(phi)),
+            np.outer(np.cos(theta), np.ones(segments)),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    positions = np.concatenate([ring, [(0, 0, 1), (0, 0, -1)]])
+    triangles = []
+    for i in range(rings - 2):
+        for j in range(segments):
+            a, b = i * segments + j, i * segments + (j + 1) % segments
+            triangles += [(a, a + segments, b + segments), (a, b + segments, b)]
+    last, north, south = (rings - 2) * segments, len(ring), len(ring) + 1
+    for j in range(segments):
+        k = (j + 1) % segments
+        triangles += [(north, j, k), (south, last + k, last + j)]
+    return positions * radius + np.array(center), np.array(triangles)
+
+
+def write_mesh(path: Path, positions: np.ndarray, triangles: np.ndarray, velocity=None) -> None:
+    columns = [positions] if velocity is None else [positions, np.broadcast_to(velocity, positions.shape)]
+    names = ["x", "y", "z"] if velocity is None else ["x", "y", "z", "vx", "vy", "vz"]
+    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("index", "<i4", (3,))])
+    faces["count"], faces["index"] = 3, triangles
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(positions)}",
+        *(f"property float {name}" for name in names),
+        f"element face {len(triangles)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(
+        "\n".join(header).encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes() + faces.tobytes()
+    )
+
+
+def spec_of(*objects, **render) -> RenderSpec:
+    """The unit cube seen straight from the front at 2 m; a red ball on grey."""
+    settings = {"resolution": RESOLUTION, "quality": "draft", "samples": 4, "denoise": False, "device": "cpu"} | render
+    return RenderSpec(
+        fps=60.0,
+        domain_min=(-0.5, -0.5, 0.0),
+        domain_max=(0.5, 0.5, 1.0),
+        camera=CameraParameters(position=(0.0, -2.5, 0.5), look_at=(0.0, 0.0, 0.5)),
+        stage=StageParameters(),
+        objects=objects,
+        render=RenderParameters(**settings),
+    )
+
+
+# Fully rough, so that no highlight hides the colour.
+BALL = MeshSequenceObject(
+    name="ball",
+    file="ball/{frame}.ply",
+    material=MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0),
+)
+
+# Share of red in a pixel: 0.29 on the grey stage, about 0.7 on the ball.
+MOSTLY_RED = 0.45
+FAINTLY_RED = 0.33
+
+
+def write_ball_frames(folder: Path) -> None:
+    """Frame 0: still. 1: moved. 2: still shape that flies along x. 3: empty. 4: NaN. 5: truncated. 6: missing."""
+    positions, triangles = sphere((0.0, 0.0, 0.5), 0.3)
+    write_mesh(folder / "ball/000000.ply", positions, triangles, velocity=(0.0, 0.0, 0.0))
+    write_mesh(folder / "ball/000001.ply", positions + np.array((0.15, 0.0, 0.0)), triangles, velocity=(0.0, 0.0, 0.0))
+    write_mesh(folder / "ball/000002.ply", positions, triangles, velocity=(24.0, 0.0, 0.0))
+    write_mesh(folder / "ball/000003.ply", np.zeros((0, 3)), np.zeros((0, 3), int), velocity=(0.0, 0.0, 0.0))
+    broken = positions.copy()
+    broken[7] = np.nan
+    write_mesh(folder / "ball/000004.ply", broken, triangles)
+    whole = (folder / "ball/000000.ply").read_bytes()
+    (folder / "ball/000005.ply").write_bytes(whole[: len(whole) // 2])
+
+
+def run_python(code: str, *arguments: str) -> str:
+    """Run code in a fresh Python of this environment, from the project's folder; returns what it printed."""
+    completed = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code), *arguments],
+        cwd=PROJECT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert completed.returncode == 0, completed.stdout + completed.stderr
+    return completed.stdout
+
+
+RENDER_FRAMES = """
+    import sys
+    from pathlib import Path
+    from render.blender import FrameRenderError, open_renderer
+    folder = Path(sys.argv[1])
+    renderer = open_renderer(folder / "spec.json", threads=1, blender=None)
+    print("DEVICE", renderer.device)
+    for frame in map(int, sys.argv[3].split(",")):
+        try:
+            renderer.render(frame, folder / sys.argv[2].format(frame=frame))
+        except FrameRenderError as error:
+            print("REFUSED", error)
+    renderer.close()
+"""
+
+
+def read(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB")).astype(float)
+
+
+def redness(picture: np.ndarray) -> np.ndarray:
+    return picture[..., 0] / (picture.sum(axis=2) + 1.0)
+
+
+@pytest.fixture(scope="module")
+def ball_pictures(tmp_path_factory) -> tuple[Path, str]:
+    """All ball frames, drawn in one process; and what it printed."""
+    folder = tmp_path_factory.mktemp("ball")
+    write_ball_frames(folder)
+    spec_of(BALL).write(folder / "spec.json")
+    return folder, run_python(RENDER_FRAMES, str(folder), ".{frame:06d}.png.part#1", "0,1,2,3,4,5,6,0")
+
+
+def test_a_frame_is_neither_black_nor_uniform(ball_pictures):
+    picture = read(ball_pictures[0] / ".000000.png.part#1")
+    assert picture.shape == (RESOLUTION[1], RESOLUTION[0], 3)
+    # A grey stage with lights: far from black (0) and from overexposed (255), with structure.
+    assert 20 < picture.mean() < 235
+    assert picture.std() > 5
+
+
+def test_the_mask_of_a_sphere_has_the_area_of_its_projection(ball_pictures):
+    folder, _ = ball_pictures
+    mask = redness(read(folder / ".000000.png.part#1")) > MOSTLY_RED
+    # A sphere of radius r at distance d is seen under tan = r / sqrt(d² - r²); 50 mm on a 36 mm sensor.
+    pixels_per_tangent = RESOLUTION[0] * 50.0 / 36.0
+    radius = pixels_per_tangent * 0.3 / np.sqrt(2.5**2 - 0.3**2)
+    # Half a pixel of radius either way is what a rim of mixed pixels is worth; shading at the rim takes a little more.
+    assert np.sqrt(mask.sum() / np.pi) == pytest.approx(radius, abs=0.8)
+
+
+def test_neighbouring_frames_differ_where_the_mesh_moved(ball_pictures):
+    folder, _ = ball_pictures
+    columns = [
+        np.nonzero(redness(read(folder / f".{frame:06d}.png.part#1")) > MOSTLY_RED)[1].mean() for frame in (0, 1)
+    ]
+    moved = RESOLUTION[0] * 50.0 / 36.0 * 0.15 / 2.5
+    # Centroids of masks of 160 pixels are good to a fraction of a pixel.
+    assert columns[1] - columns[0] == pytest.approx(moved, abs=0.6)
+
+
+def test_velocity_attribute_blurs_the_edges_by_speed_times_shutter(ball_pictures):
+    folder, _ = ball_pictures
+    row = RESOLUTION[1] // 2
+    still, flying = (
+        int((redness(read(folder / f".{frame:06d}.png.part#1"))[row] > FAINTLY_RED).sum()) for frame in (0, 2)
+    )
+    travelled = RESOLUTION[0] * 50.0 / 36.0 * (24.0 * 0.5 / 60.0) / 2.5
+    # The trace is as much wider as the ball travels while the shutter is open, less its two thinnest ends, where
+    # less than a quarter of the exposure shows red; and two pixels because the edges fall anywhere inside a pixel.
+    assert 0.5 * travelled - 1 <= flying - still <= travelled + 1
+
+
+def test_an_empty_mesh_draws_nothing(ball_pictures):
+    assert (redness(read(ball_pictures[0] / ".000003.png.part#1")) < 0.5).all()
+
+
+def test_broken_input_is_refused_with_frame_and_file(ball_pictures):
+    folder, printed = ball_pictures
+    refused = [line for line in printed.splitlines() if line.startswith("REFUSED")]
+    assert len(refused) == 3
+    assert "frame 4:" in refused[0] and "1 vertices whose positions are not finite" in refused[0]
+    assert "frame 5:" in refused[1] and "truncated" in refused[1]
+    assert "frame 6:" in refused[2] and "000006.ply" in refused[2] and "No such file" in refused[2]
+    assert not (folder / ".000004.png.part#1").exists()
+
+
+def test_another_process_draws_the_same_bytes(ball_pictures, tmp_path):
+    folder, printed = ball_pictures
+    assert "DEVICE CPU" in printed
+    run_python(RENDER_FRAMES, str(folder), "again-{frame}.png", "0")
+    assert (folder / "again-0.png").read_bytes() == (folder / ".000000.png.part#1").read_bytes()
+
+
+@pytest.fixture
+def blender_stand_in(tmp_path) -> Path:
+    """An executable with Blender's command line around this environment's own Blender, the bpy module."""
+    script = tmp_path / "stand in" / "blender"
+    script.parent.mkdir()
+    script.write_text(
+        f"#!{sys.executable}\n"
+        + textwrap.dedent(
+            """
+            import runpy, sys
+            arguments = sys.argv[1:]
+            if arguments == ["--version"]:
+                print("Blender 5.0.1")
+                sys.exit()
+            print("noise that Blender prints before anything else")
+            assert arguments[:2] == ["--background", "--factory-startup"], arguments
+            runpy.run_path(arguments[arguments.index("--python") + 1], run_name="__main__")
+            """
+        )
+    )
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    return script
+
+
+def test_external_executable_draws_the_same_bytes_as_the_module(ball_pictures, blender_stand_in):
+    folder, _ = ball_pictures
+    renderer = open_renderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
+    try:
+        assert renderer.device == "CPU"
+        renderer.render(0, folder / "external 0.png")
+        with pytest.raises(FrameRenderError, match=r"frame 4: .*not finite"):
+            renderer.render(4, folder / "external 4.png")
+        renderer.render(1, folder / "external 1.png")
+    finally:
+        renderer.close()
+    for frame in (0, 1):
+        expected = (folder / f".{frame:06d}.png.part#1").read_bytes()
+        assert (folder / f"external {frame}.png").read_bytes() == expected
+    assert isinstance(renderer, ExecutableRenderer)
+    assert renderer._process.poll() is not None
+
+
+def test_a_killed_executable_is_reported_with_its_last_lines(ball_pictures, blender_stand_in):
+    folder, _ = ball_pictures
+    renderer = ExecutableRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
+    renderer._process.kill()
+    renderer._process.wait()
+    with pytest.raises(FrameRenderError, match=r"(?s)exit code -9 .*noise that Blender prints"):
+        renderer.render(0, folder / "never.png")
+    renderer.close()
+
+
+def test_missing_spec_is_refused_by_the_executable(tmp_path, blender_stand_in):
+    with pytest.raises(BlenderUnavailableError, match=r"cannot read the render specification .*nothing\.json"):
+        open_renderer(tmp_path / "nothing.json", threads=1, blender=str(blender_stand_in))
+
+
+def test_missing_volume_and_damaged_volume_are_refused(tmp_path):
+    smoke = VolumeSequenceObject(name="smoke", file="smoke/{frame}.vdb", material=MaterialParameters(look="smoke"))
+    spec_of(smoke, samples=1).write(tmp_path / "spec.json")
+    (tmp_path / "smoke").mkdir()
+    (tmp_path / "smoke/000001.vdb").write_bytes(b"this is no volume")
+    printed = run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0,1")
+    assert "frame 0: the volume" in printed and "000000.vdb does not exist" in printed
+    assert "frame 1: cannot read the volume" in printed
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_every_look_and_stage_builds_and_draws(tmp_path):
+    positions, triangles = sphere((0.0, 0.0, 0.0), 0.12, rings=8, segments=12)
+    write_mesh(tmp_path / "ball.ply", positions, triangles)
+    looks = ("water", "rubber", "ceramic", "plastic", "metal", "stone", "glass")
+    objects = tuple(
+        MeshObject(
+            name=look,
+            file="ball.ply",
+            position=(-0.3 + 0.3 * (index % 3), 0.0, 0.15 + 0.3 * (index // 3)),
+            material=MaterialParameters(look=look),
+        )
+        for index, look in enumerate(looks)
+    )
+    for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor")):
+        spec = spec_of(*objects, samples=2).model_copy(update={"stage": stage, "camera": CameraParameters()})
+        spec.write(tmp_path / "spec.json")
+        run_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")
+        assert 10 < read(tmp_path / f"{stage.name}.png").mean() < 245
+
+
+def test_spec_survives_its_json(tmp_path):
+    spec = spec_of(BALL, seed=7)
+    spec.write(tmp_path / "spec.json")
+    assert RenderSpec.model_validate_json((tmp_path / "spec.json").read_text()) == spec
+
+
+def test_argv_starts_blender_without_the_users_settings():
+    argv = build_argv("/opt/blender", Path("/job/spec.json"), threads=3)
+    script = argv[argv.index("--python") + 1]
+    assert argv[:6] == ["/opt/blender", "--background", "--factory-startup", "--threads", "3", "--python"]
+    assert Path(script).is_file()
+    assert argv[argv.index("--") + 1 :] == ["/job/spec.json", "--serve", "--threads", "3"]
+
+
+@pytest.mark.parametrize(
+    ("text", "version"),
+    [
+        ("Blender 4.5.3 LTS\n\tbuild date: 2025-09-09\n", (4, 5, 3)),
+        ("Color management: warning\nBlender 5.2.0 LTS\n", (5, 2, 0)),
+        ("GNU coreutils 9.1\n", None),
+    ],
+)
+def test_version_is_read_from_what_blender_prints(text, version):
+    assert parse_blender_version(text) == version
+
+
+def test_old_and_foreign_and_missing_executables_are_refused(tmp_path):
+    def executable(name: str, text: str) -> str:
+        path = tmp_path / name
+        path.write_text(f"#!/bin/sh\necho '{text}'\n")
+        path.chmod(0o755)
+        return str(path)
+
+    with pytest.raises(BlenderUnavailableError, match=r"is Blender 4\.2\.1; 4\.5 LTS or newer"):
+        require_supported_executable(executable("old", "Blender 4.2.1 LTS"))
+    with pytest.raises(BlenderUnavailableError, match="is not a Blender executable"):
+        require_supported_executable(executable("foreign", "hello"))
+    with pytest.raises(BlenderUnavailableError, match=r"cannot start .*No such file"):
+        require_supported_executable(str(tmp_path / "missing"))

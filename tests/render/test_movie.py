@@ -1,0 +1,179 @@
+"""Films: colours, timestamps, independence of segments, and damaged files."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from render.errors import InvalidFileError
+from render.movie import encode_segment, frame_rate, join_segments, validate_movie
+from render.parameters import MovieParameters
+
+PARAMETERS = MovieParameters(preset="veryfast")
+
+
+def picture(path: Path, index: int, size: tuple[int, int] = (64, 48)) -> Path:
+    """A bright square that moves over a gradient; noise keeps the encoder from skipping anything."""
+    width, height = size
+    pixels = np.random.default_rng(index).integers(0, 40, (height, width, 3)).astype(np.uint8)
+    pixels[..., 1] += np.linspace(0, 200, width).astype(np.uint8)
+    pixels[10:20, (3 * index) % (width - 10) : (3 * index) % (width - 10) + 10] = 255
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("frames")
+    return [picture(folder / f"{index:06d}.png", index) for index in range(62)]
+
+
+def encode(path: Path, pictures: list[Path], fps: float = 60, **changes) -> Path:
+    encode_segment(pictures, path, fps=fps, **{"parameters": PARAMETERS, "threads": 1, **changes})
+    return path
+
+
+def encode_all(folder: Path, pictures: list[Path], fps: float = 60) -> list[Path]:
+    starts = range(0, len(pictures), 30)
+    return [encode(folder / f"{start:04d}.mp4", pictures[start : start + 30], fps) for start in starts]
+
+
+def decode(path: Path) -> tuple[list[np.ndarray], list[Fraction]]:
+    with av.open(str(path)) as container:
+        frames = [(frame.to_ndarray(), frame.pts * frame.time_base) for frame in container.decode(video=0)]
+    planes, times = zip(*frames, strict=True)
+    return list(planes), list(times)
+
+
+@pytest.mark.parametrize("fps", [60, 24, 23.976, 7.3])
+def test_the_film_shows_the_segments_frames_at_exact_times(tmp_path, pictures, fps):
+    segments = encode_all(tmp_path, pictures, fps)
+    film = tmp_path / "film.mp4"
+    join_segments(segments, film)
+    validate_movie(film, 62)
+    frames, times = decode(film)
+    assert times == [index / frame_rate(fps) for index in range(62)]
+    expected = [frame for segment in segments for frame in decode(segment)[0]]
+    np.testing.assert_array_equal(frames, expected)
+
+
+def test_the_film_looks_like_its_pictures(tmp_path, pictures):
+    planes, _ = decode(encode(tmp_path / "segment.mp4", pictures[:10], parameters=MovieParameters(crf=8)))
+    for plane, path in zip(planes, pictures, strict=False):
+        luma = 16 + 219 / 255 * np.asarray(Image.open(path)) @ np.array([0.2126, 0.7152, 0.0722])
+        difference = plane[:48, :64] - luma
+        assert abs(difference.mean()) < 0.5  # rounding has no bias; a wrong range would shift by up to 16
+        assert np.sqrt((difference**2).mean()) < 3.0  # crf 8 quantizes the noise in steps of a few levels
+
+
+@pytest.mark.parametrize(
+    ("color", "luma"),
+    # Y' = 16 + 219 (0.2126 R' + 0.7152 G' + 0.0722 B') after ITU-R BT.709-6; BT.601 would give 81, 145, 41.
+    [((255, 0, 0), 63), ((0, 255, 0), 173), ((0, 0, 255), 32), ((255, 255, 255), 235), ((0, 0, 0), 16)],
+)
+def test_colours_are_converted_by_bt709(tmp_path, color, luma):
+    plain = tmp_path / "000000.png"
+    Image.new("RGB", (32, 32), color).save(plain)
+    planes, _ = decode(encode(tmp_path / "segment.mp4", [plain]))
+    np.testing.assert_array_equal(planes[0][:32, :32], luma)
+
+
+def test_colours_are_tagged_as_bt709_in_the_film_and_its_frames(tmp_path, pictures):
+    film = tmp_path / "film.mp4"
+    join_segments(encode_all(tmp_path, pictures[:32]), film)
+    with av.open(str(film)) as container:
+        context = container.streams.video[0].codec_context
+        frame = next(container.decode(video=0))
+        for tagged in (context, frame):
+            tags = (tagged.color_primaries, tagged.color_trc, tagged.colorspace, tagged.color_range)
+            assert tags == (1, 1, 1, 1)  # BT.709 three times, and MPEG (limited) range
+        assert context.pix_fmt == "yuv420p"
+
+
+def test_the_index_stands_in_front_of_the_pictures(tmp_path, pictures):
+    film = tmp_path / "film.mp4"
+    join_segments(encode_all(tmp_path, pictures[:32]), film)
+    content = film.read_bytes()
+    assert 0 < content.find(b"moov") < content.find(b"mdat")
+
+
+def test_two_encodes_give_equal_bytes(tmp_path, pictures):
+    first = encode(tmp_path / "first.mp4", pictures[:30]).read_bytes()
+    for seed in range(8):
+        # Freed memory with other content: an encoder that reads what it did not write betrays itself.
+        leftovers = [np.full(size, seed, np.uint8) for size in range(1000, 300_000, 10_000)]
+        del leftovers
+        assert encode(tmp_path / "second.mp4", pictures[:30]).read_bytes() == first
+    join_segments([tmp_path / "first.mp4", tmp_path / "second.mp4"], tmp_path / "film.mp4")
+    join_segments([tmp_path / "first.mp4", tmp_path / "second.mp4"], tmp_path / "again.mp4")
+    assert (tmp_path / "film.mp4").read_bytes() == (tmp_path / "again.mp4").read_bytes()
+
+
+def test_a_changed_frame_changes_only_its_segment(tmp_path, pictures):
+    before = [path.read_bytes() for path in encode_all(tmp_path, pictures)]
+    changed = [*pictures]
+    changed[35] = picture(tmp_path / "000035.png", 99)
+    after = [path.read_bytes() for path in encode_all(tmp_path, changed)]
+    assert [old == new for old, new in zip(before, after, strict=True)] == [True, False, True]
+
+
+@pytest.mark.parametrize("lengths", [(1,), (2, 30), (30, 1), (1, 2, 3), (30, 30, 2)])
+def test_segments_of_any_length_join(tmp_path, pictures, lengths):
+    """One or two frames have no B-frames, so their decoding order starts elsewhere."""
+    segments = [encode(tmp_path / f"{index}.mp4", pictures[:length]) for index, length in enumerate(lengths)]
+    join_segments(segments, tmp_path / "film.mp4")
+    validate_movie(tmp_path / "film.mp4", sum(lengths))
+    assert decode(tmp_path / "film.mp4")[1] == [Fraction(index, 60) for index in range(sum(lengths))]
+
+
+@pytest.mark.parametrize("size", [(63, 48), (64, 47)])
+def test_odd_sizes_are_refused(tmp_path, size):
+    odd = picture(tmp_path / "000000.png", 0, size)
+    with pytest.raises(InvalidFileError, match=f"is {size[0]}x{size[1]} pixels, but H.264 needs an even"):
+        encode(tmp_path / "segment.mp4", [odd])
+
+
+def test_pictures_of_two_sizes_are_refused(tmp_path, pictures):
+    other = picture(tmp_path / "000001.png", 0, (32, 32))
+    with pytest.raises(InvalidFileError, match=r"000001\.png: is 32x32 pixels, but 000000\.png is 64x48"):
+        encode(tmp_path / "segment.mp4", [pictures[0], other])
+
+
+def test_segments_of_two_encodings_are_refused(tmp_path, pictures):
+    one = encode(tmp_path / "one.mp4", pictures[:3])
+    other = encode(tmp_path / "other.mp4", pictures[:3], fps=24)
+    with pytest.raises(InvalidFileError, match=r"other\.mp4: was encoded otherwise than .*one\.mp4"):
+        join_segments([one, other], tmp_path / "film.mp4")
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.01, 0.3, 0.7, 0.99])
+def test_a_truncated_film_is_refused(tmp_path, pictures, kept):
+    film = encode(tmp_path / "film.mp4", pictures[:30])
+    content = film.read_bytes()
+    film.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(InvalidFileError):
+        validate_movie(film, 30)
+
+
+@pytest.mark.parametrize("expected", [29, 31])
+def test_a_film_of_another_length_is_refused(tmp_path, pictures, expected):
+    film = encode(tmp_path / "film.mp4", pictures[:30])
+    with pytest.raises(InvalidFileError, match=f"has 30 frames, expected {expected}"):
+        validate_movie(film, expected)
+
+
+def test_nothing_to_encode_or_join_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="at least one picture"):
+        encode(tmp_path / "segment.mp4", [])
+    with pytest.raises(ValueError, match="at least one segment"):
+        join_segments([], tmp_path / "film.mp4")
+
+
+def test_a_missing_segment_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"missing\.mp4"):
+        join_segments([tmp_path / "missing.mp4"], tmp_path / "film.mp4")

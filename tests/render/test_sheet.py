@@ -1,0 +1,54 @@
+"""Contact sheets: every frame in its place, with its number."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from render.sheet import contact_sheet, frame_label
+
+COLORS = [(200, 0, 0), (0, 200, 0), (0, 0, 200), (200, 200, 0), (0, 200, 200)]
+
+
+@pytest.fixture
+def pictures(tmp_path):
+    paths = []
+    for index, color in enumerate(COLORS):
+        paths.append(tmp_path / f"{index:06d}.png")
+        Image.new("RGB", (64, 36), color).save(paths[-1])
+    return paths
+
+
+def test_frames_stand_row_by_row(tmp_path, pictures):
+    contact_sheet(pictures, tmp_path / "sheet.png", columns=2, width=212)
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
+    # Two cells of 100 pixels and three gaps of 4; a cell is 100 * 36 / 64 = 56 pixels high; three rows.
+    assert sheet.shape == (3 * 60 + 4, 212, 3)
+    for index, color in enumerate(COLORS):
+        row, column = divmod(index, 2)
+        middle = sheet[4 + 60 * row + 20, 4 + 104 * column + 50]
+        np.testing.assert_array_equal(middle, color)
+    np.testing.assert_array_equal(sheet[150, 160], sheet[0, 0])  # the last cell stays empty
+
+
+def test_frames_carry_their_labels(tmp_path, pictures):
+    contact_sheet(pictures[:1], tmp_path / "one.png", columns=1, width=200)
+    contact_sheet(pictures[:1], tmp_path / "two.png", columns=1, width=200, labels=["frame 7"])
+    one, two = (np.asarray(Image.open(tmp_path / name)) for name in ("one.png", "two.png"))
+    assert (one != COLORS[0]).any()
+    assert (one != two).any()
+
+
+def test_labels_are_frame_numbers(tmp_path):
+    assert frame_label(tmp_path / "000042.png") == "42"
+    assert frame_label(tmp_path / "before.png") == "before"
+
+
+def test_impossible_sheets_are_refused(tmp_path, pictures):
+    with pytest.raises(ValueError, match="at least one picture"):
+        contact_sheet([], tmp_path / "sheet.png")
+    with pytest.raises(ValueError, match="5 columns do not fit into 40 pixels"):
+        contact_sheet(pictures, tmp_path / "sheet.png", columns=5, width=40)
+    with pytest.raises(ValueError, match="5 pictures need as many labels, got 1"):
+        contact_sheet(pictures, tmp_path / "sheet.png", labels=["first"])

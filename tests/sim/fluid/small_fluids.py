@@ -1,0 +1,39 @@
+"""Builds small fluids in small boxes."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
+from sim.fluid.parameters import FluidParameters
+from sim.fluid.wcsph import WCSPHSolver
+from sim.scene import DomainParameters
+
+EARTH = (0.0, 0.0, -9.81)
+EVERY_FACE = ("x-", "x+", "y-", "y+", "z-", "z+")
+
+
+def lattice(low: tuple[float, ...], high: tuple[float, ...], spacing: float) -> NDArray[np.float32]:
+    """Cubic lattice that fills a box, half a spacing from its faces."""
+    axes = [np.arange(a + spacing / 2, b - spacing / 4, spacing) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+def make_fluid(
+    domain: DomainParameters,
+    positions: NDArray[np.float32],
+    velocities: NDArray[np.float32] | None = None,
+    gravity: tuple[float, float, float] = EARTH,
+    **parameters: object,
+) -> WCSPHSolver:
+    material = FluidParameters.model_validate(
+        {"name": "water", "block": [{"shape": {"type": "box", "size": (1, 1, 1)}}], **parameters}
+    )
+    walls = domain_wall_samples(domain, 2.0 * material.particle_radius)
+    return WCSPHSolver(
+        material,
+        domain=domain,
+        gravity=gravity,
+        positions=positions,
+        velocities=np.zeros_like(positions) if velocities is None else velocities,
+        boundary=BoundarySamples.of_bodies(walls),
+    )

@@ -1,0 +1,246 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_fluids import EVERY_FACE, lattice, make_fluid
+
+from sim.fluid.wcsph import expected_sound_speed
+from sim.scene import DomainParameters
+
+OPEN_SPACE = DomainParameters(min=(-1.0, -1.0, -1.0), max=(1.0, 1.0, 1.0), open_faces=EVERY_FACE)
+
+
+def steps(fluid, count: int) -> None:
+    for _ in range(count):
+        fluid.substep(fluid.stable_dt())
+
+
+def test_filled_lattice_has_rest_density_beside_walls_too(taichi_cpu):
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.2, 0.2, 0.2), open_faces=())
+    fluid = make_fluid(domain, lattice((0.0,) * 3, (0.2,) * 3, 0.02))
+    arrays = fluid.snapshots()["water"].arrays
+    walls = (arrays["position"] < 0.02) | (arrays["position"] > 0.18)
+    inside, flat = walls.sum(axis=1) == 0, walls.sum(axis=1) == 1
+    np.testing.assert_allclose(arrays["density"][inside], 1000.0, rtol=1e-3)
+    # The lattice of the walls is stretched by 1 % here to meet its edges.
+    np.testing.assert_allclose(arrays["density"][flat], 1000.0, rtol=1e-2)
+
+
+def test_free_fall_is_exact_for_symplectic_euler(taichi_cpu):
+    particles = lattice((-0.05,) * 3, (0.05,) * 3, 0.02)
+    fluid = make_fluid(OPEN_SPACE, particles, dt=1.0e-3)
+    steps(fluid, 100)
+    arrays = fluid.snapshots()["water"].arrays
+    # v = g t and x = x0 + g dt² n (n + 1)/2; a hundred float32 roundings of positions below 1 m.
+    np.testing.assert_allclose(arrays["velocity"][:, 2], -9.81 * 0.1, rtol=1e-4)
+    np.testing.assert_allclose(arrays["position"][:, 2] - particles[:, 2], -9.81e-6 * 100 * 101 / 2, rtol=1e-3)
+
+
+def test_free_blob_keeps_its_momentum_through_viscosity_and_cohesion(taichi_cpu):
+    particles = lattice((-0.1,) * 3, (0.1,) * 3, 0.02)
+    velocities = np.random.default_rng(5).normal(0.0, 0.3, particles.shape).astype(np.float32)
+    fluid = make_fluid(
+        OPEN_SPACE, particles, velocities, gravity=(0.0, 0.0, 0.0), viscosity=0.01, surface_tension=1.0e-4
+    )
+    before = fluid.diagnostics()
+    steps(fluid, 100)
+    after = fluid.diagnostics()
+    scale = before["mass"] * 0.3 * np.sqrt(3.0)
+    for axis in "xyz":
+        # Pair forces cancel to float32 rounding (6e-8) of each of a hundred kicks.
+        assert abs(after[f"momentum_{axis}"] - before[f"momentum_{axis}"]) < 1e-5 * scale
+    assert after["kinetic_energy"] < before["kinetic_energy"]
+
+
+def test_cohesion_pulls_a_blob_together(taichi_cpu):
+    particles = lattice((-0.05,) * 3, (0.05,) * 3, 0.02)
+
+    def radial_speed(surface_tension: float) -> float:
+        fluid = make_fluid(OPEN_SPACE, particles, gravity=(0.0, 0.0, 0.0), surface_tension=surface_tension)
+        steps(fluid, 5)
+        velocity = fluid.snapshots()["water"].arrays["velocity"]
+        return float((velocity * particles).sum())
+
+    assert radial_speed(0.0) == 0.0  # the density of a free surface is below rest density: no pressure, no force
+    assert radial_speed(1.0e-4) < 0.0
+
+
+def test_nobody_leaks_and_the_walls_hold_by_pressure_alone(dam_break):
+    fluid = dam_break()
+    for _ in range(900):
+        fluid.substep(fluid.stable_dt())
+        assert fluid.first_bad_quantity() is None
+    position = fluid.snapshots()["water"].arrays["position"]
+    low, high = np.float32((0.0, 0.0, 0.0)), np.float32((0.4, 0.12, 0.4))
+    assert int(((position < low) | (position > high)).any(axis=1).sum()) == 0
+    assert fluid.diagnostics()["wall_contacts"] == 0.0
+    assert fluid.particle_count + fluid.particles_removed == 360
+
+
+def test_walls_and_pressure_never_add_energy(dam_break):
+    fluid = dam_break(viscosity=0.0)
+
+    def energy() -> float:
+        now = fluid.diagnostics()
+        return now["kinetic_energy"] + now["potential_energy"] + now["elastic_energy"]
+
+    energies = [energy()]
+    for _ in range(20):
+        steps(fluid, 40)
+        energies.append(energy())
+    # Pressure and walls derive from the elastic energy, and artificial viscosity dissipates. Symplectic Euler swings
+    # about the true energy by O(c_s dt / d) of the elastic part, 0.4 of some 10 mJ.
+    assert max(np.diff(energies)) < 0.004
+    assert energies[-1] < 0.9 * energies[0]
+
+
+def test_particles_that_pass_an_open_face_are_removed_and_counted(taichi_cpu):
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.4, 0.2, 0.2), open_faces=("x+",))
+    particles = lattice((0.2, 0.05, 0.05), (0.4, 0.15, 0.15), 0.02)
+    velocities = np.zeros_like(particles)
+    velocities[:, 0] = 2.0
+    fluid = make_fluid(domain, particles, velocities, gravity=(0.0, 0.0, 0.0))
+    time = 0.0
+    while time < 0.06:  # 0.12 m: the front six of ten layers
+        dt = fluid.stable_dt()
+        fluid.substep(dt)
+        time += dt
+    arrays = fluid.snapshots()["water"].arrays
+    assert fluid.particles_removed == pytest.approx(6 / 10 * len(particles), abs=len(particles) / 10)
+    assert len(arrays["position"]) == fluid.particle_count == len(particles) - fluid.particles_removed
+    assert (np.diff(arrays["particle_id"]) > 0).all()
+    assert (arrays["position"][:, 0] <= np.float32(0.4)).all()
+
+
+def test_ten_steps_equal_five_restore_five(dam_break):
+    whole, first, second = dam_break(), dam_break(), dam_break()
+    for fluid in (whole, first, second):
+        steps(fluid, 150)  # past several neighbour searches, so that the order is no longer the first one
+    steps(second, 37)  # whatever it did before, it is forgotten
+    steps(whole, 10)
+    steps(first, 5)
+    second.restore(first.checkpoint())
+    steps(second, 5)
+    assert whole.diagnostics() == {**second.diagnostics(), **_frame_counters(whole)}
+    for name, array in whole.checkpoint().items():
+        np.testing.assert_array_equal(array, second.checkpoint()[name], err_msg=name)
+    for name, array in whole.snapshots()["water"].arrays.items():
+        np.testing.assert_array_equal(array, second.snapshots()["water"].arrays[name], err_msg=name)
+
+
+def _frame_counters(fluid) -> dict[str, float]:
+    """What counts since the frame began, which a restart begins anew."""
+    return {name: fluid.diagnostics()[name] for name in ("wall_contacts", "neighbor_searches", "substeps")}
+
+
+def test_a_checkpoint_is_not_changed_by_later_steps(dam_break):
+    fluid = dam_break()
+    saved = fluid.checkpoint()
+    copy = {name: array.copy() for name, array in saved.items()}
+    steps(fluid, 3)
+    for name, array in saved.items():
+        np.testing.assert_array_equal(array, copy[name])
+
+
+@pytest.mark.parametrize("spoil", ["missing", "shape", "dtype", "too_many"])
+def test_a_checkpoint_that_does_not_fit_is_refused(dam_break, spoil):
+    fluid = dam_break()
+    arrays = dict(fluid.checkpoint())
+    if spoil == "missing":
+        del arrays["velocity"]
+    elif spoil == "shape":
+        arrays["velocity"] = arrays["velocity"][:-1]
+    elif spoil == "dtype":
+        arrays["position"] = arrays["position"].astype(np.float64)
+    else:
+        arrays = {name: np.concatenate([array, array]) for name, array in arrays.items()}
+    with pytest.raises(ValueError, match="water"):
+        fluid.restore(arrays)
+
+
+STEP_AND_PRINT_DIGEST = """
+import hashlib, sys
+from sim.runtime import initialize
+initialize("cpu", threads=int(sys.argv[1]))
+from sim.scene import DomainParameters
+from small_fluids import lattice, make_fluid
+domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.5, 0.3, 0.4))
+fluid = make_fluid(domain, lattice((0.0, 0.0, 0.0), (0.3, 0.3, 0.2), 0.02))
+for _ in range(60):
+    fluid.substep(fluid.stable_dt())
+digest = hashlib.sha256()
+for name, array in sorted(fluid.checkpoint().items()):
+    digest.update(array.tobytes())
+print(digest.hexdigest())
+"""
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    here = Path(__file__).resolve().parent
+    digests = [
+        subprocess.run(
+            [sys.executable, "-c", STEP_AND_PRINT_DIGEST, str(threads)],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[2]), str(here)])},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in (1, 2)
+    ]
+    assert len(digests[0].strip()) == 64
+    assert digests[0] == digests[1]
+
+
+def test_non_finite_state_is_reported(dam_break):
+    fluid = dam_break()
+    arrays = dict(fluid.checkpoint())
+    arrays["velocity"][7] = np.nan
+    fluid.restore(arrays)
+    fluid.substep(1.0e-4)
+    assert "not finite" in fluid.first_bad_quantity()
+
+
+def test_runaway_speed_is_reported(dam_break):
+    fluid = dam_break()
+    arrays = dict(fluid.checkpoint())
+    arrays["velocity"][7] = 10.0 * fluid.sound_speed
+    fluid.restore(arrays)
+    fluid.substep(1.0e-6)
+    assert "speed of sound" in fluid.first_bad_quantity()
+
+
+def test_fixed_time_step_is_taken_as_it_is(dam_break):
+    assert dam_break(dt=1.0e-4).stable_dt() == 1.0e-4
+
+
+def test_adaptive_time_step_shrinks_with_viscosity_and_speed_of_sound(dam_break):
+    plain = dam_break().stable_dt()
+    assert dam_break(viscosity=1.0).stable_dt() == pytest.approx(0.125 * 0.02**2)
+    assert dam_break(sound_speed=100.0).stable_dt() == pytest.approx(0.4 * 0.02 / 100.0)
+    assert plain > dam_break(cfl=0.5).stable_dt()
+
+
+def test_sound_speed_is_ten_times_the_fall_from_the_highest_particle():
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 1.0, 1.0))
+    positions, velocities = np.array([[0.5, 0.5, 0.8]]), np.array([[3.0, 0.0, 0.0]])
+    assert expected_sound_speed(positions, velocities, domain, (0.0, 0.0, -9.81)) == pytest.approx(
+        10.0 * np.sqrt(9.0 + 2 * 9.81 * 0.8)
+    )
+    assert expected_sound_speed(positions, velocities, domain, (0.0, 0.0, 0.0)) == pytest.approx(30.0)
+
+
+def test_a_fluid_without_particles_steps_and_reports(taichi_cpu):
+    fluid = make_fluid(OPEN_SPACE, np.empty((0, 3), dtype=np.float32))
+    steps(fluid, 2)
+    assert fluid.particle_count == 0
+    assert fluid.snapshots()["water"].arrays["position"].shape == (0, 3)
+    assert json.dumps(fluid.diagnostics())
+
+
+def test_particles_outside_the_domain_are_refused(taichi_cpu):
+    with pytest.raises(ValueError, match="1 of 2 particles start outside the domain"):
+        make_fluid(OPEN_SPACE, np.float32([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]))

@@ -1,0 +1,48 @@
+"""Distances sampled on grids."""
+
+import numpy as np
+import pytest
+
+from sim.shapes import LevelSet, ShapeError, build_solid
+from sim.shapes.parameters import Placement
+
+BALL = build_solid(Placement(shape={"type": "sphere", "radius": 0.25}, position=(0.1, 0.2, 0.3)))
+
+
+def points_near_surface(count=5000):
+    rng = np.random.default_rng(2)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return BALL.position + direction * rng.uniform(0.23, 0.27, (count, 1))
+
+
+def test_error_stays_under_the_stated_bound_and_falls_with_second_order():
+    points = points_near_surface()
+    errors = []
+    for spacing in (0.02, 0.01):
+        level_set = LevelSet.sample(BALL, spacing, padding=0.05)
+        error = np.abs(level_set.signed_distance(points) - BALL.signed_distance(points)).max()
+        assert error < spacing**2 / (4.0 * 0.23) * 1.05  # 5 % for third-order terms and float32
+        errors.append(error)
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.2)
+
+
+def test_gradient_is_the_normal():
+    points = points_near_surface()
+    normal = (points - BALL.position) / np.linalg.norm(points - BALL.position, axis=1, keepdims=True)
+    level_set = LevelSet.sample(BALL, 0.01, padding=0.05)
+    # Slopes of the linear pieces: off by spacing/(2 R) = 0.02 at most per axis.
+    np.testing.assert_allclose(level_set.gradient(points), normal, atol=0.02)
+
+
+def test_outside_of_the_grid_the_distance_is_an_upper_bound_and_positive():
+    level_set = LevelSet.sample(BALL, 0.02)
+    points = BALL.position + np.array([[1.0, 0.0, 0.0], [0.0, -2.0, 1.0], [3.0, 3.0, 3.0]])
+    exact = BALL.signed_distance(points)
+    assert np.all(level_set.signed_distance(points) >= exact - 1e-3)  # the grid's own error, below spacing²/R
+    assert np.all(level_set.signed_distance(points) < 1.2 * exact)
+
+
+def test_grid_that_would_not_fit_is_refused():
+    with pytest.raises(ShapeError, match="is too large; use a larger spacing"):
+        LevelSet.sample(BALL, 1.0e-4)

@@ -1,0 +1,100 @@
+"""Mesh files: the formats, `up`, `size`, centring, and every way a file can be wrong."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from sim.shapes import ShapeError, build_solid
+from sim.shapes.parameters import Placement
+
+
+def write_wedge(path):
+    """An off-centre, asymmetric solid: a box of 1 x 2 x 3 m with one corner cut off."""
+    wedge = trimesh.convex.convex_hull(
+        [[x, y, z] for x in (4, 5) for y in (0, 2) for z in (0, 3) if (x, y, z) != (5, 2, 3)] + [[4.5, 2, 3], [5, 2, 1]]
+    )
+    wedge.export(path)
+    return wedge
+
+
+def mesh_solid(path, **options):
+    return build_solid(Placement(shape={"type": "mesh", "file": str(path), **options}))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb"])
+def test_every_format_gives_the_same_solid(tmp_path, suffix):
+    wedge = write_wedge(tmp_path / f"wedge.{suffix}")
+    solid = mesh_solid(tmp_path / f"wedge.{suffix}")
+    np.testing.assert_allclose(solid.bounds, [[-0.5, -1.0, -1.5], [0.5, 1.0, 1.5]], atol=1e-6)  # files hold float32
+    assert solid.volume == pytest.approx(wedge.volume, rel=1e-6)
+    assert solid.surface_mesh().is_closed
+    assert solid.warnings == ()
+
+
+def test_objects_of_a_scene_are_placed_and_joined(tmp_path):
+    scene = trimesh.Scene()
+    for x in (0.0, 3.0):
+        scene.add_geometry(
+            trimesh.creation.box((1, 1, 1)), transform=trimesh.transformations.translation_matrix([x, 0, 0])
+        )
+    scene.export(tmp_path / "pair.glb")
+    solid = mesh_solid(tmp_path / "pair.glb")
+    np.testing.assert_allclose(np.ptp(solid.bounds, axis=0), [4.0, 1.0, 1.0], atol=1e-6)
+    np.testing.assert_array_equal(
+        solid.signed_distance(np.array([[-1.5, 0, 0], [0, 0, 0], [1.5, 0, 0]])) < 0, [1, 0, 1]
+    )
+
+
+def test_y_up_turns_the_file_upright(tmp_path):
+    trimesh.creation.cone(
+        radius=0.5, height=2.0, transform=trimesh.geometry.align_vectors([0, 0, 1], [0, 1, 0])
+    ).export(tmp_path / "cone.obj")
+    solid = mesh_solid(tmp_path / "cone.obj", up="y")
+    np.testing.assert_allclose(np.ptp(solid.bounds, axis=0), [1.0, 1.0, 2.0], atol=1e-6)
+    near_base, near_tip = solid.signed_distance(np.array([[0.3, 0.0, -0.9], [0.3, 0.0, 0.9]]))
+    assert near_base < 0.0 < near_tip
+
+
+def test_size_sets_the_longest_edge_and_scale_multiplies_it(tmp_path):
+    write_wedge(tmp_path / "wedge.ply")
+    placement = Placement(shape={"type": "mesh", "file": str(tmp_path / "wedge.ply"), "size": 0.6}, scale=2.0)
+    np.testing.assert_allclose(np.ptp(build_solid(placement).bounds, axis=0), [0.4, 0.8, 1.2], rtol=1e-6)
+
+
+def test_max_edge_refines_without_opening_the_mesh(tmp_path):
+    write_wedge(tmp_path / "wedge.stl")
+    solid = mesh_solid(tmp_path / "wedge.stl")
+    mesh = solid.surface_mesh(max_edge=0.25)
+    assert np.linalg.norm(mesh.corners - np.roll(mesh.corners, 1, axis=1), axis=2).max() <= 0.25
+    assert mesh.is_closed
+    assert mesh.signed_volume == pytest.approx(solid.volume, rel=1e-12)
+
+
+def test_missing_file_is_refused(tmp_path):
+    with pytest.raises(
+        ShapeError, match=r'shape.file: must be a mesh file, ".*none.obj" does not exist; check the path'
+    ):
+        mesh_solid(tmp_path / "none.obj")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        (
+            "notes.txt",
+            b"hello",
+            r"must be a mesh trimesh can read, got \"notes.txt\"; convert it to OBJ, PLY, STL or GLB",
+        ),
+        ("bad.glb", b"garbage", r"is not a readable GLB file \(.+\); export it again"),
+        ("bad.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n", "PLY file|has no faces"),
+        ("cut.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", r"is not a readable OBJ file \(IndexError"),
+        ("empty.obj", b"", "empty.obj.* (has no faces|is not a readable OBJ)"),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "points.obj has no faces; a solid needs a surface"),
+        ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "nan.obj has 1 vertices that are not finite"),
+        ("dot.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "dot.obj has no extent"),
+    ],
+)
+def test_unusable_file_is_refused_by_name(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ShapeError, match=message):
+        mesh_solid(tmp_path / name, size=0.5)

@@ -1,0 +1,210 @@
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from smoke_scenes import OPEN_BOX
+
+from sim.scene import DomainParameters
+from sim.shapes import build_solid
+from sim.shapes.parameters import Placement
+from sim.smoke.grid import SmokeGrid
+from sim.smoke.parameters import SmokeParameters
+from sim.smoke.solver import SmokeSolver
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
+
+GRAVITY = (0.0, 0.0, -9.81)
+DOMAIN = DomainParameters(min=(-0.5, -0.5, 0.0), max=(0.5, 0.5, 1.5))
+BALL = {"shape": {"type": "sphere", "radius": 0.15}}
+SOURCE = {"shape": {"type": "sphere", "radius": 0.12}, "position": (0.02, 0.0, 0.2), "temperature": 450.0}
+
+
+def plume(**changes) -> SmokeParameters:
+    return SmokeParameters(**{"name": "plume", "cell_size": 1 / 16, "source": [SOURCE], **changes})
+
+
+def build_plume() -> SmokeSolver:
+    obstacle = build_solid(Placement(**BALL, position=(0.0, 0.0, 0.7)))
+    return SmokeSolver(plume(), domain=DOMAIN, gravity=GRAVITY, solids=[obstacle])
+
+
+def advance(solver: SmokeSolver, substeps: int) -> None:
+    for _ in range(substeps):
+        solver.substep(min(solver.stable_dt(), 1 / 60))
+
+
+@pytest.fixture(scope="module")
+def shared_plume(taichi_cpu):
+    return build_plume()
+
+
+@pytest.fixture
+def solver(shared_plume):
+    """At rest and empty, as just built, without compiling it anew."""
+    shared_plume.restore({name: np.zeros_like(array) for name, array in shared_plume.checkpoint().items()})
+    shared_plume.begin_frame(0.0)
+    return shared_plume
+
+
+def test_a_hot_plume_rises_past_a_ball_and_counts_what_it_emits(solver):
+    advance(solver, 1)
+    first = solver.diagnostics()
+    # Nothing moves yet, so all that is there was emitted; both are sums of the same single-precision numbers.
+    assert first["mass"] == pytest.approx(first["emitted_mass"], rel=1.0e-6)
+    ball_of_smoke = 4.0 / 3.0 * np.pi * 0.12**3
+    # 2 cells of radius: counting cell centres is a third off at worst.
+    assert first["mass"] == pytest.approx(ball_of_smoke, rel=0.35)
+
+    solver.begin_frame(solver.checkpoint()["clock"][0])
+    heights = []
+    for _ in range(4):
+        advance(solver, 15)
+        density = solver.snapshots()["plume"].arrays["density"]
+        z = (np.arange(density.shape[2]) + 0.5) * solver.grid.cell_size
+        heights.append(float((density.sum(axis=(0, 1)) * z).sum() / density.sum()))
+    assert heights == sorted(heights)
+    assert heights[-1] > heights[0] + 0.1
+    last = solver.diagnostics()
+    assert last["emitted_mass"] > first["emitted_mass"]
+    assert last["not_converged"] == 0.0
+    assert 0.0 < last["residual"] <= solver.parameters.projection_tolerance
+    assert last["iterations"] > 0.0
+    assert 0.1 < last["max_speed"] < 5.0
+    assert last["max_temperature"] <= 450.0 + 1.0e-3
+    assert solver.first_bad_quantity() is None
+
+
+def test_ten_steps_equal_five_and_a_restore_and_five(solver):
+    advance(solver, 10)
+    uninterrupted = solver.checkpoint()
+    solver.restore({name: np.zeros_like(array) for name, array in uninterrupted.items()})
+    advance(solver, 5)
+    half = solver.checkpoint()
+    advance(solver, 3)
+    solver.restore(half)
+    advance(solver, 5)
+    for name, array in solver.checkpoint().items():
+        assert np.array_equal(array, uninterrupted[name]), name
+
+
+def test_air_goes_around_solids_and_no_smoke_is_in_them(solver):
+    advance(solver, 40)
+    snapshot = solver.snapshots()["plume"]
+    solid = solver.grid.solid
+    assert solid.sum() > 20
+    assert not snapshot.arrays["density"][solid].any()
+    assert (snapshot.arrays["temperature"][solid] == np.float32(293.0)).all()
+    assert not snapshot.arrays["velocity"][solid].any()
+    state = solver.checkpoint()
+    surface = solid[:, :, 1:] != solid[:, :, :-1]
+    w = solver.grid.trim(state["w_face_z"], solver.grid.face_shape(2))
+    assert not w[:, :, 1:-1][surface].any()
+    # Beside the ball the plume passes; its cells there do move.
+    assert np.abs(snapshot.arrays["velocity"][..., 2])[~solid].max() > 0.1
+
+
+def test_snapshot_is_cell_centred_and_says_where_it_lies(solver):
+    advance(solver, 3)
+    snapshot = solver.snapshots()["plume"]
+    assert snapshot.kind == "smoke"
+    shapes = {name: (array.shape, array.dtype) for name, array in snapshot.arrays.items()}
+    assert shapes == {
+        "density": ((16, 16, 24), np.float32),
+        "temperature": ((16, 16, 24), np.float32),
+        "velocity": ((16, 16, 24, 3), np.float32),
+    }
+    assert snapshot.attributes == {"origin": (-0.5, -0.5, 0.0), "cell_size": 1 / 16, "ambient_temperature": 293.0}
+    u = solver.grid.trim(solver.checkpoint()["u_face_x"], solver.grid.face_shape(0))
+    expected = np.where(solver.grid.solid, np.float32(0.0), 0.5 * (u[1:] + u[:-1]))
+    assert np.array_equal(snapshot.arrays["velocity"][..., 0], expected)
+
+
+def test_a_source_emits_from_its_start_until_before_its_end():
+    (source,) = plume(source=[{**SOURCE, "start_s": 1.0, "end_s": 2.0}]).source
+    assert [source.emits_at(time_s) for time_s in (0.5, 1.0, 1.99, 2.0)] == [False, True, True, False]
+    (endless,) = plume().source
+    assert endless.emits_at(1.0e6)
+
+
+def test_a_field_that_is_not_finite_is_named(solver):
+    state = solver.checkpoint()
+    assert solver.first_bad_quantity() is None
+    state["density"][3, 4, 5] = np.nan
+    state["w_face_z"][3, 4, 5] = np.inf
+    solver.restore(state)
+    assert solver.first_bad_quantity() == "w_face_z is not finite at 1 places"
+
+
+def test_a_checkpoint_of_another_grid_is_refused(solver):
+    state = solver.checkpoint()
+    with pytest.raises(ValueError, match=r"density must have shape \(18, 18, 26\), got shape \(2, 2, 2\)"):
+        solver.restore({**state, "density": np.zeros((2, 2, 2), np.float32)})
+    del state["clock"]
+    with pytest.raises(ValueError, match=r"clock must have shape \(2,\), got nothing"):
+        solver.restore(state)
+
+
+def test_first_step_from_rest_is_bounded_by_the_lift_of_the_source(solver):
+    dt = solver.stable_dt()
+    parameters = solver.parameters
+    acceleration = parameters.buoyancy_temperature * (450.0 - 293.0) + parameters.buoyancy_density
+    # The lift of the source is all that moves: a dt^2 = cfl h.
+    assert acceleration * dt**2 == pytest.approx(parameters.cfl * parameters.cell_size, rel=1.0e-6)
+
+
+def test_a_source_without_a_cell_is_refused_with_a_remedy():
+    outside = plume(source=[{**SOURCE, "position": (3.0, 0.0, 0.0)}])
+    with pytest.raises(ValueError, match=r'smoke "plume", source 0: no cell centre lies inside it; move it'):
+        SmokeSolver(outside, domain=DOMAIN, gravity=GRAVITY)
+
+
+def test_a_box_full_of_solid_is_refused():
+    rock = build_solid(Placement(shape={"type": "box", "size": (5.0, 5.0, 5.0)}))
+    with pytest.raises(ValueError, match="solids fill its whole box"):
+        SmokeGrid.build(plume(), DOMAIN, [rock])
+
+
+def test_grid_is_the_domain_unless_the_smoke_names_its_own_box():
+    assert SmokeGrid.build(plume(), DOMAIN).cells == (16, 16, 24)
+    assert SmokeGrid.build(plume(cell_size=0.02), DOMAIN).cells == (50, 50, 75)
+    own = SmokeGrid.build(plume(min=(0.0, 0.0, 0.0), max=(0.3, 0.2, 0.1), cell_size=0.04), DOMAIN)
+    assert own.cells == (8, 5, 3)
+    assert own.origin == (0.0, 0.0, 0.0)
+    assert own.is_open(2, 1)
+    assert not own.is_open(2, 0)
+    assert own.open_faces == frozenset(OPEN_BOX)
+    with pytest.raises(ValueError, match="got z from 0 to -1 m"):
+        SmokeGrid.build(plume(max=(0.5, 0.5, -1.0)), DOMAIN)
+
+
+CHILD = """
+import hashlib, json, sys
+sys.path[:0] = json.loads(sys.argv[2])
+from sim.runtime import initialize
+initialize("cpu", threads=int(sys.argv[1]))
+from test_smoke_solver import advance, build_plume, digest
+solver = build_plume()
+advance(solver, 6)
+print(digest(solver))
+"""
+
+
+def digest(solver: SmokeSolver) -> str:
+    state = solver.checkpoint()
+    return hashlib.sha256(b"".join(state[name].tobytes() for name in sorted(state))).hexdigest()
+
+
+@pytest.mark.slow
+def test_one_thread_and_two_give_the_same_bits():
+    paths = json.dumps([str(Path(__file__).parent), str(Path(__file__).parents[3])])
+    digests = [
+        subprocess.run(
+            [sys.executable, "-c", CHILD, threads, paths], check=True, capture_output=True, text=True, timeout=300
+        ).stdout.split()[-1]
+        for threads in ("1", "2")
+    ]
+    assert digests[0] == digests[1]

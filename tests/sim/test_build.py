@@ -1,0 +1,76 @@
+"""From a scene to the particles that it starts with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from sim.build import build_world, fill_fluid
+from sim.fluid.parameters import FluidParameters
+from sim.rigid.static import StaticBody
+from sim.scene import SceneParameters
+
+SPACING = 0.02
+
+
+def scene(*blocks: dict, rigid: tuple[dict, ...] = ()) -> SceneParameters:
+    return SceneParameters(fluid=({"name": "water", "block": blocks},), rigid=rigid)
+
+
+def filling(scene: SceneParameters):
+    fluid: FluidParameters = scene.fluid[0]
+    return fill_fluid(fluid, scene.domain, [StaticBody(body).solid for body in scene.rigid])
+
+
+def box(size: tuple[float, float, float], position: tuple[float, float, float], **more) -> dict:
+    return {"shape": {"type": "box", "size": size}, "position": position, **more}
+
+
+def test_a_box_of_ten_spacings_holds_a_thousand_particles():
+    assert len(filling(scene(box((0.2, 0.2, 0.2), (0, 0, 0.5)))).positions) == 1000
+
+
+def test_particles_keep_their_radius_from_walls():
+    positions = filling(scene(box((2.0, 2.0, 0.3), (0, 0, 0.1)))).positions
+    # The domain spans -0.5..0.5; float32 rounding of 0.5 is far below a micrometre.
+    assert np.abs(positions[:, :2]).max() <= 0.5 - SPACING / 2 + 1e-6
+    assert positions[:, 2].min() >= SPACING / 2 - 1e-6
+
+
+def test_particles_inside_a_solid_are_left_out_and_counted():
+    ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.1}, "position": (0, 0, 0.5)}
+    without = filling(scene(box((0.4, 0.4, 0.4), (0, 0, 0.5))))
+    with_ball = filling(scene(box((0.4, 0.4, 0.4), (0, 0, 0.5)), rigid=(ball,)))
+    assert with_ball.in_solids == len(without.positions) - len(with_ball.positions)
+    # The ball grown by a particle radius has a volume of 697 lattice cells; counting points errs by about its
+    # surface times a quarter of a spacing, which is 5 %.
+    assert with_ball.in_solids == pytest.approx(4 / 3 * np.pi * (0.1 + SPACING / 2) ** 3 / SPACING**3, rel=0.05)
+    assert np.linalg.norm(with_ball.positions - [0, 0, 0.5], axis=1).min() >= 0.1 + SPACING / 2 - 1e-6
+
+
+def test_overlapping_blocks_share_no_place():
+    shifted = box((0.2, 0.2, 0.2), (0.053, 0.011, 0.507))
+    result = filling(scene(box((0.2, 0.2, 0.2), (0, 0, 0.5)), shifted))
+    assert result.in_other_blocks > 0
+    distance, _ = cKDTree(result.positions).query(result.positions, k=2)
+    assert distance[:, 1].min() >= 0.9 * SPACING - 1e-6
+
+
+def test_each_block_keeps_its_own_velocity():
+    result = filling(
+        scene(
+            box((0.1, 0.1, 0.1), (-0.3, 0, 0.5), velocity=(1, 0, 0)),
+            box((0.1, 0.1, 0.1), (0.3, 0, 0.5), velocity=(0, 2, 0)),
+        )
+    )
+    left = result.positions[:, 0] < 0
+    np.testing.assert_array_equal(result.velocities[left], np.broadcast_to([1, 0, 0], (125, 3)))
+    np.testing.assert_array_equal(result.velocities[~left], np.broadcast_to([0, 2, 0], (125, 3)))
+
+
+@pytest.mark.usefixtures("taichi_cpu")
+def test_a_fluid_without_a_free_place_is_refused():
+    block = {"name": "block", "shape": {"type": "box", "size": (0.6, 0.6, 0.6)}, "position": (0, 0, 0.5)}
+    with pytest.raises(ValueError, match='fluid "water" has no particle'):
+        build_world(scene(box((0.1, 0.1, 0.1), (0, 0, 0.5)), rigid=(block,)), frames_per_second=60)

@@ -1,0 +1,140 @@
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sim import runtime
+from sim.runtime import DeviceUnavailableError, available_devices, initialize
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_second_initialization_on_the_same_device_changes_nothing(taichi_cpu):
+    assert initialize("cpu") == "cpu"
+    assert initialize("auto") == "cpu"
+
+
+def test_second_initialization_on_another_device_is_refused(taichi_cpu):
+    with pytest.raises(RuntimeError, match='runs on "cpu" in this process already'):
+        initialize("vulkan")
+
+
+def test_second_initialization_with_other_threads_is_refused(taichi_cpu):
+    with pytest.raises(RuntimeError, match="threads in this process already"):
+        initialize("cpu", threads=977)
+
+
+def test_importing_runtime_does_not_load_taichi():
+    assert run_python("import sys, sim.runtime; print('taichi' in sys.modules)").stdout.strip() == "False"
+
+
+def test_starting_on_the_cpu_prints_nothing():
+    started = run_python("import sim.runtime as r; r.initialize('cpu')")
+    assert (started.returncode, started.stdout, started.stderr) == (0, "", "")
+
+
+def test_probe_answers_by_exit_code():
+    assert runtime._read_probe(runtime._start_probe("cpu")) == "ok"
+
+
+def test_probe_that_crashes_names_the_signal():
+    child = subprocess.Popen(
+        [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert runtime._read_probe(child) == "its driver ends the process with SIGSEGV"
+
+
+def test_devices_are_remembered_until_the_machine_changes(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = tmp_path / "physics-pipeline" / "devices.json"
+    path.parent.mkdir()
+    answers = {"cuda": "from an earlier probe", "cpu": "ok"}
+    path.write_text(json.dumps({"key": runtime._machine_key(), "devices": answers}))
+    assert available_devices() == answers
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "none of them")
+    monkeypatch.setattr(runtime, "_probe_all", lambda: {"cpu": "probed again"})
+    assert available_devices() == {"cpu": "probed again"}
+    assert available_devices() == {"cpu": "probed again"}
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 1}'])
+def test_unreadable_memory_of_devices_counts_as_none(tmp_path, content):
+    path = tmp_path / "devices.json"
+    path.write_text(content)
+    assert runtime._read_answers(path, "key") is None
+
+
+def test_device_that_does_not_work_is_refused_with_its_reason():
+    code = """
+import sys
+import sim.runtime as r
+r.available_devices = lambda: {"cuda": "no driver"}
+try:
+    r.initialize("cuda")
+except r.DeviceUnavailableError as error:
+    print(error)
+"""
+    assert run_python(code).stdout.strip() == (
+        'device "cuda" is not available: no driver; use device = "auto" or "cpu"'
+    )
+
+
+def test_auto_takes_the_cpu_where_nothing_else_works():
+    code = """
+import sim.runtime as r
+r.available_devices = lambda: {"cuda": "no driver", "metal": "no", "vulkan": "no", "cpu": "ok"}
+print(r.initialize("auto"))
+"""
+    assert run_python(code).stdout.strip() == "cpu"
+
+
+def test_missing_x11_library_is_named_with_the_remedy():
+    code = """
+import sys, types
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name == "taichi":
+            raise ImportError("libX11.so.6: cannot open shared object file: No such file or directory")
+sys.meta_path.insert(0, Refuse())
+import sim.runtime as r
+try:
+    r.initialize("cpu")
+except r.DeviceUnavailableError as error:
+    print(error)
+"""
+    assert run_python(code).stdout.strip().endswith("install it with: apt-get install libx11-6")
+
+
+def test_stale_lock_of_the_kernel_cache_is_removed_and_a_live_one_kept(tmp_path):
+    stale, live = tmp_path / "ticache.lock", tmp_path / "other.lock"
+    for lock in (stale, live):
+        lock.touch()
+    an_hour_ago = time.time() - 3600.0
+    os.utime(stale, (an_hour_ago, an_hour_ago))
+    runtime._remove_stale_lock(tmp_path)
+    assert not stale.exists()
+    assert live.exists()
+
+
+def test_device_error_survives_pickling():
+    import pickle
+
+    error = DeviceUnavailableError("cuda", "no driver")
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)

@@ -1,0 +1,86 @@
+"""The house's rules that no other test would notice: who imports whom, and what is loaded when."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = {"taichi", "bpy", "trimesh", "igl", "scipy", "av", "pysplashsurf", "openvdb"}
+
+
+def modules_after(statement: str) -> set[str]:
+    """Top-level modules that a fresh interpreter has loaded after a statement."""
+    code = f"import sys; {statement}; print(*{{name.partition('.')[0] for name in sys.modules}})"
+    child = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    return set(child.stdout.split())
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import pipeline.cli",
+        "import pipeline.__main__",
+        "import pipeline.stages",
+        "from pipeline.job.loading import load_job",
+        "import pipeline.job.schema",
+        "import sim.shapes, sim.scene",
+        "import render.parameters, render.spec",
+    ],
+)
+def test_import_loads_neither_physics_nor_blender(statement):
+    assert modules_after(statement) & HEAVY == set()
+
+
+def test_help_needs_no_arrays_and_no_tables():
+    """`pipeline --help` answers at once."""
+    assert modules_after("import pipeline.cli") & {"numpy", "rich", "h5py"} == set()
+
+
+def test_import_contracts_hold():
+    lint = Path(sys.executable).with_name("lint-imports")
+    child = subprocess.run([lint, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert child.returncode == 0, child.stdout
+
+
+def test_only_the_entrances_to_blender_import_it():
+    entrances = {"render/blender.py"}
+    importing = {
+        path.relative_to(ROOT).as_posix()
+        for folder in ("pipeline", "render", "sim", "blender_scripts")
+        for path in (ROOT / folder).rglob("*.py")
+        if re.search(r"^\s*(import|from) bpy\b", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert {path for path in importing if not path.startswith("blender_scripts/")} <= entrances
+
+
+def test_lock_pins_every_package_with_hashes_and_names_no_host():
+    lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    assert not re.search(r"://|--(extra-)?index-url|--find-links|--trusted-host", lock)
+    requirements = re.split(r"\n(?=[A-Za-z0-9])", lock)
+    assert len(requirements) > 20
+    for requirement in requirements:
+        assert re.match(r"[A-Za-z0-9._-]+==\S+", requirement)
+        assert "--hash=sha256:" in requirement
+
+
+def test_every_direct_requirement_is_locked():
+    names = {
+        re.match(r"[A-Za-z0-9._-]+", line).group().lower()
+        for file in ("requirements.in", "requirements-dev.in")
+        for line in (ROOT / file).read_text(encoding="utf-8").splitlines()
+        if line and not line.startswith("#")
+    }
+    locked = set(
+        re.findall(r"^([A-Za-z0-9._-]+)==", (ROOT / "requirements.lock").read_text(encoding="utf-8"), re.MULTILINE)
+    )
+    assert names <= {name.lower() for name in locked}
+
+
+def test_scripts_are_executable_and_valid_shell():
+    for script, shell in (("run", "sh"), (".ci/run", "bash")):
+        path = ROOT / script
+        assert path.stat().st_mode & 0o111
+        subprocess.run([shell, "-n", path], check=True)
