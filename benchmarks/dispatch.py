@@ -29,7 +29,8 @@ from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.run_events import RunEvent
 from pipeline.runner import run_job
-from pipeline.scheduler import ArtifactCommitted, Finish, Instruction, JobOutcome, Scheduler, Start, TaskSucceeded
+from pipeline.scheduler import Scheduler
+from pipeline.scheduler_events import ArtifactCommitted, Finish, Instruction, JobOutcome, Start, TaskSucceeded
 from pipeline.task import ArtifactPath, Resources, Task, TaskId, TaskState
 
 if TYPE_CHECKING:
@@ -110,8 +111,8 @@ def dispatch_ms(root: Path, tasks: int, workers: int, executor: Executor) -> tup
     return wall / count * 1e3, (clock.processor_times[-1] - clock.processor_times[0]) / count * 1e3
 
 
-def nothing_to_do_s(root: Path, tasks: int) -> float:
-    """Time of a whole run over a job that is finished [s]. Its files are made up, and on record as if committed."""
+def nothing_to_do_s(root: Path, tasks: int) -> tuple[float, float]:
+    """Wall and processor time of a whole run over a finished job [s]; its files are made up, and put on record."""
     layout = JobLayout(root)
     (root / NoopStage.name).mkdir(parents=True)
     plan = NoopStage().plan(Job(name="dispatch", frames=tasks), layout)
@@ -139,9 +140,9 @@ def nothing_to_do_s(root: Path, tasks: int) -> float:
         manifest.record_artifacts(receipts)
         manifest.end_run()
     run(root, tasks, 1, InlineExecutor(), CommitClock())  # the first one takes the states over as "up to date"
-    began = time.perf_counter()
+    began = time.perf_counter(), time.process_time()
     run(root, tasks, 1, InlineExecutor(), CommitClock())
-    return time.perf_counter() - began
+    return time.perf_counter() - began[0], time.process_time() - began[1]
 
 
 def bare_commit_ms(root: Path, count: int) -> float:
@@ -201,7 +202,7 @@ def main() -> None:
             bare.append(bare_commit_ms(Path(folder, "bare"), options.tasks))
     set_up_s, scheduled_us = scheduler_us()
     with tempfile.TemporaryDirectory() as folder:
-        idle_s = nothing_to_do_s(Path(folder, "job"), options.finished_tasks)
+        idle_s, idle_processor_s = nothing_to_do_s(Path(folder, "job"), options.finished_tasks)
     print(
         json.dumps(
             {
@@ -214,6 +215,7 @@ def main() -> None:
                 "runner_processor_ms": round(statistics.median(runner), 3),
                 "finished_tasks": options.finished_tasks,
                 "nothing_to_do_s": round(idle_s, 3),
+                "nothing_to_do_processor_s": round(idle_processor_s, 3),
                 "scheduler_set_up_s_for_100000": round(set_up_s, 3),
                 "scheduler_us_a_task": round(scheduled_us, 2),
             },

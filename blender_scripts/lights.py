@@ -71,15 +71,17 @@ def _build_studio(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     _add_ground(_cyclorama(geometry), "cyclorama", parameters["color"], roughness=0.55)
     target = geometry.place(right=0.0, towards_camera=0.0, above_floor=0.22)
     strength = parameters["strength"] * geometry.power_scale
-    for name, placement, size, power, color in (
-        ("key", {"right": -1.15, "towards_camera": 0.75, "above_floor": 1.5}, 0.35, 95.0, (1.0, 0.90, 0.78)),
-        ("fill", {"right": 1.6, "towards_camera": 0.7, "above_floor": 1.0}, 1.6, 42.0, (0.72, 0.86, 1.0)),
-        ("rim", {"right": 0.75, "towards_camera": -1.25, "above_floor": 1.25}, 0.8, 150.0, (0.86, 0.93, 1.0)),
-        ("kicker", {"right": -1.2, "towards_camera": -0.9, "above_floor": 0.7}, 0.5, 45.0, (1.0, 0.93, 0.84)),
+    for name, placement, size, spread_deg, power, color in (
+        ("key", {"right": -1.15, "towards_camera": 0.75, "above_floor": 1.5}, 0.35, 110.0, 62.0, (1.0, 0.90, 0.78)),
+        ("fill", {"right": 1.6, "towards_camera": 0.7, "above_floor": 1.0}, 1.6, 180.0, 24.0, (0.72, 0.86, 1.0)),
+        ("rim", {"right": 0.45, "towards_camera": -1.45, "above_floor": 1.3}, 0.8, 95.0, 105.0, (0.86, 0.93, 1.0)),
+        ("kicker", {"right": -1.3, "towards_camera": -0.8, "above_floor": 0.7}, 0.5, 95.0, 34.0, (1.0, 0.93, 0.84)),
     ):
         light = _new_light(name, "AREA", power * strength, color)
         light.shape = "SQUARE"
         light.size = size * geometry.size
+        # A pool of light that fades around the domain; a lamp of 180° would draw its own plane across the backdrop.
+        light.spread = math.radians(spread_deg)
         _add_light_object(name, light, geometry.place(**placement), target)
     _set_gradient_world(parameters["strength"])
     # The dome is dim and smooth: found by chance it adds no noise worth a light sample at every bounce.
@@ -102,7 +104,7 @@ def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     )
     horizontal = from_sun.normalized()
     towards_sun = Vector((horizontal.x * math.cos(elevation), horizontal.y * math.cos(elevation), math.sin(elevation)))
-    sun = _new_light("sun", "SUN", 3.2 * parameters["strength"], (1.0, 0.94, 0.86))
+    sun = _new_light("sun", "SUN", 5.5 * parameters["strength"], (1.0, 0.94, 0.86))
     sun.angle = math.radians(0.7)
     _add_light_object("sun", sun, geometry.centre + 3 * geometry.size * towards_sun, geometry.centre)
 
@@ -110,7 +112,7 @@ def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     sky = tree.nodes.new("ShaderNodeTexSky")
     # The sky's rotation is measured from +y, clockwise seen from above.
     set_physical_sky(sky, sun_elevation=elevation, sun_rotation=math.atan2(towards_sun.x, towards_sun.y))
-    _connect_background(tree, sky.outputs["Color"], 0.09 * parameters["strength"])
+    _connect_background(tree, sky.outputs["Color"], 0.14 * parameters["strength"])
 
 
 STAGES: dict[str, Callable[[dict[str, Any], StageGeometry], None]] = {

@@ -31,8 +31,10 @@ def load_volume(volume: Any, path: Path) -> None:
     """
     if not path.is_file():
         raise RenderInputError(f"the volume {path} does not exist")
-    volume.grids.unload()
     volume.filepath = str(path)
+    if not volume.grids.load():
+        # Blender reports a damaged file once more for the file after it: only a second refusal counts.
+        volume.grids.unload()
     if not volume.grids.load():
         raise RenderInputError(f"cannot read the volume {path}: {volume.grids.error_message or 'not an OpenVDB file'}")
     names = [grid.name for grid in volume.grids]

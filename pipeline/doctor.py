@@ -92,24 +92,21 @@ def examine(output: Path) -> list[Examination]:
 def print_report(examinations: Iterable[Examination]) -> None:
     """A table for people."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     marks = {"ok": "[green]ok[/]", "warning": "[yellow]warning[/]", "failed": "[red]failed[/]"}
-    table = Table(box=None, pad_edge=False)
-    for heading in ("", "", "found", "remedy"):
-        table.add_column(heading, overflow="fold")
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
     for each in examinations:
-        table.add_row(marks[each.status], each.name, *(_escaped(text) for text in (each.detail, each.remedy)))
+        remedy = f"\n[bold]→ {escape(each.remedy)}[/]" if each.remedy else ""
+        table.add_row(marks[each.status], each.name, escape(each.detail) + remedy)
     Console().print(table)
 
 
 _SYNC = "run ./run once; it installs requirements.lock"
-
-
-def _escaped(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)
 
 
 def _guarded(name: str, look: Callable[[], Iterable[Examination]]) -> list[Examination]:

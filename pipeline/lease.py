@@ -222,7 +222,7 @@ def _boot_id() -> str:
 
 
 def _uptime_s() -> float:
-    return time.time() - psutil.boot_time()
+    return time.time() - float(psutil.boot_time())
 
 
 def _pid_namespace() -> str:

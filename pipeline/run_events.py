@@ -8,7 +8,7 @@ from typing import Protocol
 
 from pipeline.executors.base import Failed, TaskEvent
 from pipeline.plan import Assessment
-from pipeline.scheduler import JobOutcome
+from pipeline.scheduler_events import JobOutcome
 from pipeline.task import TaskId, TaskState
 
 

@@ -9,17 +9,11 @@ die with it, and the lease of a dead process counts for nothing.
 from __future__ import annotations
 
 import os
-import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from types import FrameType
+from collections.abc import Sequence
 
 from pipeline.artifacts import Receipt, read_receipt, sweep_parts
-from pipeline.errors import PlanError
 from pipeline.executors.attempt import load_stages
 from pipeline.executors.base import Assignment, Committed, Executor, Failed, Finished, TaskEvent
 from pipeline.executors.failures import is_disk_full
@@ -28,11 +22,13 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.lease import HEARTBEAT_INTERVAL_S, Lease
 from pipeline.manifest import Manifest, artifact_row
-from pipeline.plan import Assessment, Verdict, assess, input_hashes, plan_job
+from pipeline.plan import Assessment, Verdict, assess, input_hashes, plan_job, up_to_date
 from pipeline.reconcile import Reconciliation, reconcile
 from pipeline.resources import machine_capacity
+from pipeline.run_control import RunControl, Selection
 from pipeline.run_events import Notice, Observer, Outcome, RunEnded, RunStarted, SilentObserver, StateChanged
-from pipeline.scheduler import (
+from pipeline.scheduler import Scheduler
+from pipeline.scheduler_events import (
     ArtifactCommitted,
     CancelRequested,
     DrainRequested,
@@ -41,7 +37,6 @@ from pipeline.scheduler import (
     JobOutcome,
     Kill,
     Policy,
-    Scheduler,
     Start,
     Stop,
     TaskFailed,
@@ -51,74 +46,14 @@ from pipeline.scheduler import (
 )
 from pipeline.task import ArtifactPath, FailureKind, Resources, Task, TaskId, TaskState
 
+__all__ = ["Outcome", "RunControl", "Selection", "run_job"]
+
 STAGES_REFERENCE = "pipeline.stages:STAGES"
 
 _TURN_S = 0.25
 """Longest time that the loop sleeps [s]; so soon it answers Ctrl-C."""
 _STOP_GRACE_S = 120.0
 """Time a long task gets to write its checkpoint when the run is drained [s]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Selection:
-    """Tasks to run again although they are up to date.
-
-    Attributes:
-        stages: names of the stages; empty: of all.
-        frames: their frames; None: all. Tasks about the whole job have no frame, and are not selected by one.
-    """
-
-    stages: frozenset[str] = frozenset()
-    frames: frozenset[int] | None = None
-
-    def of(self, tasks: Sequence[Task]) -> frozenset[TaskId]:
-        """The selected ones of these tasks.
-
-        Raises:
-            PlanError: there are none.
-        """
-        chosen = frozenset(
-            task.id
-            for task in tasks
-            if (not self.stages or task.stage in self.stages) and (self.frames is None or task.frame in self.frames)
-        )
-        if not chosen:
-            known = ", ".join(dict.fromkeys(task.stage for task in tasks))
-            raise PlanError(f"nothing to run again: no task has such a stage and frame; the stages are {known}")
-        return chosen
-
-
-class RunControl:
-    """How a person stops a run; safe to call from signal handlers and other threads."""
-
-    def __init__(self) -> None:
-        self._interruptions = 0
-
-    def interrupt(self) -> None:
-        """Once: finish what runs, and stop. Twice: stop at once. Either way the next run continues."""
-        self._interruptions += 1
-
-    @property
-    def interruptions(self) -> int:
-        """How often it was interrupted."""
-        return self._interruptions
-
-    @contextmanager
-    def on_signals(self) -> Iterator[None]:
-        """Take SIGINT and SIGTERM for interruptions, inside the block; only the main thread can."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def interrupt(_number: int, _frame: FrameType | None) -> None:
-            self.interrupt()
-
-        before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 def run_job(
@@ -232,7 +167,7 @@ class _Run:
         self._outcome: JobOutcome | None = None
         self._tasks = {assessment.task.id: assessment.task for assessment in assessments}
         self._invalidate_forced()
-        up_to_date = {each.task.id for each in assessments if each.verdict is Verdict.UP_TO_DATE}
+        done = {each.task.id for each in assessments if each.verdict is Verdict.UP_TO_DATE}
         # What a long task has committed of its present fingerprint stays; its readers need not wait for it.
         kept = {
             artifact
@@ -242,7 +177,7 @@ class _Run:
         }
         self._scheduler = Scheduler(
             [assessment.task for assessment in assessments],
-            up_to_date=up_to_date,
+            up_to_date=done,
             committed=kept,
             capacity=capacity,
             policy=policy,
@@ -329,7 +264,8 @@ class _Run:
             while todo:
                 match todo.popleft():
                     case Start(task, threads):
-                        if self._is_up_to_date(task):
+                        # Early cutoff: what was made anew upstream may have turned out the same.
+                        if task.id not in self._forced and up_to_date(task, self._rows):
                             todo += self._scheduler.handle(TaskSkipped(task.id))
                         else:
                             assignments.append(self._open_attempt(task, threads))
@@ -353,13 +289,6 @@ class _Run:
                 self._observer.notify(StateChanged(task_id, self._tasks[task_id].stage, state))
 
     # --- starting ---
-
-    def _is_up_to_date(self, task: Task) -> bool:
-        """Early cutoff: what was made anew upstream turned out the same."""
-        if task.id in self._forced:
-            return False
-        fingerprint = task_fingerprint(task, input_hashes(task, self._rows))
-        return all(output in self._rows and self._rows[output].fingerprint == fingerprint for output in task.outputs)
 
     def _open_attempt(self, task: Task, threads: int) -> Assignment:
         attempt = self._manifest.start_attempt(task.id)

@@ -22,6 +22,10 @@ from sim.world import World
 CLEARANCE_IN_SPACINGS = 0.5
 """A particle's centre keeps half a lattice spacing, its radius, from walls and solids."""
 
+ROUNDING = 1.0e-3
+"""Share of the clearance that a particle may come nearer: lattice points are float32, and a block that rests on a
+body has its first layer exactly at the clearance."""
+
 
 @dataclass(frozen=True)
 class FluidFilling:
@@ -64,7 +68,7 @@ def fill_fluid(fluid: FluidParameters, domain: DomainParameters, solids: Sequenc
     for block in fluid.block:
         points = fill_with_particles(build_solid(block), spacing, lower=lower, upper=upper)
         for solid in solids:
-            outside = solid.signed_distance(points.astype(np.float64)) >= clearance
+            outside = solid.signed_distance(points.astype(np.float64)) >= (1.0 - ROUNDING) * clearance
             in_solids += int(np.count_nonzero(~outside))
             points = points[outside]
         if positions and len(points):
@@ -80,7 +84,7 @@ def fill_fluid(fluid: FluidParameters, domain: DomainParameters, solids: Sequenc
 
 
 def _build_fluid(fluid: FluidParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:
-    from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
+    from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
     from sim.fluid.wcsph import WCSPHSolver
 
     spacing = 2.0 * fluid.particle_radius
@@ -88,7 +92,8 @@ def _build_fluid(fluid: FluidParameters, scene: SceneParameters, bodies: Sequenc
     if len(filling.positions) == 0:
         raise ValueError(f'fluid "{fluid.name}" has no particle: its blocks are outside the domain or inside solids')
     boundary = BoundarySamples.of_bodies(
-        domain_wall_samples(scene.domain, spacing), *(body.boundary_samples(spacing) for body in bodies)
+        domain_wall_samples(scene.domain, spacing),
+        *(sink_samples(body.surface_samples(spacing), body.solid.signed_distance, spacing) for body in bodies),
     )
     return WCSPHSolver(
         fluid,

@@ -47,7 +47,7 @@ def plan(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path
 
     loaded, _ = load_checked_job(job_file, overrides, preview=preview)
     layout = JobLayout(output / loaded.job.name)
-    assessments, estimates = _assess(loaded.job, layout)
+    assessments, estimates = assess_job(loaded.job, layout)
     if as_json:
         click.echo(json.dumps([_assessment_as_json(each) for each in assessments], indent=1))
         return
@@ -148,7 +148,7 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
     from pipeline.manifest_reader import ManifestReader
 
     layout = find_job(job, output)
-    assessments, _ = _assess(load_job(layout.job_file), layout)
+    assessments, _ = assess_job(load_job(layout.job_file), layout)
     found = next((each for each in assessments if each.task.id == task), None)
     if found is None:
         raise PipelineError(f'the job has no task "{task}"{_nearest(task, [each.task.id for each in assessments])}')
@@ -187,7 +187,7 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
         click.echo(f"  {_when(event.time)}  {event.kind}: {event.message}")
 
 
-def _assess(job: Job, layout: JobLayout) -> tuple[list[Assessment], dict[str, Any]]:
+def assess_job(job: Job, layout: JobLayout) -> tuple[list[Assessment], dict[str, Any]]:
     """What would run, and what the stages have taken so far."""
     from pipeline.manifest_reader import ManifestReader
     from pipeline.plan import assess, plan_job

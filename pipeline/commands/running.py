@@ -40,13 +40,17 @@ def submit(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
     """
     from pipeline.commands.arguments import DEFAULT_OUTPUT
     from pipeline.job.checks import load_checked_job
+    from pipeline.job.loading import read_job
 
-    loaded, _ = load_checked_job(job_file, overrides, preview=preview)
-    for warning in loaded.warnings:
-        click.secho(f"warning: {warning}", err=True, fg="yellow")
+    loaded = read_job(job_file, overrides, preview=preview)
     in_its_folder = output == DEFAULT_OUTPUT and job_file.name == "job.toml" and not overrides and not preview
     own_folder = JobLayout(job_file.parent)
     layout = own_folder if in_its_folder and own_folder.manifest.exists() else JobLayout(output / loaded.job.name)
+    if not _is_done(loaded.job, layout):
+        # Checking the scene builds its shapes, which takes longer than finding out that there is nothing to do.
+        loaded, _ = load_checked_job(job_file, overrides, preview=preview)
+        for warning in loaded.warnings:
+            click.secho(f"warning: {warning}", err=True, fg="yellow")
     run(loaded.job, layout, job_text=loaded.text, cores=cores)
 
 
@@ -141,6 +145,17 @@ def _report(job: Job, layout: JobLayout, outcome: Outcome) -> None:
             f"{film}: {job.frame_count} frames, {job.frame_count / (job.movie.playback_fps or job.fps):.3g} s of film, "
             f"in {_duration(outcome.seconds)}"
         )
+
+
+def _is_done(job: Job, layout: JobLayout) -> bool:
+    """Whether every file of the job is there and up to date."""
+    from pipeline.commands.inspecting import assess_job
+    from pipeline.plan import Verdict
+
+    if not layout.manifest.exists():
+        return False
+    assessments, _ = assess_job(job, layout)
+    return all(assessment.verdict is Verdict.UP_TO_DATE for assessment in assessments)
 
 
 def _job_in(layout: JobLayout) -> Job:

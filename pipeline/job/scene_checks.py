@@ -31,6 +31,10 @@ BYTES_PER_PARTICLE = 1024
 """Upper bound of what the fluid solvers take, neighbour search and snapshot included."""
 BYTES_PER_CELL = 200
 """Upper bound of what the smoke solver takes, multigrid levels and snapshot included."""
+BYTES_PER_SEARCH_CELL = 16
+"""Starts and counts of fluid and boundary; a cell is as wide as the support radius, two particle spacings."""
+BYTES_PER_WALL_SAMPLE = 150
+"""State, search and what building the walls takes for a moment."""
 COUNTED_PARTICLES = 200_000
 """Up to so many particles a fluid is filled as the simulation fills it; beyond, a coarser lattice is scaled up."""
 ALL = 1.0 - 1e-6
@@ -152,9 +156,25 @@ def _check_fluid(job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: 
             f"{_gigabytes(budget)}; at most {_count(possible)} fit: use {_rounded_up(radius):g} m or more",
         )
         return int(expected)
+    _check_domain_size(job.domain, fluid, budget, findings)
     _check_time_step(job, index, findings)
     lattice = _Lattice(_domain_box(job.domain), obstacles, spacing, max(1.0, (expected / COUNTED_PARTICLES) ** (1 / 3)))
     return sum(_check_block(path, solid, lattice, findings) for path, solid in blocks.items())
+
+
+def _check_domain_size(domain: DomainParameters, fluid: FluidParameters, budget: int, findings: Findings) -> None:
+    """The whole domain is covered by cells for the neighbour search, and its walls by samples, fluid or not."""
+    box = _domain_box(domain)
+    x, y, z = (box[1] - box[0]) / (2.0 * fluid.particle_radius)
+    need = x * y * z / 8.0 * BYTES_PER_SEARCH_CELL + 2.0 * (x * y + y * z + z * x) * BYTES_PER_WALL_SAMPLE
+    if need > budget:
+        radius = _rounded_up(fluid.particle_radius * math.sqrt(need / budget))
+        findings.error(
+            ("domain",),
+            f"is so large that walls and search cells for particles of {fluid.particle_radius:g} m need "
+            f"{_gigabytes(need)}, this machine has {_gigabytes(budget)}; "
+            f"make it smaller, or particle_radius {radius:g} m",
+        )
 
 
 @dataclass(frozen=True)
@@ -175,6 +195,7 @@ class _Lattice:
 
     def fill(self, solid: Solid) -> tuple[int, int]:
         """How many particles find a free place in the solid, and how many are kept out by obstacles."""
+        from sim.build import ROUNDING
         from sim.shapes import fill_with_particles
 
         step = self.spacing * self.coarsening
@@ -183,7 +204,7 @@ class _Lattice:
         for obstacle in self.obstacles:
             if not _touch(obstacle.bounds, solid.bounds, margin=step):
                 continue
-            free &= obstacle.signed_distance(points.astype(np.float64)) >= step / 2
+            free &= obstacle.signed_distance(points.astype(np.float64)) >= (1.0 - ROUNDING) * step / 2
         left = int(np.count_nonzero(free))
         scale = self.coarsening**3
         return round(left * scale), round((len(points) - left) * scale)

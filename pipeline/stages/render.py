@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
+from math import cos, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from scipy.spatial.transform import Rotation
 
 from pipeline.fingerprint import ParameterSet, digest_of
 from pipeline.job.models import Job
@@ -122,9 +121,14 @@ def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]
 
 
 def _orientation(rotation_deg: tuple[float, float, float]) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) of rotations about the world's x, then y, then z axis."""
-    x, y, z, w = Rotation.from_euler("xyz", rotation_deg, degrees=True).as_quat()
-    return float(w), float(x), float(y), float(z)
+    """Unit quaternion (w, x, y, z) of rotations about the world's x, then y, then z axis: q = q_z q_y q_x."""
+    (cx, sx), (cy, sy), (cz, sz) = ((cos(half), sin(half)) for half in (radians(angle) / 2 for angle in rotation_deg))
+    return (
+        cx * cy * cz + sx * sy * sz,
+        sx * cy * cz - cx * sy * sz,
+        cx * sy * cz + sx * cy * sz,
+        cx * cy * sz - sx * sy * cz,
+    )
 
 
 _WARM: dict[str, Renderer] = {}

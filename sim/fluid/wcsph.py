@@ -158,7 +158,7 @@ class WCSPHSolver(ParticleFluid):
         rest_density = self.parameters.rest_density
         compute_density_and_pressure(
             particles.position, particles.count, particles.neighbors.start, particles.neighbors.boundary_start,
-            particles.neighbors.indices, self.boundary.position, self.boundary.psi,
+            particles.neighbors.end, particles.neighbors.indices, self.boundary.position, self.boundary.psi,
             self.particle_mass, normalization(self.support_radius), 1.0 / self.support_radius,
             rest_density, rest_density * self.sound_speed**2 / GAMMA, self._density, self._pressure_term,
         )  # fmt: skip
@@ -167,7 +167,8 @@ class WCSPHSolver(ParticleFluid):
         particles, parameters = self._particles, self.parameters
         compute_acceleration(
             particles.position, particles.velocity, self._density, self._pressure_term, particles.count,
-            particles.neighbors.start, particles.neighbors.boundary_start, particles.neighbors.indices,
+            particles.neighbors.start, particles.neighbors.boundary_start, particles.neighbors.end,
+            particles.neighbors.indices,
             self.boundary.position, self.boundary.psi, ti.math.vec3(*self.gravity),
             self.particle_mass, normalization(self.support_radius), 1.0 / self.support_radius,
             SOFTENING * self.support_radius**2,
@@ -201,7 +202,7 @@ def expected_sound_speed(
 
 @ti.kernel
 def compute_density_and_pressure(
-    position: Vectors, count: ti.i32, start: Integers, boundary_start: Integers, neighbors: Integers,
+    position: Vectors, count: ti.i32, start: Integers, boundary_start: Integers, end: Integers, neighbors: Integers,
     boundary_position: Vectors, boundary_psi: Floats,
     mass: ti.f32, sigma: ti.f32, inverse_support: ti.f32, rest_density: ti.f32, stiffness: ti.f32,
     density: Floats, pressure_term: Floats,
@@ -214,7 +215,7 @@ def compute_density_and_pressure(
         for k in range(start[i], boundary_start[i]):
             fluid_sum += spline((x_i - position[neighbors[k]]).norm() * inverse_support)
         boundary_sum = 0.0
-        for k in range(boundary_start[i], start[i + 1]):
+        for k in range(boundary_start[i], end[i]):
             b = neighbors[k]
             boundary_sum += boundary_psi[b] * spline((x_i - boundary_position[b]).norm() * inverse_support)
         rho_i = sigma * (mass * fluid_sum + boundary_sum)
@@ -228,7 +229,7 @@ def compute_density_and_pressure(
 @ti.kernel
 def compute_acceleration(
     position: Vectors, velocity: Vectors, density: Floats, pressure_term: Floats, count: ti.i32,
-    start: Integers, boundary_start: Integers, neighbors: Integers,
+    start: Integers, boundary_start: Integers, end: Integers, neighbors: Integers,
     boundary_position: Vectors, boundary_psi: Floats, gravity: ti.math.vec3,
     mass: ti.f32, sigma: ti.f32, inverse_support: ti.f32,
     softening: ti.f32, nu: ti.f32, artificial: ti.f32, wall_friction: ti.f32, cohesion: ti.f32, spacing: ti.f32,
@@ -253,7 +254,7 @@ def compute_acceleration(
             if ti.static(with_cohesion):
                 cohesion_sum += cohesion_becker_teschner2007(r, inverse_support, spacing) * x_ij
         boundary_sum = ti.math.vec3(0.0)
-        for k in range(boundary_start[i], start[i + 1]):
+        for k in range(boundary_start[i], end[i]):
             b = neighbors[k]
             x_ib = x_i - boundary_position[b]
             r_squared = x_ib.norm_sqr()

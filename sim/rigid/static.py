@@ -38,8 +38,8 @@ class StaticBody:
         """Its surface, scaled but neither rotated nor moved: the mesh that the poses of its snapshots place."""
         return self.solid.rest_mesh(max_edge)
 
-    def boundary_samples(self, spacing: float) -> NDArray[np.float32]:
-        """Surface samples in world coordinates [m], (m, 3), for the boundary handling of Akinci et al. 2012.
+    def surface_samples(self, spacing: float) -> NDArray[np.float32]:
+        """Evenly spread points on its surface in world coordinates [m], (m, 3), for boundary handling.
 
         They are sampled on the mesh at rest and then placed, so that two bodies of one shape carry the same pattern.
         """

@@ -12,6 +12,9 @@ Faces = NDArray[np.int64]
 _MERGE_DISTANCE = 1.0e-6
 """Vertices closer than this many bounding-box diagonals are one: what float32 files can tell apart."""
 
+_CAVITY_PROBES = 256
+"""About how many vertices of a closed patch are asked whether they lie inside of the rest."""
+
 
 def merge_vertices(vertices: Points, faces: Faces) -> tuple[Points, Faces]:
     """Join vertices in the same place, and drop those that no face uses."""
@@ -119,8 +122,9 @@ def _turn_closed_patches(vertices: Points, faces: Faces, patch: NDArray[np.int64
             continue
         others = faces[~own]
         if len(others):
-            probe = vertices[faces[own][:1, 0]]
-            if igl.winding_number(vertices, others, probe)[0] > 0.5:
+            corners = np.unique(faces[own])
+            probes = vertices[corners[:: 1 + len(corners) // _CAVITY_PROBES]]
+            if np.all(igl.winding_number(vertices, others, probes) > 0.5):
                 continue  # a cavity
         faces = _turn(faces, own)
     return faces

@@ -28,6 +28,9 @@ _DECIDED_WITHIN = 0.1
 _LARGEST_UNDECIDED = 0.2
 """Largest fraction of the surface beside which the inside may be undecided."""
 
+_WORTH_A_WARNING = 0.01
+"""Undecided fraction of a mesh without holes from which on the user is told."""
+
 _PROBES = 4096
 _PROBE_OFFSET = 1.0e-4
 """How far from the surface the probes are, in bounding-box diagonals: above float32 round-off, below any wall."""
@@ -177,6 +180,11 @@ def solid_from_triangles(vertices: ArrayLike, faces: ArrayLike, *, label: str) -
         warnings.append(
             f"{label} has {holes} ({len(open_edges)} boundary edges); its inside is taken from the generalized "
             f"winding number, decided beside {100.0 * (1.0 - undecided):.1f} % of the surface, and flat caps close it"
+        )
+    elif undecided > _WORTH_A_WARNING:
+        warnings.append(
+            f"{label} folds into itself: beside {100.0 * undecided:.1f} % of its surface the winding number finds no "
+            "inside, and there it counts as outside"
         )
     if solid.parts_overlap:
         warnings.append(f"{label} has parts that overlap; they are united")

@@ -8,6 +8,7 @@ asks for; what the mesh encloses gets exact distances from `MeshSolid`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from sim.shapes.solid import Points, TriangleMesh
+from sim.shapes.tessellation import cut_along
 
 Distances = NDArray[np.float64]
 DistanceFunction = Callable[[Points], Distances]
@@ -77,11 +79,10 @@ def smooth_difference(a: Distances, b: Distances, blend: float) -> Distances:
 def mesh_parts(
     parts: Callable[[Points], Mapping[str, Distances]], lower: Sequence[float], upper: Sequence[float], cell: float
 ) -> TriangleMesh:
-    """Closed mesh of the union of named parts.
+    """Closed mesh of the union of named parts, cut along their seams.
 
     Marching cubes, then a few rounds in which vertices move towards the mean of their neighbours and back onto the
-    surface, which evens out the triangles; vertices beside the seam of two parts move onto it, so that a change of
-    colour there follows edges.
+    surface, which evens out the triangles. Seams are filleted over a cell: smooth shading finds no crease there.
 
     Args:
         parts: the distance of every part at points (n, 3), by name.
@@ -90,18 +91,21 @@ def mesh_parts(
         cell: edge of a cell.
 
     Returns:
-        The mesh, with `part` and `part_names`.
+        The mesh, with `part` and `part_names`; no triangle belongs to two parts.
     """
 
     def union(points: Points) -> Distances:
-        return np.min(list(parts(points).values()), axis=0)
+        return reduce(lambda a, b: smooth_union(a, b, cell), parts(points).values())
 
     mesh = _march(union, np.asarray(lower), np.asarray(upper), cell)
-    vertices = _relax(mesh, union, parts, cell)
-    centroids = vertices[mesh.faces].mean(axis=1)
-    distances = parts(centroids)
-    part = np.argmin(list(distances.values()), axis=0).astype(np.int32)
-    return TriangleMesh(vertices, mesh.faces, part, tuple(distances))
+    mesh = TriangleMesh(_relax(mesh, union, cell), mesh.faces)
+    names = tuple(parts(mesh.vertices[:1]))
+    for name in names if len(names) > 1 else ():
+        distances = dict(parts(mesh.vertices))
+        own = distances.pop(name)
+        mesh = cut_along(mesh, own - np.min(list(distances.values()), axis=0))
+    nearest = np.argmin(list(parts(mesh.corners.mean(axis=1)).values()), axis=0)
+    return TriangleMesh(mesh.vertices, mesh.faces, nearest.astype(np.int32), names)
 
 
 def _march(function: DistanceFunction, lower: Points, upper: Points, cell: float) -> TriangleMesh:
@@ -126,31 +130,16 @@ def _march(function: DistanceFunction, lower: Points, upper: Points, cell: float
     return mesh if mesh.signed_volume > 0.0 else TriangleMesh(vertices, mesh.faces[:, ::-1])
 
 
-def _relax(
-    mesh: TriangleMesh, union: DistanceFunction, parts: Callable[[Points], Mapping[str, Distances]], cell: float
-) -> Points:
+def _relax(mesh: TriangleMesh, union: DistanceFunction, cell: float) -> Points:
     vertices, count = mesh.vertices, len(mesh.vertices)
     edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     adjacency = csr_array((np.ones(len(edges)), edges.T), shape=(count, count))  # closed: every edge both ways
     neighbours = adjacency.sum(axis=1)[:, None]
-
-    def seam(points: Points) -> Distances:
-        nearest_two = np.sort(list(parts(points).values()), axis=0)[:2]
-        return nearest_two[1] - nearest_two[0]
-
-    has_seams = len(parts(vertices[:1])) > 1
     for _ in range(_RELAXATION_ROUNDS):
         # Two steps of averaging for one of projection: evaluating the model is what takes the time.
         averaged = adjacency @ vertices / neighbours
         averaged = 0.5 * (averaged + adjacency @ averaged / neighbours)
         vertices = _project(averaged, union, cell)
-        if has_seams:
-            near = np.flatnonzero(seam(vertices) < 1.5 * cell)
-            moved = vertices[near]
-            for _ in range(2):
-                moved = _project(_project(moved, seam, cell), union, cell)
-            beside = np.linalg.norm(moved - vertices[near], axis=1) < 0.55 * cell
-            vertices[near[beside]] = moved[beside]
     return vertices
 
 

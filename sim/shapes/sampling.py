@@ -14,8 +14,8 @@ _ROUND_OFF = 1.0e-6
 _MIN_DISTANCE = 0.8
 """Least distance of two samples, in spacings: a maximal random set then holds one sample per spacing squared."""
 
-_CANDIDATES_PER_SAMPLE = 24
-"""Density of the candidates: their own gaps, 0.2 spacings, add to the largest gap between samples."""
+_CANDIDATES_PER_SAMPLE = 16
+"""Density of the candidates: their own gaps, a quarter of a spacing, add to the largest gap between samples."""
 
 _LARGEST_LATTICE = 2**31
 _LAYER_POINTS = 2**20

@@ -116,3 +116,50 @@ def subdivide(mesh: TriangleMesh) -> TriangleMesh:
     vertices = np.concatenate([mesh.vertices, mesh.vertices[unique_edges].mean(axis=1)])
     part = None if mesh.part is None else np.repeat(mesh.part, 4)
     return TriangleMesh(vertices, faces, part, mesh.part_names)
+
+
+def cut_along(mesh: TriangleMesh, values: NDArray[np.float64]) -> TriangleMesh:
+    """Cut the triangles of a closed mesh where a function, given at its vertices, is zero; parts are dropped.
+
+    Vertices beside the cut, within a fifth of an edge, move onto it, so that no slivers remain.
+    """
+    vertices, values = mesh.vertices.copy(), values.copy()
+    edges = np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    start, end = edges[np.prod(values[edges], axis=1) < 0.0].T
+    fraction = values[start] / (values[start] - values[end])
+    crossing = vertices[start] + fraction[:, None] * (vertices[end] - vertices[start])
+    for near, vertex in ((fraction < 0.2, start), (fraction > 0.8, end)):
+        vertices[vertex[near]] = crossing[near]
+        values[vertex[near]] = 0.0
+
+    edges = edges[np.prod(values[edges], axis=1) < 0.0]
+    start, end = edges.T
+    fraction = (values[start] / (values[start] - values[end]))[:, None]
+    inserted = vertices[start] + fraction * (vertices[end] - vertices[start])
+    edge_key = start * len(vertices) + end
+
+    def on_edge(tail: NDArray, head: NDArray) -> NDArray:
+        key = np.minimum(tail, head).astype(np.int64) * len(vertices) + np.maximum(tail, head)
+        return len(vertices) + np.searchsorted(edge_key, key)
+
+    sign = np.sign(values).astype(int)[mesh.faces]
+    cut_edges = np.sum(sign * np.roll(sign, -1, axis=1) < 0, axis=1)
+    pieces = [mesh.faces[cut_edges == 0]]
+
+    # One edge cut, the opposite corner on the cut: turn the face so that this corner comes first.
+    face = _turned_to_first(mesh.faces[cut_edges == 1], sign[cut_edges == 1] == 0)
+    a, b, c = face.T
+    pieces += [np.stack([a, b, on_edge(b, c)], axis=1), np.stack([a, on_edge(b, c), c], axis=1)]
+
+    # Two edges cut: turn the face so that the corner alone on its side comes first.
+    of_face = sign[cut_edges == 2]
+    face = _turned_to_first(mesh.faces[cut_edges == 2], of_face == -of_face.sum(axis=1, keepdims=True))
+    a, b, c = face.T
+    ab, ca = on_edge(a, b), on_edge(c, a)
+    pieces += [np.stack([a, ab, ca], axis=1), np.stack([ab, b, c], axis=1), np.stack([ab, c, ca], axis=1)]
+    return TriangleMesh(np.concatenate([vertices, inserted]), np.concatenate(pieces).astype(np.int32))
+
+
+def _turned_to_first(faces: NDArray, chosen: NDArray[np.bool_]) -> NDArray:
+    """Faces with their corners rotated so that the one chosen corner (m, 3) comes first."""
+    return np.take_along_axis(faces, (np.argmax(chosen, axis=1)[:, None] + np.arange(3)) % 3, axis=1)

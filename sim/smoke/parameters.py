@@ -16,7 +16,12 @@ class SmokeSourceParameters(Placement):
     """A region that emits: inside it, each step sets the fields to at least these values."""
 
     density: Fraction = Field(default=1.0, description="Smoke density inside the source [-].")
-    temperature: Positive = Field(default=350.0, description="Temperature inside the source [K].")
+    temperature: Positive = Field(default=450.0, description="Temperature inside the source [K].")
+    fluctuation: Fraction = Field(
+        default=0.2,
+        description="How far its heat falls short of that, at random in space and time [-]; "
+        "0 makes a plume as symmetric as its source.",
+    )
     velocity: Vector3 | None = Field(
         default=None, description="Velocity inside the source [m/s]; left to the flow if omitted."
     )
@@ -54,7 +59,7 @@ class SmokeParameters(Parameters):
         description="Lift beta of heat: upward acceleration per kelvin [m/(s² K)]; g/T of an ideal gas by default.",
     )
     vorticity_confinement: NonNegative = Field(
-        default=0.2, description="Strength epsilon of the vorticity confinement [-]; 0 switches it off."
+        default=0.3, description="Strength epsilon of the vorticity confinement [-]; 0 switches it off."
     )
     density_dissipation: NonNegative = Field(default=0.0, description="Rate at which smoke thins out [1/s].")
     cooling: NonNegative = Field(default=0.2, description="Rate at which it cools to the air's temperature [1/s].")

@@ -230,7 +230,7 @@ class SmokeSolver:
     def _emit(self) -> None:
         for source in self._sources:
             if source.parameters.emits_at(self._time_s):
-                self._emitted_mass += source.emit() * self.grid.cell_size**3
+                self._emitted_mass += source.emit(self._time_s) * self.grid.cell_size**3
 
     def _project(self) -> None:
         report = self._projection.project()

@@ -13,6 +13,20 @@ from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 BLOCK = 256
 """Cells whose emission one thread adds up."""
 
+FLUCTUATION_CELLS = 4
+"""Edge of the blocks of cells that fluctuate together: smaller ones are averaged away by the flow."""
+
+FLUCTUATION_RATE_HZ = 20.0
+"""How often the fluctuation changes."""
+
+
+@ti.func
+def hash_to_unit(key: ti.u32):
+    """A number in [0, 1) from 32 bits (Jarzynski & Olano 2020, PCG)."""
+    state = key * ti.u32(747796405) + ti.u32(2891336453)
+    word = ((state >> ((state >> ti.u32(28)) + ti.u32(4))) ^ state) * ti.u32(277803737)
+    return ti.cast(((word >> ti.u32(22)) ^ word) >> ti.u32(8), ti.f32) / 16777216.0
+
 
 @ti.data_oriented
 class Source:
@@ -40,6 +54,11 @@ class Source:
         self.target_density = parameters.density
         self.target_excess = parameters.temperature - ambient_temperature
         self.speed = max(map(abs, parameters.velocity)) if parameters.velocity is not None else 0.0
+        self._step_x, self._step_y, self._padded_y = (
+            grid.padded[1] * grid.padded[2],
+            grid.padded[2],
+            grid.padded[1],
+        )
         self._density, self._excess = cell_fields
         self._velocity = velocity
         region = build_solid(parameters)
@@ -54,16 +73,22 @@ class Source:
         self._face_counts = [len(indices) for indices in faces]
         self._faces = [_index_field(indices) for indices in faces]
 
-    def emit(self) -> float:
-        """Raise the fields to the source's values; returns the density added, summed over cells [-]."""
-        self._raise_cells()
+    def emit(self, time_s: float) -> float:
+        """Raise the fields to the source's values at a simulated time [s].
+
+        The fluctuation is a function of place and time alone, so a run that continues sees the same.
+
+        Returns:
+            The density added, summed over cells [-].
+        """
+        self._raise_cells(int(time_s * FLUCTUATION_RATE_HZ))
         if self.parameters.velocity is not None:
             for axis, speed in enumerate(self.parameters.velocity):
                 self._set_faces(self._faces[axis], self._velocity[axis], self._face_counts[axis], speed)
         return float(self._emitted.to_numpy().sum(dtype=np.float64))
 
     @ti.kernel
-    def _raise_cells(self):
+    def _raise_cells(self, tick: ti.i32):
         for block in range(self._block_count):
             emitted = 0.0
             for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.cell_count)):
@@ -72,8 +97,19 @@ class Source:
                 after = ti.max(before, self.target_density)
                 self._density[at] = after
                 emitted += after - before
-                self._excess[at] = ti.max(self._excess[at], self.target_excess)
+                shortfall = self.parameters.fluctuation * self._fluctuate(at, tick)
+                self._excess[at] = ti.max(self._excess[at], (1.0 - shortfall) * self.target_excess)
             self._emitted[block] = emitted
+
+    @ti.func
+    def _fluctuate(self, at: ti.i32, tick: ti.i32):
+        """A number in [0, 1) that a few neighbouring cells share."""
+        patch_i = at // self._step_x // FLUCTUATION_CELLS
+        patch_j = at // self._step_y % self._padded_y // FLUCTUATION_CELLS
+        patch_k = at % self._step_y // FLUCTUATION_CELLS
+        patch = (patch_i * 1024 + patch_j) * 1024 + patch_k
+        # The odd factor (Knuth's) spreads ticks over all bits, so that they do not shift the pattern.
+        return hash_to_unit(ti.cast(patch, ti.u32) ^ (ti.cast(tick, ti.u32) * ti.u32(2654435769)))
 
     @ti.kernel
     def _set_faces(self, faces: ti.template(), field: ti.template(), count: ti.i32, speed: ti.f32):

@@ -12,7 +12,7 @@ from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.run_events import Outcome, RunEvent, StateChanged
 from pipeline.runner import run_job
-from pipeline.scheduler import Policy
+from pipeline.scheduler_events import Policy
 from pipeline.task import Resources, TaskId, TaskState
 
 

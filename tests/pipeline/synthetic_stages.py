@@ -227,6 +227,15 @@ def _wait_for_stop(context: TaskContext) -> None:
         time.sleep(0.01)
 
 
+def _wait_for_reader(context: TaskContext) -> None:
+    """Go on only when somebody has read the first frame."""
+    until = time.monotonic() + 30.0
+    while not context.layout.path(double_artifact(0)).exists():
+        if time.monotonic() > until:
+            raise TimeoutError("nobody reads the first frame")
+        time.sleep(0.01)
+
+
 def _leave_child(context: TaskContext) -> None:
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     (context.layout.root / "child.pid").write_text(str(child.pid))
@@ -253,6 +262,7 @@ FAULTS = {
     "hang": _hang,
     "wait for stop": _wait_for_stop,
     "child": _start_child_and_hang,
+    "wait for reader": _wait_for_reader,
     "leave child": _leave_child,
     "puts": _print_from_c,
 }

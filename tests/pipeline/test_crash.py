@@ -137,7 +137,7 @@ def test_a_killed_runner_takes_its_workers_with_it_and_its_lease_is_taken_over(t
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_signal_drains_the_runner_and_the_next_run_continues(tmp_path: Path, number: signal.Signals) -> None:
     root = tmp_path / "job"
-    write_faults(root, {}, pause_s=0.2)
+    write_faults(root, {}, pause_s=0.1)
     runner = start_runner(root)
     wait_for_artifacts(root, 3, runner)
     runner.send_signal(number)

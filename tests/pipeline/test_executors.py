@@ -250,7 +250,9 @@ class TestProcesses(ExecutorContract):
             events += executor.wait(0.5)
         executor.cancel(TaskId("steps"), grace_s=PATIENCE_S)
         failed = failure(events_until_end(executor))
-        assert (failed.kind, failed.message) == (FailureKind.CANCELLED, "stopped after 4 of 6 outputs")
+        assert failed.kind is FailureKind.CANCELLED
+        # The task looks before a frame; the request comes just before or after its look at the fourth.
+        assert failed.message in {"stopped after 3 of 6 outputs", "stopped after 4 of 6 outputs"}
 
     def test_a_task_that_does_not_stop_is_killed_with_all_it_started(
         self, executor: ProcessExecutor, layout: JobLayout

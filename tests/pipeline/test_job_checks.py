@@ -192,13 +192,13 @@ def test_overlap_of_fluid_and_body_is_counted_in_particles(tmp_path):
 
 
 def test_fluid_that_does_not_fit_into_memory_is_refused_with_a_radius_that_fits(tmp_path):
-    errors, _ = errors_and_warnings(HEAD + WATER, tmp_path, memory_bytes=100 * 1024)
+    errors, _ = errors_and_warnings(HEAD + WATER, tmp_path, memory_bytes=1_000_000)
     assert len(errors) == 1
     radius = float(re.search(r"use ([\d.]+) m or more", errors[0]).group(1))
     assert "dam.toml:6 fluid[0].particle_radius: 1000 particles need" in errors[0]
-    assert "at most 100 fit" in errors[0]
+    assert "at most 976 fit" in errors[0]
     text = (HEAD + WATER).replace("particle_radius = 0.02", f"particle_radius = {radius}")
-    assert errors_and_warnings(text, tmp_path, memory_bytes=100 * 1024)[0] == []
+    assert errors_and_warnings(text, tmp_path, memory_bytes=1_000_000)[0] == []
 
 
 def test_a_fluid_far_too_large_is_refused_at_once(tmp_path):
@@ -206,6 +206,16 @@ def test_a_fluid_far_too_large_is_refused_at_once(tmp_path):
     errors, _ = errors_and_warnings(text, tmp_path)
     assert len(errors) == 1
     assert "particles need" in errors[0]
+
+
+def test_domain_too_large_for_its_particles_is_refused_with_a_radius_that_fits(tmp_path):
+    text = HEAD + WATER + "[domain]\nmin = [-300, -300, 0]\nmax = [300, 300, 100]\n"
+    errors, _ = errors_and_warnings(text, tmp_path, memory_bytes=10**9)
+    assert len(errors) == 1
+    assert errors[0].startswith("dam.toml:10 domain: is so large that walls and search cells for particles of 0.02 m")
+    radius = re.search(r"particle_radius ([\d.]+) m$", errors[0]).group(1)
+    text = text.replace("particle_radius = 0.02", f"particle_radius = {radius}").replace("0.4, 0.4, 0.4", "9, 9, 9")
+    assert errors_and_warnings(text, tmp_path, memory_bytes=10**9)[0] == []
 
 
 def test_smoke_that_does_not_fit_into_memory_is_refused_with_a_cell_size_that_fits(tmp_path):

@@ -129,6 +129,10 @@ BAD = {
         'name = "dam"\n[[cloth]]\nname = "flag"',
         ["dam.toml:2 cloth: cloth is not simulated by this version; remove [[cloth]]"],
     ),
+    "film without end": (
+        'name = "dam"\nduration = 1e300',
+        ["dam.toml: duration of 1e+300 s at 60 fps is more than 1,000,000 frames"],
+    ),
     "frames and duration": ('name = "dam"\nframes = 3\nduration = 1', ["dam.toml: give frames or duration, not both"]),
     "empty domain": (
         'name = "dam"\n[domain]\nmin = [1, 0, 0]\nmax = [0, 1, 1]',

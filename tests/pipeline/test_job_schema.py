@@ -1,9 +1,11 @@
 """The schema that editors use, and the reference that is made of it."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from pipeline.job.loading import load_job
 from pipeline.job.reference import with_reference
 from pipeline.job.schema import job_schema, node_at
 
@@ -58,6 +60,13 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
         assert node.unit == unit
     assert node_at(("fluid", 0, "no_such_key")) is None
     assert node_at(("gravity", 3)) is None
+
+
+def test_example_in_the_documentation_is_a_valid_job(tmp_path):
+    document = (ROOT / "docs" / "job-file.md").read_text(encoding="utf-8")
+    [example] = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    (tmp_path / "drop.toml").write_text(example)
+    assert load_job(tmp_path / "drop.toml").frame_count == 90
 
 
 def test_reference_in_the_documentation_is_current():

@@ -23,8 +23,9 @@ from render.blender import (
     parse_blender_version,
     require_supported_executable,
 )
-from render.parameters import CameraParameters, MaterialParameters, RenderParameters, StageParameters
+from render.parameters import CameraParameters, MaterialParameters, RenderParameters, StageParameters, VolumeParameters
 from render.spec import MeshObject, MeshSequenceObject, RenderSpec, VolumeSequenceObject
+from render.volume import write_volume
 
 RESOLUTION = (64, 36)
 PROJECT = Path(__file__).resolve().parents[2]
@@ -163,7 +164,7 @@ def ball_pictures(tmp_path_factory) -> tuple[Path, str]:
     """All ball frames, drawn in one process; and what it printed."""
     folder = tmp_path_factory.mktemp("ball")
     write_ball_frames(folder)
-    spec_of(BALL).write(folder / "spec.json")
+    spec_of(BALL, samples=16).write(folder / "spec.json")
     return folder, run_python(RENDER_FRAMES, str(folder), ".{frame:06d}.png.part#1", "0,1,2,3,4,5,6,0")
 
 
@@ -285,15 +286,41 @@ def test_missing_spec_is_refused_by_the_executable(tmp_path, blender_stand_in):
         open_renderer(tmp_path / "nothing.json", threads=1, blender=str(blender_stand_in))
 
 
-def test_missing_volume_and_damaged_volume_are_refused(tmp_path):
-    smoke = VolumeSequenceObject(name="smoke", file="smoke/{frame}.vdb", material=MaterialParameters(look="smoke"))
-    spec_of(smoke, samples=1).write(tmp_path / "spec.json")
+def test_smoke_is_drawn_where_it_is_and_unfit_volumes_are_refused(tmp_path):
+    smoke = VolumeSequenceObject(
+        name="smoke",
+        file="smoke/{frame}.vdb",
+        material=MaterialParameters(look="smoke", color=(0.02, 0.02, 0.02), density=200.0),
+    )
+    spec_of(smoke).write(tmp_path / "spec.json")
     (tmp_path / "smoke").mkdir()
     (tmp_path / "smoke/000001.vdb").write_bytes(b"this is no volume")
-    printed = run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0,1")
+    cells = 16
+    for frame, filled in ((2, slice(0, 0)), (3, slice(0, cells // 2))):
+        density = np.zeros((cells,) * 3, np.float32)
+        density[filled] = 1.0
+        write_volume(
+            tmp_path / f"smoke/{frame:06d}.vdb",
+            density=density,
+            temperature=np.full_like(density, 300.0),
+            velocity=np.zeros((cells, cells, cells, 3), np.float32),
+            origin=(-0.3, -0.3, 0.2),
+            cell_size=0.6 / cells,
+            ambient_temperature=293.0,
+            parameters=VolumeParameters(),
+            fps=60.0,
+            shutter=0.5,
+        )
+    printed = run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0,1,2,3")
     assert "frame 0: the volume" in printed and "000000.vdb does not exist" in printed
     assert "frame 1: cannot read the volume" in printed
-    assert not list(tmp_path.glob("*.png"))
+    assert not (tmp_path / "0.png").exists() and not (tmp_path / "1.png").exists()
+    empty, half_full = (read(tmp_path / f"{frame}.png").mean(axis=2) for frame in (2, 3))
+    darkening = (empty - half_full)[10:26]
+    # Black, dense smoke fills the left half of a 0.6 m cube: there the picture darkens to a fraction, while the right
+    # half only loses some light that was reflected by the floor.
+    assert darkening[:, 24:30].mean() > 0.5 * empty[10:26, 24:30].mean()
+    assert abs(darkening[:, 36:42]).mean() < 0.15 * empty[10:26, 36:42].mean()
 
 
 def test_every_look_and_stage_builds_and_draws(tmp_path):

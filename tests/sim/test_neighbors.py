@@ -53,11 +53,13 @@ def find_neighbors(
         arrays.append(tuple(device(ordered[-1][:, axis]) for axis in range(3)))
     found = NeighborList(grid, len(points), 1)  # room for one neighbour each: has to grow
     found.build(RADIUS, arrays[0], sorts[0].cell_start, len(points), arrays[1], sorts[1].cell_start)
-    start, middle = found.start.to_numpy(), found.boundary_start.to_numpy()
+    start, middle, end = found.start.to_numpy(), found.boundary_start.to_numpy(), found.end.to_numpy()
     indices = found.indices.to_numpy()
     fluid = [set(indices[start[i] : middle[i]].tolist()) for i in range(len(points))]
-    solid = [set(indices[middle[i] : start[i + 1]].tolist()) for i in range(len(points))]
-    assert sum(map(len, fluid)) + sum(map(len, solid)) == found.length
+    solid = [set(indices[middle[i] : end[i]].tolist()) for i in range(len(points))]
+    assert sum(map(len, fluid)) == (middle - start[:-1]).sum()  # nobody twice
+    assert sum(map(len, solid)) == (end - middle).sum()
+    assert (end <= start[1:]).all()
     return fluid, solid, ordered[0], ordered[1]
 
 

@@ -106,7 +106,7 @@ def test_a_checkpoint_of_another_scene_is_refused():
 def test_divergence_names_body_frame_time_and_quantity():
     # omega dt = 50: explicit integration grows about 2500-fold a step and overflows within the third frame.
     world = World([Oscillator("spring", 1 / 6000, omega=3.0e5)], frames_per_second=60)
-    with pytest.raises(SimulationDivergedError, match='"spring" diverged at frame 1.*x is') as caught:
+    with pytest.raises(SimulationDivergedError, match=r'"spring" diverged at frame 1.*x is') as caught:
         for _ in range(10):
             world.advance_frame()
     assert caught.value.body == "spring"

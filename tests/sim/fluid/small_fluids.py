@@ -1,5 +1,7 @@
 """Builds small fluids in small boxes."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +25,7 @@ def make_fluid(
     positions: NDArray[np.float32],
     velocities: NDArray[np.float32] | None = None,
     gravity: tuple[float, float, float] = EARTH,
+    bodies: Sequence[NDArray[np.float32]] = (),
     **parameters: object,
 ) -> WCSPHSolver:
     material = FluidParameters.model_validate(
@@ -35,5 +38,5 @@ def make_fluid(
         gravity=gravity,
         positions=positions,
         velocities=np.zeros_like(positions) if velocities is None else velocities,
-        boundary=BoundarySamples.of_bodies(walls),
+        boundary=BoundarySamples.of_bodies(walls, *bodies),
     )

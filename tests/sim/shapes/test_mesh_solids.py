@@ -105,6 +105,12 @@ def test_inverted_part_beside_a_sound_one_is_turned():
     assert solid.volume == pytest.approx(1.125 * SPHERE.volume, rel=1e-12)
 
 
+def test_inverted_part_that_reaches_into_a_sound_one_is_no_cavity():
+    vertices = np.concatenate([VERTICES, 0.3 * VERTICES + np.array([0.0, 0.0, 1.0])])
+    solid = solid_from_triangles(vertices, np.concatenate([FACES, FACES[:, ::-1] + len(VERTICES)]), label="balls")
+    assert np.all(solid.signed_distance(np.array([[0.0, 0.0, 0.9], [0.0, 0.0, 1.2]])) < 0.0)
+
+
 def test_cavity_stays_outside():
     vertices = np.concatenate([VERTICES, 0.5 * VERTICES])
     solid = solid_from_triangles(vertices, np.concatenate([FACES, FACES[:, ::-1] + len(VERTICES)]), label="shell")

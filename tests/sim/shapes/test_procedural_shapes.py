@@ -7,6 +7,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from sim.rigid.mass_properties import mass_properties_of_mesh
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
+from sim.shapes.tessellation import cut_along
 
 LENGTH = 0.2
 SHAPES = {"duck": {"type": "duck", "length": LENGTH}, "bunny": {"type": "bunny", "height": LENGTH}}
@@ -30,8 +31,9 @@ def test_no_triangle_is_a_needle(shape):
     squared_edges = np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=(1, 2))
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     quality = 4.0 * np.sqrt(3.0) * area / squared_edges  # 1 for equilateral, 0 for collapsed
-    # Marching cubes alone leaves a tenth of its triangles below 0.3.
-    assert np.mean(quality < 0.3) < 0.002
+    # Marching cubes alone leaves collapsed triangles; after relaxing and cutting, 0.16 is the worst measured.
+    assert quality.min() > 0.1
+    assert np.mean(quality < 0.5) < 0.005
     assert np.median(quality) > 0.9
 
 
@@ -77,6 +79,20 @@ def test_both_halves_are_mirror_images(shape):
     points = np.random.default_rng(0).uniform(*solid.bounds, (2000, 3))
     difference = solid.signed_distance(points) - solid.signed_distance(points * [1.0, -1.0, 1.0])
     assert np.abs(difference).max() < 5e-3 * LENGTH  # half a cell: the triangles themselves need not mirror
+
+
+def test_cut_separates_the_sides_and_keeps_the_mesh_closed():
+    mesh = build_solid(Placement(shape={"type": "sphere", "radius": 1.0})).surface_mesh()
+    heights = mesh.vertices @ [0.1, 0.2, 1.0] - 0.3
+    cut = cut_along(mesh, heights)
+    side = cut.vertices @ [0.1, 0.2, 1.0] - 0.3
+    below, above = side[cut.faces].min(axis=1), side[cut.faces].max(axis=1)
+    # The function is linear, so that cuts are exact up to round-off.
+    assert not np.any((below < -1e-12) & (above > 1e-12))
+    assert cut.is_closed
+    assert len(cut.faces) > len(mesh.faces)
+    # Snapped vertices move by a fifth of an edge of 0.06 at most, along edges: within the mesh's own facets.
+    assert cut.signed_volume == pytest.approx(mesh.signed_volume, rel=1e-4)
 
 
 @both

@@ -80,8 +80,8 @@ def test_surface_samples_are_spread_evenly_on_the_surface(shape):
     everywhere, _ = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces), 100_000, seed=1)
     assert tree.query(everywhere)[0].max() < 1.05 * spacing
     area = np.linalg.norm(mesh.area_vectors, axis=1).sum()
-    # Measured 0.95 to 0.97 over all primitives; edges and curvature move it by some percent.
-    assert len(samples) * spacing**2 / area == pytest.approx(0.96, abs=0.06)
+    # Measured 0.90 to 0.95 over all primitives; edges and curvature move it by some percent.
+    assert len(samples) * spacing**2 / area == pytest.approx(0.93, abs=0.06)
 
 
 def test_samples_are_the_same_every_time():

@@ -34,7 +34,7 @@ def relative_divergence(grid: SmokeGrid, faces) -> float:
 @pytest.mark.parametrize(
     ("cells", "open_faces", "obstacle"),
     [
-        ((32, 32, 32), OPEN_BOX, True),
+        pytest.param((32, 32, 32), OPEN_BOX, True, marks=pytest.mark.slow),
         ((32, 32, 32), CLOSED_BOX, True),
         ((19, 7, 26), ("z+",), False),
     ],

@@ -78,6 +78,24 @@ def test_a_hot_plume_rises_past_a_ball_and_counts_what_it_emits(solver):
     assert solver.first_bad_quantity() is None
 
 
+def test_heat_of_the_source_fluctuates_within_its_bounds_and_the_same_in_every_run(solver):
+    fields = []
+    for time_s in (0.0, 0.06, 0.0):
+        solver.restore({name: np.zeros_like(array) for name, array in solver.checkpoint().items()})
+        solver.begin_frame(time_s)
+        solver._emit()
+        snapshot = solver.snapshots()["plume"].arrays
+        fields.append(snapshot["temperature"][snapshot["density"] > 0.0])
+    first, later, again = fields
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, later)
+    (source,) = solver.parameters.source
+    shortfall = (450.0 - first) / (450.0 - 293.0)
+    # The bounds, but for the rounding of temperatures in single precision: 3e-5 K of 157 K.
+    assert -1.0e-6 < shortfall.min() < shortfall.max() < source.fluctuation + 1.0e-6
+    assert np.ptp(shortfall) > 0.1 * source.fluctuation
+
+
 def test_ten_steps_equal_five_and_a_restore_and_five(solver):
     advance(solver, 10)
     uninterrupted = solver.checkpoint()

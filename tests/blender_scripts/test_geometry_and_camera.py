@@ -1,0 +1,155 @@
+"""The parts of the Blender scripts that are arithmetic; importing them needs the bpy module, in a child process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from render.blender import missing_libraries
+
+PROJECT = Path(__file__).resolve().parents[2]
+
+pytestmark = pytest.mark.skipif(
+    find_spec("bpy") is None or bool(missing_libraries()),
+    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
+)
+
+
+def run_inside_blender(code: str, *arguments: str) -> None:
+    """Run code with its assertions where bpy may be imported: one process, one Blender."""
+    completed = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code), *arguments],
+        cwd=PROJECT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert completed.returncode == 0, completed.stdout + completed.stderr
+
+
+def test_automatic_camera_shows_the_whole_domain_and_no_more_than_needed():
+    run_inside_blender(
+        """
+        import itertools
+        import numpy as np
+        from blender_scripts.camera import frame_box
+
+        margin = 0.05
+        for low, high in (((-.5, -.5, 0), (.5, .5, 1)), ((0, 0, 0), (4, .3, .2)), ((10, 10, -3), (10.1, 10.2, 5))):
+            for aspect in (16 / 9, 1.0, 9 / 16):
+                view = frame_box(np.array(low), np.array(high), focal_length_mm=50, aspect=aspect, margin=margin)
+                forward = np.subtract(view.look_at, view.position)
+                forward /= np.linalg.norm(forward)
+                right = np.cross(forward, (0, 0, 1))
+                right /= np.linalg.norm(right)
+                up = np.cross(right, forward)
+                corners = np.array(list(itertools.product(*zip(low, high)))) - view.position
+                depth = corners @ forward
+                half_long = 18.0 / 50
+                half = half_long * min(1, aspect), half_long / max(1, aspect)
+                extents = []
+                for axis, tangent in ((right, half[0]), (up, half[1])):
+                    screen = corners @ axis / depth / tangent
+                    assert abs(screen).max() <= 1 - 2 * margin + 1e-9
+                    # The axis that decides the distance is filled on both sides, the other one is not.
+                    extents.append(min(screen.max(), -screen.min()))
+                assert abs(max(extents) - (1 - 2 * margin)) < 1e-9, (low, high, aspect, extents)
+                assert depth.min() > 0 and forward[2] < 0
+        """
+    )
+
+
+def test_ply_of_the_projects_writer_reads_back_and_fills_a_blender_mesh(tmp_path):
+    run_inside_blender(
+        """
+        import sys
+        from pathlib import Path
+        import bpy
+        import numpy as np
+        from blender_scripts.geometry import fill_mesh, read_ply
+        from render.meshes import write_ply
+
+        path = Path(sys.argv[1]) / "mesh.ply"
+        rng = np.random.default_rng(1)
+        vertices, triangles = rng.normal(size=(50, 3)), rng.permuted(np.tile(np.arange(50), (30, 1)), axis=1)[:, :3]
+        normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+        velocities = rng.normal(size=(50, 3))
+        write_ply(path, vertices, triangles, normals=normals, velocities=velocities)
+        source = read_ply(path)
+        for count in (30, 7):
+            # A second, smaller filling leaves nothing of the first.
+            part = type(source)(source.positions, source.triangles[:count], source.normals, source.velocities)
+            mesh = bpy.data.meshes.get("m") or bpy.data.meshes.new("m")
+            fill_mesh(mesh, part)
+            assert not mesh.validate(), "Blender had to repair the mesh"
+            assert (len(mesh.vertices), len(mesh.polygons)) == (50, count)
+            for name, expected in (("position", vertices), ("velocity", velocities), ("custom_normal", normals)):
+                values = np.empty(150, np.float32)
+                mesh.attributes[name].data.foreach_get("vector", values)
+                np.testing.assert_array_equal(values.reshape(50, 3), expected.astype(np.float32))
+            corners = np.empty(3 * count, np.int32)
+            mesh.loops.foreach_get("vertex_index", corners)
+            np.testing.assert_array_equal(corners.reshape(count, 3), triangles[:count])
+        """,
+        str(tmp_path),
+    )
+
+
+UNFIT_MESHES = {
+    "is not a PLY mesh": b"solid stl",
+    "binary_little_endian is needed": b"ply\nformat ascii 1.0\nend_header\n",
+    "needs exactly the elements": b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n",
+    "refers to vertices that it does not have": (
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+        b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        + bytes(12)
+        + b"\x03"
+        + b"\x05\0\0\0" * 3
+    ),
+}
+
+
+def test_unfit_meshes_are_refused_with_the_reason(tmp_path):
+    for index, content in enumerate(UNFIT_MESHES.values()):
+        (tmp_path / f"{index}.ply").write_bytes(content)
+    run_inside_blender(
+        """
+        import sys
+        from pathlib import Path
+        from blender_scripts.errors import RenderInputError
+        from blender_scripts.geometry import read_ply
+
+        for index, complaint in enumerate(sys.argv[2:]):
+            try:
+                read_ply(Path(sys.argv[1]) / f"{index}.ply")
+            except RenderInputError as error:
+                assert complaint in str(error), error
+            else:
+                raise AssertionError(f"accepted: {complaint}")
+        """,
+        str(tmp_path),
+        *UNFIT_MESHES,
+    )
+
+
+def test_stripping_removes_what_varies_and_keeps_every_pixel(tmp_path):
+    from PIL import Image, PngImagePlugin
+
+    from blender_scripts.png import iterate_chunks, strip_metadata
+
+    stamp = PngImagePlugin.PngInfo()
+    stamp.add_text("Date", "2026/01/01 00:00:00")
+    picture = Image.effect_noise((40, 30), 50)
+    picture.save(tmp_path / "stamped.png", pnginfo=stamp)
+    picture.save(tmp_path / "plain.png")
+    assert (tmp_path / "stamped.png").read_bytes() != (tmp_path / "plain.png").read_bytes()
+    strip_metadata(tmp_path / "stamped.png")
+    assert (tmp_path / "stamped.png").read_bytes() == (tmp_path / "plain.png").read_bytes()
+    with pytest.raises(ValueError, match="truncated"):
+        list(iterate_chunks((tmp_path / "plain.png").read_bytes()[:-5]))
