@@ -42,7 +42,7 @@ class QualityPreset:
 
 
 QUALITY_PRESETS = {
-    "draft": QualityPreset(8, 0.1, "FAST", "ACCURATE", False, True, 2.0, 0, 6, 1, 6),
+    "draft": QualityPreset(6, 0.1, "FAST", "ACCURATE", False, True, 2.0, 0, 6, 1, 6),
     "preview": QualityPreset(48, 0.05, "BALANCED", "ACCURATE", True, True, 1.0, 1, 10, 2, 10),
     "final": QualityPreset(256, 0.02, "HIGH", "ACCURATE", True, False, 1.0, 3, 24, 4, 16),
 }

@@ -69,12 +69,54 @@ def reconstruct_surface(
     except RuntimeError as error:
         raise SurfaceReconstructionError(f"splashsurf failed on {len(position_rows)} particles: {error}") from error
     attributes = reconstructed.point_attributes
-    return SurfaceMesh(
-        vertices=np.array(reconstructed.mesh.vertices, np.float32),
-        faces=np.array(reconstructed.mesh.triangles, np.int32),
-        normals=np.array(attributes["normals"], np.float32),
-        velocities=np.array(attributes["velocity"], np.float32),
+    return without_collapsed_parts(
+        SurfaceMesh(
+            vertices=np.array(reconstructed.mesh.vertices, np.float32),
+            faces=np.array(reconstructed.mesh.triangles, np.int32),
+            normals=np.array(attributes["normals"], np.float32),
+            velocities=np.array(attributes["velocity"], np.float32),
+        )
     )
+
+
+def without_collapsed_parts(mesh: SurfaceMesh) -> SurfaceMesh:
+    """Drop the parts of a surface that have no volume, and make sure that every normal is a unit vector.
+
+    Mesh cleanup now and then collapses a cavity of a single cell to two triangles back to back. Their area vectors
+    cancel, so splashsurf gives their vertices no normal (NaN), and there is nothing to see of them. A vertex without a
+    normal in a part that does have volume takes the mean of its triangles.
+
+    Raises:
+        SurfaceReconstructionError: a vertex of a part with volume has triangles of no area only.
+    """
+    assert mesh.normals is not None and mesh.velocities is not None
+    undefined = ~np.isfinite(mesh.normals).all(axis=1)
+    if not undefined.any():
+        return mesh
+    faces = mesh.faces[~undefined[mesh.faces].all(axis=1)]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    kept = used | ~undefined
+    normals = mesh.normals.copy()
+    for vertex in np.flatnonzero(undefined & used):
+        normals[vertex] = _mean_normal(mesh.vertices, faces[(faces == vertex).any(axis=1)])
+    number = np.cumsum(kept, dtype=np.int32) - 1
+    return SurfaceMesh(
+        vertices=mesh.vertices[kept],
+        faces=number[faces].astype(np.int32),
+        normals=normals[kept],
+        velocities=mesh.velocities[kept],
+    )
+
+
+def _mean_normal(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Unit normal of the sum of some triangles' area vectors."""
+    corners = vertices[faces].astype(np.float64)
+    total = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(axis=0)
+    length = float(np.linalg.norm(total))
+    if length == 0.0:
+        raise SurfaceReconstructionError(f"the surface has no direction at {corners[0, 0].tolist()}")
+    return np.asarray(total / length)
 
 
 def pipeline_options(parameters: SurfaceParameters) -> dict[str, Any]:

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from pipeline.run_events import Outcome
     from pipeline.runner import Selection
 
+STALL_TIMEOUT_S = 3600.0
+"""A task without a sign of life for so long is ended. A single frame shows none while Cycles draws it, and a final one
+in film resolution takes half an hour on a few cores."""
+
 cores_option = click.option(
     "--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all of them if omitted."
 )
@@ -98,7 +102,7 @@ def run(
     rerun: Selection | None = None,
 ) -> None:
     """Run a job with progress on standard error, say how it ended, and exit with the outcome's code."""
-    from pipeline.executors.processes import ProcessExecutor
+    from pipeline.executors.processes import ProcessExecutor, WorkerLimits
     from pipeline.progress import ProgressObserver, open_display
     from pipeline.resources import machine_capacity
     from pipeline.runner import run_job
@@ -109,7 +113,8 @@ def run(
     if cores is not None:
         capacity = replace(capacity, cores=min(cores, capacity.cores))
     try:
-        with ProgressObserver(open_display()) as observer, ProcessExecutor() as executor:
+        limits = WorkerLimits(stall_timeout_s=STALL_TIMEOUT_S)
+        with ProgressObserver(open_display()) as observer, ProcessExecutor(limits) as executor:
             outcome = run_job(
                 job,
                 layout,

@@ -15,7 +15,7 @@ class SurfaceStage:
     """One PLY a fluid and frame (splashsurf)."""
 
     name = "surface"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a fluid and frame."""

@@ -12,7 +12,7 @@ import pytest
 
 from render.meshes import SurfaceMesh
 from render.parameters import SurfaceParameters
-from render.surface import SurfaceReconstructionError, reconstruct_surface
+from render.surface import SurfaceReconstructionError, reconstruct_surface, without_collapsed_parts
 
 RADIUS = 0.005
 BALL_RADIUS = 0.1
@@ -181,3 +181,38 @@ def test_arrays_that_do_not_fit_together_are_refused():
         mesh_of(ball(), ball()[:-1])
     with pytest.raises(ValueError, match=r"positions must have the shape \(n, 3\), got \(4, 2\)"):
         mesh_of(np.zeros((4, 2)), np.zeros((4, 2)))
+
+
+TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+TETRAHEDRON_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+
+
+def surface_of(vertices, faces, undefined) -> SurfaceMesh:
+    normals = np.tile(np.float32([0, 0, 1]), (len(vertices), 1))
+    normals[list(undefined)] = np.nan
+    velocities = np.arange(3 * len(vertices), dtype=np.float32).reshape(-1, 3)
+    return SurfaceMesh(np.asarray(vertices, np.float32), np.asarray(faces, np.int32), normals, velocities)
+
+
+def test_a_part_collapsed_to_two_triangles_back_to_back_is_dropped():
+    flat = np.array([[5, 5, 5], [6, 5, 5], [5, 6, 5]], np.float32)
+    whole = surface_of(
+        np.concatenate([flat, TETRAHEDRON]), np.concatenate([[[0, 1, 2], [2, 1, 0]], TETRAHEDRON_FACES + 3]), {0, 1, 2}
+    )
+    cleaned = without_collapsed_parts(whole)
+    np.testing.assert_array_equal(cleaned.vertices, TETRAHEDRON)
+    np.testing.assert_array_equal(cleaned.faces, TETRAHEDRON_FACES)
+    np.testing.assert_array_equal(cleaned.velocities, whole.velocities[3:])
+    assert np.isfinite(cleaned.normals).all()
+
+
+def test_a_vertex_without_a_normal_takes_the_mean_of_its_triangles():
+    cleaned = without_collapsed_parts(surface_of(TETRAHEDRON, TETRAHEDRON_FACES, {0}))
+    np.testing.assert_array_equal(cleaned.faces, TETRAHEDRON_FACES)
+    # The corner at the origin of three equal right triangles: the diagonal, pointing out, to float32 rounding.
+    np.testing.assert_allclose(cleaned.normals[0], -np.ones(3) / np.sqrt(3), atol=1e-6)
+
+
+def test_a_surface_whose_normals_are_all_defined_is_left_alone():
+    whole = surface_of(TETRAHEDRON, TETRAHEDRON_FACES, ())
+    assert without_collapsed_parts(whole) is whole
