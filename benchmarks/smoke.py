@@ -1,6 +1,6 @@
 """Time and memory of a smoke step: MacCormack, confinement and projection of a developed plume.
 
-    python -m benchmarks.smoke [--cells 64 128] [--steps 7] [--threads N]
+    python -m benchmarks.smoke [--cells 64 128] [--steps 7] [--threads N] [--device cpu]
 
 Prints JSON. Times are of whole substeps, after the plume has risen through the box; the fastest is the one that other
 work on the machine disturbed least, and processor time, summed over the threads, tells what contention hides.
@@ -75,8 +75,9 @@ def main() -> None:
     parser.add_argument("--cells", type=int, nargs="+", default=[64, 128])
     parser.add_argument("--steps", type=int, default=7)
     parser.add_argument("--threads", type=int)
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    device = initialize("cpu", threads=arguments.threads)
+    device = initialize(arguments.device, threads=arguments.threads)
     results = [measure(cells, arguments.steps) for cells in arguments.cells]
     print(json.dumps({"device": device, "results": results}, indent=2))
 

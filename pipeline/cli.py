@@ -66,7 +66,7 @@ def new(name: Path, template: str) -> None:
 @job_options
 @click.option("--json", "as_json", is_flag=True, help="Print the whole job, defaults included, as JSON.")
 def check(job_file: Path, overrides: tuple[str, ...], preview: bool, as_json: bool) -> None:
-    """Say what is wrong with a job file, and how large the job is; runs nothing.
+    """Say what is wrong with a job file, and how large the job is.
 
     \b
     pipeline check jobs/quickstart.toml
@@ -92,7 +92,9 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, as_json: bo
 
 @main.command()
 def schema() -> None:
-    """Print the JSON Schema of the job file; editors complete and check TOML with it.
+    """Print the JSON Schema of the job file.
+
+    Editors complete and check TOML with it.
 
     \b
     pipeline schema > job.schema.json      then, as a job file's first line:   #:schema job.schema.json

@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from pipeline.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
+from render.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
 
 Status = Literal["ok", "warning", "failed"]
 

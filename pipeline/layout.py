@@ -30,6 +30,10 @@ class JobLayout:
         """Who runs this job right now."""
         return self.root / "runner.lease"
 
+    def is_of_lease(self, path: Path) -> bool:
+        """Whether a path is that of the lease or of its guard."""
+        return path.parent == self.root and self.lease.name in path.name
+
     @property
     def receipts(self) -> Path:
         """Folder of all receipts."""
@@ -64,9 +68,9 @@ class JobLayout:
         return ArtifactPath(f"cache/{frame:06d}.h5")
 
     @staticmethod
-    def body_mesh(body: str) -> ArtifactPath:
-        """PLY mesh of a rigid body in its rest pose."""
-        return ArtifactPath(f"meshes/{body}.ply")
+    def body_mesh(body: str, part: str = "body") -> ArtifactPath:
+        """PLY mesh of a rigid body, or of a part of it, in its rest pose."""
+        return ArtifactPath(f"meshes/{body}.ply" if part == "body" else f"meshes/{body}.{part}.ply")
 
     @staticmethod
     def surface(body: str, frame: int) -> ArtifactPath:

@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
+from pipeline import wording
 from pipeline.executors.base import Committed, Failed
 from pipeline.executors.base import Progress as TaskProgress
 from pipeline.plan import Assessment, Verdict, summarize
 from pipeline.run_events import Notice, RunEvent, RunStarted, StateChanged
-from pipeline.task import TaskId, TaskState
+from pipeline.task import ArtifactPath, TaskId, TaskState
 
 PLAIN_INTERVAL_S = 10.0
 """Between two lines about the same stage where there is no terminal."""
@@ -44,8 +45,8 @@ class StageProgress:
             self.ended = now
 
     def rate(self, now: float) -> float | None:
-        """Artifacts a second of this run; None before there are two."""
-        if self.began is None or self.done - self.at_start < 2:
+        """Artifacts a second of this run; None before there are three, as two may come at once."""
+        if self.began is None or self.done - self.at_start < 3:
             return None
         seconds = (self.ended or now) - self.began
         # The first one only starts the clock, as its beginning was not seen.
@@ -63,7 +64,7 @@ class StageProgress:
         if rate is not None:
             parts.append(f"{rate:.2f}/s" if rate >= 0.1 else f"{1.0 / rate:.1f} s each")
         if remaining:
-            parts.append(f"{_duration(remaining)} left")
+            parts.append(f"{wording.duration(remaining)} left")
         if self.failed:
             parts.append(f"{self.failed} failed")
         return ", ".join(parts)
@@ -88,8 +89,7 @@ class ProgressObserver:
 
     display: Display
     stages: dict[str, StageProgress] = field(default_factory=dict)
-    _outputs: dict[TaskId, int] = field(default_factory=dict)
-    _committed: dict[TaskId, int] = field(default_factory=dict)
+    _awaited: dict[TaskId, set[ArtifactPath]] = field(default_factory=dict)
     _stage_of: dict[TaskId, str] = field(default_factory=dict)
 
     def notify(self, event: RunEvent) -> None:
@@ -98,13 +98,12 @@ class ProgressObserver:
         match event:
             case RunStarted(assessments):
                 self._start(assessments)
-            case Committed(task_id):
-                self._committed[task_id] = self._committed.get(task_id, 0) + 1
-                self.stages[self._stage_of[task_id]].advance(1, now)
+            case Committed(task_id, _, receipt):
+                self._count(task_id, {receipt.artifact}, now)
             case TaskProgress(task_id, _, _, _, message):
                 self.stages[self._stage_of[task_id]].message = message
-            case StateChanged(task_id, stage, TaskState.UP_TO_DATE):
-                self.stages[stage].advance(self._outputs[task_id] - self._committed.get(task_id, 0), now)
+            case StateChanged(task_id, _, TaskState.UP_TO_DATE | TaskState.SUCCEEDED):
+                self._count(task_id, self._awaited[task_id], now)
             case StateChanged(task_id, stage, TaskState.FAILED):
                 self.stages[stage].failed += 1
             case Failed(task_id, attempt, kind, message):
@@ -128,7 +127,14 @@ class ProgressObserver:
             stage.done += done
             stage.at_start += done
             self._stage_of[task.id] = task.stage
-            self._outputs[task.id] = len(assessment.rebuilds)
+            self._awaited[task.id] = set(assessment.rebuilds)
+
+    def _count(self, task_id: TaskId, artifacts: set[ArtifactPath], now: float) -> None:
+        """These are there now; each counts once, also if a second attempt commits it again."""
+        news = self._awaited[task_id] & artifacts
+        if news:
+            self._awaited[task_id] = self._awaited[task_id] - news
+            self.stages[self._stage_of[task_id]].advance(len(news), now)
 
     def __enter__(self) -> Self:
         return self
@@ -210,10 +216,3 @@ def open_display() -> Display:
     """Live bars if standard error is a terminal, else plain lines."""
     console = Console(stderr=True)
     return LiveDisplay(console) if console.is_terminal else PlainDisplay(sys.stderr)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"

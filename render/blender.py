@@ -6,7 +6,6 @@ Both draw with `blender_scripts`; the executable is started once and asked for f
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import logging
 import re
 import subprocess
@@ -16,24 +15,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 
+from render.system_libraries import install_line, missing_libraries, missing_packages
+
 logger = logging.getLogger(__name__)
 
 MINIMUM_BLENDER_VERSION = (4, 5)
 _STARTUP_VERSION_TIMEOUT_S = 120.0
 _TERMINATE_TIMEOUT_S = 10.0
 _LOG_TAIL_LINES = 30
-
-_SHARED_LIBRARIES = {
-    "libX11.so.6": "libx11-6",
-    "libXrender.so.1": "libxrender1",
-    "libXfixes.so.3": "libxfixes3",
-    "libXi.so.6": "libxi6",
-    "libxkbcommon.so.0": "libxkbcommon0",
-    "libSM.so.6": "libsm6",
-    "libICE.so.6": "libice6",
-    "libGL.so.1": "libgl1",
-}
-"""What the bpy module needs of a Linux system beyond a minimal Debian: library -> Debian package."""
 
 
 class BlenderUnavailableError(RuntimeError):
@@ -85,13 +74,6 @@ def open_renderer(spec_path: Path, *, threads: int, blender: str | None) -> Rend
     return ExecutableRenderer(spec_path, threads=threads, blender=blender)
 
 
-def missing_libraries() -> list[tuple[str, str]]:
-    """Shared libraries that the bpy module needs and this system lacks, as (library, Debian package)."""
-    if sys.platform != "linux":
-        return []
-    return [(library, package) for library, package in _SHARED_LIBRARIES.items() if not _can_load(library)]
-
-
 def require_bpy() -> None:
     """Raise BlenderUnavailableError, with the remedy, when the bpy module cannot be imported here.
 
@@ -106,8 +88,8 @@ def require_bpy() -> None:
     missing = missing_libraries()
     if missing:
         raise BlenderUnavailableError(
-            f"Blender needs shared libraries that this system lacks: {', '.join(library for library, _ in missing)}; "
-            f"install them: apt-get install {' '.join(package for _, package in missing)}"
+            f"Blender needs shared libraries that this system lacks: {', '.join(missing)}; "
+            f"install them: {install_line(missing_packages())}"
         )
 
 
@@ -269,11 +251,3 @@ def _render_script() -> Path:
     if package is None or package.origin is None:
         raise BlenderUnavailableError("the folder blender_scripts of this project is not on Python's path")
     return Path(package.origin).with_name("render_frames.py")
-
-
-def _can_load(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True

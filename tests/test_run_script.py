@@ -43,10 +43,11 @@ def wheel(folder: Path, value: int) -> str:
 def project(tmp_path: Path) -> Path:
     root = tmp_path / "my project"
     (root / "pipeline").mkdir(parents=True)
+    (root / "render").mkdir()
     shutil.copy2(ROOT / "run", root / "run")
     (root / "pipeline" / "__init__.py").touch()
     (root / "pipeline" / "__main__.py").write_text("import sys\nprint('ours', *sys.argv[1:])\n")
-    shutil.copy2(ROOT / "pipeline" / "system_libraries.py", root / "pipeline")
+    shutil.copy2(ROOT / "render" / "system_libraries.py", root / "render")
     (root / "requirements.lock").write_text(wheel(tmp_path, 1))
     return root
 

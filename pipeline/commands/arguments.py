@@ -66,7 +66,8 @@ def find_job(job: str, output: Path) -> JobLayout:
         if path.name == "job.toml" and (path.parent / "manifest.db").exists():
             folder = path.parent
     else:
-        folder = path if path.is_dir() else output / job
+        # A name wins over a folder of the same name that is no job's.
+        folder = path if JobLayout(path).job_file.exists() else output / job
     layout = JobLayout(folder)
     if not layout.job_file.exists():
         raise PipelineError(f"no submitted job in {folder}; submit one with: pipeline submit JOB.toml")

@@ -6,12 +6,12 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from pipeline import wording
 from pipeline.commands.arguments import (
     find_job,
     job_options,
@@ -29,6 +29,12 @@ if TYPE_CHECKING:
     from pipeline.plan import Assessment
 
 FOLLOW_INTERVAL_S = 0.5
+
+_VERDICT_WORDING = {
+    "up to date": "up to date",
+    "stale": "would run",
+    "downstream": "would run if its inputs turn out different",
+}
 
 
 @click.command()
@@ -57,9 +63,10 @@ def plan(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path
         click.echo(line)
     for each in estimate(assessments, estimates):
         if each.seconds is not None and each.bytes is not None:
-            click.echo(f"{each.stage}: about {_seconds(each.seconds)} of work, {_bytes(each.bytes)}")
-    todo = sum(len(each.rebuilds) for each in assessments if each.verdict is not Verdict.UP_TO_DATE)
-    click.echo(f"{todo} of {sum(len(each.task.outputs) for each in assessments)} files to make")
+            click.echo(f"{each.stage}: about {wording.duration(each.seconds)} of work, {wording.size(each.bytes)}")
+    todo = sum(len(each.rebuilds) for each in assessments)
+    at_most = "at most " if any(each.verdict is Verdict.DOWNSTREAM for each in assessments) else ""
+    click.echo(f"{at_most}{todo} of {sum(len(each.task.outputs) for each in assessments)} files to make")
 
 
 @click.command()
@@ -95,7 +102,10 @@ def status(job: str, output: Path, as_json: bool) -> None:
         return
     click.echo(f"{layout.root}: {_activity(holder.pid if holder else None, summary)}")
     for stage in summary:
-        counts = ", ".join(f"{count} {state}" for state, count in stage.counts.items())
+        counts = ", ".join(
+            f"{count} {'interrupted' if state is TaskState.RUNNING and holder is None else state}"
+            for state, count in stage.counts.items()
+        )
         click.echo(f"  {stage.stage:>9}  {counts}")
     for attempt in failures[:10]:
         click.secho(f"  {attempt.task} {attempt.outcome}: {attempt.message}", fg="red")
@@ -109,7 +119,9 @@ def status(job: str, output: Path, as_json: bool) -> None:
 @click.option("--attempt", type=click.IntRange(min=1), help="Number of the attempt; the last one if omitted.")
 @click.option("--follow", "-f", is_flag=True, help="Keep printing as the log grows.")
 def logs(job: str, output: Path, task: str | None, attempt: int | None, follow: bool) -> None:
-    """Print the log of a task's attempt; without a task, list the tasks that have one.
+    """Print the log of a task.
+
+    Without a task, list those that have a log.
 
     \b
     pipeline logs quickstart
@@ -137,7 +149,9 @@ def logs(job: str, output: Path, task: str | None, attempt: int | None, follow: 
 @click.argument("task")
 @json_option
 def explain(job: str, output: Path, task: str, as_json: bool) -> None:
-    """Tell the whole story of one task: its inputs, its outputs, every attempt, and what it is waiting for.
+    """Tell the whole story of one task.
+
+    Its inputs, its outputs, every attempt, and why it would run again.
 
     \b
     pipeline explain quickstart render/000012
@@ -167,7 +181,8 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
         }
         click.echo(json.dumps(story, indent=1))
         return
-    click.echo(f"{task}: {state or 'not planned yet'}, {found.verdict.value}")
+    states = dict.fromkeys([state or "not planned yet", _VERDICT_WORDING[found.verdict.value]])
+    click.echo(f"{task}: {', '.join(states)}")
     for reason in found.reasons:
         click.echo(f"  {reason.text}")
     click.echo(f"reads   {_shortened(found.task.inputs) or 'the job file only'}")
@@ -176,7 +191,9 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
             click.echo(f"makes   {path}: not there yet")
         else:
             flaw = verify_artifact(layout, receipt, deep=False)
-            click.echo(f"makes   {path}: {_bytes(receipt.size)}, attempt {receipt.attempt}, {flaw or 'as committed'}")
+            click.echo(
+                f"makes   {path}: {wording.size(receipt.size)}, attempt {receipt.attempt}, {flaw or 'as committed'}"
+            )
     if len(receipts) > 3:
         there = sum(receipt is not None for _, receipt in receipts)
         click.echo(f"        ... {there} of {len(receipts)} files are there")
@@ -184,7 +201,7 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
     for attempt in history:
         click.echo(_attempt_line(attempt))
     for event in events:
-        click.echo(f"  {_when(event.time)}  {event.kind}: {event.message}")
+        click.echo(f"  {wording.moment(event.time)}  {event.kind}: {event.message}")
 
 
 def assess_job(job: Job, layout: JobLayout) -> tuple[list[Assessment], dict[str, Any]]:
@@ -270,27 +287,11 @@ def _attempt_line(attempt: AttemptRow) -> str:
     if attempt.finished is None:
         how = "running"
     else:
-        how = f"{attempt.outcome}" + (f" in {_seconds(attempt.seconds)}" if attempt.seconds is not None else "")
-        how += f", peak {_bytes(attempt.peak_memory_bytes)}" if attempt.peak_memory_bytes else ""
+        how = f"{attempt.outcome}" + (f" in {wording.duration(attempt.seconds)}" if attempt.seconds is not None else "")
+        how += f", peak {wording.size(attempt.peak_memory_bytes)}" if attempt.peak_memory_bytes else ""
         how += f": {attempt.message}" if attempt.message else ""
-    return f"  {_when(attempt.started)}  attempt {attempt.number} on {attempt.host}: {how}"
+    return f"  {wording.moment(attempt.started)}  attempt {attempt.number} on {attempt.host}: {how}"
 
 
 def _shortened(paths: Sequence[str]) -> str:
     return ", ".join(paths) if len(paths) <= 4 else f"{paths[0]} ... {paths[-1]} ({len(paths)} files)"
-
-
-def _when(time_s: float) -> str:
-    return datetime.fromtimestamp(time_s, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
-
-
-def _seconds(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
-
-
-def _bytes(size: float) -> str:
-    for unit in ("bytes", "KiB", "MiB", "GiB"):
-        if size < 1024 or unit == "GiB":
-            return f"{size:.0f} {unit}" if unit == "bytes" else f"{size:.1f} {unit}"
-        size /= 1024
-    raise AssertionError

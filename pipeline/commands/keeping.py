@@ -10,6 +10,7 @@ from pathlib import Path
 
 import click
 
+from pipeline import wording
 from pipeline.commands.arguments import find_job, json_option, submitted_job_argument
 from pipeline.errors import PipelineError
 from pipeline.layout import JobLayout
@@ -22,9 +23,10 @@ from pipeline.task import ArtifactPath
 @click.option("--rebuild", is_flag=True, help="Make a new manifest of the receipts; the old one is kept aside.")
 @json_option
 def verify(job: str, output: Path, deep: bool, rebuild: bool, as_json: bool) -> None:
-    """Check that every finished file is as it was committed. Submitting the job again makes anew what is not.
+    """Check that every finished file is as it was committed.
 
-    Exits with 1 if something is wrong.
+    Submitting the job again makes anew what is not. Where only its bytes give a damaged file away, it gets a new
+    modification time, so that submitting finds it too. Exits with 1 if something is wrong.
 
     \b
     pipeline verify quickstart
@@ -56,7 +58,19 @@ def verify(job: str, output: Path, deep: bool, rebuild: bool, as_json: bool) -> 
         click.echo(f"{checked} files checked {how}, {len(flaws)} not as committed")
         if flaws:
             click.echo(f"heal with: pipeline resume {layout.root}")
+    if deep:
+        for artifact in flaws:
+            _mark_as_touched(layout.path(ArtifactPath(artifact)))
     sys.exit(int(bool(flaws)))
+
+
+def _mark_as_touched(path: Path) -> None:
+    """Give a damaged file a modification time that its receipt does not know, if it is there and has not got one."""
+    try:
+        if path.exists():
+            path.touch()
+    except OSError as error:
+        raise PipelineError(f"cannot mark {path} as damaged: {error.strerror}; remove it before resuming") from error
 
 
 @click.command()
@@ -65,7 +79,9 @@ def verify(job: str, output: Path, deep: bool, rebuild: bool, as_json: bool) -> 
 @click.option("--all", "everything", is_flag=True, help="Remove the job's whole folder.")
 @click.option("--yes", is_flag=True, help="Really remove; without it, only say what would go.")
 def clean(job: str, output: Path, stages: tuple[str, ...], everything: bool, yes: bool) -> None:
-    """Remove a job's files, by stage or all of them. Without --yes it only says what would go.
+    """Remove a job's files, by stage or all of them.
+
+    Without --yes it only says what would go.
 
     \b
     pipeline clean quickstart --stage surface --stage volume
@@ -76,18 +92,29 @@ def clean(job: str, output: Path, stages: tuple[str, ...], everything: bool, yes
     if not stages and not everything:
         raise click.UsageError("say what to remove: --stage or --all")
     layout = find_job(job, output)
+    if everything and not layout.manifest.exists():
+        # A folder with somebody's job.toml in it, for all we know.
+        raise PipelineError(f"{layout.root} holds no finished work of a job; remove it yourself if you mean to")
     with Lease.acquire(layout.lease):
         if everything:
-            _remove_everything(layout, really=yes)
+            _remove_contents(layout, really=yes)
         else:
             _remove_stages(layout, frozenset(stages), really=yes)
-
-
-def _remove_everything(layout: JobLayout, *, really: bool) -> None:
-    files = [path for path in layout.root.rglob("*") if path.is_file()]
-    _announce(layout.root, files, really=really)
-    if really:
+    if everything and yes and all(map(layout.is_of_lease, layout.root.iterdir())):
         shutil.rmtree(layout.root)
+
+
+def _remove_contents(layout: JobLayout, *, really: bool) -> None:
+    """Everything but the lease's own files, which are needed to give it back."""
+    files = [path for path in layout.root.rglob("*") if path.is_file() and not layout.is_of_lease(path)]
+    _announce(layout.root, files, really=really)
+    if not really:
+        return
+    for path in layout.root.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif not layout.is_of_lease(path):
+            path.unlink()
 
 
 def _remove_stages(layout: JobLayout, stages: frozenset[str], *, really: bool) -> None:
@@ -128,7 +155,7 @@ def _remove(layout: JobLayout, artifacts: Iterable[ArtifactPath]) -> None:
 
 def _announce(folder: Path, files: list[Path], *, really: bool) -> None:
     size = sum(path.stat().st_size for path in files if path.exists())
-    verb = "removed" if really else "would remove"
-    click.echo(f"{verb} {len(files)} files, {size / 2**20:.1f} MiB, in {folder}")
+    verb = "removing" if really else "would remove"
+    click.echo(f"{verb} {len(files)} files, {wording.size(size)}, in {folder}")
     if not really and files:
         click.echo("nothing was removed; add --yes to do it")

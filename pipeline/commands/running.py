@@ -5,11 +5,19 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 
-from pipeline.commands.arguments import find_job, job_options, output_option, parse_frames, submitted_job_argument
+from pipeline import wording
+from pipeline.commands.arguments import (
+    DEFAULT_OUTPUT,
+    find_job,
+    job_options,
+    output_option,
+    parse_frames,
+    submitted_job_argument,
+)
 from pipeline.errors import JobBusyError, PipelineError, StageUnavailableError
 from pipeline.layout import JobLayout
 
@@ -32,30 +40,32 @@ cores_option = click.option(
 @output_option
 @cores_option
 def submit(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path, cores: int | None) -> None:
-    """Run a job until its film is there; whatever is there already is kept.
+    """Run a job until its film is there.
 
-    Submitted again after a crash, a kill or Ctrl-C, it continues. Submitted again after a change, it runs what the
-    change concerns, and says so first. If the job is running already, it watches that run instead.
+    Whatever is there already is kept. Submitted again after a crash, a kill or Ctrl-C, it continues. Submitted again
+    after a change, it runs what the change concerns, and says so first. If the job is running already, it watches that
+    run first.
 
     \b
     pipeline submit jobs/quickstart.toml
     pipeline submit dam.toml --preview
     pipeline submit dam.toml --set render.quality=final --set camera.f_stop=2.8
     """
-    from pipeline.commands.arguments import DEFAULT_OUTPUT
-    from pipeline.job.checks import load_checked_job
     from pipeline.job.loading import read_job
 
     loaded = read_job(job_file, overrides, preview=preview)
     in_its_folder = output == DEFAULT_OUTPUT and job_file.name == "job.toml" and not overrides and not preview
     own_folder = JobLayout(job_file.parent)
     layout = own_folder if in_its_folder and own_folder.manifest.exists() else JobLayout(output / loaded.job.name)
-    if not _is_done(loaded.job, layout):
+    todo = _stages_to_run(loaded.job, layout)
+    if todo:
         # Checking the scene builds its shapes, which takes longer than finding out that there is nothing to do.
+        from pipeline.job.checks import load_checked_job
+
         loaded, _ = load_checked_job(job_file, overrides, preview=preview)
         for warning in loaded.warnings:
             click.secho(f"warning: {warning}", err=True, fg="yellow")
-    run(loaded.job, layout, job_text=loaded.text, cores=cores)
+    run(loaded.job, layout, todo, job_text=loaded.text, cores=cores)
 
 
 @click.command()
@@ -69,7 +79,8 @@ def resume(job: str, output: Path, cores: int | None) -> None:
     pipeline resume /mnt/films/dam-break
     """
     layout = find_job(job, output)
-    run(_job_in(layout), layout, cores=cores)
+    submitted = _job_in(layout)
+    run(submitted, layout, _stages_to_run(submitted, layout), cores=cores)
 
 
 @click.command()
@@ -78,59 +89,92 @@ def resume(job: str, output: Path, cores: int | None) -> None:
 @click.option("--frames", metavar="RANGES", help="Only these frames: 7 or 0-29 or 0-29,60-89.")
 @cores_option
 def rerun(job: str, output: Path, stages: tuple[str, ...], frames: str | None, cores: int | None) -> None:
-    """Run stages or frames again although they are up to date, and then what depends on them if it changed.
+    """Run stages or frames again although they are up to date.
+
+    What depends on them follows if they turn out different.
 
     \b
     pipeline rerun quickstart --stage render --frames 10-19
     pipeline rerun quickstart --stage surface
     """
     from pipeline.runner import Selection
+    from pipeline.stages import STAGES
 
     if not stages and frames is None:
         raise click.UsageError("say what to run again: --stage, --frames or both")
     layout = find_job(job, output)
     selection = Selection(frozenset(stages), None if frames is None else parse_frames(frames))
-    run(_job_in(layout), layout, cores=cores, rerun=selection)
+    run(_job_in(layout), layout, frozenset(stage.name for stage in STAGES), cores=cores, rerun=selection)
 
 
 def run(
     job: Job,
     layout: JobLayout,
+    todo: frozenset[str],
     *,
     job_text: str | None = None,
     cores: int | None = None,
     rerun: Selection | None = None,
-) -> None:
-    """Run a job with progress on standard error, say how it ended, and exit with the outcome's code."""
+) -> NoReturn:
+    """Run a job with progress on standard error, say how it ended, and exit with the outcome's code.
+
+    Args:
+        job: the job.
+        layout: its folder; made if it is not there.
+        todo: the stages that will have to run; that they can run here is made sure of before any work.
+        job_text: the job file, kept in the folder; None: it is there already.
+        cores: how many cores to use at most.
+        rerun: tasks to run again although they are up to date.
+
+    Raises:
+        PipelineError: the folder cannot be written to, the record is damaged, or there is nothing such to run again.
+        StageUnavailableError: a stage that has to run cannot run on this machine.
+        JobBusyError: the job is being run by another process, and something is to run again. (Otherwise that run is
+            watched.)
+    """
+    _require_possible(job, todo)
+    _make_folder(layout)
+    while True:
+        try:
+            outcome = _attempt(job, layout, job_text=job_text, cores=cores, rerun=rerun)
+        except JobBusyError as busy:
+            if rerun is not None:
+                raise
+            _watch(busy, layout, job_text)
+        else:
+            _report(job, layout, outcome)
+            sys.exit(outcome.exit_code)
+
+
+def _attempt(
+    job: Job, layout: JobLayout, *, job_text: str | None, cores: int | None, rerun: Selection | None
+) -> Outcome:
     from pipeline.executors.processes import ProcessExecutor, WorkerLimits
     from pipeline.progress import ProgressObserver, open_display
     from pipeline.resources import machine_capacity
     from pipeline.runner import run_job
 
-    _require_possible(job)
-    _make_folder(layout)
     capacity = machine_capacity(gpus=_gpus())
     if cores is not None:
         capacity = replace(capacity, cores=min(cores, capacity.cores))
-    try:
-        limits = WorkerLimits(stall_timeout_s=STALL_TIMEOUT_S)
-        with ProgressObserver(open_display()) as observer, ProcessExecutor(limits) as executor:
-            outcome = run_job(
-                job,
-                layout,
-                executor=executor,
-                job_text=job_text,
-                observer=observer,
-                rerun=rerun,
-                capacity=capacity,
-            )
-    except JobBusyError as busy:
-        from pipeline.commands.watching import watch
+    limits = WorkerLimits(stall_timeout_s=STALL_TIMEOUT_S)
+    with ProgressObserver(open_display()) as observer, ProcessExecutor(limits) as executor:
+        return run_job(
+            job, layout, executor=executor, job_text=job_text, observer=observer, rerun=rerun, capacity=capacity
+        )
 
-        click.echo(f"{busy}; watching it instead (Ctrl-C ends the watching only)", err=True)
-        sys.exit(watch(layout))
-    _report(job, layout, outcome)
-    sys.exit(outcome.exit_code)
+
+def _watch(busy: JobBusyError, layout: JobLayout, job_text: str | None) -> None:
+    """Watch the run that is under way; returns when it has ended if our version of the job is another than that one."""
+    from pipeline.commands.watching import INTERRUPTED, watch
+
+    click.echo(f"{busy}; watching it instead (Ctrl-C ends the watching only)", err=True)
+    another_version = job_text is not None and _text_of(layout.job_file) != job_text
+    if another_version:
+        click.echo("it runs an earlier version of the job; this one follows", err=True)
+    code = watch(layout)
+    if code == INTERRUPTED or not another_version:
+        sys.exit(code)
 
 
 def _report(job: Job, layout: JobLayout, outcome: Outcome) -> None:
@@ -138,7 +182,7 @@ def _report(job: Job, layout: JobLayout, outcome: Outcome) -> None:
 
     film = layout.path(layout.movie())
     if outcome.kind is not JobOutcome.SUCCEEDED:
-        click.secho(f"{job.name}: {outcome.kind.value} after {_duration(outcome.seconds)}", err=True, fg="red")
+        click.secho(f"{job.name}: {outcome.kind.value} after {wording.duration(outcome.seconds)}", err=True, fg="red")
         for failed in outcome.failures[:5]:
             click.echo(f"  {failed.task_id}: {failed.message}", err=True)
             click.echo(f"    pipeline logs {layout.root} {failed.task_id}", err=True)
@@ -148,19 +192,17 @@ def _report(job: Job, layout: JobLayout, outcome: Outcome) -> None:
     else:
         click.echo(
             f"{film}: {job.frame_count} frames, {job.frame_count / (job.movie.playback_fps or job.fps):.3g} s of film, "
-            f"in {_duration(outcome.seconds)}"
+            f"in {wording.duration(outcome.seconds)}"
         )
 
 
-def _is_done(job: Job, layout: JobLayout) -> bool:
-    """Whether every file of the job is there and up to date."""
+def _stages_to_run(job: Job, layout: JobLayout) -> frozenset[str]:
+    """The stages with a task that is not up to date, going by a look at the record and the files."""
     from pipeline.commands.inspecting import assess_job
     from pipeline.plan import Verdict
 
-    if not layout.manifest.exists():
-        return False
     assessments, _ = assess_job(job, layout)
-    return all(assessment.verdict is Verdict.UP_TO_DATE for assessment in assessments)
+    return frozenset(each.task.stage for each in assessments if each.verdict is not Verdict.UP_TO_DATE)
 
 
 def _job_in(layout: JobLayout) -> Job:
@@ -169,11 +211,17 @@ def _job_in(layout: JobLayout) -> Job:
     return load_job(layout.job_file)
 
 
-def _require_possible(job: Job) -> None:
-    """Refuse before any work what this machine cannot do."""
+def _text_of(path: Path) -> str:
+    return path.read_text(encoding="utf-8") if path.exists() else ""
+
+
+def _require_possible(job: Job, todo: frozenset[str]) -> None:
+    """Refuse before any work what has to be done and cannot be done here."""
     from pipeline.stages import STAGES
 
-    obstacles = [f"{stage.name}: {obstacle}" for stage in STAGES for obstacle in stage.obstacles(job)]
+    obstacles = [
+        f"{stage.name}: {obstacle}" for stage in STAGES if stage.name in todo for obstacle in stage.obstacles(job)
+    ]
     if obstacles:
         raise StageUnavailableError("\n".join(obstacles))
 
@@ -195,11 +243,3 @@ def _gpus() -> int:
     from sim.runtime import resolve_device
 
     return int(resolve_device("auto") != "cpu")
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s"

@@ -7,10 +7,13 @@ import time
 from pipeline.layout import JobLayout
 from pipeline.lease import live_holder
 from pipeline.manifest_reader import ManifestReader, StageSummary
-from pipeline.progress import StageProgress, open_display
+from pipeline.progress import Display, StageProgress, open_display
 from pipeline.task import TaskState
 
 POLL_INTERVAL_S = 0.5
+
+INTERRUPTED = 130
+"""As shells report a program that Ctrl-C ended."""
 
 DONE = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
 
@@ -19,7 +22,7 @@ def watch(layout: JobLayout) -> int:
     """Show a running job's progress until its runner ends.
 
     Returns:
-        0 if everything is done then, else 5, as `submit` would have.
+        0 if everything is done then, else 5, as `submit` would have; INTERRUPTED after Ctrl-C.
     """
     display = open_display()
     stages: dict[str, StageProgress] = {}
@@ -30,13 +33,22 @@ def watch(layout: JobLayout) -> int:
             _update(stages, summary)
             display.show(stages.values())
             if not running:
-                return 0 if summary and all(_done(stage) == stage.total for stage in summary) else 5
+                return _say_how_it_ended(display, layout, summary)
             time.sleep(POLL_INTERVAL_S)
     except KeyboardInterrupt:
         display.say("not watching any more; the job runs on")
-        return 130
+        return INTERRUPTED
     finally:
         display.close()
+
+
+def _say_how_it_ended(display: Display, layout: JobLayout, summary: list[StageSummary]) -> int:
+    done, total = sum(map(_done, summary)), sum(stage.total for stage in summary)
+    if done == total > 0:
+        display.say(f"{layout.path(layout.movie())} is done")
+        return 0
+    display.say(f"it ended with {done} of {total} tasks done; continue with: pipeline resume {layout.root}")
+    return 5
 
 
 def _summary(layout: JobLayout) -> list[StageSummary]:

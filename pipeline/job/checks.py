@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import JobFileError
 from pipeline.job.loading import LoadedJob, read_job
+from pipeline.job.looks import BODY, parts_of
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
@@ -61,6 +62,8 @@ def _check_bodies(job: Job, findings: Findings) -> None:
 
 def _check_materials(job: Job, findings: Findings) -> None:
     kinds = {name: kind for _, kind, name in named_bodies(job)}
+    for body in job.rigid:
+        kinds |= {f"{body.name}.{part}": "rigid" for part in parts_of(body.shape.type) if part != BODY}
     for name, material in job.material.items():
         path: KeyPath = ("material", name)
         if name not in kinds:

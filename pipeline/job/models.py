@@ -7,6 +7,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from pipeline.job.looks import BODY, FLUID, NATURAL_MATERIALS, PAINTED_LOOKS, SMOKE, SOLID
 from render.parameters import (
     CameraParameters,
     LightParameters,
@@ -41,7 +42,8 @@ class Job(SceneParameters):
     surface: SurfaceParameters = Field(default=SurfaceParameters(), description="Fluid surfaces.")
     volume: VolumeParameters = Field(default=VolumeParameters(), description="Smoke volumes.")
     material: dict[str, MaterialParameters] = Field(
-        default_factory=dict, description="What each body looks like, by the body's name: [material.NAME]."
+        default_factory=dict,
+        description='What each body looks like, by its name: [material.duck]; a part of one: [material."duck.bill"].',
     )
     stage: StageParameters = Field(default=StageParameters(), description="Ground, background and their lights.")
     light: tuple[LightParameters, ...] = Field(default=(), description="Extra lights.")
@@ -63,15 +65,17 @@ class Job(SceneParameters):
         """Names of all bodies, in the order of the job file."""
         return [body.name for body in self._bodies()]
 
-    def material_of(self, body: str) -> MaterialParameters:
-        """The body's look: from the job file, else the usual one of its kind."""
-        if body in self.material:
-            return self.material[body]
+    def material_of(self, body: str, part: str = BODY) -> MaterialParameters:
+        """What a body, or a part of its shape, looks like: from the job file, else as such things usually do."""
+        shape = next((rigid.shape.type for rigid in self.rigid if rigid.name == body), "")
+        own = self.material.get(body, NATURAL_MATERIALS.get(shape, {}).get(BODY))
+        if part != BODY and (own is None or own.look in PAINTED_LOOKS):
+            return self.material.get(f"{body}.{part}", NATURAL_MATERIALS[shape][part])
+        if own is not None:
+            return own
         if any(fluid.name == body for fluid in self.fluid):
-            return MaterialParameters(look="water")
-        if any(smoke.name == body for smoke in self.smoke):
-            return MaterialParameters(look="smoke")
-        return MaterialParameters(look="plastic")
+            return FLUID
+        return SMOKE if any(smoke.name == body for smoke in self.smoke) else SOLID
 
     def _bodies(self) -> Iterator[RigidBodyParameters | FluidParameters | SmokeParameters]:
         yield from self.rigid

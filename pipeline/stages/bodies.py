@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pipeline.fingerprint import ParameterSet
+from pipeline.job.looks import parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.stages.base import TaskContext
@@ -11,10 +12,10 @@ from pipeline.task import Task, TaskId
 
 
 class BodiesStage:
-    """One PLY a rigid body; poses come from the specification or the cache, never from the mesh."""
+    """One PLY a rigid body and part of its shape, in its rest pose: where it stands is no matter of its mesh."""
 
     name = "bodies"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a body."""
@@ -23,7 +24,7 @@ class BodiesStage:
                 id=TaskId(f"bodies/{body.name}"),
                 stage=self.name,
                 inputs=(),
-                outputs=(layout.body_mesh(body.name),),
+                outputs=tuple(layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)),
                 parameters=ParameterSet.of(
                     stage=self.name,
                     version=self.version,
@@ -48,6 +49,8 @@ class BodiesStage:
 
         parameters = next(body for body in context.job.rigid if body.name == context.task.subject)
         mesh = StaticBody(parameters).rest_mesh()
-        with context.committing(context.task.outputs[0], validate_ply) as path:
-            write_ply(path, mesh.vertices, mesh.faces)
+        for part, output in zip(parts_of(parameters.shape.type), context.task.outputs, strict=True):
+            piece = mesh.piece(part)
+            with context.committing(output, validate_ply) as path:
+                write_ply(path, piece.vertices, piece.faces)
         context.progress(1, 1)

@@ -8,15 +8,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.fingerprint import ParameterSet, digest_of
+from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import tool_version
-from pipeline.task import ArtifactPath, Task, TaskId
+from pipeline.task import ArtifactPath, Resources, Task, TaskId
 from render.spec import MeshObject, MeshSequenceObject, RenderSpec, SceneObject, VolumeSequenceObject
 
 if TYPE_CHECKING:
     from render.blender import Renderer
+
+CORES = 2
+"""Threads a frame. Cycles with one keeps a second busy waiting: 7.0 s of processor time a frame against 3.7 s with two
+(quickstart, draft), so two frames beside each other on two cores take longer than one after the other. The pixels do
+not depend on it."""
 
 _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"device", "blender"}}
 
@@ -36,7 +42,7 @@ class RenderStage:
             version=self.version,
             tools={"blender": blender} if blender else {"bpy": tool_version("bpy")},
         )
-        static = tuple(layout.body_mesh(body.name) for body in job.rigid)
+        static = tuple(layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type))
         return [
             Task(
                 id=TaskId(f"render/{frame:06d}"),
@@ -45,6 +51,7 @@ class RenderStage:
                 outputs=(layout.picture(frame),),
                 parameters=parameters,
                 frame=frame,
+                resources=Resources(cores=CORES),
             )
             for frame in range(job.frame_count)
         ]
@@ -82,13 +89,14 @@ def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
     """The job as Blender sees it; paths are relative to the job's folder."""
     objects: list[SceneObject] = [
         MeshObject(
-            name=body.name,
-            file=layout.body_mesh(body.name),
+            name=body.name if part == BODY else f"{body.name}.{part}",
+            file=layout.body_mesh(body.name, part),
             position=body.position,
             orientation=_orientation(body.rotation_deg),
-            material=job.material_of(body.name),
+            material=job.material_of(body.name, part),
         )
         for body in job.rigid
+        for part in parts_of(body.shape.type)
     ]
     objects += [
         MeshSequenceObject(

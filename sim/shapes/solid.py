@@ -69,6 +69,14 @@ class TriangleMesh:
         vertices = scale * self.vertices @ rotation.T + position
         return TriangleMesh(vertices, self.faces, self.part, self.part_names)
 
+    def piece(self, part: str) -> TriangleMesh:
+        """The faces of one part, with the vertices that they use; the whole mesh if it has no parts."""
+        if self.part is None:
+            return self
+        faces = self.faces[self.part == self.part_names.index(part)]
+        used, numbers = np.unique(faces, return_inverse=True)
+        return TriangleMesh(self.vertices[used], numbers.reshape(faces.shape).astype(np.int32))
+
 
 class Solid(Protocol):
     """A closed region of the world."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from render.blender import missing_libraries
+from render.system_libraries import missing_libraries
 
 PROJECT = Path(__file__).resolve().parents[2]
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from pipeline import doctor
 from pipeline.cli import main
 from pipeline.doctor import Examination, examine, print_report
-from pipeline.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
+from render.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
 
 
 @pytest.mark.slow
@@ -81,7 +81,7 @@ def test_missing_libraries_are_named_with_their_packages():
 
 def test_library_check_prints_packages_only_and_loads_nothing_but_the_standard_library():
     code = (
-        "import sys, runpy; runpy.run_module('pipeline.system_libraries', run_name='__main__'); "
+        "import sys, runpy; runpy.run_module('render.system_libraries', run_name='__main__'); "
         "assert not {'click', 'numpy', 'pydantic'} & set(sys.modules)"
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -1,5 +1,6 @@
 """The schema that editors use, and the reference that is made of it."""
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -72,3 +73,8 @@ def test_example_in_the_documentation_is_a_valid_job(tmp_path):
 def test_reference_in_the_documentation_is_current():
     document = (ROOT / "docs" / "job-file.md").read_text(encoding="utf-8")
     assert with_reference(document) == document, "run: python -m pipeline.job.reference docs/job-file.md"
+
+
+def test_the_schema_that_the_sample_jobs_name_is_current():
+    stored = json.loads((Path(__file__).parents[2] / "docs" / "job.schema.json").read_text(encoding="utf-8"))
+    assert stored == job_schema(), "run: pipeline schema > docs/job.schema.json"

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pipeline.job.looks import parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
 from pipeline.stages import STAGES
 from pipeline.stages.render import render_spec
+from sim.shapes import build_solid
+from sim.shapes.parameters import Placement
 
 LAYOUT = JobLayout(Path("renders/tank"))
 
@@ -97,3 +100,34 @@ def test_a_blender_that_is_not_there_is_said_before_any_work(tmp_path):
     render = next(stage for stage in STAGES if stage.name == "render")
     (obstacle,) = render.obstacles(job(render={"blender": str(tmp_path / "blender")}))
     assert "cannot start the Blender executable" in obstacle
+
+
+DUCK = {"name": "duck", "shape": {"type": "duck", "length": 0.2}}
+
+
+def test_a_duck_comes_in_parts_with_colours_of_their_own():
+    objects = render_spec(job(rigid=[DUCK]), LAYOUT).objects
+    assert [each.name for each in objects[:3]] == ["duck", "duck.bill", "duck.eyes"]
+    assert len({each.material.color for each in objects[:3]}) == 3
+    assert [each.file for each in objects[:3]] == ["meshes/duck.ply", "meshes/duck.bill.ply", "meshes/duck.eyes.ply"]
+
+
+def test_a_duck_of_metal_is_of_one_piece():
+    objects = render_spec(job(rigid=[DUCK], material={"duck": {"look": "metal"}}), LAYOUT).objects
+    assert {each.material.look for each in objects[:3]} == {"metal"}
+
+
+def test_a_part_can_be_painted():
+    material = {"duck.bill": {"look": "rubber", "color": (0.0, 0.2, 0.9)}}
+    objects = render_spec(job(rigid=[DUCK], material=material), LAYOUT).objects
+    assert objects[1].material.color == (0.0, 0.2, 0.9)
+
+
+@pytest.mark.parametrize("shape", ["duck", "bunny"])
+def test_the_parts_that_have_looks_are_those_that_the_shape_has(shape):
+    mesh = build_solid(Placement.model_validate({"shape": {"type": shape}})).rest_mesh()
+    assert parts_of(shape) == mesh.part_names
+    pieces = [mesh.piece(part) for part in mesh.part_names]
+    assert sum(len(piece.faces) for piece in pieces) == len(mesh.faces)
+    # The cut changes no triangle, so the volumes under the pieces' faces add up to float64 rounding.
+    assert sum(piece.area_vectors.sum(axis=0) @ [1, 1, 1] for piece in pieces) == pytest.approx(0.0, abs=1e-9)

@@ -18,13 +18,13 @@ from render.blender import (
     ExecutableRenderer,
     FrameRenderError,
     build_argv,
-    missing_libraries,
     open_renderer,
     parse_blender_version,
     require_supported_executable,
 )
 from render.parameters import CameraParameters, MaterialParameters, RenderParameters, StageParameters, VolumeParameters
 from render.spec import MeshObject, MeshSequenceObject, RenderSpec, VolumeSequenceObject
+from render.system_libraries import missing_libraries
 from render.volume import write_volume
 
 RESOLUTION = (64, 36)

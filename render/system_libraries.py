@@ -1,7 +1,7 @@
 """Shared libraries that the wheels take from the system, and the Debian packages that hold them.
 
 `bpy` links against X11 and OpenGL even where it never opens a window, and `taichi` against X11, so their import fails
-on a bare machine. `python -m pipeline.system_libraries` prints the packages that are missing, and nothing if none is;
+on a bare machine. `python -m render.system_libraries` prints the packages that are missing, and nothing if none is;
 it imports the standard library only, as `./run` calls it to finish setting up.
 """
 
