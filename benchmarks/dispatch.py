@@ -23,10 +23,11 @@ from pipeline import artifacts
 from pipeline.executors.base import Committed, Executor
 from pipeline.executors.inline import InlineExecutor
 from pipeline.executors.processes import ProcessExecutor, WorkerLimits
-from pipeline.fingerprint import ParameterSet, task_fingerprint
+from pipeline.fingerprint import task_fingerprint
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
+from pipeline.parameter_set import ParameterSet
 from pipeline.run_events import RunEvent
 from pipeline.runner import run_job
 from pipeline.scheduler import Scheduler

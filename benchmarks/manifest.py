@@ -19,9 +19,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.artifacts import Receipt, committing
-from pipeline.fingerprint import ParameterSet, task_fingerprint
+from pipeline.fingerprint import task_fingerprint
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
+from pipeline.parameter_set import ParameterSet
 from pipeline.plan import Assessment, Verdict, assess, in_order, summarize
 from pipeline.reconcile import reconcile
 from pipeline.task import ArtifactPath, Task, TaskId, TaskState

@@ -32,12 +32,24 @@ class StageUnavailableError(PipelineError):
     exit_code = 3
 
 
+class MissingInputError(PipelineError):
+    """A file of the user's that the job is made from is not there, or cannot be read."""
+
+    exit_code = 2
+
+
 class InvalidArtifactError(PipelineError):
     """A file is not what its stage promises: truncated, not decodable, or wrong in content."""
 
 
 class StaleAttemptError(PipelineError):
     """A newer attempt of the same task has committed already; this one must not write."""
+
+
+class DiskFullError(PipelineError):
+    """There is no room for what a command has to write."""
+
+    exit_code = 7
 
 
 class JobBusyError(PipelineError):
@@ -54,6 +66,10 @@ class LeaseLostError(PipelineError):
 
 class ManifestError(PipelineError):
     """The job's manifest cannot be used; says how to get a good one from the receipts."""
+
+
+class OutdatedManifestError(ManifestError):
+    """The manifest is of an older program, or was never finished; the next run of the job brings it up to date."""
 
 
 class PlanError(PipelineError):

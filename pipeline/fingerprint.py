@@ -1,76 +1,15 @@
 """Fingerprints: what decides an artifact's content, as a digest.
 
-    fingerprint(task) = blake3(parameters of the task, (path, hash) of each input artifact)
-
-A parameter set holds what the stage reads of the job, the stage's version, the versions of the tools that do the work
-and the hashes of files from outside the job's folder. Comments, key order and keys that the stage does not read are
-not in it.
+fingerprint(task) = blake3(parameters of the task, (path, hash) of each input artifact)
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
 
-from blake3 import blake3
-from pydantic import BaseModel
-
-if TYPE_CHECKING:
-    from pipeline.task import ArtifactPath, Task
-
-_SHOWN_LENGTH = 80
-"""Longest value shown in full when a change is described [characters]."""
-
-
-def digest_of(text: str) -> str:
-    """blake3 of a text, in hexadecimal."""
-    return blake3(text.encode()).hexdigest()
-
-
-@dataclass(frozen=True)
-class ParameterSet:
-    """Canonical JSON of everything but the inputs that decides a task's outputs."""
-
-    canonical: str
-
-    @cached_property
-    def digest(self) -> str:
-        """Digest of the canonical text."""
-        return digest_of(self.canonical)
-
-    @classmethod
-    def of(
-        cls,
-        values: Mapping[str, Any] = MappingProxyType({}),
-        /,
-        *,
-        stage: str,
-        version: int,
-        tools: Mapping[str, str],
-        **more: Any,
-    ) -> ParameterSet:
-        """Collect parameters; models and plain JSON values alike, in any order.
-
-        Args:
-            values: parameters by name; here a name may be one of the words below.
-            stage: name of the stage.
-            version: the stage's version.
-            tools: version of each tool that does the work.
-            **more: further parameters.
-
-        Raises:
-            ValueError: two parameters share a name, or a value is not a finite number.
-        """
-        document = {"stage_name": stage, "stage_version": version, "tools": dict(tools)}
-        for name, value in (*values.items(), *more.items()):
-            if name in document:
-                raise ValueError(f"two parameters of stage {stage} are called {name}")
-            document[name] = _plain(value)
-        return cls(json.dumps(document, sort_keys=True, separators=(",", ":"), allow_nan=False))
+from pipeline.parameter_set import digest_of
+from pipeline.task import ArtifactPath, Task
 
 
 def task_fingerprint(task: Task, hashes: Mapping[ArtifactPath, str]) -> str:
@@ -85,63 +24,3 @@ def task_fingerprint(task: Task, hashes: Mapping[ArtifactPath, str]) -> str:
     """
     document = [task.parameters.digest, [[path, hashes[path]] for path in task.inputs]]
     return digest_of(json.dumps(document, separators=(",", ":")))
-
-
-def explain_difference(old: ParameterSet, new: ParameterSet) -> list[str]:
-    """Name what changed from one parameter set to another, by its path in the job file.
-
-    Returns:
-        One clause a change, such as `camera.position changed from [3, 2, 1] to [4, 2, 1]`; lists of tables are shown
-        by the tables' names, as in `fluid[water].viscosity`. Empty if nothing changed.
-    """
-    return [*_differences("", json.loads(old.canonical), json.loads(new.canonical))]
-
-
-def _differences(path: str, old: Any, new: Any) -> Iterator[str]:
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in sorted(old.keys() | new.keys()):
-            yield from _member_differences(f"{path}.{key}" if path else key, key, old, new)
-    elif _is_list_of_tables(old) and _is_list_of_tables(new):
-        old_tables, new_tables = _by_name(old), _by_name(new)
-        for name in dict.fromkeys([*old_tables, *new_tables]):
-            yield from _member_differences(f"{path}[{name}]", name, old_tables, new_tables)
-        if sorted(old_tables) == sorted(new_tables) and list(old_tables) != list(new_tables):
-            yield f"{path} changed its order"
-    elif json.dumps(old) != json.dumps(new):  # as the digest sees it: 1 and 1.0 differ
-        yield f"{path} changed from {_show(old)} to {_show(new)}"
-
-
-def _member_differences(path: str, key: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
-    if key not in old:
-        yield f"{path} was added: {_show(new[key])}"
-    elif key not in new:
-        yield f"{path} was removed: {_show(old[key])}"
-    else:
-        yield from _differences(path, old[key], new[key])
-
-
-def _is_list_of_tables(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(item, dict) for item in value)
-
-
-def _by_name(tables: list[dict[str, Any]]) -> dict[str, Any]:
-    """Tables under their names where all have one of their own, else under their positions."""
-    names = [str(table.get("name", "")) for table in tables]
-    if "" in names or len(set(names)) < len(names):
-        names = [str(index) for index in range(len(tables))]
-    return dict(zip(names, tables, strict=True))
-
-
-def _show(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= _SHOWN_LENGTH else f"{text[: _SHOWN_LENGTH - 3]}..."
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value

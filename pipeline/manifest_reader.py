@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from pipeline.errors import ManifestError
-from pipeline.fingerprint import ParameterSet
+from pipeline.errors import ManifestError, OutdatedManifestError
 from pipeline.migrations import migrations, refuse_newer, schema_version
+from pipeline.parameter_set import ParameterSet
 from pipeline.task import ArtifactPath, FailureKind, TaskId, TaskState
 
 BUSY_TIMEOUT_S = 10.0
@@ -95,7 +95,8 @@ class ManifestReader:
         """Open beside a working runner, or where the folder itself may only be read.
 
         Raises:
-            ManifestError: there is none, it is damaged, or of another schema than this program's.
+            ManifestError: there is none, it is damaged, or a newer program's.
+            OutdatedManifestError: it is an older program's, or was never finished.
         """
         if not path.exists():
             raise ManifestError(f"{path}: no manifest; this job has not been submitted yet")
@@ -111,7 +112,8 @@ class ManifestReader:
         refuse_newer(version)
         if version < len(migrations()):
             connection.close()
-            raise ManifestError(f"{path}: written by an older program; submit the job once to bring it up to date")
+            why = "written by an older program" if version else "not finished when it was made"
+            raise OutdatedManifestError(f"{path}: {why}; submit the job once to bring it up to date")
         return ManifestReader(connection, path)
 
     def close(self) -> None:

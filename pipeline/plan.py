@@ -12,9 +12,10 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.errors import PlanError
-from pipeline.fingerprint import ParameterSet, explain_difference, task_fingerprint
+from pipeline.fingerprint import task_fingerprint
 from pipeline.layout import JobLayout
 from pipeline.manifest_reader import ArtifactRow, StageCost
+from pipeline.parameter_set import ParameterSet, explain_difference
 from pipeline.task import ArtifactPath, Task, TaskId
 
 if TYPE_CHECKING:

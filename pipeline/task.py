@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NewType
 
-from pipeline.fingerprint import ParameterSet
+from pipeline.parameter_set import ParameterSet
 
 TaskId = NewType("TaskId", str)
 ArtifactPath = NewType("ArtifactPath", str)

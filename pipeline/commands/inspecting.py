@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -117,7 +118,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
 @submitted_job_argument
 @click.argument("task", required=False)
 @click.option("--attempt", type=click.IntRange(min=1), help="Number of the attempt; the last one if omitted.")
-@click.option("--follow", "-f", is_flag=True, help="Keep printing as the log grows.")
+@click.option("--follow", "-f", is_flag=True, help="Keep printing until the attempt ends.")
 def logs(job: str, output: Path, task: str | None, attempt: int | None, follow: bool) -> None:
     """Print the log of a task.
 
@@ -141,7 +142,14 @@ def logs(job: str, output: Path, task: str | None, attempt: int | None, follow: 
     chosen = max(attempts) if attempt is None else attempt
     if chosen not in attempts:
         raise PipelineError(f"no log of attempt {chosen}; there are {', '.join(map(str, sorted(attempts)))}")
-    _print_log(attempts[chosen], follow=follow)
+    with attempts[chosen].open("r", encoding="utf-8", errors="replace") as log:
+        while True:
+            ended = not follow or not _is_running(layout, TaskId(task), chosen)
+            for text in iter(partial(log.read, 1 << 16), ""):
+                click.echo(text, nl=False)
+            if ended:
+                return
+            time.sleep(FOLLOW_INTERVAL_S)
 
 
 @click.command()
@@ -244,21 +252,14 @@ def _attempts_with_log(layout: JobLayout, task: TaskId) -> dict[int, Path]:
     return {int(path.name.split(".")[-2]): path for path in logs if path.name.split(".")[-2].isdigit()}
 
 
-def _print_log(path: Path, *, follow: bool) -> None:
-    with path.open("r", encoding="utf-8", errors="replace") as log:
-        for chunk in _chunks(log, follow=follow):
-            click.echo(chunk, nl=False)
+def _is_running(layout: JobLayout, task: TaskId, attempt: int) -> bool:
+    from pipeline.lease import live_holder
+    from pipeline.manifest_reader import ManifestReader
 
-
-def _chunks(log: Any, *, follow: bool) -> Iterator[str]:
-    while True:
-        text = log.read(1 << 16)
-        if text:
-            yield text
-        elif follow:
-            time.sleep(FOLLOW_INTERVAL_S)
-        else:
-            return
+    if live_holder(layout.lease) is None:
+        return False
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        return any((row.task, row.number) == (task, attempt) for row in manifest.running_attempts())
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:

@@ -18,7 +18,15 @@ from pipeline.commands.arguments import (
     parse_frames,
     submitted_job_argument,
 )
-from pipeline.errors import JobBusyError, PipelineError, StageUnavailableError
+from pipeline.errors import (
+    DiskFullError,
+    JobBusyError,
+    MissingInputError,
+    OutdatedManifestError,
+    PipelineError,
+    StageUnavailableError,
+)
+from pipeline.executors.failures import is_disk_full
 from pipeline.layout import JobLayout
 
 if TYPE_CHECKING:
@@ -29,6 +37,8 @@ if TYPE_CHECKING:
 STALL_TIMEOUT_S = 3600.0
 """A task without a sign of life for so long is ended. A single frame shows none while Cycles draws it, and a final one
 in film resolution takes half an hour on a few cores."""
+
+DISK_FULL = "the disk is full ({}); free some space and submit the job again"
 
 cores_option = click.option(
     "--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all of them if omitted."
@@ -128,6 +138,7 @@ def run(
 
     Raises:
         PipelineError: the folder cannot be written to, the record is damaged, or there is nothing such to run again.
+        DiskFullError: not even the record could be opened; nothing is lost.
         StageUnavailableError: a stage that has to run cannot run on this machine.
         JobBusyError: the job is being run by another process, and something is to run again. (Otherwise that run is
             watched.)
@@ -136,7 +147,11 @@ def run(
     _make_folder(layout)
     while True:
         try:
-            outcome = _attempt(job, layout, job_text=job_text, cores=cores, rerun=rerun)
+            outcome = _run_once(job, layout, job_text=job_text, cores=cores, rerun=rerun)
+        except OSError as error:
+            if not is_disk_full(error):
+                raise
+            raise DiskFullError(DISK_FULL.format(layout.root)) from error
         except JobBusyError as busy:
             if rerun is not None:
                 raise
@@ -146,7 +161,7 @@ def run(
             sys.exit(outcome.exit_code)
 
 
-def _attempt(
+def _run_once(
     job: Job, layout: JobLayout, *, job_text: str | None, cores: int | None, rerun: Selection | None
 ) -> Outcome:
     from pipeline.executors.processes import ProcessExecutor, WorkerLimits
@@ -200,8 +215,13 @@ def _stages_to_run(job: Job, layout: JobLayout) -> frozenset[str]:
     """The stages with a task that is not up to date, going by a look at the record and the files."""
     from pipeline.commands.inspecting import assess_job
     from pipeline.plan import Verdict
+    from pipeline.stages import STAGES
 
-    assessments, _ = assess_job(job, layout)
+    try:
+        assessments, _ = assess_job(job, layout)
+    except (OutdatedManifestError, MissingInputError):
+        # Only the runner may bring the record up to date; and what is missing is for the check of the job to say.
+        return frozenset(stage.name for stage in STAGES)
     return frozenset(each.task.stage for each in assessments if each.verdict is not Verdict.UP_TO_DATE)
 
 
@@ -233,6 +253,8 @@ def _make_folder(layout: JobLayout) -> None:
         probe.touch()
         probe.unlink()
     except OSError as error:
+        if is_disk_full(error):
+            raise DiskFullError(DISK_FULL.format(layout.root)) from error
         raise PipelineError(
             f"cannot write to {layout.root}: {error.strerror}; name another folder with --output"
         ) from error

@@ -28,6 +28,10 @@ _STACK_DUMP_S = 1.0
 """Time a stalled worker gets to write its stacks before it is killed [s]."""
 _RETIRE_GRACE_S = 20.0
 """Time a worker gets to leave by itself, writing its kernel cache for instance, before it is killed [s]."""
+FURTHER_WORKERS = 6
+"""Idle workers beyond one a core: as many as there are stages. They cost memory and no time; starting Blender anew
+for every frame, as one worker a core did on two cores with three stages, made the quickstart's frames three times as
+slow."""
 _POLL_S = 0.2
 """How often exits are looked for where the system has no pidfd [s]."""
 
@@ -39,7 +43,8 @@ class WorkerLimits:
     Attributes:
         tasks_per_worker: a worker is replaced after this many tasks.
         resident_memory_bytes: a worker larger than this after a task is replaced; None: a quarter of the machine's.
-        workers: idle workers are let go when there would be more in all; None: one a core.
+        workers: idle workers are let go when there would be more in all; None: one a core, and one for each further
+            stage, so that stages that take turns frame by frame all keep theirs warm.
         stall_timeout_s: a task that shows no sign of life for so long is ended as stalled [s].
     """
 
@@ -59,7 +64,7 @@ class ProcessExecutor:
     def __init__(self, limits: WorkerLimits | None = None) -> None:
         self._limits = limits or WorkerLimits()
         self._memory_limit = self._limits.resident_memory_bytes or psutil.virtual_memory().total // 4
-        self._worker_limit = self._limits.workers or os.cpu_count() or 1
+        self._worker_limit = self._limits.workers or (os.cpu_count() or 1) + FURTHER_WORKERS
         self._workers: list[WorkerProcess] = []
         self._selector = selectors.DefaultSelector()
         self._events: list[TaskEvent] = []

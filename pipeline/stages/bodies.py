@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pipeline.fingerprint import ParameterSet
 from pipeline.job.looks import parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
+from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import mesh_file_hashes, tool_version
+from pipeline.stages.inputs import by_content, tool_version
 from pipeline.task import Task, TaskId
 
 
@@ -29,9 +29,8 @@ class BodiesStage:
                     stage=self.name,
                     version=self.version,
                     tools={name: tool_version(name) for name in ("libigl", "trimesh")},
-                    shape=body.shape,
+                    shape=by_content(body).shape,
                     scale=body.scale,
-                    files=mesh_file_hashes(iter([body])),
                 ),
                 subject=body.name,
             )

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TypeVar
 
 from blake3 import blake3
 
+from pipeline.errors import MissingInputError
 from sim.scene import SceneParameters
 from sim.shapes.parameters import MeshShape, Placement
+
+P = TypeVar("P", bound=Placement)
 
 
 @cache
@@ -22,24 +25,39 @@ def tool_version(package: str) -> str:
         return "absent"
 
 
-def mesh_file_hashes(placements: Iterator[Placement]) -> dict[str, str]:
-    """Content hash of every mesh file that these bodies use, by path."""
-    files = {placement.shape.file for placement in placements if isinstance(placement.shape, MeshShape)}
-    return {Path(file).name: _hash(file, *_identity(file)) for file in sorted(files)}
+def by_content(placement: P) -> P:
+    """The placement with its mesh file, if it has one, named by what is in it: where it lies has no effect.
+
+    Raises:
+        MissingInputError: the file cannot be read.
+    """
+    if not isinstance(placement.shape, MeshShape):
+        return placement
+    shape = placement.shape.model_copy(update={"file": _content_name(placement.shape.file)})
+    return placement.model_copy(update={"shape": shape})
 
 
-def placements(scene: SceneParameters) -> Iterator[Placement]:
-    """Every placed shape of a scene."""
-    yield from scene.rigid
-    for fluid in scene.fluid:
-        yield from fluid.block
-    for smoke in scene.smoke:
-        yield from smoke.source
+def bodies_by_content(scene: SceneParameters) -> dict[str, object]:
+    """The scene's bodies for a fingerprint, mesh files named by their content.
+
+    Raises:
+        MissingInputError: a mesh file cannot be read.
+    """
+    return {
+        "rigid": [by_content(body) for body in scene.rigid],
+        "fluid": [fluid.model_copy(update={"block": tuple(map(by_content, fluid.block))}) for fluid in scene.fluid],
+        "smoke": [smoke.model_copy(update={"source": tuple(map(by_content, smoke.source))}) for smoke in scene.smoke],
+    }
 
 
-def _identity(file: str) -> tuple[int, int]:
-    status = Path(file).stat()
-    return status.st_size, status.st_mtime_ns
+def _content_name(file: str) -> str:
+    """Hash and suffix, for the suffix decides how the file is read."""
+    path = Path(file)
+    try:
+        status = path.stat()
+        return _hash(file, status.st_size, status.st_mtime_ns) + path.suffix.lower()
+    except OSError as error:
+        raise MissingInputError(f"cannot read the mesh {file}: {error.strerror}; the job needs it") from error
 
 
 @cache

@@ -7,10 +7,10 @@ from math import cos, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.fingerprint import ParameterSet, digest_of
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
+from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import tool_version
 from pipeline.task import ArtifactPath, Resources, Task, TaskId

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from pipeline.cache import Checkpoint, read_checkpoint, validate_frame, write_checkpoint, write_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
-from pipeline.fingerprint import ParameterSet
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
+from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import mesh_file_hashes, placements, tool_version
+from pipeline.stages.inputs import bodies_by_content, tool_version
 from pipeline.task import Resources, Task, TaskId
 from sim.scene import SceneParameters
 from sim.world import FrameReport, World
@@ -44,8 +44,7 @@ class SimulateStage:
                     version=self.version,
                     tools={name: tool_version(name) for name in ("taichi", "libigl", "numpy")},
                     fps=job.fps,
-                    files=mesh_file_hashes(placements(job)),
-                    **scene,
+                    **scene | bodies_by_content(job),
                 ),
                 resources=_resources(job),
                 checkpointed=True,

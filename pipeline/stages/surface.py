@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pipeline.cache import read_frame
-from pipeline.fingerprint import ParameterSet
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
+from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import tool_version
 from pipeline.task import Task, TaskId

@@ -126,6 +126,12 @@ def test_a_longer_film_continues_the_shorter_one_and_equals_one_made_at_once(fin
 
 
 @pytest.mark.slow
+def test_the_number_of_cores_changes_no_byte(empty: Studio, reference: Studio) -> None:
+    empty.submit("--cores", "1")
+    empty.assert_whole(like=reference)
+
+
+@pytest.mark.slow
 def test_rerun_makes_just_these_frames_and_the_film_stays_as_their_pixels_are_the_same(
     finished: Studio, reference: Studio
 ) -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from pipeline.artifacts import Receipt, committing
 from pipeline.errors import InvalidArtifactError
-from pipeline.fingerprint import ParameterSet, task_fingerprint
+from pipeline.fingerprint import task_fingerprint
 from pipeline.layout import JobLayout
+from pipeline.parameter_set import ParameterSet
 from pipeline.task import ArtifactPath, Task, TaskId
 
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 from blake3 import blake3
 
 from pipeline.errors import InvalidArtifactError
-from pipeline.fingerprint import ParameterSet
+from pipeline.parameter_set import ParameterSet
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
 
 if TYPE_CHECKING:

@@ -226,6 +226,20 @@ class TestProcesses(ExecutorContract):
         pids = [event.pid for event in starts if isinstance(event, Started)]
         assert pids[0] == pids[1] != pids[2] == pids[3]
 
+    def test_stages_that_take_turns_keep_their_workers_even_on_one_core(
+        self, layout: JobLayout, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("os.cpu_count", lambda: 1)
+        with ProcessExecutor() as executor:
+            run(executor, assign(layout, "steps"))
+            pids: dict[int, set[int]] = {1: set(), 2: set()}  # by number of threads: workers as unlike as of two stages
+            for frame in range(3):
+                for threads, workers in pids.items():
+                    started = run(executor, assign(layout, f"double/{frame:06d}", threads=threads))[0]
+                    assert isinstance(started, Started)
+                    workers.add(started.pid)
+        assert [len(workers) for workers in pids.values()] == [1, 1]
+
     @pytest.mark.slow
     def test_a_worker_that_grew_too_large_is_replaced(self, layout: JobLayout) -> None:
         with ProcessExecutor(WorkerLimits(resident_memory_bytes=1)) as executor:

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from record_samples import film, parameter_set
 
-from pipeline.fingerprint import ParameterSet, explain_difference, task_fingerprint
+from pipeline.fingerprint import task_fingerprint
+from pipeline.parameter_set import ParameterSet, explain_difference
 from pipeline.task import ArtifactPath
 
 SCALARS = st.one_of(

@@ -11,10 +11,11 @@ from record_samples import film, parameter_set
 
 from pipeline.artifacts import Receipt
 from pipeline.errors import PlanError
-from pipeline.fingerprint import ParameterSet, task_fingerprint
+from pipeline.fingerprint import task_fingerprint
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.manifest import ArtifactRow, StageCost, artifact_row
+from pipeline.parameter_set import ParameterSet
 from pipeline.plan import (
     Assessment,
     Estimate,

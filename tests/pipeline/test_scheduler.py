@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.fingerprint import ParameterSet
+from pipeline.parameter_set import ParameterSet
 from pipeline.resources import claim, fits
 from pipeline.scheduler import TERMINAL_STATES, Scheduler
 from pipeline.scheduler_events import (

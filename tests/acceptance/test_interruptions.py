@@ -1,0 +1,214 @@
+"""Killed, stopped, or started twice: submitting again ends in the very same bytes, and nothing is done twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from films import (
+    FRAMES,
+    PATIENCE_S,
+    STAGE_NAMES,
+    Finished,
+    Studio,
+    assert_all_gone,
+    family_of,
+    finish,
+    kill,
+    listen,
+    stage_of,
+    standing_still,
+)
+
+from pipeline.task import FailureKind
+
+# --- killed ---
+
+
+@pytest.mark.slow
+def test_runner_killed_in_every_stage_and_the_film_is_the_same(empty: Studio, reference: Studio) -> None:
+    spared = set(STAGE_NAMES)
+    runner = empty.start("submit", "tiny.toml")
+    while (found := empty.wait_for_attempt(runner, spared)) is not None:
+        spared.discard(stage_of(found[0].task))
+        kill(runner)
+        runner = empty.start("submit", "tiny.toml")
+    finish(runner).assert_code(0)
+    assert spared == set()
+    empty.assert_whole(like=reference)
+    empty.assert_nothing_done_twice()
+
+
+@pytest.mark.slow
+def test_worker_killed_in_every_stage_and_the_run_goes_on_to_the_same_film(empty: Studio, reference: Studio) -> None:
+    spared = set(STAGE_NAMES)
+    runner = empty.start("submit", "tiny.toml")
+    while (found := empty.wait_for_attempt(runner, spared)) is not None:
+        attempt, worker = found
+        os.kill(worker, signal.SIGKILL)
+        spared.discard(stage_of(attempt.task))
+    finished = finish(runner).assert_code(0)
+    lost = {
+        stage_of(task)
+        for task, history in empty.histories().items()
+        for attempt in history
+        if attempt.outcome == FailureKind.WORKER_LOST
+    }
+    assert lost == set(STAGE_NAMES)
+    assert "died of SIGKILL in the middle of its task" in finished.err
+    empty.assert_whole(like=reference)
+    empty.assert_nothing_done_twice()
+
+
+def test_runner_killed_while_it_renders_leaves_nobody_behind_and_the_next_one_takes_over(
+    finished: Studio, reference: Studio
+) -> None:
+    finished.run("clean", "tiny", "--stage", "render", "--yes").assert_code(0)
+    runner = finished.start("submit", "tiny.toml")
+    assert finished.wait_for_attempt(runner, ["render"]) is not None
+    kill(runner)
+    assert "not running" in finished.run("status", "tiny").assert_code(0).out
+    taken_over = finished.submit()
+    assert f"taking over from process {runner.pid}" in taken_over.err
+    finished.assert_whole(like=reference)
+
+
+# --- stopped ---
+
+
+def interrupt_while_worker_stands_still(studio: Studio, stage: str, *, times: int) -> Finished:
+    """Start the job, stop the clock of a worker of this stage, and press Ctrl-C."""
+    runner = studio.start("submit", "tiny.toml")
+    _, worker = studio.wait_for_attempt(runner, [stage]) or pytest.fail(f"{stage} never ran")
+    process = psutil.Process(worker)
+    with standing_still(worker):
+        said = ""
+        for expected in ("stopping: what runs is finished or checkpointed", "stopping at once")[:times]:
+            runner.send_signal(signal.SIGINT)
+            said += listen(runner, expected)
+        if times == 2:
+            assert_all_gone([process])
+    ended = finish(runner)
+    assert_all_gone([process])
+    return Finished(ended.code, ended.out, said + ended.err)
+
+
+@pytest.mark.slow
+def test_ctrl_c_once_keeps_a_checkpoint_that_the_simulation_continues_from(finished: Studio, reference: Studio) -> None:
+    finished.run("clean", "tiny", "--stage", "simulate", "--yes").assert_code(0)
+    stopped = interrupt_while_worker_stands_still(finished, "simulate", times=1).assert_code(130)
+    assert "continue with: pipeline resume renders/tiny" in stopped.err
+    assert len(finished.artifacts()) < len(reference.artifacts())
+    [checkpoint] = finished.layout.checkpoints.glob("[0-9]*.h5")
+    finished.run("resume", "tiny").assert_code(0)
+    assert f"starting at frame {int(checkpoint.stem)}\n" in finished.run("logs", "tiny", "simulate").out
+    finished.assert_whole(like=reference)
+    # The frames came out the same, so nothing that is made of them was made again.
+    assert {task for task, count in finished.attempts().items() if count > 1} == {"simulate"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 2])
+def test_ctrl_c_while_rendering_and_the_next_run_ends_the_same(finished: Studio, reference: Studio, times: int) -> None:
+    finished.run("clean", "tiny", "--stage", "render", "--yes").assert_code(0)
+    before = finished.attempts()
+    interrupt_while_worker_stands_still(finished, "render", times=times).assert_code(130)
+    pictures = sum(path.startswith("frames/") for path in finished.artifacts())
+    assert pictures < FRAMES
+    finished.submit()
+    finished.assert_whole(like=reference)
+    finished.assert_nothing_done_twice(since=before)
+
+
+# --- two at a time ---
+
+
+@pytest.mark.slow
+def test_a_second_submit_watches_the_first(finished: Studio, reference: Studio) -> None:
+    finished.run("clean", "tiny", "--stage", "render", "--yes").assert_code(0)
+    before = finished.attempts()
+    first = finished.start("submit", "tiny.toml")
+    attempt, worker = finished.wait_for_attempt(first, ["render"]) or pytest.fail("nothing was rendered")
+    with standing_still(worker):
+        second = finished.start("submit", "tiny.toml")
+        said = listen(second, "watching it instead")
+        followed = finished.start("logs", "tiny", attempt.task, "--follow")
+        state = json.loads(finished.run("status", "tiny", "--json").assert_code(0).out)
+        assert state["runner"]["pid"] == first.pid
+        assert f"running, process {first.pid}" in finished.run("status", "tiny").assert_code(0).out
+        busy = f"is being run already, by process {first.pid}"
+        assert busy in said
+        assert busy in finished.run("clean", "tiny", "--stage", "movie", "--yes").assert_code(4).err
+        assert busy in finished.run("rerun", "tiny", "--stage", "movie").assert_code(4).err
+    watched, made = finish(second).assert_code(0), finish(first).assert_code(0)
+    assert "renders/tiny/movie.mp4 is done" in watched.err
+    assert made.out.startswith("renders/tiny/movie.mp4: ")
+    assert f"{attempt.task}, attempt 2, on " in finish(followed).assert_code(0).out
+    finished.assert_whole(like=reference)
+    finished.assert_nothing_done_twice(since=before)
+
+
+@pytest.mark.slow
+def test_another_version_submitted_meanwhile_follows_the_one_that_runs(finished: Studio) -> None:
+    finished.run("clean", "tiny", "--stage", "render", "--yes").assert_code(0)
+    first = finished.start("submit", "tiny.toml")
+    _, worker = finished.wait_for_attempt(first, ["render"]) or pytest.fail("nothing was rendered")
+    with standing_still(worker):
+        second = finished.start("submit", "tiny.toml", "--set", "camera.focal_length_mm=70")
+        listen(second, "this one follows")
+    finish(first).assert_code(0)
+    assert "render 0-5: stale, camera.focal_length_mm changed" in finish(second).assert_code(0).err
+    planned = finished.run("plan", "tiny.toml", "--set", "camera.focal_length_mm=70", "--json").assert_code(0)
+    assert {each["verdict"] for each in json.loads(planned.out)} == {"up to date"}
+
+
+# --- a Blender of one's own ---
+
+
+@pytest.fixture
+def blender(tmp_path: Path) -> Path:
+    """An executable with Blender's command line around this environment's own Blender, the bpy module."""
+    script = tmp_path / "stand in" / "blender"
+    script.parent.mkdir()
+    script.write_text(
+        f"#!{sys.executable}\n"
+        + textwrap.dedent(
+            """
+            import runpy, sys
+            arguments = sys.argv[1:]
+            if arguments == ["--version"]:
+                print("Blender 5.0.1")
+                sys.exit()
+            runpy.run_path(arguments[arguments.index("--python") + 1], run_name="__main__")
+            """
+        )
+    )
+    script.chmod(0o755)
+    return script
+
+
+@pytest.mark.slow
+def test_an_external_blender_dies_with_its_runner_and_draws_the_same_pixels(
+    finished: Studio, reference: Studio, blender: Path
+) -> None:
+    external = ("--set", f"render.blender={blender}")
+    attempts = finished.attempts()
+    runner = finished.start("submit", "tiny.toml", *external)
+    assert finished.wait_for_attempt(runner, ["render"]) is not None
+    until = time.monotonic() + PATIENCE_S
+    while not any(str(blender) in process.cmdline() for process in family_of(runner)):
+        assert time.monotonic() < until
+        assert runner.poll() is None
+        time.sleep(0.01)
+    kill(runner)
+    submitted = finished.submit(*external)
+    assert "render" in submitted.err
+    finished.assert_whole(like=reference)
+    assert {stage_of(task) for task in finished.tasks_run_since(attempts)} == {"render"}

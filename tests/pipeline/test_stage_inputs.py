@@ -1,0 +1,61 @@
+"""What of the user's own files counts for a fingerprint: what is in them, not where they lie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import MissingInputError
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.plan import plan_job
+from pipeline.stages import STAGES
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 {height}\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def write_mesh(path: Path, *, height: int = 1) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(TETRAHEDRON.format(height=height))
+    return path
+
+
+def digests(*files: Path) -> dict[str, str]:
+    """Of the simulation and of the bodies' meshes, in a scene with these meshes as a body and as a block of water."""
+    body, block = (files * 2)[:2]
+    job = Job.model_validate(
+        {
+            "name": "film",
+            "device": "cpu",
+            "rigid": [{"name": "body", "shape": {"type": "mesh", "file": str(body)}}],
+            "fluid": [{"name": "water", "block": [{"shape": {"type": "mesh", "file": str(block)}}]}],
+        }
+    )
+    tasks = plan_job(job, JobLayout(Path("renders/film")), STAGES)
+    return {task.stage: task.parameters.digest for task in tasks if task.stage in ("simulate", "bodies")}
+
+
+def test_a_mesh_that_was_moved_is_the_same_mesh(tmp_path: Path) -> None:
+    here, there = write_mesh(tmp_path / "here/stone.obj"), write_mesh(tmp_path / "there/rock.OBJ")
+    assert digests(here) == digests(there)
+
+
+def test_a_mesh_that_was_changed_is_another_mesh(tmp_path: Path) -> None:
+    before = digests(write_mesh(tmp_path / "stone.obj"))
+    after = digests(write_mesh(tmp_path / "stone.obj", height=2))
+    assert before["simulate"] != after["simulate"]
+    assert before["bodies"] != after["bodies"]
+
+
+def test_meshes_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
+    body, block = write_mesh(tmp_path / "a/mesh.obj"), write_mesh(tmp_path / "b/mesh.obj", height=2)
+    assert digests(body, block)["simulate"] != digests(block, body)["simulate"]
+    before = digests(body, block)
+    write_mesh(body, height=3)
+    assert digests(body, block)["bodies"] != before["bodies"]
+
+
+def test_a_mesh_that_is_gone_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MissingInputError, match=r"cannot read the mesh .*stone\.obj: No such file"):
+        digests(tmp_path / "stone.obj")
