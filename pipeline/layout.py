@@ -57,6 +57,11 @@ class JobLayout:
         return self.root / artifact
 
     @property
+    def inputs(self) -> Path:
+        """Copies of the user's own files, such as meshes."""
+        return self.root / "inputs"
+
+    @property
     def checkpoints(self) -> Path:
         """Folder of the simulation's checkpoints."""
         return self.root / "cache" / "checkpoints"

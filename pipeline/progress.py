@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Protocol, Self, TextIO
@@ -205,8 +206,9 @@ class PlainDisplay:
                 self.say(f"{stage.name} {stage.describe(now)}")
 
     def say(self, sentence: str, *, style: str = "") -> None:  # noqa: ARG002 - colours are for terminals
-        """Print with the time since the start."""
-        print(f"[{time.monotonic() - self._began:8.1f} s] {sentence}", file=self._stream, flush=True)
+        """Print with the time since the start. Nobody listening any more (`| head`) is no reason to end the run."""
+        with suppress(BrokenPipeError):
+            print(f"[{time.monotonic() - self._began:8.1f} s] {sentence}", file=self._stream, flush=True)
 
     def close(self) -> None:
         """Nothing to tidy up."""

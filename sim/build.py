@@ -91,10 +91,13 @@ def _build_fluid(fluid: FluidParameters, scene: SceneParameters, bodies: Sequenc
     filling = fill_fluid(fluid, scene.domain, [body.solid for body in bodies])
     if len(filling.positions) == 0:
         raise ValueError(f'fluid "{fluid.name}" has no particle: its blocks are outside the domain or inside solids')
-    boundary = BoundarySamples.of_bodies(
-        domain_wall_samples(scene.domain, spacing),
-        *(sink_samples(body.surface_samples(spacing), body.solid.signed_distance, spacing) for body in bodies),
-    )
+    samples = [
+        sink_samples(
+            _reachable(body.surface_samples(spacing), scene.domain, spacing), body.solid.signed_distance, spacing
+        )
+        for body in bodies
+    ]
+    boundary = BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing), *samples)
     return WCSPHSolver(
         fluid,
         domain=scene.domain,
@@ -103,6 +106,13 @@ def _build_fluid(fluid: FluidParameters, scene: SceneParameters, bodies: Sequenc
         velocities=filling.velocities,
         boundary=boundary,
     )
+
+
+def _reachable(samples: NDArray[np.float32], domain: DomainParameters, spacing: float) -> NDArray[np.float32]:
+    """The samples that fluid in the domain can come near: a body may stand partly or wholly outside."""
+    margin = 2.0 * spacing
+    inside = (samples >= np.asarray(domain.min) - margin) & (samples <= np.asarray(domain.max) + margin)
+    return samples[inside.all(axis=1)]
 
 
 def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:

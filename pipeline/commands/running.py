@@ -30,6 +30,7 @@ from pipeline.executors.failures import is_disk_full
 from pipeline.layout import JobLayout
 
 if TYPE_CHECKING:
+    from pipeline.job.loading import LoadedJob
     from pipeline.job.models import Job
     from pipeline.run_events import Outcome
     from pipeline.runner import Selection
@@ -75,7 +76,7 @@ def submit(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
         loaded, _ = load_checked_job(job_file, overrides, preview=preview)
         for warning in loaded.warnings:
             click.secho(f"warning: {warning}", err=True, fg="yellow")
-    run(loaded.job, layout, todo, job_text=loaded.text, cores=cores)
+    run(loaded.job, layout, todo, submitted=loaded, cores=cores)
 
 
 @click.command()
@@ -122,7 +123,7 @@ def run(
     layout: JobLayout,
     todo: frozenset[str],
     *,
-    job_text: str | None = None,
+    submitted: LoadedJob | None = None,
     cores: int | None = None,
     rerun: Selection | None = None,
 ) -> NoReturn:
@@ -132,7 +133,7 @@ def run(
         job: the job.
         layout: its folder; made if it is not there.
         todo: the stages that will have to run; that they can run here is made sure of before any work.
-        job_text: the job file, kept in the folder; None: it is there already.
+        submitted: the job file, kept in the folder with the meshes that it names; None: it is there already.
         cores: how many cores to use at most.
         rerun: tasks to run again although they are up to date.
 
@@ -145,6 +146,7 @@ def run(
     """
     _require_possible(job, todo)
     _make_folder(layout)
+    job_text = None if submitted is None else _keep(submitted, layout)
     while True:
         try:
             outcome = _run_once(job, layout, job_text=job_text, cores=cores, rerun=rerun)
@@ -244,6 +246,18 @@ def _require_possible(job: Job, todo: frozenset[str]) -> None:
     ]
     if obstacles:
         raise StageUnavailableError("\n".join(obstacles))
+
+
+def _keep(submitted: LoadedJob, layout: JobLayout) -> str:
+    """Copy what the job reads into its folder; returns the job's text that names the copies."""
+    from pipeline.job.inputs import keep_inputs
+
+    try:
+        return keep_inputs(submitted, layout)
+    except OSError as error:
+        if is_disk_full(error):
+            raise DiskFullError(DISK_FULL.format(layout.root)) from error
+        raise PipelineError(f"cannot copy {error.filename} into {layout.root}: {error.strerror}") from error
 
 
 def _make_folder(layout: JobLayout) -> None:

@@ -70,12 +70,12 @@ def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool =
     changes = _parse_overrides(overrides, document)
     source = JobSource(path.name, text, {change.path: change.origin for change in changes})
     if changes:
-        text = _changed(text, changes)
+        text = changed_text(text, changes)
     job = _validate(_parse(path, text), source)
     if preview:
         preview_changes = preview_overrides(job)
         source.options.update({change.path: change.origin for change in preview_changes})
-        text = _changed(text, preview_changes)
+        text = changed_text(text, preview_changes)
     text = _with_absolute_meshes(text, job, path)
     return LoadedJob(job=_validate(_parse(path, text), source), text=text, path=path, source=source)
 
@@ -156,7 +156,12 @@ def _parse_overrides(arguments: Sequence[str], document: Mapping[str, Any]) -> l
     return changes
 
 
-def _changed(text: str, changes: Sequence[Override]) -> str:
+def changed_text(text: str, changes: Sequence[Override]) -> str:
+    """A job file's text with these keys changed, comments and order kept.
+
+    Raises:
+        JobFileError: a change does not fit the text.
+    """
     try:
         return apply_overrides(text, changes)
     except OverrideError as error:
@@ -185,4 +190,4 @@ def _with_absolute_meshes(text: str, job: Job, path: Path) -> str:
         for place, shape in mesh_shapes(job)
         if not Path(shape.file).is_absolute()
     ]
-    return _changed(text, changes) if changes else text
+    return changed_text(text, changes) if changes else text

@@ -38,6 +38,7 @@ class MovieStage:
                 ),
                 outputs=(layout.segment(index),),
                 parameters=parameters,
+                subject="segment",
                 frame=start,
             )
             for index, start in enumerate(starts)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 from math import cos, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.errors import StageUnavailableError
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -35,12 +37,11 @@ class RenderStage:
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
-        blender = job.render.blender
         parameters = ParameterSet.of(
             render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS),
             stage=self.name,
             version=self.version,
-            tools={"blender": blender} if blender else {"bpy": tool_version("bpy")},
+            tools={"blender": _blender_version(job.render.blender)},
         )
         static = tuple(layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type))
         return [
@@ -120,6 +121,23 @@ def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
         objects=tuple(objects),
         render=job.render,
     )
+
+
+@cache
+def _blender_version(executable: str | None) -> str:
+    """Version of the Blender that draws; wherever it lies, the same version gives the same frames.
+
+    Raises:
+        StageUnavailableError: the executable is not there, or not a Blender that can be used.
+    """
+    from render.blender import BlenderUnavailableError, require_supported_executable
+
+    if executable is None:
+        return tool_version("bpy")
+    try:
+        return ".".join(map(str, require_supported_executable(executable)))
+    except BlenderUnavailableError as error:
+        raise StageUnavailableError(f"render: {error}") from error
 
 
 def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:

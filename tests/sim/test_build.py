@@ -74,3 +74,16 @@ def test_a_fluid_without_a_free_place_is_refused():
     block = {"name": "block", "shape": {"type": "box", "size": (0.6, 0.6, 0.6)}, "position": (0, 0, 0.5)}
     with pytest.raises(ValueError, match='fluid "water" has no particle'):
         build_world(scene(box((0.1, 0.1, 0.1), (0, 0, 0.5)), rigid=(block,)), frames_per_second=60)
+
+
+@pytest.mark.usefixtures("taichi_cpu")
+def test_a_body_that_reaches_out_of_the_domain_holds_the_fluid_back_inside():
+    pillar = {"name": "pillar", "shape": {"type": "box", "size": (0.2, 0.2, 3.0)}, "position": (-0.45, 0, 0.5)}
+    far = {"name": "far", "shape": {"type": "sphere", "radius": 0.3}, "position": (5, 5, 5)}
+    water = box((0.12, 0.2, 0.1), (-0.28, 0, 0.06), velocity=(-1, 0, 0))
+    world = build_world(scene(water, rigid=(pillar, far)), frames_per_second=60)
+    for _ in range(4):
+        world.advance_frame()
+    positions = world.snapshots()["water"].arrays["position"]
+    inside_pillar = (positions[:, 0] < -0.35) & (np.abs(positions[:, 1]) < 0.1)
+    assert not inside_pillar.any()
