@@ -89,7 +89,8 @@ def main() -> None:
         "particle_steps_per_core_s": {"median": float(np.median(core_rates)), "best": max(core_rates)},
         "steps_per_neighbor_search": state["substeps"] / max(state["neighbor_searches"], 1.0),
         "list_entries_per_particle": fluid.mean_neighbors,
-        "bytes_per_particle": estimate_bytes(fluid.particle_count, fluid.boundary.count) / fluid.particle_count,
+        "bytes_per_particle": estimate_bytes(fluid.particle_count, fluid.boundary.count, fluid.cell_count)
+        / fluid.particle_count,
         "peak_resident_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
     json.dump(result, sys.stdout, indent=2)

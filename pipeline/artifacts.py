@@ -42,6 +42,7 @@ from typing import Any, Self
 from blake3 import blake3
 
 from pipeline.errors import InvalidArtifactError, StaleAttemptError
+from pipeline.files import sync
 from pipeline.layout import JobLayout
 from pipeline.task import ArtifactPath, Task, TaskId
 
@@ -223,20 +224,20 @@ class Commit:
         receipt_path = self._layout.receipt(self._artifact)
         _make_folder(receipt_path.parent)
         self._receipt_part.write_text(receipt.to_json())
-        _sync(self._receipt_part)
+        sync(self._receipt_part)
         with _lock(receipt_path.with_name(_LOCK_NAME)):
             self._fence()
             self.kept_aside = _invalidate(self._layout, self._artifact)
             self.path.replace(self._target)
-            _sync(self._target.parent)
+            sync(self._target.parent)
             self._receipt_part.replace(receipt_path)
-            _sync(receipt_path.parent)
+            sync(receipt_path.parent)
         self._receipt = receipt
 
     def _describe_part(self) -> Receipt:
         """Hash the part and force it to the disk; only then are its size and time settled."""
         content_hash = hash_file(self.path)
-        _sync(self.path)
+        sync(self.path)
         status = self.path.stat()
         return Receipt(
             artifact=self._artifact,
@@ -303,19 +304,6 @@ def committing(
     )
 
 
-def invalidate(layout: JobLayout, artifact: ArtifactPath) -> ArtifactPath | None:
-    """Make an artifact count no more, so that its task makes it anew; its file stays until then.
-
-    Returns:
-        Where the file was moved to if somebody had edited it by hand, else None.
-    """
-    receipt_path = layout.receipt(artifact)
-    if not receipt_path.exists():
-        return None
-    with _lock(receipt_path.with_name(_LOCK_NAME)):
-        return _invalidate(layout, artifact)
-
-
 def sweep_parts(layout: JobLayout) -> list[Path]:
     """Remove the part files that dead attempts left anywhere in the job's folder; returns what was removed.
 
@@ -348,7 +336,7 @@ def _invalidate(layout: JobLayout, artifact: ArtifactPath) -> ArtifactPath | Non
     receipt_path = layout.receipt(artifact)
     if receipt_path.exists():
         receipt_path.unlink()
-        _sync(receipt_path.parent)
+        sync(receipt_path.parent)
     return kept_aside
 
 
@@ -363,19 +351,10 @@ def _lock(path: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _sync(path: Path) -> None:
-    """Force a file's bytes, or a folder's names, to the disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _make_folder(path: Path) -> None:
     """Make a folder and its parents; each new name is forced to the disk."""
     if path.is_dir():
         return
     _make_folder(path.parent)
     path.mkdir(exist_ok=True)
-    _sync(path.parent)
+    sync(path.parent)

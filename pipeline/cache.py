@@ -35,6 +35,7 @@ class CachedFrame:
 
     frame: int
     time_s: float
+    device: str
     bodies: Mapping[str, Snapshot]
     diagnostics: Mapping[str, Diagnostics]
 
@@ -49,13 +50,14 @@ class Checkpoint:
     arrays: Mapping[str, NDArray[np.generic]]
 
 
-def write_frame(path: Path, bodies: Mapping[str, Snapshot], report: FrameReport) -> None:
-    """Write one frame."""
+def write_frame(path: Path, bodies: Mapping[str, Snapshot], report: FrameReport, *, device: str) -> None:
+    """Write one frame, and the device that computed it."""
     with h5py.File(path, "w", libver=("v108", "v110")) as file:
         file.attrs["format"] = FRAME_FORMAT
         file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["frame"] = report.frame
         file.attrs["time_s"] = report.time_s
+        file.attrs["device"] = device
         for name, snapshot in bodies.items():
             group = file.create_group(f"bodies/{name}")
             group.attrs["kind"] = snapshot.kind
@@ -85,6 +87,7 @@ def read_frame(path: Path, body: str | None = None) -> CachedFrame:
             return CachedFrame(
                 frame=int(file.attrs["frame"]),
                 time_s=float(file.attrs["time_s"]),
+                device=str(file.attrs["device"]),
                 bodies={name: _read_body(file["bodies"][name]) for name in names},
                 diagnostics={
                     name: {key: float(value) for key, value in group.attrs.items()}

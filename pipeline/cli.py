@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from pipeline.commands.arguments import job_options
+from pipeline.commands.arguments import job_options, print_warnings
 from pipeline.commands.inspecting import explain, logs, plan, status
 from pipeline.commands.keeping import clean, verify
 from pipeline.commands.running import rerun, resume, submit
@@ -130,9 +130,3 @@ def doctor(output: Path, as_json: bool) -> None:
     else:
         print_report(examinations)
     sys.exit(int(any(each.status == "failed" for each in examinations)))
-
-
-def print_warnings(warnings: tuple[str, ...]) -> None:
-    """Warnings go to the error stream, so that output stays fit for a pipe."""
-    for warning in warnings:
-        click.secho(f"warning: {warning}", err=True, fg="yellow")

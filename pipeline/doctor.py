@@ -35,7 +35,7 @@ _BPY_PROBE = "import bpy; print('Blender', bpy.app.version_string, 'as the bpy m
 _OPENVDB_PROBE = """
 from render.volume import import_openvdb
 vdb = import_openvdb()
-print('OpenVDB', *vdb.LIBRARY_VERSION[:2] if hasattr(vdb, 'LIBRARY_VERSION') else ())
+print('OpenVDB', '.'.join(map(str, vdb.LIBRARY_VERSION)) if hasattr(vdb, 'LIBRARY_VERSION') else '')
 """
 _CODEC_PROBE = """
 import av

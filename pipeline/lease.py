@@ -3,7 +3,8 @@
 The holder is named in a small file: machine, boot, process and the process's start time, so that a number that was
 given to another process later is not mistaken for it. The file's modification time is the heartbeat. Whoever changes
 the file holds a `flock` on a guard file beside it meanwhile, so of two that race one finds the other's name. Nothing
-here has to be deleted by a person: the kernel drops the guard with its process, and a dead holder is taken over.
+here has to be deleted by a person: the kernel drops the guard with its process, and a dead holder is taken over. A
+thread of the holder's keeps the heartbeat going, whatever the holder is busy with.
 
 On the same machine the process itself is looked for, so a holder that is stopped or slow keeps its lease and a dead
 one loses it at once. On another machine (or in another container) only the heartbeat can be seen. Its age is taken
@@ -17,6 +18,7 @@ import fcntl
 import json
 import os
 import platform
+import threading
 import time
 import uuid
 from collections.abc import Iterator
@@ -30,7 +32,7 @@ import psutil
 from pipeline.errors import JobBusyError, LeaseLostError
 
 HEARTBEAT_INTERVAL_S = 5.0
-"""How often a runner should call `Lease.heartbeat`."""
+"""How often a holder says that it is alive."""
 
 EXPIRY_S = 60.0
 """Age of the heartbeat at which a holder on another machine counts as dead: a dozen heartbeats missed in a row."""
@@ -76,7 +78,7 @@ class LeaseHolder:
 
 
 class Lease:
-    """A lease that this process holds; a context manager that gives it back.
+    """A lease that this process holds; a context manager that keeps its heartbeat going, and gives it back.
 
     Attributes:
         holder: this process.
@@ -85,6 +87,9 @@ class Lease:
 
     def __init__(self, path: Path, holder: LeaseHolder, takeover: str | None) -> None:
         self._path = path
+        self._loss: Exception | None = None
+        self._given_back = threading.Event()
+        self._beating: threading.Thread | None = None
         self.holder = holder
         self.takeover = takeover
 
@@ -118,7 +123,7 @@ class Lease:
         return cls(path, mine, takeover)
 
     def heartbeat(self) -> None:
-        """Say that the holder is alive; call it every HEARTBEAT_INTERVAL_S.
+        """Say that the holder is alive; inside the context a thread does, every HEARTBEAT_INTERVAL_S.
 
         Raises:
             LeaseLostError: somebody has taken the job over. Stop at once, and write no record any more.
@@ -131,6 +136,31 @@ class Lease:
                 )
             os.utime(self._path)
 
+    def check(self) -> None:
+        """Make sure that the lease was still ours at the last heartbeat; costs nothing.
+
+        Raises:
+            LeaseLostError: see `heartbeat`.
+        """
+        if self._loss is not None:
+            raise self._loss
+
+    def _beat(self) -> None:
+        """Keep the heartbeat going until the lease is given back or lost."""
+        heard = time.monotonic()
+        while not self._given_back.wait(HEARTBEAT_INTERVAL_S):
+            try:
+                self.heartbeat()
+                heard = time.monotonic()
+            except LeaseLostError as loss:
+                self._loss = loss
+                return
+            except OSError as error:
+                # A file system that does not answer may do so the next time; until then others may count us alive.
+                if time.monotonic() - heard > EXPIRY_S:
+                    self._loss = LeaseLostError(f"{self._path} could not be renewed for {EXPIRY_S:.0f} s: {error}")
+                    return
+
     def release(self) -> None:
         """Give the lease back; one that somebody else has taken over is left alone."""
         with _guard(self._path):
@@ -142,9 +172,14 @@ class Lease:
         return holder is not None and holder.token == self.holder.token
 
     def __enter__(self) -> Self:
+        self._beating = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._beating.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._given_back.set()
+        if self._beating is not None:
+            self._beating.join()
         self.release()
 
 
@@ -169,6 +204,13 @@ def live_holder(path: Path, *, expiry_s: float = EXPIRY_S) -> LeaseHolder | None
     return holder if _evidence_of_death(holder, age_s=age_s, expiry_s=expiry_s) is None else None
 
 
+def remove_guard(path: Path) -> None:
+    """Remove the guard file of a lease, unless somebody holds the lease: the last step before its folder goes."""
+    with _guard(path):
+        if not path.exists():
+            _guard_file(path).unlink()
+
+
 def _evidence_of_death(holder: LeaseHolder | None, *, age_s: float, expiry_s: float) -> str | None:
     """Why the holder counts as dead, or None if it may be alive."""
     if holder is None:
@@ -187,14 +229,29 @@ def _evidence_of_death(holder: LeaseHolder | None, *, age_s: float, expiry_s: fl
 @contextmanager
 def _guard(path: Path) -> Iterator[float]:
     """Exclude all others that read and change this lease; yields the file system's present time [s]."""
-    guard = path.with_name(f".{path.name}.guard")
-    descriptor = os.open(guard, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    while True:
+        descriptor = os.open(_guard_file(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            if not _is_at(descriptor, _guard_file(path)):
+                continue  # removed while we waited for it, by `remove_guard`: it guards nothing any more
+            os.utime(descriptor)
+            yield os.fstat(descriptor).st_mtime
+            return
+        finally:
+            os.close(descriptor)
+
+
+def _guard_file(path: Path) -> Path:
+    return path.with_name(f".{path.name}.guard")
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether an open file is still the one of that name."""
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        os.utime(guard)
-        yield os.fstat(descriptor).st_mtime
-    finally:
-        os.close(descriptor)
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def _process_start(pid: int) -> str | None:

@@ -24,16 +24,21 @@ import psutil
 
 from pipeline.artifacts import Receipt
 from pipeline.errors import ManifestError
+from pipeline.layout import JobLayout
 from pipeline.manifest_reader import (
     BUSY_TIMEOUT_S,
     SUCCEEDED,
     ArtifactRow,
     AttemptRow,
     EventRow,
+    LastRun,
     ManifestReader,
     StageCost,
     StageSummary,
+    clear_errors,
     damaged,
+    is_damage,
+    result_code,
 )
 from pipeline.migrations import migrate
 from pipeline.task import ArtifactPath, FailureKind, Task, TaskId, TaskState
@@ -43,6 +48,7 @@ __all__ = [
     "ArtifactRow",
     "AttemptRow",
     "EventRow",
+    "LastRun",
     "Manifest",
     "ManifestReader",
     "StageCost",
@@ -90,8 +96,12 @@ class Manifest(ManifestReader):
             raise
 
     # --- a run's frame ---
-    def begin_run(self, job_name: str) -> bool:
+    def begin_run(self, job_name: str, *, run: str = "") -> bool:
         """Mark the job as being run.
+
+        Args:
+            job_name: name of the job.
+            run: the run's token, that of its lease.
 
         Returns:
             Whether the last run had ended cleanly. False for a new manifest, too: there may be receipts that an older
@@ -100,16 +110,22 @@ class Manifest(ManifestReader):
         with self.transaction():
             row = self._connection.execute("SELECT clean_shutdown FROM job").fetchone()
             self._connection.execute(
-                "INSERT INTO job VALUES (1, ?, ?, 0)"
-                " ON CONFLICT (id) DO UPDATE SET name = excluded.name, clean_shutdown = 0",
-                (job_name, time.time()),
+                "INSERT INTO job (id, name, created, clean_shutdown, run) VALUES (1, ?, ?, 0, ?)"
+                " ON CONFLICT (id) DO UPDATE SET"
+                " name = excluded.name, clean_shutdown = 0, run = excluded.run, outcome = NULL",
+                (job_name, time.time(), run),
             )
         return row is not None and bool(row[0])
 
-    def end_run(self) -> None:
-        """Mark the clean end of a run: everything that was committed has been recorded."""
+    def end_run(self, outcome: str = SUCCEEDED, *, clean: bool = True) -> None:
+        """Mark the end of a run.
+
+        Args:
+            outcome: how it ended, a JobOutcome's value.
+            clean: whether everything that was committed has been recorded for certain.
+        """
         with self.transaction():
-            self._connection.execute("UPDATE job SET clean_shutdown = 1")
+            self._connection.execute("UPDATE job SET clean_shutdown = ?, outcome = ?", (clean, outcome))
 
     @contextmanager
     def transaction(self, *, durable: bool = True) -> Iterator[None]:
@@ -120,24 +136,26 @@ class Manifest(ManifestReader):
 
         Raises:
             OSError: ENOSPC, the disk is full.
+            ManifestError: the file is damaged, or cannot be written any more.
         """
         if self._connection.in_transaction:
             yield
             return
         # In rollback mode an unsynced commit could damage the file at a power cut, so there everything is synced.
         synchronous = "FULL" if durable or self._journal_mode != "WAL" else "NORMAL"
-        try:
-            self._connection.execute(f"PRAGMA synchronous = {synchronous}")
-            self._connection.execute("BEGIN IMMEDIATE")
-            yield
-            self._connection.execute("COMMIT")
-        except sqlite3.OperationalError as error:
-            if _is_full(error):
-                raise _disk_full(self._path) from error
-            raise
-        finally:
-            if self._connection.in_transaction:
-                self._connection.execute("ROLLBACK")
+        with clear_errors(self._path, "written"):
+            try:
+                self._connection.execute(f"PRAGMA synchronous = {synchronous}")
+                self._connection.execute("BEGIN IMMEDIATE")
+                yield
+                self._connection.execute("COMMIT")
+            except sqlite3.OperationalError as error:
+                if _is_full(error):
+                    raise _disk_full(self._path) from error
+                raise
+            finally:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
 
     # --- the plan ---
     def record_plan(self, tasks: Sequence[Task], states: Mapping[TaskId, TaskState] | None = None) -> None:
@@ -150,9 +168,7 @@ class Manifest(ManifestReader):
         states = states or {}
         known = {
             row[0]: row[1:]
-            for row in self._connection.execute(
-                "SELECT id, position, stage, subject, frame, parameters, state FROM task"
-            )
+            for row in self._rows("SELECT id, position, stage, subject, frame, parameters, state FROM task")
         }
         planned: set[str] = set()
         changed: list[tuple[object, ...]] = []
@@ -185,12 +201,11 @@ class Manifest(ManifestReader):
             )
 
     # --- attempts ---
-    def start_attempt(self, task: TaskId, *, log: str = "", host: str | None = None) -> int:
+    def start_attempt(self, task: TaskId, *, host: str | None = None) -> int:
         """Open an attempt of a planned task and set the task RUNNING.
 
         Args:
             task: the task.
-            log: path of the attempt's log, relative to the job's folder.
             host: the machine it runs on; this one by default.
 
         Returns:
@@ -198,10 +213,13 @@ class Manifest(ManifestReader):
         """
         with self.transaction():
             (number,) = self._connection.execute(
-                "INSERT INTO attempt (task, number, started, host, log)"
-                " SELECT ?1, coalesce(max(number), 0) + 1, ?2, ?3, ?4 FROM attempt WHERE task = ?1 RETURNING number",
-                (task, time.time(), platform.node() if host is None else host, log),
+                "INSERT INTO attempt (task, number, started, host)"
+                " SELECT ?1, coalesce(max(number), 0) + 1, ?2, ?3 FROM attempt WHERE task = ?1 RETURNING number",
+                (task, time.time(), platform.node() if host is None else host),
             ).fetchone()
+            layout = JobLayout(self._path.parent)
+            log = layout.log(task, number).relative_to(layout.root).as_posix()
+            self._connection.execute("UPDATE attempt SET log = ? WHERE task = ? AND number = ?", (log, task, number))
             self.set_states({task: TaskState.RUNNING})
         return int(number)
 
@@ -329,19 +347,14 @@ def is_on_network(path: Path, mounts: Iterable[tuple[str, str]] | None = None) -
 def _opening_error(path: Path, error: sqlite3.Error) -> Exception:
     if _is_full(error):
         return _disk_full(path)
-    if _code(error) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+    if is_damage(error):
         return damaged(path, str(error))
     return ManifestError(f"{path} cannot be opened ({error}); the job's folder must exist and be writable")
 
 
 def _is_full(error: sqlite3.Error) -> bool:
     """Whether SQLite ran out of disk space; growing the log's index it calls that an I/O error."""
-    return _code(error) in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE)
-
-
-def _code(error: sqlite3.Error) -> int:
-    """SQLite's extended result code, whose low byte is the kind of error; 0 for errors of the module itself."""
-    return int(getattr(error, "sqlite_errorcode", 0))
+    return result_code(error) in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE)
 
 
 def _disk_full(path: Path) -> OSError:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from pipeline.errors import ManifestError, OutdatedManifestError
 from pipeline.migrations import migrations, refuse_newer, schema_version
 from pipeline.parameter_set import ParameterSet
-from pipeline.task import ArtifactPath, FailureKind, TaskId, TaskState
+from pipeline.task import ArtifactPath, TaskId, TaskState
 
 BUSY_TIMEOUT_S = 10.0
 """How long to wait for another process's lock; with a write-ahead log only a checkpoint ever makes one wait."""
@@ -46,12 +48,7 @@ class AttemptRow(NamedTuple):
     seconds: float | None
     peak_memory_bytes: int | None
     host: str
-    log: str
-
-    @property
-    def failure(self) -> FailureKind | None:
-        """Why it ended without success; None if it runs or succeeded."""
-        return None if self.outcome in (None, SUCCEEDED) else FailureKind(self.outcome)
+    log: str  # path relative to the job's folder; empty if it is known from its receipt only
 
 
 class EventRow(NamedTuple):
@@ -83,8 +80,18 @@ class StageCost(NamedTuple):
     bytes_per_artifact: float
 
 
+class LastRun(NamedTuple):
+    """The last run of the job: the token of its lease, and how it ended."""
+
+    run: str | None
+    outcome: str | None  # a JobOutcome's value; None while it goes on, and if it was killed
+
+
 class ManifestReader:
-    """Queries on the record. The connection belongs to the thread that opened it."""
+    """Queries on the record. The connection belongs to the thread that opened it.
+
+    Every query raises ManifestError when the file is damaged, its text naming the remedy, or cannot be read.
+    """
 
     def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
         self._connection = connection
@@ -104,12 +111,15 @@ class ManifestReader:
         # A write-ahead log needs a place for its index; without a log there is nothing that could change beneath us.
         immutable = not log_exists and not os.access(path.parent, os.W_OK)
         uri = f"{path.absolute().as_uri()}?mode=ro{'&immutable=1' if immutable else ''}"
-        try:
+        with clear_errors(path, "read"):
             connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=BUSY_TIMEOUT_S)
-            version = schema_version(connection)
-        except sqlite3.DatabaseError as error:
-            raise damaged(path, str(error)) from error
-        refuse_newer(version)
+        try:
+            with clear_errors(path, "read"):
+                version = schema_version(connection)
+            refuse_newer(version)
+        except ManifestError:
+            connection.close()
+            raise
         if version < len(migrations()):
             connection.close()
             why = "written by an older program" if version else "not finished when it was made"
@@ -128,22 +138,18 @@ class ManifestReader:
 
     def artifacts(self) -> dict[ArtifactPath, ArtifactRow]:
         """Every artifact on record."""
-        return {row.artifact: row for row in map(ArtifactRow._make, self._connection.execute("SELECT * FROM artifact"))}
-
-    def artifact_hashes(self) -> dict[ArtifactPath, str]:
-        """Content hash of every artifact on record."""
-        return dict(self._connection.execute("SELECT path, hash FROM artifact"))
+        return {row.artifact: row for row in map(ArtifactRow._make, self._rows("SELECT * FROM artifact"))}
 
     def states(self) -> dict[TaskId, TaskState]:
         """State of every planned task, in the plan's order."""
-        rows = self._connection.execute("SELECT id, state FROM task WHERE position IS NOT NULL ORDER BY position")
+        rows = self._rows("SELECT id, state FROM task WHERE position IS NOT NULL ORDER BY position")
         return {TaskId(task): TaskState(state) for task, state in rows}
 
     def summary(self) -> list[StageSummary]:
         """Counts per stage, stages in the plan's order."""
-        rows = self._connection.execute(
+        rows = self._rows(
             "SELECT stage, state, count(*), min(position) FROM task WHERE position IS NOT NULL GROUP BY stage, state"
-        ).fetchall()
+        )
         counts: dict[str, dict[TaskState, int]] = {}
         for stage, state, count, _ in sorted(rows, key=lambda row: int(row[3])):
             counts.setdefault(stage, {})[TaskState(state)] = count
@@ -151,17 +157,17 @@ class ManifestReader:
 
     def history(self, task: TaskId) -> list[AttemptRow]:
         """Every attempt of a task, first to last."""
-        rows = self._connection.execute("SELECT * FROM attempt WHERE task = ? ORDER BY number", (task,))
+        rows = self._rows("SELECT * FROM attempt WHERE task = ? ORDER BY number", (task,))
         return [AttemptRow._make(row) for row in rows]
 
     def running_attempts(self) -> list[AttemptRow]:
         """Attempts that have not been closed; at the start of a run, those whose worker died with its runner."""
-        rows = self._connection.execute("SELECT * FROM attempt WHERE finished IS NULL ORDER BY task, number")
+        rows = self._rows("SELECT * FROM attempt WHERE finished IS NULL ORDER BY task, number")
         return [AttemptRow._make(row) for row in rows]
 
     def failures(self) -> list[AttemptRow]:
         """The last attempt of each planned task that has failed, in the plan's order."""
-        rows = self._connection.execute(
+        rows = self._rows(
             "SELECT attempt.* FROM task JOIN attempt ON attempt.task = task.id"
             " WHERE task.position IS NOT NULL AND task.state = ?"
             " AND attempt.number = (SELECT max(number) FROM attempt AS later WHERE later.task = task.id)"
@@ -172,20 +178,25 @@ class ManifestReader:
 
     def events(self, *, task: TaskId | None = None, limit: int = 100) -> list[EventRow]:
         """The last `limit` events, oldest first; of one task, or of all."""
-        rows = self._connection.execute(
+        rows = self._rows(
             "SELECT time, kind, task, message FROM event WHERE ?1 IS NULL OR task = ?1 ORDER BY id DESC LIMIT ?2",
             (task, limit),
-        ).fetchall()
+        )
         return [EventRow._make(row) for row in reversed(rows)]
 
     def parameters(self, digest: str) -> ParameterSet | None:
         """The parameter set of this digest; None if it is unknown, as after a rebuild."""
-        row = self._connection.execute("SELECT canonical FROM parameters WHERE digest = ?", (digest,)).fetchone()
-        return None if row is None else ParameterSet(row[0])
+        rows = self._rows("SELECT canonical FROM parameters WHERE digest = ?", (digest,))
+        return ParameterSet(rows[0][0]) if rows else None
+
+    def last_run(self) -> LastRun:
+        """The last run of the job."""
+        rows = self._rows("SELECT run, outcome FROM job")
+        return LastRun._make(rows[0]) if rows else LastRun(None, None)
 
     def stage_costs(self) -> dict[str, StageCost]:
         """Mean time and disk space that an artifact of each stage has taken; stages without any are left out."""
-        rows = self._connection.execute(
+        rows = self._rows(
             "WITH made AS (SELECT stage, count(*) AS artifacts, sum(size) AS bytes FROM artifact"
             "   JOIN task ON task.id = artifact.task GROUP BY stage),"
             " spent AS (SELECT stage, sum(seconds) AS seconds FROM attempt"
@@ -196,10 +207,49 @@ class ManifestReader:
         )
         return {row.stage: row for row in map(StageCost._make, rows)}
 
+    def _rows(self, query: str, parameters: Sequence[object] = ()) -> list[tuple[Any, ...]]:
+        """All rows of a query. Damage shows only at the page that it hit, so they are fetched here, under one roof."""
+        with clear_errors(self._path, "read"):
+            return self._connection.execute(query, parameters).fetchall()
+
 
 def damaged(path: Path, finding: str) -> ManifestError:
     """The error for a manifest that SQLite cannot trust."""
     return ManifestError(
         f"{path} is damaged ({finding}). No finished work is lost: every artifact has its receipt. "
-        "Make a new manifest of the receipts with: pipeline verify --rebuild"
+        f"Make a new manifest of the receipts with: pipeline verify {shlex.quote(str(path.parent))} --rebuild"
     )
+
+
+@contextmanager
+def clear_errors(path: Path, what: str) -> Iterator[None]:
+    """Turn SQLite's errors in the block into ones for the user; a mistake in a statement itself stays what it is.
+
+    Args:
+        path: the manifest.
+        what: what the block does to it: "read" or "written".
+
+    Raises:
+        ManifestError: the file is damaged, or it cannot be used now.
+    """
+    try:
+        yield
+    except sqlite3.Error as error:
+        if is_damage(error):
+            raise damaged(path, str(error)) from error
+        if isinstance(error, sqlite3.OperationalError):
+            raise ManifestError(f"{path} cannot be {what} ({error})") from error
+        raise
+
+
+def is_damage(error: sqlite3.Error) -> bool:
+    """Whether SQLite found the file damaged, rather than busy, locked or out of reach."""
+    if result_code(error) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+        return True
+    # Flipped bits in a text; an error of the Python module, which has no result code.
+    return isinstance(error, sqlite3.OperationalError) and str(error).startswith("Could not decode to UTF-8")
+
+
+def result_code(error: sqlite3.Error) -> int:
+    """SQLite's extended result code, whose low byte is the kind of error; 0 for errors of the module itself."""
+    return int(getattr(error, "sqlite_errorcode", 0))

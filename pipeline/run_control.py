@@ -7,9 +7,11 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from difflib import get_close_matches
 from types import FrameType
 
 from pipeline.errors import PlanError
+from pipeline.plan import frame_ranges
 from pipeline.task import Task, TaskId
 
 
@@ -29,17 +31,36 @@ class Selection:
         """The selected ones of these tasks.
 
         Raises:
-            PlanError: there are none.
+            PlanError: a stage or a frame is not in the plan, or a stage has no frames; says so of each.
         """
-        chosen = frozenset(
-            task.id
-            for task in tasks
-            if (not self.stages or task.stage in self.stages) and (self.frames is None or task.frame in self.frames)
-        )
-        if not chosen:
-            known = ", ".join(dict.fromkeys(task.stage for task in tasks))
-            raise PlanError(f"nothing to run again: no task has such a stage and frame; the stages are {known}")
-        return chosen
+        known = [*dict.fromkeys(task.stage for task in tasks)]
+        unknown = sorted(self.stages - set(known))
+        if unknown:
+            names = "; ".join(f'no stage "{name}" in this job{_nearest(name, known)}' for name in unknown)
+            raise PlanError(f"{names}; the stages are {', '.join(known)}")
+        chosen = [task for task in tasks if not self.stages or task.stage in self.stages]
+        if self.frames is not None:
+            self._check_frames(chosen, self.frames)
+            chosen = [task for task in chosen if task.frame in self.frames]
+        return frozenset(task.id for task in chosen)
+
+    def _check_frames(self, tasks: Sequence[Task], frames: frozenset[int]) -> None:
+        planned = {task.frame for task in tasks if task.frame is not None}
+        whole = sorted(self.stages - {task.stage for task in tasks if task.frame is not None})
+        if whole:
+            raise PlanError(f"{', '.join(whole)}: about the whole job, has no frames to choose from; leave them out")
+        outside = frames - planned
+        if outside:
+            told = frame_ranges(outside, range(max(outside) + 1))
+            theirs = frame_ranges(planned, planned)
+            raise PlanError(
+                f"no frame {told} in this job; the frames are {theirs}" if theirs else "there are no frames"
+            )
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    close = get_close_matches(name, names, n=1)
+    return f'; did you mean "{close[0]}"?' if close else ""
 
 
 class RunControl:

@@ -8,26 +8,26 @@ die with it, and the lease of a dead process counts for nothing.
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from collections.abc import Sequence
 
-from pipeline.artifacts import Receipt, read_receipt, sweep_parts
+from pipeline.artifacts import Receipt, read_receipt, sweep_parts, verify_artifact
 from pipeline.executors.attempt import load_stages
 from pipeline.executors.base import Assignment, Committed, Executor, Failed, Finished, TaskEvent
 from pipeline.executors.failures import is_disk_full
+from pipeline.files import replace_durably
 from pipeline.fingerprint import task_fingerprint
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
-from pipeline.lease import HEARTBEAT_INTERVAL_S, Lease
+from pipeline.lease import Lease
 from pipeline.manifest import Manifest, artifact_row
 from pipeline.plan import Assessment, Verdict, assess, input_hashes, plan_job, up_to_date
 from pipeline.reconcile import Reconciliation, reconcile
 from pipeline.resources import machine_capacity
 from pipeline.run_control import RunControl, Selection
 from pipeline.run_events import Notice, Observer, Outcome, RunEnded, RunStarted, SilentObserver, StateChanged
-from pipeline.scheduler import Scheduler
+from pipeline.scheduler import OWN_FAILURES, Scheduler
 from pipeline.scheduler_events import (
     ArtifactCommitted,
     CancelRequested,
@@ -44,7 +44,7 @@ from pipeline.scheduler_events import (
     TaskSucceeded,
     Tick,
 )
-from pipeline.task import ArtifactPath, FailureKind, Resources, Task, TaskId, TaskState
+from pipeline.task import FailureKind, Resources, Task, TaskId, TaskState
 
 __all__ = ["Outcome", "RunControl", "Selection", "run_job"]
 
@@ -52,6 +52,8 @@ STAGES_REFERENCE = "pipeline.stages:STAGES"
 
 _TURN_S = 0.25
 """Longest time that the loop sleeps [s]; so soon it answers Ctrl-C."""
+_FORCED_ENDS = frozenset(FailureKind) - OWN_FAILURES - {FailureKind.DISK_FULL}
+"""Ends that may come from outside, at any moment: between a commit and the word of it, too."""
 _STOP_GRACE_S = 120.0
 """Time a long task gets to write its checkpoint when the run is drained [s]."""
 
@@ -98,7 +100,7 @@ def run_job(
     with Lease.acquire(layout.lease) as lease, Manifest(layout.manifest) as manifest, control.on_signals():
         if job_text is not None:
             _write_job_file(layout, job_text)
-        clean = manifest.begin_run(job.name)
+        clean = manifest.begin_run(job.name, run=lease.holder.token)
         if lease.takeover is not None:
             manifest.log_event("takeover", lease.takeover)
             observer.notify(Notice(lease.takeover))
@@ -111,6 +113,7 @@ def run_job(
             tasks, reconciliation.rows, reconciliation.problems, parameters=manifest.parameters, forced=forced
         )
         observer.notify(RunStarted(assessments))
+        lease.check()
         run = _Run(
             layout,
             assessments,
@@ -164,6 +167,8 @@ class _Run:
         self._last_failures: dict[TaskId, Failed] = {}
         self._obeyed = 0
         self._parts_left = False
+        self._ended_by_force = False
+        self._assignments: dict[TaskId, Assignment] = {}
         self._outcome: JobOutcome | None = None
         self._tasks = {assessment.task.id: assessment.task for assessment in assessments}
         self._invalidate_forced()
@@ -191,17 +196,13 @@ class _Run:
         """Run until the scheduler says that it is over."""
         try:
             self._turn([], self._scheduler.start())
-            beat = time.monotonic()
             while self._outcome is None:
                 events = self._executor.wait(self._sleep_s())
-                now = time.monotonic()
-                if now - beat >= HEARTBEAT_INTERVAL_S:
-                    self._lease.heartbeat()
-                    beat = now
-                self._turn(events, self._obey_control() + self._scheduler.handle(Tick(now)))
+                self._lease.check()
+                self._turn(events, self._obey_control() + self._scheduler.handle(Tick(time.monotonic())))
             if self._parts_left:
                 sweep_parts(self._layout)
-            self._manifest.end_run()
+            self._manifest.end_run(self._outcome, clean=not self._ended_by_force)
         except OSError as error:
             if not is_disk_full(error):
                 raise
@@ -293,7 +294,7 @@ class _Run:
     def _open_attempt(self, task: Task, threads: int) -> Assignment:
         attempt = self._manifest.start_attempt(task.id)
         inputs = input_hashes(task, self._rows)
-        return Assignment(
+        self._assignments[task.id] = assignment = Assignment(
             task=task,
             attempt=attempt,
             fingerprint=task_fingerprint(task, inputs),
@@ -304,6 +305,7 @@ class _Run:
             stages=self._stages,
             timeout_s=None if task.frame is None else self._task_timeout_s,
         )
+        return assignment
 
     def _invalidate_forced(self) -> None:
         """Drop the receipts of what is to run again, so that its stage finds nothing to reuse.
@@ -327,6 +329,10 @@ class _Run:
                 return self._take_receipt(task_id, receipt)
             case Finished(task_id, attempt, seconds, peak_memory_bytes):
                 instructions = self._adopt_lacking(task_id)
+                if lacking := self._scheduler.lacking(task_id):
+                    gone = f"{lacking[0]} was there when its task ended, and is not as it was committed any more"
+                    failed = Failed(task_id, attempt, FailureKind.FAILED, gone, "", seconds, peak_memory_bytes)
+                    return instructions + self._take_failure(failed)
                 self._manifest.finish_attempt(task_id, attempt, seconds=seconds, peak_memory_bytes=peak_memory_bytes)
                 return instructions + self._scheduler.handle(TaskSucceeded(task_id))
             case Failed():
@@ -340,28 +346,42 @@ class _Run:
         return self._scheduler.handle(ArtifactCommitted(task_id, receipt.artifact))
 
     def _take_failure(self, failed: Failed) -> list[Instruction]:
+        # A process that was killed could not remove what it was writing, nor tell of its last commit.
+        self._parts_left = True
+        self._ended_by_force |= failed.kind in _FORCED_ENDS
+        instructions = self._adopt_lacking(failed.task_id)
+        succeeded = failed.kind in _FORCED_ENDS and not self._scheduler.lacking(failed.task_id)
         self._manifest.finish_attempt(
             failed.task_id,
             failed.attempt,
-            failure=failed.kind,
-            message=failed.message,
+            failure=None if succeeded else failed.kind,
+            message=f"after its last commit: {failed.message}" if succeeded else failed.message,
             seconds=failed.seconds,
             peak_memory_bytes=failed.peak_memory_bytes or None,
         )
+        if succeeded:
+            return instructions + self._scheduler.handle(TaskSucceeded(failed.task_id))
         self._last_failures[failed.task_id] = failed
-        # A process that was killed could not remove what it was writing.
-        self._parts_left = True
         if failed.kind is FailureKind.DISK_FULL:
             self._notice(f"the disk is full ({self._layout.root}): the job pauses; free some space and submit it again")
-        return self._scheduler.handle(TaskFailed(failed.task_id, failed.kind, time.monotonic()))
+        return instructions + self._scheduler.handle(TaskFailed(failed.task_id, failed.kind, time.monotonic()))
 
     def _adopt_lacking(self, task_id: TaskId) -> list[Instruction]:
-        """Outputs that the stage found committed already, though the record did not know them."""
+        """Take in outputs that are committed without the record knowing it.
+
+        The stage found them there already, or its process was killed between a commit and the word of it.
+        """
+        assignment = self._assignments[task_id]
         instructions: list[Instruction] = []
         for artifact in self._scheduler.lacking(task_id):
-            receipt = read_receipt(self._layout, ArtifactPath(artifact))
-            assert receipt is not None, f"{artifact} was there when its task ended"
-            instructions += self._take_receipt(task_id, receipt)
+            receipt = read_receipt(self._layout, artifact)
+            if (
+                receipt is not None
+                and receipt.fingerprint == assignment.fingerprint
+                and verify_artifact(self._layout, receipt) is None
+            ):
+                self._observer.notify(Committed(task_id, assignment.attempt, receipt))
+                instructions += self._take_receipt(task_id, receipt)
         return instructions
 
     def _notice(self, sentence: str) -> None:
@@ -372,9 +392,4 @@ def _write_job_file(layout: JobLayout, text: str) -> None:
     """Replace the job's own copy of its file, at once as a whole; left alone if nothing changed."""
     if layout.job_file.exists() and layout.job_file.read_text(encoding="utf-8") == text:
         return
-    part = layout.root / f".job.toml.part.{os.getpid()}"
-    with part.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(layout.job_file)
+    replace_durably(layout.job_file, text)

@@ -78,7 +78,8 @@ class Scheduler:
     """Decides what runs next.
 
     Lower frames go first, and of one frame the later stage, so that the film shows early and few intermediate files
-    wait for their reader. Tasks about the whole job go before any frame.
+    wait for their reader. Tasks about the whole job go before any frame, and of these the earlier stage: the small ones
+    that prepare something are not kept waiting by a simulation that takes the whole machine.
 
     Args:
         tasks: all tasks of the job; stages in the order of their first task.
@@ -123,7 +124,7 @@ class Scheduler:
                 need = claim(task.resources, capacity)
             except ValueError as error:
                 raise ValueError(f"{task.id} {error}") from None
-            priority = (-1 if task.frame is None else task.frame, -rank, index)
+            priority = (-1, rank, index) if task.frame is None else (task.frame, -rank, index)
             entry = _Entry(task, need, priority)
             self._entries[task.id] = entry
             self._counts[task.stage, TaskState.PENDING] += 1

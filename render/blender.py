@@ -45,6 +45,21 @@ class FrameRenderError(RuntimeError):
         return f"frame {self.frame}: {self.reason}"
 
 
+class BlenderDiedError(FrameRenderError):
+    """The Blender executable ended, or was ended, while it was needed: no fault of the frame that it was to draw.
+
+    The renderer is of no more use; another one may draw the frame.
+
+    Attributes:
+        returncode: exit code of the child; negative for the signal that ended it.
+    """
+
+    def __init__(self, frame: int, returncode: int, last_lines: str) -> None:
+        super().__init__(frame, f"Blender is gone, exit code {returncode}; its last lines:\n{last_lines}")
+        self.args = (frame, returncode, last_lines)  # what pickling calls this with
+        self.returncode = returncode
+
+
 class Renderer(Protocol):
     """Draws frames of one RenderSpec."""
 
@@ -138,7 +153,11 @@ class ExecutableRenderer:
         try:
             answer = self._read_answer(("RENDERER_READY", "RENDERER_FAILED"))
             if answer is None:
-                raise BlenderUnavailableError(f"Blender did not start: {self._describe_end()}")
+                self.close()
+                raise BlenderUnavailableError(
+                    f"Blender did not start: exit code {self._process.returncode} of {' '.join(self._argv)}; "
+                    f"its last lines:\n{self._last_lines()}"
+                )
             if answer.startswith("RENDERER_FAILED"):
                 raise BlenderUnavailableError(answer.partition(" ")[2])
         except BaseException:
@@ -147,17 +166,22 @@ class ExecutableRenderer:
         _, self.version, self.device = answer.split(" ", 2)
 
     def render(self, frame: int, output_path: Path) -> None:
-        """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
+        """Draw a frame into a PNG file of any name.
+
+        Raises:
+            FrameRenderError: this frame cannot be drawn.
+            BlenderDiedError: the executable is gone; this renderer is of no more use.
+        """
         stdin = self._process.stdin
         assert stdin is not None
         try:
             stdin.write(f"{frame} {output_path.resolve()}\n")
             stdin.flush()
         except (BrokenPipeError, ValueError) as error:
-            raise FrameRenderError(frame, f"Blender is gone: {self._describe_end()}") from error
+            raise self._died(frame) from error
         answer = self._read_answer((f"FRAME_DONE {frame} ", f"FRAME_FAILED {frame} "))
         if answer is None:
-            raise FrameRenderError(frame, f"Blender ended while drawing: {self._describe_end()}")
+            raise self._died(frame)
         if answer.startswith("FRAME_FAILED"):
             raise FrameRenderError(frame, answer.split(" ", 2)[2])
 
@@ -187,11 +211,12 @@ class ExecutableRenderer:
             logger.debug("blender: %s", text)
         return None
 
-    def _describe_end(self) -> str:
+    def _died(self, frame: int) -> BlenderDiedError:
         self.close()
-        exit_code = self._process.returncode
-        last_lines = "\n".join(self._log_tail) or "(it wrote nothing)"
-        return f"exit code {exit_code} of {' '.join(self._argv)}; its last lines:\n{last_lines}"
+        return BlenderDiedError(frame, self._process.returncode, self._last_lines())
+
+    def _last_lines(self) -> str:
+        return "\n".join(self._log_tail) or "(it wrote nothing)"
 
 
 def build_argv(blender: str, spec_path: Path, *, threads: int) -> list[str]:

@@ -100,7 +100,10 @@ class RenderParameters(Parameters):
     exposure: float = Field(default=0.0, description="Exposure [stops].")
     seed: int = Field(default=0, ge=0, description="Seed of the sampling pattern.")
     device: Literal["auto", "cpu", "gpu"] = Field(default="auto", description="What Cycles renders on.")
-    blender: str | None = Field(default=None, description="Path of a Blender executable; the bpy module if omitted.")
+    blender: str | None = Field(
+        default=None,
+        description="Path of a Blender executable, relative to the job file; the bpy module if omitted.",
+    )
 
 
 class MovieParameters(Parameters):

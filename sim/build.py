@@ -34,14 +34,10 @@ class FluidFilling:
     Attributes:
         positions: (n, 3) float32 [m].
         velocities: (n, 3) float32 [m/s].
-        in_solids: how many lattice points were left out because they lay inside a solid.
-        in_other_blocks: how many were left out because an earlier block of the fluid filled their place.
     """
 
     positions: NDArray[np.float32]
     velocities: NDArray[np.float32]
-    in_solids: int
-    in_other_blocks: int
 
 
 def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
@@ -58,29 +54,35 @@ def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
 
 
 def fill_fluid(fluid: FluidParameters, domain: DomainParameters, solids: Sequence[Solid]) -> FluidFilling:
-    """Fill the fluid's blocks on lattices of spacing 2r, clear of walls, solids and each other."""
+    """Fill the fluid's blocks on lattices of spacing 2r, clear of walls, solids and each other.
+
+    A place in two blocks belongs to the first.
+
+    Raises:
+        ShapeError: a block's shape cannot be built.
+        ValueError: a block is left without a particle.
+    """
     spacing = 2.0 * fluid.particle_radius
     clearance = CLEARANCE_IN_SPACINGS * spacing
-    lower, upper = np.asarray(domain.min) + clearance, np.asarray(domain.max) - clearance
     positions: list[NDArray[np.float32]] = []
     velocities: list[NDArray[np.float32]] = []
-    in_solids = in_other_blocks = 0
-    for block in fluid.block:
-        points = fill_with_particles(build_solid(block), spacing, lower=lower, upper=upper)
+    for number, block in enumerate(fluid.block):
+        points = fill_with_particles(build_solid(block), spacing, lower=domain.min, upper=domain.max)
         for solid in solids:
             outside = solid.signed_distance(points.astype(np.float64)) >= (1.0 - ROUNDING) * clearance
-            in_solids += int(np.count_nonzero(~outside))
             points = points[outside]
         if positions and len(points):
             distance, _ = cKDTree(np.concatenate(positions)).query(points, distance_upper_bound=0.9 * spacing)
             free = ~np.isfinite(distance)
-            in_other_blocks += int(np.count_nonzero(~free))
             points = points[free]
+        if len(points) == 0:
+            raise ValueError(
+                f'fluid "{fluid.name}" block[{number}] has no particle: '
+                "it is outside the domain, inside solids, or filled by the blocks before it"
+            )
         positions.append(points)
         velocities.append(np.broadcast_to(np.float32(block.velocity), points.shape))
-    return FluidFilling(
-        np.concatenate(positions), np.ascontiguousarray(np.concatenate(velocities)), in_solids, in_other_blocks
-    )
+    return FluidFilling(np.concatenate(positions), np.ascontiguousarray(np.concatenate(velocities)))
 
 
 def _build_fluid(fluid: FluidParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:
@@ -89,8 +91,6 @@ def _build_fluid(fluid: FluidParameters, scene: SceneParameters, bodies: Sequenc
 
     spacing = 2.0 * fluid.particle_radius
     filling = fill_fluid(fluid, scene.domain, [body.solid for body in bodies])
-    if len(filling.positions) == 0:
-        raise ValueError(f'fluid "{fluid.name}" has no particle: its blocks are outside the domain or inside solids')
     samples = [
         sink_samples(
             _reachable(body.surface_samples(spacing), scene.domain, spacing), body.solid.signed_distance, spacing

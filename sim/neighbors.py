@@ -22,6 +22,12 @@ Cells = ti.types.vector(3, ti.i32)
 
 SCAN_BLOCK = 1024
 GROWTH = 1.25
+MAX_CELLS = 2**28
+"""Most cells of a grid: 1 GiB for each of its int32 arrays, however few the particles."""
+
+MAX_LIST_LENGTH = 2**31 - 1
+"""Most entries of a neighbour list, as their places are int32."""
+
 ROUNDING_MARGIN = 1.0e-5
 """Relative margin on a squared radius: far above the rounding of float32, far below the spacing of particles."""
 
@@ -42,10 +48,20 @@ class CellGrid:
 
     @classmethod
     def covering(cls, low: NDArray[np.floating], high: NDArray[np.floating], cell_size: float) -> "CellGrid":
-        """The grid for a box from `low` to `high` [m]."""
-        inner = np.maximum(np.ceil((np.asarray(high) - np.asarray(low)) / cell_size), 1).astype(int)
+        """The grid for a box from `low` to `high` [m].
+
+        Raises:
+            ValueError: the box holds more than `MAX_CELLS` cells, wherever the points are.
+        """
+        size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
+        shape = np.maximum(np.ceil(size / cell_size), 1.0) + 2.0
+        if not shape.prod() <= MAX_CELLS:
+            raise ValueError(
+                f"a box of {' x '.join(f'{edge:g}' for edge in size)} m has {shape.prod():.3g} neighbour cells of "
+                f"{cell_size:g} m, more than {MAX_CELLS}; give a smaller domain or a larger particle radius"
+            )
         origin = np.asarray(low, dtype=np.float64) - cell_size
-        return cls(tuple(origin.tolist()), cell_size, tuple((inner + 2).tolist()))
+        return cls(tuple(origin.tolist()), cell_size, tuple(shape.astype(int).tolist()))
 
     @property
     def cell_count(self) -> int:
@@ -140,6 +156,9 @@ class NeighborList:
             count: number of particles.
             boundary_points: x, y and z of the boundary samples, sorted by cell [m].
             boundary_cell_start: their cell ranges.
+
+        Raises:
+            OverflowError: there are more neighbours than `MAX_LIST_LENGTH`.
         """
         grid = self.grid
         search = (
@@ -148,8 +167,13 @@ class NeighborList:
         )  # fmt: skip
         count_neighbors(*search, self._room, self.end)
         self.length = int(exclusive_scan(self._room, count, self._block_sums, self.start))
+        if self.length < 0:  # the sum has passed the largest int32
+            raise OverflowError(
+                f"{count} particles have more than {MAX_LIST_LENGTH} neighbours within {radius:g} m; "
+                "give fewer particles, or start them farther apart"
+            )
         if self.length > self.indices.shape[0]:
-            self.indices = ti.ndarray(ti.i32, int(self.length * GROWTH))
+            self.indices = ti.ndarray(ti.i32, min(int(self.length * GROWTH), MAX_LIST_LENGTH))
         list_neighbors(*search, self.start, self.boundary_start, self.end, self.indices)
 
 
@@ -281,7 +305,8 @@ def count_neighbors(
                     inside = dx_ib * dx_ib + dy_ib * dy_ib + dz_ib * dz_ib < radius_squared
                     boundary_near += ti.cast(inside, ti.i32)
         # The count includes the particle itself: the list uses that place to write before it knows whether to keep.
-        room[i] = fluid_near + boundary_near
+        # A particle at NaN is not even near itself, and needs the place too.
+        room[i] = ti.max(fluid_near + boundary_near, 1)
         boundary_count[i] = boundary_near
 
 
@@ -316,8 +341,11 @@ def list_neighbors(
                     reach = ti.sqrt(reach_squared)
                     left = ti.cast(ti.floor((x_i - reach - origin[0]) * inverse_cell_size), ti.i32) - cell[0]
                     right = ti.cast(ti.floor((x_i + reach - origin[0]) * inverse_cell_size), ti.i32) - cell[0]
+                    # Never right of the cell, nor left of it; said for a particle at NaN, which becomes any integer.
+                    left = ti.max(ti.min(left, 0), -1)
+                    right = ti.min(ti.max(right, 0), 1)
                     row = row_of_cell(cell, dy, dz, shape)
-                    for j in range(cell_start[row + ti.max(left, -1)], cell_start[row + 1 + ti.min(right, 1)]):
+                    for j in range(cell_start[row + left], cell_start[row + 1 + right]):
                         dx_ij, dy_ij, dz_ij = x_i - x[j], y_i - y[j], z_i - z[j]
                         inside = dx_ij * dx_ij + dy_ij * dy_ij + dz_ij * dz_ij < radius_squared
                         indices[slot] = j

@@ -252,7 +252,8 @@ def _read_probe(child: subprocess.Popen[str]) -> str:
     if child.returncode < 0:
         return f"its driver ends the process with {signal.Signals(-child.returncode).name}"
     lines = (answer.strip() or complaint.strip() or f"the probe ended with {child.returncode}").splitlines()
-    return lines[-1]
+    # Taichi's own words for a missing driver library are "Arch=[<Arch.cuda: 3>] is not supported".
+    return "no driver for it was found" if "is not supported" in lines[-1] else lines[-1]
 
 
 def _probe(device: str) -> None:

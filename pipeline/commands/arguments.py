@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,12 @@ def submitted_job_argument(command: Any) -> Any:
 def json_option(command: Any) -> Any:
     """For machines."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
+
+
+def print_warnings(warnings: Sequence[str]) -> None:
+    """Warnings go to the error stream, so that output stays fit for a pipe."""
+    for warning in warnings:
+        click.secho(f"warning: {warning}", err=True, fg="yellow")
 
 
 def find_job(job: str, output: Path) -> JobLayout:

@@ -18,6 +18,7 @@ from pipeline.commands.arguments import (
     job_options,
     json_option,
     output_option,
+    print_warnings,
     submitted_job_argument,
 )
 from pipeline.errors import PipelineError
@@ -58,8 +59,7 @@ def plan(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path
     if as_json:
         click.echo(json.dumps([_assessment_as_json(each) for each in assessments], indent=1))
         return
-    for warning in loaded.warnings:
-        click.secho(f"warning: {warning}", err=True, fg="yellow")
+    print_warnings(loaded.warnings)
     for line in summarize(assessments):
         click.echo(line)
     for each in estimate(assessments, estimates):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 import click
@@ -87,7 +87,7 @@ def clean(job: str, output: Path, stages: tuple[str, ...], everything: bool, yes
     pipeline clean quickstart --stage surface --stage volume
     pipeline clean quickstart --all --yes
     """
-    from pipeline.lease import Lease
+    from pipeline.lease import Lease, remove_guard
 
     if not stages and not everything:
         raise click.UsageError("say what to remove: --stage or --all")
@@ -100,8 +100,10 @@ def clean(job: str, output: Path, stages: tuple[str, ...], everything: bool, yes
             _remove_contents(layout, really=yes)
         else:
             _remove_stages(layout, frozenset(stages), really=yes)
-    if everything and yes and all(map(layout.is_of_lease, layout.root.iterdir())):
-        shutil.rmtree(layout.root)
+    if everything and yes:
+        remove_guard(layout.lease)
+        with suppress(OSError):  # not empty: a job that was submitted in this moment has the folder now
+            layout.root.rmdir()
 
 
 def _remove_contents(layout: JobLayout, *, really: bool) -> None:
@@ -140,17 +142,10 @@ def _remove_stages(layout: JobLayout, stages: frozenset[str], *, really: bool) -
         _announce(layout.root, files, really=really)
         if not really:
             return
-        _remove(layout, artifacts)
-        for path in files:
+        # Receipts go first: a file without one does not count, a receipt without its file would be a claim.
+        for path in [*map(layout.receipt, artifacts), *files]:
             path.unlink(missing_ok=True)
         manifest.forget_artifacts(artifacts)
-
-
-def _remove(layout: JobLayout, artifacts: Iterable[ArtifactPath]) -> None:
-    """The receipt goes first: a file without one does not count, a receipt without its file would be a claim."""
-    for artifact in artifacts:
-        layout.receipt(artifact).unlink(missing_ok=True)
-        layout.path(artifact).unlink(missing_ok=True)
 
 
 def _announce(folder: Path, files: list[Path], *, really: bool) -> None:

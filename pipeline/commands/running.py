@@ -16,6 +16,7 @@ from pipeline.commands.arguments import (
     job_options,
     output_option,
     parse_frames,
+    print_warnings,
     submitted_job_argument,
 )
 from pipeline.errors import (
@@ -38,6 +39,10 @@ if TYPE_CHECKING:
 STALL_TIMEOUT_S = 3600.0
 """A task without a sign of life for so long is ended. A single frame shows none while Cycles draws it, and a final one
 in film resolution takes half an hour on a few cores."""
+
+GPU_TASKS = 1
+"""One task at a time on the GPU. Whether there is one is not asked here: if not, a stage that has to run names it as an
+obstacle, and what is up to date needs none."""
 
 DISK_FULL = "the disk is full ({}); free some space and submit the job again"
 
@@ -74,8 +79,7 @@ def submit(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
         from pipeline.job.checks import load_checked_job
 
         loaded, _ = load_checked_job(job_file, overrides, preview=preview)
-        for warning in loaded.warnings:
-            click.secho(f"warning: {warning}", err=True, fg="yellow")
+        print_warnings(loaded.warnings)
     run(loaded.job, layout, todo, submitted=loaded, cores=cores)
 
 
@@ -146,7 +150,9 @@ def run(
     """
     _require_possible(job, todo)
     _make_folder(layout)
-    job_text = None if submitted is None else _keep(submitted, layout)
+    job_text = None
+    if submitted is not None:
+        job, job_text = _keep(submitted, layout)
     while True:
         try:
             outcome = _run_once(job, layout, job_text=job_text, cores=cores, rerun=rerun)
@@ -171,7 +177,7 @@ def _run_once(
     from pipeline.resources import machine_capacity
     from pipeline.runner import run_job
 
-    capacity = machine_capacity(gpus=_gpus())
+    capacity = machine_capacity(gpus=GPU_TASKS)
     if cores is not None:
         capacity = replace(capacity, cores=min(cores, capacity.cores))
     limits = WorkerLimits(stall_timeout_s=STALL_TIMEOUT_S)
@@ -248,8 +254,8 @@ def _require_possible(job: Job, todo: frozenset[str]) -> None:
         raise StageUnavailableError("\n".join(obstacles))
 
 
-def _keep(submitted: LoadedJob, layout: JobLayout) -> str:
-    """Copy what the job reads into its folder; returns the job's text that names the copies."""
+def _keep(submitted: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
+    """Copy what the job reads into its folder; returns the job that reads the copies, and its text."""
     from pipeline.job.inputs import keep_inputs
 
     try:
@@ -272,10 +278,3 @@ def _make_folder(layout: JobLayout) -> None:
         raise PipelineError(
             f"cannot write to {layout.root}: {error.strerror}; name another folder with --output"
         ) from error
-
-
-def _gpus() -> int:
-    """One simulation at a time on a GPU, if there is one that works."""
-    from sim.runtime import resolve_device
-
-    return int(resolve_device("auto") != "cpu")

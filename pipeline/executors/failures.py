@@ -12,6 +12,8 @@ from pipeline.task import FailureKind
 _DISK_FULL_CODES = {errno.ENOSPC, errno.EDQUOT}
 _DISK_FULL_TEXT = os.strerror(errno.ENOSPC)
 _DIVERGED = "SimulationDivergedError"
+_BLENDER_DIED = "BlenderDiedError"
+"""By name: asking isinstance would import the simulation and the renderer into every process."""
 
 
 def classify(error: BaseException) -> FailureKind:
@@ -21,14 +23,16 @@ def classify(error: BaseException) -> FailureKind:
             return FailureKind.OUT_OF_MEMORY
         if _means_disk_full(link):
             return FailureKind.DISK_FULL
-        if _is_divergence(link):
+        if _is_called(_DIVERGED, link):
             return FailureKind.DIVERGED
+        if _is_called(_BLENDER_DIED, link):
+            return FailureKind.WORKER_LOST
     return FailureKind.FAILED
 
 
 def describe(error: BaseException) -> str:
     """One line for the user: our own errors are sentences already, others need their type's name."""
-    if isinstance(error, PipelineError) or _is_divergence(error):
+    if isinstance(error, PipelineError) or _is_called(_DIVERGED, error):
         return str(error)
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
@@ -52,6 +56,5 @@ def _means_disk_full(error: BaseException) -> bool:
     return isinstance(error, OSError | RuntimeError) and _DISK_FULL_TEXT in str(error)
 
 
-def _is_divergence(error: BaseException) -> bool:
-    """By name: asking isinstance would import the simulation into every process."""
-    return any(base.__name__ == _DIVERGED for base in type(error).__mro__)
+def _is_called(name: str, error: BaseException) -> bool:
+    return any(base.__name__ == name for base in type(error).__mro__)

@@ -14,6 +14,7 @@ from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.scene_checks import check_scene
+from sim.smoke.parameters import SmokeParameters
 
 MANY_FRAMES = 100_000
 
@@ -45,12 +46,21 @@ def named_bodies(job: Job) -> Iterator[tuple[KeyPath, str, str]]:
             yield (kind, index), kind, body.name
 
 
+def _shares_space(smoke: SmokeParameters, job: Job) -> bool:
+    """Whether fluid and smoke could meet: the domain and the smoke's box overlap."""
+    lower, upper = smoke.min or job.domain.min, smoke.max or job.domain.max
+    return all(
+        low < end and high > begin
+        for low, high, begin, end in zip(lower, upper, job.domain.min, job.domain.max, strict=True)
+    )
+
+
 def _check_bodies(job: Job, findings: Findings) -> None:
     if not job.body_names:
         findings.error((), "has no body; add [[fluid]], [[smoke]] or [[rigid]]")
     elif not job.fluid and not job.smoke:
         findings.warn((), "has neither fluid nor smoke, so nothing will move")
-    if job.fluid and job.smoke:
+    if job.fluid and any(_shares_space(smoke, job) for smoke in job.smoke):
         findings.warn((), "fluid and smoke do not act on each other in this version")
     # Names become file names, and some file systems do not tell upper from lower case.
     taken: dict[str, KeyPath] = {}

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 from blake3 import blake3
 
-from pipeline.job.loading import LoadedJob, changed_text
+from pipeline.files import sync
+from pipeline.job.loading import LoadedJob, changed_text, job_of_text
+from pipeline.job.models import Job
 from pipeline.job.overrides import Override
 from pipeline.job.placements import mesh_shapes
 from pipeline.layout import JobLayout
 
 
-def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> str:
+def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
     """Copy the job's mesh files into its folder.
 
-    A copy is named after its content, so one of another job version never replaces it.
+    A copy is named after its content, so one of another job version never replaces it. One that does not hold that
+    content any more is written again.
 
     Returns:
-        The job's text, naming the copies by paths relative to the folder.
+        The job that reads the copies, as the workers will load it, and its text, which names them by paths relative to
+        the folder. What is planned from this job is of the bytes that the workers get, even if an original changes
+        meanwhile.
 
     Raises:
         OSError: a mesh cannot be read, or the folder not be written.
@@ -28,19 +34,27 @@ def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> str:
     for place, shape in mesh_shapes(loaded.job):
         source = Path(shape.file)
         content = source.read_bytes()
-        stem = source.stem.removesuffix(f"-{blake3(content).hexdigest()[:12]}")
-        copy = layout.inputs / f"{stem}-{blake3(content).hexdigest()[:12]}{source.suffix}"
-        if not copy.exists():
+        digest = blake3(content).hexdigest()[:12]
+        copy = layout.inputs / f"{source.stem.removesuffix(f'-{digest}')}-{digest}{source.suffix}"
+        if not copy.is_file() or copy.read_bytes() != content:
             _write(copy, content)
         changes.append(Override((*place, "file"), copy.relative_to(layout.root).as_posix(), loaded.path.name))
-    return changed_text(loaded.text, changes) if changes else loaded.text
+    text = changed_text(loaded.text, changes) if changes else loaded.text
+    return job_of_text(text, layout.job_file), text
 
 
 def _write(path: Path, content: bytes) -> None:
+    """Write aside and rename. No lease is held yet: the name is not one that the runner of this folder sweeps away."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part.{os.getpid()}")
-    with part.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".copying", dir=path.parent)
+    part = Path(name)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.chmod(0o644)  # mkstemp's files are for their owner alone
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    sync(path.parent)

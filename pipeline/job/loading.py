@@ -16,6 +16,7 @@ from pipeline.job.messages import explain
 from pipeline.job.models import Job
 from pipeline.job.overrides import Override, OverrideError, apply_overrides, parse_override
 from pipeline.job.placements import mesh_shapes
+from pipeline.job.positions import KeyPath
 from pipeline.job.presets import preview_overrides
 from pipeline.job.problems import JobSource
 
@@ -34,8 +35,8 @@ class LoadedJob:
     """A valid job, and the text to keep of it.
 
     Attributes:
-        job: the job; mesh files are absolute paths.
-        text: self-contained TOML: overrides applied, mesh files absolute. Loading it anywhere gives the same job.
+        job: the job; its files (meshes, the Blender executable) are absolute paths.
+        text: self-contained TOML: overrides applied, files absolute. Loading it anywhere gives the same job.
         path: the file it was read from.
         source: turns a problem into a line with its place.
         warnings: what is worth a look, one line each.
@@ -76,8 +77,19 @@ def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool =
         preview_changes = preview_overrides(job)
         source.options.update({change.path: change.origin for change in preview_changes})
         text = changed_text(text, preview_changes)
-    text = _with_absolute_meshes(text, job, path)
+    text = _with_absolute_files(text, job, path)
     return LoadedJob(job=_validate(_parse(path, text), source), text=text, path=path, source=source)
+
+
+def job_of_text(text: str, path: Path) -> Job:
+    """The job that `load_job` will find in a file once this text is written to it.
+
+    Raises:
+        JobFileError: carries every problem found.
+    """
+    source = JobSource(path.name, text)
+    job = _validate(_parse(path, text), source)
+    return _validate(_parse(path, _with_absolute_files(text, job, path)), source)
 
 
 def _read_text(path: Path) -> str:
@@ -183,11 +195,13 @@ def _with_tuples(value: Any) -> Any:
     return tuple(_with_tuples(child) for child in value) if isinstance(value, list) else value
 
 
-def _with_absolute_meshes(text: str, job: Job, path: Path) -> str:
+def _with_absolute_files(text: str, job: Job, path: Path) -> str:
+    """The text with the files that it names relative to its own folder named by absolute paths."""
+    files: list[tuple[KeyPath, str]] = [((*place, "file"), shape.file) for place, shape in mesh_shapes(job)]
+    if job.render.blender is not None:
+        files.append((("render", "blender"), job.render.blender))
     folder = path.resolve().parent
     changes = [
-        Override((*place, "file"), (folder / shape.file).as_posix(), path.name)
-        for place, shape in mesh_shapes(job)
-        if not Path(shape.file).is_absolute()
+        Override(place, (folder / file).as_posix(), path.name) for place, file in files if not Path(file).is_absolute()
     ]
     return changed_text(text, changes) if changes else text

@@ -199,7 +199,7 @@ class _Lattice:
         from sim.shapes import fill_with_particles
 
         step = self.spacing * self.coarsening
-        points = fill_with_particles(solid, step, lower=self.box[0] + step / 2, upper=self.box[1] - step / 2)
+        points = fill_with_particles(solid, step, lower=self.box[0], upper=self.box[1])
         free = np.ones(len(points), dtype=bool)
         for obstacle in self.obstacles:
             if not _touch(obstacle.bounds, solid.bounds, margin=step):

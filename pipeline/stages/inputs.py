@@ -13,16 +13,19 @@ from pipeline.errors import MissingInputError
 from sim.scene import SceneParameters
 from sim.shapes.parameters import MeshShape, Placement
 
+ABSENT = "absent"
+"""Version of a package that is not installed."""
+
 P = TypeVar("P", bound=Placement)
 
 
 @cache
 def tool_version(package: str) -> str:
-    """Installed version of a package, or "absent"; reads metadata, imports nothing."""
+    """Installed version of a package, or ABSENT; reads metadata, imports nothing."""
     try:
         return version(package)
     except PackageNotFoundError:
-        return "absent"
+        return ABSENT
 
 
 def by_content(placement: P) -> P:

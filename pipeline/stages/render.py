@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from functools import cache
-from math import cos, radians, sin
+from math import cos, prod, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,12 @@ CORES = 2
 (quickstart, draft), so two frames beside each other on two cores take longer than one after the other. The pixels do
 not depend on it."""
 
-_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"device", "blender"}}
+WORKER_BYTES = 500_000_000
+BYTES_PER_PIXEL = 700
+"""Measured peaks of the quickstart with denoising, Blender included: 538 MB at 480 x 270 and 1880 MB at 1920 x 1080."""
+
+_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"blender"}}
+"""The executable counts by its version. The device does count: CPU and GPU round differently."""
 
 
 class RenderStage:
@@ -43,6 +48,11 @@ class RenderStage:
             version=self.version,
             tools={"blender": _blender_version(job.render.blender)},
         )
+        resources = Resources(
+            cores=CORES,
+            memory_bytes=WORKER_BYTES + BYTES_PER_PIXEL * prod(job.render.resolution),
+            gpus=int(job.render.device == "gpu"),
+        )
         static = tuple(layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type))
         return [
             Task(
@@ -52,7 +62,7 @@ class RenderStage:
                 outputs=(layout.picture(frame),),
                 parameters=parameters,
                 frame=frame,
-                resources=Resources(cores=CORES),
+                resources=resources,
             )
             for frame in range(job.frame_count)
         ]
@@ -72,6 +82,7 @@ class RenderStage:
 
     def run(self, context: TaskContext) -> None:
         """Draw one frame."""
+        from render.blender import BlenderDiedError
         from render.pictures import validate_picture
 
         task, job = context.task, context.job
@@ -81,8 +92,12 @@ class RenderStage:
         def validate(path: Path) -> None:
             validate_picture(path, job.render.resolution)
 
-        with context.committing(task.outputs[0], validate) as path:
-            renderer.render(task.frame, path)
+        try:
+            with context.committing(task.outputs[0], validate) as path:
+                renderer.render(task.frame, path)
+        except BlenderDiedError:
+            _close_renderers()  # the next attempt, maybe in this process, needs a living one
+            raise
         context.progress(1, 1)
 
 
@@ -167,12 +182,16 @@ def _warm_renderer(context: TaskContext) -> Renderer:
     spec = render_spec(context.job, context.layout)
     key = digest_of(f"{context.layout.root} {context.threads} {spec.model_dump_json()}")
     if key not in _WARM:
-        for renderer in _WARM.values():
-            renderer.close()
-        _WARM.clear()
+        _close_renderers()
         path = context.layout.root / "scene.json"
         part = context.layout.root / f".scene.json.part.{os.getpid()}"
         spec.write(part)
         part.replace(path)
         _WARM[key] = open_renderer(path, threads=context.threads, blender=context.job.render.blender)
     return _WARM[key]
+
+
+def _close_renderers() -> None:
+    for renderer in _WARM.values():
+        renderer.close()
+    _WARM.clear()

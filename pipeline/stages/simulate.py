@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Collection, Sequence
 
-from pipeline.cache import Checkpoint, read_checkpoint, validate_frame, write_checkpoint, write_frame
+from pipeline.cache import Checkpoint, read_checkpoint, read_frame, validate_frame, write_checkpoint, write_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
+from pipeline.files import sync
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
@@ -28,7 +27,7 @@ class SimulateStage:
     """One task for the whole job: it commits a frame at a time and continues where it stopped."""
 
     name = "simulate"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""
@@ -91,6 +90,7 @@ class _Simulation:
     def run(self, missing: Sequence[int]) -> None:
         """Advance to the last missing frame, and commit those that are missing on the way."""
         wanted, last = frozenset(missing), missing[-1]
+        self._require_device_of_committed_frames(wanted)
         self._continue_from_checkpoint(before=missing[0])
         print(f"device {self._device}, starting at frame {self._world.frame}", flush=True)
         if self._world.frame in wanted:
@@ -109,7 +109,22 @@ class _Simulation:
 
     def _commit(self, report: FrameReport) -> None:
         with self._context.committing(self._context.task.outputs[report.frame], validate_frame) as path:
-            write_frame(path, self._world.snapshots(), report)
+            write_frame(path, self._world.snapshots(), report, device=self._device)
+
+    def _require_device_of_committed_frames(self, missing: Collection[int]) -> None:
+        """Devices differ in their rounding, and the flow amplifies that: their frames do not fit together."""
+        outputs = self._context.task.outputs
+        first = next((output for frame, output in enumerate(outputs) if frame not in missing), None)
+        if first is not None:
+            device = read_frame(self._context.layout.path(first)).device
+            if device != self._device:
+                raise self._another_device(device)
+
+    def _another_device(self, device: str) -> StageUnavailableError:
+        return StageUnavailableError(
+            f"this job was simulated on {device} so far, and this machine offers {self._device}; "
+            f'continue where {device} is, or set device = "{self._device}" to start anew'
+        )
 
     def _continue_from_checkpoint(self, *, before: int) -> None:
         """Restore the newest checkpoint of this fingerprint from before a frame; else start at frame 0."""
@@ -124,10 +139,7 @@ class _Simulation:
                 path.unlink()
                 continue
             if checkpoint.device != self._device:
-                raise StageUnavailableError(
-                    f"this job was simulated on {checkpoint.device} so far, and this machine offers {self._device}; "
-                    f'continue where {checkpoint.device} is, or set device = "{self._device}" to start anew'
-                )
+                raise self._another_device(checkpoint.device)
             if checkpoint.frame < before:
                 self._world.restore(checkpoint.frame, checkpoint.arrays)
                 self._last_checkpoint = checkpoint.frame
@@ -146,9 +158,9 @@ class _Simulation:
         part = self._folder / f".{path.name}.part.{self._context.attempt}"
         write_checkpoint(part, Checkpoint(frame, self._context.fingerprint, self._device, self._world.checkpoint()))
         read_checkpoint(part)
-        _sync(part)
+        sync(part)
         part.replace(path)
-        _sync(self._folder)
+        sync(self._folder)
         self._last_checkpoint = frame
         so_far = sorted(each for each in self._folder.glob("[0-9]*.h5") if each.name <= path.name)
         for old in so_far[:-CHECKPOINTS_KEPT]:
@@ -156,22 +168,16 @@ class _Simulation:
 
 
 def _resources(job: Job) -> Resources:
-    """All cores where the CPU computes, so that it runs alone; one core and the GPU where that does."""
+    """All cores where the CPU computes, so that it runs alone; one core and the GPU where that does.
+
+    A device that does not work here is no matter of the plan, but an obstacle to running it.
+    """
     from sim.runtime import resolve_device
 
-    if resolve_device(job.device) == "cpu":
-        return Resources(cores=0)
-    return Resources(cores=1, gpus=1)
+    device = resolve_device("auto") if job.device == "auto" else job.device
+    return Resources(cores=0) if device == "cpu" else Resources(cores=1, gpus=1)
 
 
 def _describe(report: FrameReport) -> str:
     substeps = ", ".join(f"{name} {count} substeps" for name, count in report.substeps.items())
     return f"frame {report.frame}: {substeps}"
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -50,14 +50,16 @@ class MotionSummary:
     """What the last step did to the particles.
 
     Attributes:
-        max_speed: largest |v_i| [m/s].
+        max_speed: largest |v_i|, before a wall stops it [m/s].
         max_acceleration: largest |a_i| [m/s²].
+        max_displacement: largest way that a particle went [m].
         left: particles that passed an open face.
         non_finite: particles with a position or velocity that is NaN or infinite.
     """
 
     max_speed: float
     max_acceleration: float
+    max_displacement: float = 0.0
     left: int = 0
     non_finite: int = 0
 
@@ -87,6 +89,9 @@ class ParticleFluid(ABC):
         self.support_radius = SUPPORT_IN_SPACINGS * self.spacing
         self.particle_mass = parameters.rest_density * particle_volume(self.spacing)
         self.particles_removed = 0
+        largest = float(np.sqrt((np.asarray(velocities, dtype=np.float64) ** 2).sum(axis=1).max(initial=0.0)))
+        self._motion = MotionSummary(max_speed=largest, max_acceleration=float(np.linalg.norm(gravity)))
+        self._first_bad: str | None = None
         self.begin_frame(0.0)
 
         self._walls = _limits(domain, of_walls=True)
@@ -100,8 +105,6 @@ class ParticleFluid(ABC):
             self._grid,
         )
         self._density = ti.ndarray(ti.f32, self._particles.capacity)
-        largest = float(np.sqrt((np.asarray(velocities, dtype=np.float64) ** 2).sum(axis=1).max(initial=0.0)))
-        self._motion = MotionSummary(max_speed=largest, max_acceleration=float(np.linalg.norm(gravity)))
         self._find_neighbors()
 
     @property
@@ -110,12 +113,18 @@ class ParticleFluid(ABC):
         return self._particles.count
 
     @property
+    def cell_count(self) -> int:
+        """Cells of the grid in which neighbours are searched; follows from the domain, not from the particles."""
+        return self._grid.cell_count
+
+    @property
     def mean_neighbors(self) -> float:
         """Entries of the neighbour list per particle, skin and boundary samples included."""
         return self._particles.neighbors.length / max(self._particles.count, 1)
 
     def begin_frame(self, time_s: float) -> None:  # noqa: ARG002  a fluid's counters do not depend on the time
-        """Restart the counters of the frame."""
+        """Restart the counters of the frame, and its largest speed at the present one."""
+        self._peak_speed = self._motion.max_speed
         self._wall_contacts = 0
         self._neighbor_searches = 0
         self._substeps = 0
@@ -169,13 +178,18 @@ class ParticleFluid(ABC):
         self._travelled = float(arrays["travelled"][0])
         self._motion = MotionSummary(float(arrays["max_speed"][0]), float(arrays["max_acceleration"][0]))
         self.particles_removed = int(arrays["particles_removed"][0])
+        self._peak_speed = self._motion.max_speed
+        self._first_bad = None
 
     def synchronize(self) -> None:
         """Wait until the device has done all that it was asked to, as measurements of time need."""
         ti.sync()
 
     def diagnostics(self) -> Diagnostics:
-        """Mass, momentum and energies, summed in float64 by particle id, and the numbers of this frame's steps."""
+        """Mass, momentum and energies, summed in float64 by particle id, and the numbers of this frame's steps.
+
+        `max_speed` is the largest of the whole frame, every substep of it [m/s].
+        """
         self._compute_density()
         order = self._by_id()
         position = self._host(self._particles.position)[order].astype(np.float64)
@@ -189,7 +203,7 @@ class ParticleFluid(ABC):
             "momentum_z": float(momentum[2]),
             "kinetic_energy": 0.5 * self.particle_mass * float((velocity**2).sum()),
             "potential_energy": -self.particle_mass * float((position @ np.array(self.gravity)).sum()),
-            "max_speed": self._motion.max_speed,
+            "max_speed": self._peak_speed,
             "max_compression": float(density.max(initial=0.0)) / self.parameters.rest_density - 1.0,
             "particle_count": float(self.particle_count),
             "particles_removed": float(self.particles_removed),
@@ -206,9 +220,16 @@ class ParticleFluid(ABC):
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
 
-    @abstractmethod
     def first_bad_quantity(self) -> str | None:
-        """The first non-finite or runaway quantity of the state, in words, or None."""
+        """The first non-finite or runaway quantity of any step since the start or `restore`, in words; costs nothing.
+
+        A particle that diverged may leave the domain or come to rest at a wall before anybody asks.
+        """
+        return self._first_bad
+
+    @abstractmethod
+    def _bad_motion(self) -> str | None:
+        """What was not finite or ran away in the last step, in words, or None."""
 
     @abstractmethod
     def _compute_density(self) -> None:
@@ -223,10 +244,13 @@ class ParticleFluid(ABC):
         self._motion = MotionSummary(
             max_speed=float(np.sqrt(motion.max_speed_squared)),
             max_acceleration=float(np.sqrt(motion.max_acceleration_squared)),
+            max_displacement=float(np.sqrt(motion.max_displacement_squared)),
             left=int(motion.left),
             non_finite=int(motion.bad),
         )
-        self._travelled += self._motion.max_speed * dt
+        self._first_bad = self._first_bad or self._bad_motion()
+        self._peak_speed = max(self._peak_speed, self._motion.max_speed)
+        self._travelled += self._motion.max_displacement
         self._wall_contacts += int(motion.touched)
         self._substeps += 1
 
@@ -296,16 +320,18 @@ def _limits(domain: DomainParameters, *, of_walls: bool) -> tuple[Vector3, Vecto
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
-def estimate_bytes(particle_count: int, boundary_count: int) -> int:
-    """Memory of a particle fluid on its device [bytes], for planning; its cells, some bytes each, are not included.
+def estimate_bytes(particle_count: int, boundary_count: int, cell_count: int) -> int:
+    """Memory of a particle fluid on its device [bytes], for planning.
 
     Args:
         particle_count: particles at the start.
         boundary_count: samples of walls and bodies.
+        cell_count: cells of the search for neighbours, which cover the whole domain.
     """
     vector, number = 12, 4
     state = 2 * (2 * vector + number) + vector  # position, velocity and id, sorted from and to; reference
     results = vector + 2 * number  # acceleration, density, pressure
     search = 5 * number + EXPECTED_NEIGHBORS * GROWTH * number  # cell, order, counts, starts; the list itself
     boundary = 2 * vector + 3 * number  # twice the positions, psi, cell, order
-    return int(particle_count * (state + results + search) + boundary_count * boundary)
+    cell = 3 * number  # where its particles and its samples start; the cursor of the sort
+    return int(particle_count * (state + results + search) + boundary_count * boundary + cell_count * cell)

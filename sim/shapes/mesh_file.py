@@ -1,7 +1,8 @@
-"""Mesh files: OBJ, PLY, STL, GLB and whatever else trimesh reads, as one solid about the origin."""
+"""Mesh files: OBJ, PLY, STL and GLB, as one solid about the origin."""
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,10 @@ from numpy.typing import NDArray
 from sim.shapes.mesh_solid import MeshSolid, solid_from_triangles
 from sim.shapes.parameters import MeshShape
 from sim.shapes.solid import Points, ShapeError
+
+FORMATS = ("obj", "ply", "stl", "glb")
+"""Formats whose geometry is all in one file, so that a copy of the file is a copy of the mesh. (A .gltf or .dae spreads
+over several; the materials beside an .obj are not read.)"""
 
 _Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -44,12 +49,11 @@ def read_triangles(path: Path) -> tuple[Points, NDArray[np.int64]]:
     if not path.is_file():
         raise ShapeError(f'shape.file: must be a mesh file, "{path}" does not exist; check the path')
     kind = path.suffix.lower().removeprefix(".")
-    if kind not in trimesh.available_formats():
-        raise ShapeError(
-            f'shape.file: must be a mesh trimesh can read, got "{path.name}"; convert it to OBJ, PLY, STL or GLB'
-        )
+    if kind not in FORMATS:
+        raise ShapeError(f'shape.file: must be an OBJ, PLY, STL or GLB file, got "{path.name}"; export it as GLB')
     try:
-        mesh = trimesh.load_scene(path, process=False).to_mesh()
+        # Of the bytes alone: given the path, trimesh would follow references to files beside it.
+        mesh = trimesh.load_scene(BytesIO(path.read_bytes()), file_type=kind, process=False).to_mesh()
     except Exception as error:  # a parser of foreign bytes raises anything: struct.error, IndexError, KeyError...
         raise ShapeError(
             f'shape.file: "{path}" is not a readable {kind.upper()} file '

@@ -88,10 +88,23 @@ class SmokeGrid:
         )
         if not solids:
             return empty
-        solid = np.any([empty.cells_inside(region) for region in solids], axis=0)
+        masks = [empty.cells_inside(region) for region in solids]
+        for region, mask in zip(solids, masks, strict=True):
+            thinnest = float(np.ptp(region.bounds, axis=0).min())
+            if thinnest < parameters.cell_size and not mask.any() and empty.touches(region):
+                raise ValueError(
+                    f'smoke "{parameters.name}": an obstacle {thinnest:.3g} m thin falls between its cells of '
+                    f"{parameters.cell_size:g} m, and would not be there; use a smaller cell_size or a thicker body"
+                )
+        solid = np.any(masks, axis=0)
         if solid.all():
             raise ValueError(f'smoke "{parameters.name}": solids fill its whole box; there is no air to move')
         return cls(empty.origin, empty.cell_size, empty.cells, empty.open_faces, solid)
+
+    def touches(self, region: SolidRegion) -> bool:
+        """Whether the bounds of a region overlap the box."""
+        lower, upper = region.bounds
+        return bool(np.all((lower < self.upper) & (upper > self.origin)))
 
     @property
     def padded(self) -> Index3:

@@ -13,7 +13,7 @@ Face = Literal["x-", "x+", "y-", "y+", "z-", "z+"]
 
 
 class SmokeSourceParameters(Placement):
-    """A region that emits: inside it, each step sets the fields to at least these values."""
+    """A region that emits: inside it, each step brings the fields at least to these values, from the air's."""
 
     density: Fraction = Field(default=1.0, description="Smoke density inside the source [-].")
     temperature: Positive = Field(default=450.0, description="Temperature inside the source [K].")
@@ -34,9 +34,9 @@ class SmokeSourceParameters(Placement):
             raise ValueError(f"end_s must be after start_s = {self.start_s:g} s, got {self.end_s:g} s")
         return self
 
-    def emits_at(self, time_s: float) -> bool:
-        """Whether it emits at a simulated time [s]; its end is excluded."""
-        return self.start_s <= time_s and (self.end_s is None or time_s < self.end_s)
+    def emits_during(self, begin_s: float, end_s: float) -> bool:
+        """Whether it emits in some part of a span of time [s]: no short source falls between two steps."""
+        return self.start_s < end_s and (self.end_s is None or begin_s < self.end_s)
 
 
 class SmokeParameters(Parameters):

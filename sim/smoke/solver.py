@@ -128,10 +128,14 @@ class SmokeSolver:
         """
         self._compute_speed_and_acceleration()
         speed, acceleration = self._rows.maxima()
+        without_sources = self._largest_step(speed, acceleration)
         for source in self._sources:
-            if source.parameters.emits_at(self._time_s):
+            if source.parameters.emits_during(self._time_s, self._time_s + without_sources):
                 speed = max(speed, source.speed)
                 acceleration = max(acceleration, self._buoyancy_bound(source.target_excess, source.target_density))
+        return self._largest_step(speed, acceleration)
+
+    def _largest_step(self, speed: float, acceleration: float) -> float:
         distance = self.parameters.cfl * self.grid.cell_size
         if acceleration <= 0.0 and speed <= 0.0:
             return math.inf
@@ -141,7 +145,7 @@ class SmokeSolver:
         """Advance by dt [s]."""
         self._advection.advance(dt)
         self._forces.accelerate(dt)
-        self._emit()
+        self._emit(dt)
         self._project()
         self._cool(
             math.exp(-self.parameters.density_dissipation * dt),
@@ -227,9 +231,9 @@ class SmokeSolver:
         speed, _ = self._rows.maxima()
         return f"max_speed is {speed:.3g} m/s" if speed > RUNAWAY_SPEED else None
 
-    def _emit(self) -> None:
+    def _emit(self, dt: float) -> None:
         for source in self._sources:
-            if source.parameters.emits_at(self._time_s):
+            if source.parameters.emits_during(self._time_s, self._time_s + dt):
                 self._emitted_mass += source.emit(self._time_s) * self.grid.cell_size**3
 
     def _project(self) -> None:

@@ -74,7 +74,7 @@ class Source:
         self._faces = [_index_field(indices) for indices in faces]
 
     def emit(self, time_s: float) -> float:
-        """Raise the fields to the source's values at a simulated time [s].
+        """Bring the fields to the source's values at a simulated time [s].
 
         The fluctuation is a function of place and time alone, so a run that continues sees the same.
 
@@ -98,7 +98,10 @@ class Source:
                 self._density[at] = after
                 emitted += after - before
                 shortfall = self.parameters.fluctuation * self._fluctuate(at, tick)
-                self._excess[at] = ti.max(self._excess[at], (1.0 - shortfall) * self.target_excess)
+                target = (1.0 - shortfall) * self.target_excess
+                # Heat is raised to the target, and cold lowered.
+                excess = self._excess[at]
+                self._excess[at] = ti.max(excess, target) if self.target_excess >= 0.0 else ti.min(excess, target)
             self._emitted[block] = emitted
 
     @ti.func

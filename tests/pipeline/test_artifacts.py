@@ -17,7 +17,6 @@ from pipeline.artifacts import (
     Receipt,
     committing,
     hash_file,
-    invalidate,
     is_committed,
     read_receipt,
     sweep_parts,
@@ -133,15 +132,11 @@ def test_an_untouched_or_merely_copied_file_is_not_kept_aside(layout: JobLayout)
     assert files_below(layout.root) == {"cache/000000.h5", ".receipts/cache/000000.h5.json"}
 
 
-def test_an_invalidated_artifact_counts_no_more_and_an_edit_of_it_is_kept(layout: JobLayout) -> None:
+def test_an_artifact_without_its_receipt_counts_no_more(layout: JobLayout) -> None:
     commit(layout, SIMULATE, ARTIFACT, "ours")
-    assert invalidate(layout, ARTIFACT) is None
-    assert not is_committed(layout, ARTIFACT, FINGERPRINT)
+    layout.receipt(ARTIFACT).unlink()
     assert layout.path(ARTIFACT).exists()
-    assert invalidate(layout, ARTIFACT) is None
-    commit(layout, SIMULATE, ARTIFACT, "ours")
-    layout.path(ARTIFACT).write_text("theirs")
-    assert invalidate(layout, ARTIFACT) == "cache/000000.h5.edited-1"
+    assert not is_committed(layout, ARTIFACT, FINGERPRINT)
 
 
 @pytest.mark.parametrize(
@@ -308,4 +303,4 @@ def test_two_processes_that_commit_the_same_artifact_end_with_the_newer_attempt(
         assert receipt is not None
         assert receipt.attempt == 2
         assert layout.path(ARTIFACT).read_text() == "by 2 END"
-        invalidate(layout, ARTIFACT)
+        layout.receipt(ARTIFACT).unlink()

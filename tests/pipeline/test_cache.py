@@ -43,9 +43,9 @@ def bodies(particles: int = 50_000) -> dict[str, Snapshot]:
 def test_a_frame_reads_back_as_written(tmp_path):
     path = tmp_path / "frame.h5"
     written = bodies()
-    write_frame(path, written, REPORT)
+    write_frame(path, written, REPORT, device="cpu")
     frame = read_frame(path)
-    assert (frame.frame, frame.time_s) == (7, 7 / 60)
+    assert (frame.frame, frame.time_s, frame.device) == (7, 7 / 60, "cpu")
     assert frame.diagnostics["water"] == {"substeps": 12, "smallest_dt_s": 1.25e-3, "mass": 8.0, "iterations": 3.0}
     for name, body in written.items():
         assert frame.bodies[name].kind == body.kind
@@ -56,18 +56,18 @@ def test_a_frame_reads_back_as_written(tmp_path):
 
 
 def test_one_body_is_read_without_the_others(tmp_path):
-    write_frame(tmp_path / "frame.h5", bodies(), REPORT)
+    write_frame(tmp_path / "frame.h5", bodies(), REPORT, device="cpu")
     assert list(read_frame(tmp_path / "frame.h5", "plume").bodies) == ["plume"]
 
 
 def test_the_same_frame_gives_the_same_bytes(tmp_path):
     for name in ("a.h5", "b.h5"):
-        write_frame(tmp_path / name, bodies(), REPORT)
+        write_frame(tmp_path / name, bodies(), REPORT, device="cpu")
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
 
 
 def test_a_fluid_without_particles_is_a_frame_too(tmp_path):
-    write_frame(tmp_path / "frame.h5", bodies(0), REPORT)
+    write_frame(tmp_path / "frame.h5", bodies(0), REPORT, device="cpu")
     validate_frame(tmp_path / "frame.h5")
     assert read_frame(tmp_path / "frame.h5").bodies["water"].arrays["position"].shape == (0, 3)
 
@@ -75,7 +75,7 @@ def test_a_fluid_without_particles_is_a_frame_too(tmp_path):
 @pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.999])
 def test_a_truncated_frame_is_refused(tmp_path, kept):
     path = tmp_path / "frame.h5"
-    write_frame(path, bodies(), REPORT)
+    write_frame(path, bodies(), REPORT, device="cpu")
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * kept)])
     with pytest.raises(InvalidArtifactError):
@@ -84,7 +84,7 @@ def test_a_truncated_frame_is_refused(tmp_path, kept):
 
 def test_a_flipped_bit_in_an_array_is_refused(tmp_path):
     path = tmp_path / "frame.h5"
-    write_frame(path, bodies(), REPORT)
+    write_frame(path, bodies(), REPORT, device="cpu")
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
@@ -95,7 +95,7 @@ def test_a_flipped_bit_in_an_array_is_refused(tmp_path):
 def test_values_that_are_not_finite_are_refused(tmp_path):
     damaged = bodies()
     damaged["water"].arrays["velocity"][17, 1] = np.nan
-    write_frame(tmp_path / "frame.h5", damaged, REPORT)
+    write_frame(tmp_path / "frame.h5", damaged, REPORT, device="cpu")
     with pytest.raises(InvalidArtifactError, match='velocity of "water"'):
         validate_frame(tmp_path / "frame.h5")
 

@@ -96,3 +96,19 @@ def test_warnings_go_to_the_error_stream(in_tmp_path):
 
 def test_schema_is_json():
     assert json.loads(pipeline("schema").stdout)["title"] == "Job file"
+
+
+def test_a_device_that_this_machine_lacks_is_refused_before_any_work_but_planned(in_tmp_path, monkeypatch):
+    devices = {"cpu": "ok", "cuda": "no driver"}
+    monkeypatch.setattr("sim.runtime.available_devices", lambda: devices)
+    pipeline("new", "film")
+    planned = pipeline("plan", "film.toml", "--set", "device=cuda")
+    assert planned.exit_code == 0
+    assert "simulate: stale, never made" in planned.stdout
+    submitted = pipeline("submit", "film.toml", "--set", "device=cuda")
+    assert submitted.exit_code == 3
+    assert "Traceback" not in submitted.output
+    assert (
+        'error: simulate: device "cuda" is not available: no driver; use device = "auto" or "cpu"' in submitted.stderr
+    )
+    assert not (in_tmp_path / "renders").exists()

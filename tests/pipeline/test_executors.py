@@ -23,6 +23,7 @@ from pipeline.executors.processes import ProcessExecutor, WorkerLimits
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.task import FailureKind, Task, TaskId
+from render.blender import BlenderDiedError, FrameRenderError
 
 JOB = """
 name = "synthetic"
@@ -349,6 +350,8 @@ def test_kills_for_want_of_memory_are_counted(tmp_path: Path) -> None:
         (OSError("unable to write: error message = 'No space left on device'"), FailureKind.DISK_FULL),
         (FileNotFoundError(errno.ENOENT, "absent"), FailureKind.FAILED),
         (StageUnavailableError("no Blender"), FailureKind.FAILED),
+        (FrameRenderError(3, "the mesh is broken"), FailureKind.FAILED),
+        (BlenderDiedError(3, -9, "(it wrote nothing)"), FailureKind.WORKER_LOST),
     ],
 )
 def test_exceptions_are_classified_with_what_is_behind_them(error: Exception, kind: FailureKind) -> None:

@@ -194,6 +194,18 @@ def test_windows_line_ends_and_byte_order_mark_do_not_matter(tmp_path):
     assert load_job(path) == Job(name="dam", frames=3)
 
 
+def test_a_blender_named_relative_to_the_job_file_is_found_from_anywhere(tmp_path):
+    path = tmp_path / "blender.toml"
+    path.write_text('name = "film"\n[render]\nblender = "tools/blender"  # mine\n')
+    loaded = read_job(path)
+    assert loaded.job.render.blender == (tmp_path / "tools" / "blender").as_posix()
+    elsewhere = tmp_path / "renders" / "film" / "job.toml"
+    elsewhere.parent.mkdir(parents=True)
+    elsewhere.write_text(loaded.text)
+    assert load_job(elsewhere) == loaded.job
+    assert "# mine" in loaded.text
+
+
 def test_mesh_files_are_absolute_in_the_job_and_in_its_text_and_comments_stay(tmp_path):
     path = tmp_path / "dam.toml"
     path.write_text(

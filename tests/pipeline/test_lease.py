@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 import multiprocessing
 import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from typing import Any
 import pytest
 
 from pipeline.errors import JobBusyError, LeaseLostError
-from pipeline.lease import EXPIRY_S, Lease, LeaseHolder, live_holder, read_holder
+from pipeline.lease import EXPIRY_S, Lease, LeaseHolder, live_holder, read_holder, remove_guard
 
 ONE_DAY_S = 86_400.0
 
@@ -131,6 +133,87 @@ def test_a_holder_that_was_taken_over_learns_it_and_leaves_the_new_lease_alone(p
         with pytest.raises(LeaseLostError, match="was taken over by process"):
             old.heartbeat()
     assert read_holder(path) == newer
+
+
+PATIENCE_S = 60.0  # heartbeats come every few milliseconds in these tests; only a hang gets there
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.005)
+
+
+def test_the_heart_beats_while_the_holder_is_busy_with_something_else(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.lease.HEARTBEAT_INTERVAL_S", 0.01)
+    with Lease.acquire(path) as lease:
+        os.utime(path, (0, 0))
+        wait_until(lambda: path.stat().st_mtime > 0)
+        lease.check()
+
+
+def test_a_holder_that_was_taken_over_is_told_so_when_it_asks(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.lease.HEARTBEAT_INTERVAL_S", 0.01)
+
+    def work_until_told(lease: Lease) -> None:
+        wait_until(lambda: lease.check() is not None)
+
+    with Lease.acquire(path) as old:
+        newer = write_holder(path, token="another")
+        with pytest.raises(LeaseLostError, match="was taken over by process"):
+            work_until_told(old)
+    assert read_holder(path) == newer
+
+
+def test_a_lease_that_could_not_be_renewed_for_long_counts_as_lost(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.lease.HEARTBEAT_INTERVAL_S", 0.01)
+    monkeypatch.setattr("pipeline.lease.EXPIRY_S", 0.05)
+    folder = path.parent / "mounted"
+    folder.mkdir()
+    with Lease.acquire(folder / "lease") as lease:
+        folder.rename(path.parent / "gone")  # as when a network file system goes away
+        wait_until(lambda: lease._loss is not None)
+        (path.parent / "gone").rename(folder)
+        with pytest.raises(LeaseLostError, match="could not be renewed"):
+            lease.check()
+
+
+def test_a_guard_is_removed_only_when_nobody_holds_the_lease(path: Path) -> None:
+    guard = path.with_name(f".{path.name}.guard")
+    with Lease.acquire(path):
+        remove_guard(path)
+        assert guard.exists()
+    remove_guard(path)
+    assert not guard.exists()
+
+
+def wait_at_the_guard(path: str, reached: Any, answers: Any) -> None:
+    reached.set()
+    lease = Lease.acquire(Path(path))
+    answers.put(read_holder(Path(path)) == lease.holder)
+
+
+def test_who_waits_at_a_guard_that_is_removed_meanwhile_takes_the_new_one(path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    reached, answers = context.Event(), context.Queue()
+    guard = path.with_name(f".{path.name}.guard")
+    waiting = context.Process(target=wait_at_the_guard, args=(str(path), reached, answers))
+    with guard.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        waiting.start()
+        assert reached.wait(PATIENCE_S)
+        wait_until(lambda: any(file.samefile(guard) for file in open_files_of(waiting.pid)))
+        guard.unlink()
+    assert answers.get(timeout=PATIENCE_S)
+    waiting.join(timeout=PATIENCE_S)
+    assert guard.exists()
+
+
+def open_files_of(pid: int | None) -> list[Path]:
+    return [link for link in Path(f"/proc/{pid}/fd").iterdir() if link.exists()]
 
 
 def compete(path: str, barrier: Any, answers: Any) -> None:

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import re
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,8 @@ from record_samples import film, make_film
 from pipeline.artifacts import Receipt
 from pipeline.errors import ManifestError
 from pipeline.layout import JobLayout
-from pipeline.manifest import Manifest, StageSummary, artifact_row, is_on_network
+from pipeline.manifest import SUCCEEDED, LastRun, Manifest, StageSummary, artifact_row, is_on_network
+from pipeline.manifest_reader import ManifestReader
 from pipeline.migrations import migrations, schema_version
 from pipeline.task import FailureKind, TaskId, TaskState
 
@@ -91,18 +94,19 @@ def test_attempt_numbers_grow_for_ever_and_survive_a_new_plan_and_a_reopening(la
 def test_an_attempt_tells_its_story(layout: JobLayout) -> None:
     with Manifest(layout.manifest) as manifest:
         manifest.record_plan(film(1))
-        first = manifest.start_attempt(RENDER, log="logs/render/000000.1.log", host="blue")
+        first = manifest.start_attempt(RENDER, host="blue")
         assert [attempt.task for attempt in manifest.running_attempts()] == [RENDER]
         manifest.finish_attempt(
             RENDER, first, failure=FailureKind.STALLED, message="no progress", state=TaskState.FAILED
         )
-        assert [attempt.failure for attempt in manifest.failures()] == [FailureKind.STALLED]
+        assert [attempt.outcome for attempt in manifest.failures()] == [FailureKind.STALLED]
         second = manifest.start_attempt(RENDER)
         manifest.finish_attempt(RENDER, second, seconds=1.5, peak_memory_bytes=7, state=TaskState.SUCCEEDED)
         stalled, succeeded = manifest.history(RENDER)
         assert (stalled.number, stalled.outcome, stalled.message) == (1, "stalled", "no progress")
         assert (stalled.log, stalled.host) == ("logs/render/000000.1.log", "blue")
-        assert (succeeded.failure, succeeded.seconds, succeeded.peak_memory_bytes) == (None, 1.5, 7)
+        assert succeeded.log == "logs/render/000000.2.log"
+        assert (succeeded.outcome, succeeded.seconds, succeeded.peak_memory_bytes) == (SUCCEEDED, 1.5, 7)
         assert manifest.running_attempts() == []
         assert manifest.failures() == []
 
@@ -113,7 +117,7 @@ def test_a_closed_attempt_keeps_what_it_says(layout: JobLayout) -> None:
         number = manifest.start_attempt(RENDER)
         manifest.finish_attempt(RENDER, number, failure=FailureKind.CANCELLED)
         manifest.finish_attempt(RENDER, number)
-        assert manifest.history(RENDER)[0].failure is FailureKind.CANCELLED
+        assert manifest.history(RENDER)[0].outcome == FailureKind.CANCELLED
 
 
 def test_an_artifact_row_is_replaced_by_a_newer_one(layout: JobLayout) -> None:
@@ -123,7 +127,6 @@ def test_an_artifact_row_is_replaced_by_a_newer_one(layout: JobLayout) -> None:
         newer = receipt(attempt=2, hash="other", size=9)
         manifest.record_artifact(newer)
         assert manifest.artifacts() == {newer.artifact: artifact_row(newer)}
-        assert manifest.artifact_hashes() == {newer.artifact: "other"}
         manifest.adopt_mtimes({newer.artifact: 77})
         assert manifest.artifacts()[newer.artifact].mtime_ns == 77
         manifest.forget_artifacts([newer.artifact])
@@ -174,6 +177,18 @@ def test_a_run_is_clean_only_if_the_last_one_ended(layout: JobLayout) -> None:
         manifest.end_run()
         assert manifest.begin_run("film")
         assert not manifest.begin_run("film")
+        manifest.end_run("cancelled", clean=False)
+        assert not manifest.begin_run("film")
+
+
+def test_how_the_last_run_ended_is_known_only_once_it_has_ended(layout: JobLayout) -> None:
+    with Manifest(layout.manifest) as manifest:
+        assert manifest.last_run() == LastRun(None, None)
+        manifest.begin_run("film", run="first")
+        manifest.end_run("failed")
+        assert manifest.last_run() == LastRun("first", "failed")
+        manifest.begin_run("film", run="second")
+        assert manifest.last_run() == LastRun("second", None)
 
 
 KILLED_WRITER = """
@@ -228,8 +243,64 @@ def test_a_damaged_manifest_names_its_remedy(layout: JobLayout, offset: int) -> 
     content = bytearray(layout.manifest.read_bytes())
     content[offset : offset + 3000] = b"\xa5" * 3000
     layout.manifest.write_bytes(content)
-    with pytest.raises(ManifestError, match=r"damaged .* pipeline verify --rebuild"):
+    with pytest.raises(ManifestError, match=rf"damaged .* pipeline verify {re.escape(str(layout.root))} --rebuild"):
         Manifest(layout.manifest)
+
+
+def damage_pages_past_the_header(manifest: Path) -> None:
+    content = bytearray(manifest.read_bytes())
+    content[4096:] = b"\xa5" * (len(content) - 4096)
+    manifest.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        ManifestReader.artifacts,
+        ManifestReader.states,
+        ManifestReader.summary,
+        ManifestReader.running_attempts,
+        ManifestReader.failures,
+        ManifestReader.events,
+        ManifestReader.last_run,
+        ManifestReader.stage_costs,
+        lambda manifest: manifest.history(RENDER),
+        lambda manifest: manifest.parameters("any"),
+    ],
+)
+def test_damage_past_the_header_is_named_by_every_query(
+    layout: JobLayout, query: Callable[[ManifestReader], object]
+) -> None:
+    with Manifest(layout.manifest) as manifest:
+        manifest.record_plan(film(30))
+    damage_pages_past_the_header(layout.manifest)
+    with (
+        Manifest.open_readonly(layout.manifest) as reader,
+        pytest.raises(ManifestError, match=r"is damaged .* --rebuild"),
+    ):
+        query(reader)
+
+
+def test_damage_that_shows_at_writing_is_named_too(layout: JobLayout) -> None:
+    with Manifest(layout.manifest) as manifest:
+        manifest.record_plan(film(30))
+    with Manifest(layout.manifest) as manifest:
+        manifest._connection.execute("PRAGMA shrink_memory")  # forget the pages that were read at opening
+        damage_pages_past_the_header(layout.manifest)
+        with pytest.raises(ManifestError, match="is damaged"):
+            manifest.set_states({RENDER: TaskState.RUNNING})
+
+
+def test_a_manifest_that_is_only_busy_is_not_called_damaged(layout: JobLayout, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.manifest_reader.BUSY_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(
+        "pipeline.manifest.is_on_network", lambda _: True
+    )  # a rollback journal, which locks readers out
+    with Manifest(layout.manifest) as manifest:
+        manifest.record_plan(film(1))
+        manifest._connection.execute("BEGIN EXCLUSIVE")
+        with pytest.raises(ManifestError, match=r"manifest\.db cannot be read \(database is locked\)"):
+            Manifest.open_readonly(layout.manifest)
 
 
 def test_a_folder_that_is_not_there_is_not_called_damage(tmp_path: Path) -> None:

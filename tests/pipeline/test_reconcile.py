@@ -76,7 +76,7 @@ def test_attempts_that_died_with_their_runner_are_closed_as_worker_lost(layout: 
         "swept away 1 unfinished file",
     )
     with Manifest.open_readonly(layout.manifest) as reader:
-        assert reader.history(task)[-1].failure is FailureKind.WORKER_LOST
+        assert reader.history(task)[-1].outcome == FailureKind.WORKER_LOST
         assert reader.states()[task] is TaskState.PENDING
 
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import sqlite3
+import time
 from pathlib import Path
 
 import pytest
 from synthetic_jobs import Recorder, contents, job_text, run_synthetic
 from synthetic_stages import write_faults
 
-from pipeline.errors import JobBusyError, PlanError
-from pipeline.executors.base import Committed, Failed
+from pipeline.errors import JobBusyError, LeaseLostError, PlanError
+from pipeline.executors.base import Assignment, Committed, Failed, Finished, TaskEvent
 from pipeline.executors.inline import InlineExecutor
 from pipeline.executors.processes import ProcessExecutor
 from pipeline.layout import JobLayout
@@ -21,7 +23,7 @@ from pipeline.manifest import Manifest
 from pipeline.run_control import RunControl, Selection
 from pipeline.run_events import Notice, Outcome, RunEnded, RunEvent, RunStarted
 from pipeline.scheduler_events import JobOutcome, Policy
-from pipeline.task import FailureKind, Resources, TaskId, TaskState
+from pipeline.task import ArtifactPath, FailureKind, Resources, TaskId, TaskState
 
 ALL = ["steps", *(f"double/{k:06d}" for k in range(6)), "film"]
 
@@ -134,9 +136,30 @@ def test_an_edited_file_is_kept_aside_on_request_of_a_rerun_too(finished: Path) 
     assert (finished / "double/000003.bin.edited-1").read_bytes() == b"painted over by hand"
 
 
-def test_a_selection_of_nothing_is_refused(finished: Path) -> None:
-    with pytest.raises(PlanError, match="the stages are steps, double, film"):
-        run(finished, rerun=Selection(frozenset({"doubel"})))
+@pytest.mark.parametrize(
+    ("selection", "complaint"),
+    [
+        (
+            Selection(frozenset({"double", "doubel", "sumilate"})),
+            'no stage "doubel" in this job; did you mean "double"?; no stage "sumilate" in this job; '
+            "the stages are steps, double, film",
+        ),
+        (
+            Selection(frozenset({"double"}), frozenset({1, 6, 7, 9})),
+            "no frame 6-7, 9 in this job; the frames are 0-5",
+        ),
+        (Selection(frames=frozenset({99})), "no frame 99 in this job; the frames are 0-5"),
+        (
+            Selection(frozenset({"steps", "double"}), frozenset({1})),
+            "steps: about the whole job, has no frames to choose from; leave them out",
+        ),
+    ],
+)
+def test_a_selection_of_what_is_not_there_is_refused(finished: Path, selection: Selection, complaint: str) -> None:
+    with pytest.raises(PlanError) as refused:
+        run(finished, rerun=selection)
+    assert str(refused.value) == complaint
+    assert run(finished)[1].ran() == []
 
 
 def test_a_failed_frame_is_told_and_runs_next_time(root: Path) -> None:
@@ -251,3 +274,136 @@ def test_the_manifest_is_whole_after_a_run(finished: Path) -> None:
     with sqlite3.connect(JobLayout(finished).manifest) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         assert connection.execute("PRAGMA foreign_key_check").fetchall() == []
+
+
+class LosingExecutor(InlineExecutor):
+    """Loses all word of one commit: the worker is killed between the receipt and the message."""
+
+    def __init__(self, artifact: str, kind: FailureKind) -> None:
+        super().__init__()
+        self.artifact, self.kind = artifact, kind
+        self.lost: TaskId | None = None
+        self.submitted: list[TaskId] = []
+
+    def submit(self, assignment: Assignment) -> None:
+        self.submitted.append(assignment.task.id)
+        super().submit(assignment)
+
+    def wait(self, timeout_s: float) -> list[TaskEvent]:
+        events: list[TaskEvent] = []
+        for event in super().wait(timeout_s):
+            if isinstance(event, Committed) and event.receipt.artifact == self.artifact:
+                self.lost = event.task_id
+                events.append(Failed(event.task_id, event.attempt, self.kind, "killed"))
+            elif event.task_id != self.lost:
+                events.append(event)
+        return events
+
+
+@pytest.mark.parametrize("kind", [FailureKind.WORKER_LOST, FailureKind.STALLED, FailureKind.CANCELLED])
+def test_a_commit_whose_word_was_lost_is_adopted_and_not_made_again(root: Path, kind: FailureKind) -> None:
+    recorder = Recorder()
+    with LosingExecutor("double/000002.bin", kind) as executor:
+        outcome = run_synthetic(root, executor, observer=recorder)
+    assert (outcome.kind, outcome.ran, outcome.failures) == (JobOutcome.SUCCEEDED, 8, ())
+    assert executor.submitted.count(TaskId("double/000002")) == 1
+    assert "double/000002.bin" in {event.receipt.artifact for event in recorder.of(Committed)}
+    with Manifest(JobLayout(root).manifest) as manifest:
+        (attempt,) = manifest.history(TaskId("double/000002"))
+        assert (attempt.outcome, attempt.message) == ("succeeded", "after its last commit: killed")
+    assert run(root)[1].ran() == []
+
+
+def test_after_an_end_by_force_the_next_run_looks_for_receipts_that_nobody_told_of(root: Path) -> None:
+    write_faults(root, {"double/000001": ["segfault"]})
+    with ProcessExecutor() as executor:
+        run_synthetic(root, executor)
+    with Manifest(JobLayout(root).manifest) as manifest:
+        manifest.forget_artifacts([ArtifactPath("double/000003.bin")])
+    _, recorder = run(root)
+    assert recorder.ran() == []  # its receipt was adopted
+
+
+class Vandal(Recorder):
+    """Removes a file at the moment that its task ends."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def notify(self, event: RunEvent) -> None:
+        super().notify(event)
+        if isinstance(event, Finished) and event.task_id == "steps":
+            self.path.unlink()
+
+
+def test_a_file_that_vanishes_while_its_task_ends_fails_the_task(finished: Path) -> None:
+    """Its stage found the frames there; the record did not know of them, and one is gone before it is told."""
+    with Manifest(JobLayout(finished).manifest) as manifest:
+        manifest.forget_artifacts(manifest.artifacts())
+    vandal = Vandal(finished / "steps/000003.bin")
+    with InlineExecutor() as executor:
+        outcome = run_synthetic(finished, executor, observer=vandal)
+    assert outcome.kind is JobOutcome.FAILED
+    assert "steps/000003.bin was there when its task ended" in outcome.failures[0].message
+    assert run(finished)[0].kind is JobOutcome.SUCCEEDED
+
+
+class Planner(Recorder):
+    """Takes its time between the plan and the first task, until the lease has been renewed."""
+
+    def __init__(self, lease: Path) -> None:
+        super().__init__()
+        self.lease = lease
+
+    def notify(self, event: RunEvent) -> None:
+        super().notify(event)
+        if isinstance(event, RunStarted):
+            os.utime(self.lease, (0, 0))
+            until = time.monotonic() + 30.0
+            while self.lease.stat().st_mtime == 0:
+                assert time.monotonic() < until, "no heartbeat while the run is planned"
+                time.sleep(0.01)
+
+
+def test_the_lease_is_renewed_while_the_run_is_planned(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.lease.HEARTBEAT_INTERVAL_S", 0.01)
+    with InlineExecutor() as executor:
+        outcome = run_synthetic(root, executor, observer=Planner(JobLayout(root).lease))
+    assert outcome.kind is JobOutcome.SUCCEEDED
+
+
+class Usurper(Recorder):
+    """Takes the job over after its first commit, as a runner on another machine would."""
+
+    def __init__(self, lease: Path) -> None:
+        super().__init__()
+        self.lease = lease
+
+    def notify(self, event: RunEvent) -> None:
+        super().notify(event)
+        if isinstance(event, Committed):
+            holder = json.loads(self.lease.read_text())
+            part = self.lease.with_name("new.lease")
+            part.write_text(json.dumps(holder | {"token": "another", "host": "elsewhere"}))
+            part.replace(self.lease)
+
+
+def test_a_run_whose_lease_was_taken_over_stops(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.lease.HEARTBEAT_INTERVAL_S", 0.01)
+    write_faults(root, {}, pause_s=0.1)
+    with InlineExecutor() as executor, pytest.raises(LeaseLostError, match=r"taken over by process \d+ on elsewhere"):
+        run_synthetic(root, executor, observer=Usurper(JobLayout(root).lease))
+    assert JobLayout(root).lease.exists()
+
+
+def test_the_record_says_how_each_run_ended(root: Path) -> None:
+    write_faults(root, {"double/000002": ["fail"]})
+    run(root)
+    with Manifest.open_readonly(JobLayout(root).manifest) as manifest:
+        failed = manifest.last_run()
+    run(root)
+    with Manifest.open_readonly(JobLayout(root).manifest) as manifest:
+        succeeded = manifest.last_run()
+    assert (failed.outcome, succeeded.outcome) == (JobOutcome.FAILED, JobOutcome.SUCCEEDED)
+    assert failed.run != succeeded.run

@@ -111,6 +111,16 @@ def test_a_simulation_on_all_cores_runs_alone() -> None:
     assert started(succeed(scheduler, tasks[0])) == ["surface/0", "surface/1"]
 
 
+def test_of_tasks_about_the_whole_job_the_earlier_stage_goes_first() -> None:
+    """Meshing bodies takes a moment; after a simulation on all cores, rendering would begin that much later."""
+    tasks = [task(f"bodies/{name}") for name in "abc"] + film(1, simulation=Resources(cores=0))
+    scheduler = Scheduler(tasks, capacity=TWO_CORES)
+    assert started(scheduler.start()) == ["bodies/a", "bodies/b"]
+    assert started(succeed(scheduler, tasks[0])) == ["bodies/c"]
+    assert started(succeed(scheduler, tasks[1])) == []
+    assert started(succeed(scheduler, tasks[2])) == ["simulate"]
+
+
 def test_a_simulation_on_the_gpu_overlaps_with_other_stages() -> None:
     scheduler = Scheduler(film(2, simulation=Resources(cores=1, gpus=1)), capacity=Resources(cores=2, gpus=1))
     scheduler.start()

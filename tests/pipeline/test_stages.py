@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pipeline.commands.running import GPU_TASKS
 from pipeline.job.looks import parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
+from pipeline.scheduler import Scheduler
+from pipeline.scheduler_events import Start
 from pipeline.stages import STAGES
 from pipeline.stages.render import render_spec
+from pipeline.task import Resources
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
 
@@ -69,7 +73,7 @@ def test_the_film_is_cut_every_half_second():
         ({"gravity": [0, 0, -1.62]}, {"simulate"}),
         ({"frames": 80}, set()),
         ({"name": "other"}, set()),
-        ({"render": {"device": "cpu"}}, set()),
+        ({"render": {"device": "cpu"}}, {"render"}),
         ({"render": {"shutter": 0.25}}, {"render", "volume"}),
         ({"fps": 30}, {"simulate", "volume", "render", "movie"}),
     ],
@@ -94,6 +98,67 @@ def test_nothing_stands_in_the_way_of_a_job_on_this_machine_but_what_is_said(mon
     assert simulate.obstacles(job()) == []
     (obstacle,) = simulate.obstacles(job(device="cuda"))
     assert obstacle == 'device "cuda" is not available: no driver; use device = "auto" or "cpu"'
+
+
+@pytest.mark.parametrize("device", ["cuda", "vulkan", "metal"])
+def test_a_device_that_does_not_work_here_is_planned_all_the_same(monkeypatch, device):
+    monkeypatch.setattr("sim.runtime.available_devices", lambda: {"cpu": "ok"})
+    (simulate,) = (task for task in plan_job(job(device=device), LAYOUT, STAGES) if task.stage == "simulate")
+    assert simulate.resources == Resources(cores=1, gpus=1)
+
+
+def test_a_device_left_open_takes_the_resources_of_the_one_that_works(monkeypatch):
+    def resources(devices: dict[str, str]) -> Resources:
+        monkeypatch.setattr("sim.runtime.available_devices", lambda: devices)
+        return next(task.resources for task in plan_job(job(device="auto"), LAYOUT, STAGES) if task.id == "simulate")
+
+    assert resources({"cpu": "ok"}) == Resources(cores=0)
+    assert resources({"cpu": "ok", "cuda": "ok"}) == Resources(cores=1, gpus=1)
+
+
+def test_a_job_simulated_on_a_gpu_elsewhere_is_rendered_on_a_machine_without_one():
+    tasks = plan_job(job(device="cuda"), LAYOUT, STAGES)
+    done = {task.id for task in tasks if task.stage != "render"}
+    scheduler = Scheduler(tasks, up_to_date=done, capacity=Resources(cores=2, gpus=GPU_TASKS))
+    assert [each.task.stage for each in scheduler.start() if isinstance(each, Start)] == ["render"]
+
+
+def test_pictures_drawn_on_the_gpu_take_turns():
+    def gpus(device: str) -> set[int]:
+        tasks = plan_job(job(render={"device": device}), LAYOUT, STAGES)
+        return {task.resources.gpus for task in tasks if task.stage == "render"}
+
+    assert (gpus("gpu"), gpus("cpu")) == ({1}, {0})
+
+
+@pytest.mark.parametrize("resolution", [(480, 270), (1920, 1080), (3840, 2160)])
+def test_many_cores_do_not_draw_more_than_the_memory_holds(resolution):
+    """64 cores beside 8 GB: by cores alone, 32 frames would be drawn at once."""
+    tasks = plan_job(job(render={"resolution": resolution}), LAYOUT, STAGES)
+    capacity = Resources(cores=64, memory_bytes=8_000_000_000)
+    ready = {task.id for task in tasks if task.stage in ("bodies", "simulate", "surface", "volume")}
+    scheduler = Scheduler(tasks, up_to_date=ready, capacity=capacity)
+    started = [each for each in scheduler.start() if isinstance(each, Start)]
+    worker = 450e6 + 690 * resolution[0] * resolution[1]  # as measured: 538 MB at 480 x 270, 1880 MB at 1920 x 1080
+    assert 1 <= len(started) < 32
+    assert len(started) * worker <= capacity.memory_bytes
+    assert scheduler.free.memory_bytes < started[0].task.resources.memory_bytes  # and no fewer than it holds
+
+
+def test_surfaces_and_volumes_are_counted_in_memory_too():
+    smoke = {**TANK["smoke"][0], "cell_size": 0.002}
+    tasks = plan_job(job(smoke=[smoke]), LAYOUT, STAGES)
+    need = {task.stage: task.resources.memory_bytes for task in tasks}
+    assert need["surface"] > 0
+    assert need["volume"] > 500**3 * 66  # the domain of 1 m³, and what a cell was measured to take
+
+
+def test_volumes_depend_on_the_openvdb_that_writes_them(monkeypatch):
+    before = digests(job())["volume"]
+    monkeypatch.setattr("pipeline.stages.volume.tool_version", lambda package: "12.1" if package == "openvdb" else "5")
+    installed = digests(job())["volume"]
+    monkeypatch.setattr("pipeline.stages.volume.tool_version", lambda package: "12.1" if package == "openvdb" else "6")
+    assert before != installed == digests(job())["volume"]
 
 
 def test_a_blender_that_is_not_there_is_said_before_any_work(tmp_path):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import pickle
+import signal
 import stat
 import subprocess
 import sys
 import textwrap
+import threading
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,7 +17,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.executors.base import Assignment, Failed, Finished, TaskEvent
+from pipeline.executors.inline import InlineExecutor
+from pipeline.job.loading import load_job
+from pipeline.layout import JobLayout
+from pipeline.stages import render as render_stage
+from pipeline.stages.render import RenderStage
+from pipeline.task import FailureKind
 from render.blender import (
+    BlenderDiedError,
     BlenderUnavailableError,
     ExecutableRenderer,
     FrameRenderError,
@@ -276,9 +288,53 @@ def test_a_killed_executable_is_reported_with_its_last_lines(ball_pictures, blen
     renderer = ExecutableRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
     renderer._process.kill()
     renderer._process.wait()
-    with pytest.raises(FrameRenderError, match=r"(?s)exit code -9 .*noise that Blender prints"):
+    with pytest.raises(BlenderDiedError, match=r"(?s)exit code -9; .*noise that Blender prints") as death:
         renderer.render(0, folder / "never.png")
+    assert (death.value.frame, death.value.returncode) == (0, -9)
+    again = pickle.loads(pickle.dumps(death.value))
+    assert (str(again), again.returncode) == (str(death.value), -9)
     renderer.close()
+
+
+def test_an_executable_killed_between_frames_or_while_it_draws_costs_an_attempt(tmp_path, blender_stand_in):
+    layout = JobLayout(tmp_path / "job")
+    layout.root.mkdir()
+    layout.job_file.write_text(
+        'name = "still"\nframes = 3\n[render]\nresolution = [64, 36]\nquality = "draft"\nsamples = 1\ndenoise = false\n'
+        f"blender = '{blender_stand_in}'\n"
+    )
+    tasks = RenderStage().plan(load_job(layout.job_file), layout)
+
+    def attempt(frame: int, number: int) -> TaskEvent:
+        task = tasks[frame]
+        with InlineExecutor() as executor:
+            executor.submit(
+                Assignment(task, number, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES")
+            )
+            return executor.wait(0.0)[-1]
+
+    def kill_blender(renderer: ExecutableRenderer) -> None:
+        renderer._process.kill()
+        renderer._process.wait()
+
+    assert isinstance(attempt(0, 1), Finished)
+    (renderer,) = render_stage._WARM.values()
+    kill_blender(renderer)
+    lost = attempt(1, 1)
+    assert isinstance(lost, Failed)
+    assert lost.kind is FailureKind.WORKER_LOST
+    assert isinstance(attempt(1, 2), Finished)
+
+    (renderer,) = render_stage._WARM.values()
+    os.kill(renderer._process.pid, signal.SIGSTOP)  # it has been asked for the frame, and has not drawn it
+    killer = threading.Timer(0.5, kill_blender, (renderer,))
+    killer.start()
+    lost = attempt(2, 1)
+    killer.join()
+    assert isinstance(lost, Failed)
+    assert lost.kind is FailureKind.WORKER_LOST
+    assert isinstance(attempt(2, 2), Finished)
+    render_stage._close_renderers()
 
 
 def test_missing_spec_is_refused_by_the_executable(tmp_path, blender_stand_in):

@@ -39,6 +39,16 @@ def test_sort_orders_by_cell_then_id_and_drops_what_is_outside(taichi_cpu):
     np.testing.assert_array_equal(cells.order.to_numpy()[:kept], expected)
 
 
+@pytest.mark.parametrize("size", [(1.0e3, 1.0, 1.0e3), (1.0e30, 1.0, 1.0)])
+def test_a_box_of_too_many_cells_is_refused(size):
+    with pytest.raises(ValueError, match=r"smaller .* or .* larger"):
+        CellGrid.covering(np.zeros(3), np.array(size), 0.01)
+
+
+def test_a_box_of_as_many_cells_as_fit_is_taken():
+    assert CellGrid.covering(np.zeros(3), np.array([1022.0, 1022.0, 254.0]), 1.0).cell_count == 2**28
+
+
 def find_neighbors(
     points: np.ndarray, boundary: np.ndarray
 ) -> tuple[list[set[int]], list[set[int]], np.ndarray, np.ndarray]:
@@ -60,6 +70,7 @@ def find_neighbors(
     assert sum(map(len, fluid)) == (middle - start[:-1]).sum()  # nobody twice
     assert sum(map(len, solid)) == (end - middle).sum()
     assert (end <= start[1:]).all()
+    assert (start[1:] > start[:-1]).all()  # the list writes a candidate before it knows whether to keep it
     return fluid, solid, ordered[0], ordered[1]
 
 
@@ -78,3 +89,23 @@ def test_a_thousand_particles_in_one_spot_do_not_overflow(taichi_cpu):
     points = np.full((1000, 3), 0.5, dtype=np.float32)
     fluid, _, _, _ = find_neighbors(points, np.full((1, 3), 0.9, dtype=np.float32))
     assert all(len(near) == 999 for near in fluid)
+
+
+def test_a_particle_at_nan_finds_nobody_and_keeps_a_place_of_its_own(taichi_cpu):
+    points = np.random.default_rng(4).uniform(0.0, 1.0, (500, 3)).astype(np.float32)
+    for k, axis in enumerate((0, 1, 2, slice(None))):
+        points[100 * k, axis] = np.nan
+    fluid, solid, points, _ = find_neighbors(points, np.full((1, 3), 0.9, dtype=np.float32))
+    lost = np.isnan(points).any(axis=1)
+    assert lost.sum() == 4
+    assert all(len(fluid[i]) + len(solid[i]) == 0 for i in np.flatnonzero(lost))
+    there = np.flatnonzero(~lost)
+    tree = cKDTree(points[there])
+    for i, near in zip(there, tree.query_ball_point(points[there], RADIUS), strict=True):
+        assert fluid[i] == set(there[near].tolist()) - {i}
+
+
+def test_more_neighbors_than_a_list_can_index_are_refused(taichi_cpu):
+    points = np.full((47_000, 3), 0.5, dtype=np.float32)  # 47 000² is just above 2³¹
+    with pytest.raises(OverflowError, match="47000 particles"):
+        find_neighbors(points, np.full((1, 3), 0.9, dtype=np.float32))

@@ -1,5 +1,7 @@
 """Mesh files: the formats, `up`, `size`, centring, and every way a file can be wrong."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -80,11 +82,7 @@ def test_missing_file_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        (
-            "notes.txt",
-            b"hello",
-            r"must be a mesh trimesh can read, got \"notes.txt\"; convert it to OBJ, PLY, STL or GLB",
-        ),
+        ("notes.txt", b"hello", r"must be an OBJ, PLY, STL or GLB file, got \"notes.txt\"; export it as GLB"),
         ("bad.glb", b"garbage", r"is not a readable GLB file \(.+\); export it again"),
         ("bad.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n", "PLY file|has no faces"),
         ("cut.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", r"is not a readable OBJ file \(IndexError"),
@@ -98,3 +96,28 @@ def test_unusable_file_is_refused_by_name(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ShapeError, match=message):
         mesh_solid(tmp_path / name, size=0.5)
+
+
+@pytest.mark.parametrize("suffix", ["gltf", "off"])
+def test_formats_that_a_copy_of_one_file_may_not_hold_are_refused(tmp_path, suffix):
+    written = write_wedge(tmp_path / "wedge.stl").export(file_type=suffix)
+    for name, content in (written if suffix == "gltf" else {"wedge": written}).items():
+        path = tmp_path / (f"wedge.{suffix}" if name in ("wedge", "model.gltf") else name)
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(ShapeError, match=f'got "wedge.{suffix}"; export it as GLB'):
+        mesh_solid(tmp_path / f"wedge.{suffix}")
+
+
+def test_a_glb_that_keeps_its_triangles_in_a_file_beside_it_is_refused(tmp_path):
+    write_wedge(tmp_path / "wedge.glb")
+    whole = (tmp_path / "wedge.glb").read_bytes()
+    json_length = int.from_bytes(whole[12:16], "little")
+    tree = json.loads(whole[20 : 20 + json_length])
+    (tmp_path / "wedge.bin").write_bytes(whole[20 + json_length + 8 :])
+    tree["buffers"][0]["uri"] = "wedge.bin"
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunk = len(text).to_bytes(4, "little") + b"JSON" + text
+    (tmp_path / "wedge.glb").write_bytes(b"glTF" + whole[4:8] + (12 + len(chunk)).to_bytes(4, "little") + chunk)
+    with pytest.raises(ShapeError, match="is not a readable GLB file"):
+        mesh_solid(tmp_path / "wedge.glb")

@@ -83,7 +83,7 @@ def test_heat_of_the_source_fluctuates_within_its_bounds_and_the_same_in_every_r
     for time_s in (0.0, 0.06, 0.0):
         solver.restore({name: np.zeros_like(array) for name, array in solver.checkpoint().items()})
         solver.begin_frame(time_s)
-        solver._emit()
+        solver._emit(1 / 60)
         snapshot = solver.snapshots()["plume"].arrays
         fields.append(snapshot["temperature"][snapshot["density"] > 0.0])
     first, later, again = fields
@@ -141,11 +141,39 @@ def test_snapshot_is_cell_centred_and_says_where_it_lies(solver):
     assert np.array_equal(snapshot.arrays["velocity"][..., 0], expected)
 
 
-def test_a_source_emits_from_its_start_until_before_its_end():
+def test_a_source_emits_in_every_step_that_it_has_a_part_of():
     (source,) = plume(source=[{**SOURCE, "start_s": 1.0, "end_s": 2.0}]).source
-    assert [source.emits_at(time_s) for time_s in (0.5, 1.0, 1.99, 2.0)] == [False, True, True, False]
+    steps = [(0.0, 1.0), (0.9, 1.1), (1.4, 1.5), (0.0, 3.0), (1.9, 2.1), (2.0, 2.1)]
+    assert [source.emits_during(*step) for step in steps] == [False, True, True, True, True, False]
     (endless,) = plume().source
-    assert endless.emits_at(1.0e6)
+    assert endless.emits_during(1.0e6, 1.0e6 + 1.0e-3)
+
+
+@pytest.mark.slow
+def test_a_source_shorter_than_a_step_is_not_missed():
+    short = plume(source=[{**SOURCE, "start_s": 0.002, "end_s": 0.012}])
+    solver = SmokeSolver(short, domain=DOMAIN, gravity=GRAVITY)
+    solver.begin_frame(0.0)
+    solver.substep(min(solver.stable_dt(), 1 / 60))
+    assert solver.diagnostics()["emitted_mass"] > 0.0
+
+
+@pytest.mark.slow
+def test_a_cold_source_sinks():
+    cold = plume(source=[{**SOURCE, "temperature": 250.0, "position": (0.0, 0.0, 1.0), "density": 0.0}])
+    solver = SmokeSolver(cold, domain=DOMAIN, gravity=GRAVITY)
+    solver.begin_frame(0.0)
+    advance(solver, 6)
+    snapshot = solver.snapshots()["plume"]
+    assert snapshot.arrays["temperature"].min() < 293.0
+    # Air 43 K colder falls with 9.81 * 43 / 293 = 1.4 m/s²; after a tenth of a second it moves downward at least.
+    assert snapshot.arrays["velocity"][8, 8, 16, 2] < -0.01
+
+
+def test_an_obstacle_that_falls_between_the_cells_is_refused():
+    plate = build_solid(Placement(shape={"type": "box", "size": (0.4, 0.4, 0.01)}, position=(0.0, 0.0, 0.625)))
+    with pytest.raises(ValueError, match=r"0\.01 m thin falls between its cells of 0\.0625 m"):
+        SmokeGrid.build(plume(), DOMAIN, [plate])
 
 
 def test_a_field_that_is_not_finite_is_named(solver):

@@ -1,0 +1,35 @@
+"""Files that are replaced as a whole, and outlive a power cut."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def replace_durably(path: Path, content: str | bytes) -> None:
+    """Write a file aside, force it to the disk and rename it: others see the old one or the new one, never a part.
+
+    Args:
+        path: the file; its folder is there.
+        content: what it is to hold; text is written as UTF-8.
+
+    Raises:
+        OSError: it cannot be written, as on a full disk; the old file stands then, and nothing is left beside it.
+    """
+    part = path.with_name(f".{path.name}.part.{os.getpid()}")
+    try:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+        sync(part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Force a file's bytes, or a folder's names, to the disk."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

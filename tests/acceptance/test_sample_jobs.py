@@ -1,0 +1,32 @@
+"""Every job in jobs/ runs, small and short."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import pytest
+
+JOBS = sorted((Path(__file__).parents[2] / "jobs").glob("*.toml"))
+
+TINY = {
+    "quickstart": {"fluid.water.particle_radius": 0.02, "smoke.plume.cell_size": 0.06},
+}
+
+
+def test_every_sample_job_has_a_tiny_version():
+    assert [path.stem for path in JOBS] == sorted(TINY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", JOBS, ids=lambda path: path.stem)
+def test_a_sample_job_becomes_a_film(path, tmp_path):
+    changes = {"frames": 2, "render.resolution": [64, 36], "render.samples": 1, "device": "cpu", **TINY[path.stem]}
+    options = [part for key, value in changes.items() for part in ("--set", f"{key}={value}")]
+    command = [sys.executable, "-m", "pipeline", "submit", str(path), "--output", str(tmp_path), *options]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    with av.open(str(tmp_path / path.stem / "movie.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) == 2

@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.files import replace_durably
+
+
+@pytest.mark.parametrize("content", ["größer\n", "größer\n".encode()])
+def test_a_replaced_file_holds_the_new_content_and_leaves_nothing_beside_it(
+    tmp_path: Path, content: str | bytes
+) -> None:
+    path = tmp_path / "job.toml"
+    path.write_text("old")
+    replace_durably(path, content)
+    assert path.read_bytes() == "größer\n".encode()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failed_replacement_leaves_the_old_file_alone(tmp_path: Path) -> None:
+    path = tmp_path / "job.toml"
+    path.mkdir()  # which a file cannot replace
+    with pytest.raises(OSError):
+        replace_durably(path, "new")
+    assert list(tmp_path.iterdir()) == [path]
+    assert path.is_dir()

@@ -1,0 +1,92 @@
+"""Watching a run of another process: what counts is how that run ended."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from record_samples import film
+
+from pipeline.commands.watching import watch
+from pipeline.layout import JobLayout
+from pipeline.lease import Lease
+from pipeline.manifest import Manifest
+from pipeline.scheduler_events import JobOutcome
+from pipeline.task import TaskState
+
+TASKS = film(2)
+DONE = {task.id: TaskState.SUCCEEDED for task in TASKS}
+
+
+@pytest.fixture
+def layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobLayout:
+    """A job whose last run did everything."""
+    monkeypatch.setattr("pipeline.commands.watching.POLL_INTERVAL_S", 0.02)
+    layout = JobLayout(tmp_path)
+    with Manifest(layout.manifest) as manifest:
+        manifest.begin_run("film", run="earlier")
+        manifest.record_plan(TASKS, DONE)
+        manifest.end_run(JobOutcome.SUCCEEDED)
+    return layout
+
+
+def watch_while(layout: JobLayout, runner: Callable[[Lease], None]) -> int:
+    """Watch a run that goes on for a few looks, does what `runner` does, and gives its lease back."""
+    lease = Lease.acquire(layout.lease)
+
+    def run() -> None:
+        time.sleep(0.2)
+        runner(lease)
+        lease.release()
+
+    running = threading.Thread(target=run)
+    running.start()
+    try:
+        return watch(layout)
+    finally:
+        running.join()
+
+
+def test_a_run_that_says_it_did_everything_is_a_success(layout: JobLayout, capsys: pytest.CaptureFixture[str]) -> None:
+    def succeed(lease: Lease) -> None:
+        with Manifest(layout.manifest) as manifest:
+            manifest.begin_run("film", run=lease.holder.token)
+            manifest.end_run(JobOutcome.SUCCEEDED)
+
+    assert watch_while(layout, succeed) == 0
+    assert "movie.mp4 is done" in capsys.readouterr().err
+
+
+def test_a_run_that_was_killed_before_it_had_a_record_is_no_success(
+    layout: JobLayout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert watch_while(layout, lambda _: None) == 5
+    assert "it was cut short with 4 of 4 tasks done; continue with: pipeline resume" in capsys.readouterr().err
+
+
+def test_a_run_that_was_killed_before_it_had_planned_is_no_success(layout: JobLayout) -> None:
+    def die_while_planning(lease: Lease) -> None:
+        with Manifest(layout.manifest) as manifest:
+            manifest.begin_run("film", run=lease.holder.token)
+
+    assert watch_while(layout, die_while_planning) == 5
+
+
+def test_a_run_that_was_stopped_is_no_success_and_that_is_said(
+    layout: JobLayout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def drain(lease: Lease) -> None:
+        with Manifest(layout.manifest) as manifest:
+            manifest.begin_run("film", run=lease.holder.token)
+            manifest.set_states({TASKS[-1].id: TaskState.CANCELLED})
+            manifest.end_run(JobOutcome.DRAINED)
+
+    assert watch_while(layout, drain) == 5
+    assert "it ended (drained) with 3 of 4 tasks done" in capsys.readouterr().err
+
+
+def test_a_run_that_ended_before_the_first_look_is_judged_by_the_record(layout: JobLayout) -> None:
+    assert watch(layout) == 0
