@@ -87,7 +87,7 @@ class Lease:
 
     def __init__(self, path: Path, holder: LeaseHolder, takeover: str | None) -> None:
         self._path = path
-        self._loss: Exception | None = None
+        self._loss: LeaseLostError | None = None
         self._given_back = threading.Event()
         self._beating: threading.Thread | None = None
         self.holder = holder

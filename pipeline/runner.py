@@ -91,7 +91,7 @@ def run_job(
         JobBusyError: another live process runs this job.
         LeaseLostError: another process took the job over, because this one did not answer for long.
         ManifestError: the record is damaged; the text says what to do.
-        PlanError: the stages' tasks do not fit together.
+        PlanError: the stages' tasks do not fit together, or `rerun` names what is not there.
     """
     observer = observer or SilentObserver()
     control = control or RunControl()
@@ -100,15 +100,16 @@ def run_job(
     with Lease.acquire(layout.lease) as lease, Manifest(layout.manifest) as manifest, control.on_signals():
         if job_text is not None:
             _write_job_file(layout, job_text)
+        # What is refused here was no run: the record goes on saying how the last one ended.
+        tasks = plan_job(job, layout, load_stages(stages))
+        forced = frozenset[TaskId]() if rerun is None else rerun.of(tasks)
         clean = manifest.begin_run(job.name, run=lease.holder.token)
         if lease.takeover is not None:
             manifest.log_event("takeover", lease.takeover)
             observer.notify(Notice(lease.takeover))
-        tasks = plan_job(job, layout, load_stages(stages))
         reconciliation = reconcile(manifest, layout, clean=clean)
         for sentence in reconciliation.sentences:
             observer.notify(Notice(sentence))
-        forced = frozenset[TaskId]() if rerun is None else rerun.of(tasks)
         assessments = assess(
             tasks, reconciliation.rows, reconciliation.problems, parameters=manifest.parameters, forced=forced
         )

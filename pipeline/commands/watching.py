@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+from pipeline.errors import OutdatedManifestError
 from pipeline.layout import JobLayout
 from pipeline.lease import live_holder
 from pipeline.manifest_reader import LastRun, ManifestReader, StageSummary
@@ -60,11 +61,14 @@ def _say_how_it_ended(display: Display, layout: JobLayout, summary: list[StageSu
 
 
 def _record(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:
-    """Counts by stage and the last run; nothing while the runner has not made its manifest yet."""
+    """Counts by stage and the last run; nothing while the runner is still making its manifest, or renewing it."""
     if not layout.manifest.exists():
         return [], LastRun(None, None)
-    with ManifestReader.open_readonly(layout.manifest) as manifest:
-        return manifest.summary(), manifest.last_run()
+    try:
+        with ManifestReader.open_readonly(layout.manifest) as manifest:
+            return manifest.summary(), manifest.last_run()
+    except OutdatedManifestError:
+        return [], LastRun(None, None)
 
 
 def _update(stages: dict[str, StageProgress], summary: list[StageSummary]) -> None:

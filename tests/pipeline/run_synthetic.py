@@ -9,6 +9,7 @@ from synthetic_jobs import job_text, run_synthetic
 
 from pipeline.executors.processes import ProcessExecutor
 from pipeline.run_events import Notice, RunEvent
+from pipeline.scheduler_events import Policy
 
 
 class Printer:
@@ -20,4 +21,6 @@ class Printer:
 if __name__ == "__main__":
     with ProcessExecutor() as executor:
         text = job_text(frames=int(sys.argv[2]))
-        sys.exit(run_synthetic(Path(sys.argv[1]), executor, text, observer=Printer()).exit_code)
+        # Whoever kills at random may hit the same task many times.
+        policy = Policy(attempts=100, backoff_s=0.01)
+        sys.exit(run_synthetic(Path(sys.argv[1]), executor, text, observer=Printer(), policy=policy).exit_code)

@@ -90,3 +90,14 @@ def test_a_run_that_was_stopped_is_no_success_and_that_is_said(
 
 def test_a_run_that_ended_before_the_first_look_is_judged_by_the_record(layout: JobLayout) -> None:
     assert watch(layout) == 0
+
+
+def test_a_runner_that_is_still_making_its_manifest_is_waited_for(layout: JobLayout) -> None:
+    layout.manifest.write_bytes(b"")  # as SQLite leaves it until the first commit
+
+    def succeed(lease: Lease) -> None:
+        with Manifest(layout.manifest) as manifest:
+            manifest.begin_run("film", run=lease.holder.token)
+            manifest.end_run(JobOutcome.SUCCEEDED)
+
+    assert watch_while(layout, succeed) == 0
