@@ -152,7 +152,8 @@ RENDER_FRAMES = """
     from pathlib import Path
     from render.blender import FrameRenderError, open_renderer
     folder = Path(sys.argv[1])
-    renderer = open_renderer(folder / "spec.json", threads=1, blender=None)
+    threads = int(sys.argv[4]) if len(sys.argv) > 4 else 1
+    renderer = open_renderer(folder / "spec.json", threads=threads, blender=None)
     print("DEVICE", renderer.device)
     for frame in map(int, sys.argv[3].split(",")):
         try:
@@ -239,6 +240,15 @@ def test_another_process_draws_the_same_bytes(ball_pictures, tmp_path):
     assert "DEVICE CPU" in printed
     run_python(RENDER_FRAMES, str(folder), "again-{frame}.png", "0")
     assert (folder / "again-0.png").read_bytes() == (folder / ".000000.png.part#1").read_bytes()
+
+
+@pytest.mark.parametrize("quality", ["draft", "preview"])
+def test_a_denoised_frame_does_not_depend_on_the_process_or_its_threads(quality, tmp_path):
+    write_ball_frames(tmp_path)
+    spec_of(BALL, denoise=True, quality=quality, motion_blur=True).write(tmp_path / "spec.json")
+    for threads in ("1", "2"):
+        run_python(RENDER_FRAMES, str(tmp_path), f"{threads}-{{frame}}.png", "2", threads)
+    assert (tmp_path / "1-2.png").read_bytes() == (tmp_path / "2-2.png").read_bytes()
 
 
 @pytest.fixture
