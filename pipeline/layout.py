@@ -39,11 +39,6 @@ class JobLayout:
         """Folder of all receipts."""
         return self.root / ".receipts"
 
-    @property
-    def report(self) -> Path:
-        """Timings, plots and a contact sheet."""
-        return self.root / "report.html"
-
     def log(self, task_id: TaskId, attempt: int) -> Path:
         """Log of one attempt."""
         return self.root / "logs" / f"{task_id}.{attempt}.log"
