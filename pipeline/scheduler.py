@@ -160,11 +160,6 @@ class Scheduler:
         """What no running task occupies."""
         return self._free
 
-    @property
-    def ending(self) -> JobOutcome | None:
-        """Why nothing more is started, or None while the job goes on."""
-        return self._ending
-
     def state(self, task_id: TaskId) -> TaskState:
         """Where a task stands."""
         return self._entries[task_id].state
