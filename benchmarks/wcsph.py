@@ -38,7 +38,7 @@ def main() -> None:
 
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
     from sim.fluid.parameters import FluidParameters
-    from sim.fluid.particle_fluid import estimate_bytes
+    from sim.fluid.memory import estimate_bytes
     from sim.fluid.wcsph import WCSPHSolver
     from sim.scene import DomainParameters
 

@@ -1,16 +1,106 @@
 """Reductions and tests whose result does not depend on the order in which threads run.
 
-Sums of floating-point numbers depend on their order, so none is done with atomics here; maxima of non-negative
-numbers do not, and are.
+Sums of floating-point numbers depend on their order, so they are done in a fixed shape: a number of lanes that depends
+on the kind of device alone, each with its own share of the numbers, and a tree over the lanes. No float atomics.
 """
 
+from dataclasses import dataclass
+
+import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
+
+Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
+
+CPU_LANES = 256
+GPU_LANES = 32768
+"""Few for a CPU, whose threads read best what lies together; enough for a GPU to be busy."""
+
+BRANCHES = 128
+"""Numbers that one node of the tree takes together."""
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """How the numbers 0 ... n-1 are shared out: lane l has l * lane_step + k * item_step for k < items_per_lane(n).
+
+    A lane of a CPU has a run of neighbours; neighbouring lanes of a GPU have neighbouring numbers.
+    """
+
+    count: int
+    on_gpu: bool
+
+    def items(self, length: int) -> int:
+        """Most numbers of one lane."""
+        return (length + self.count - 1) // self.count
+
+    def lane_step(self, length: int) -> int:
+        """Distance of the first numbers of neighbouring lanes."""
+        return 1 if self.on_gpu else self.items(length)
+
+    def item_step(self) -> int:
+        """Distance of neighbouring numbers of one lane."""
+        return self.count if self.on_gpu else 1
+
+
+class LaneReduction:
+    """Several maxima and sums over the same numbers, of which a kernel leaves one partial result a lane.
+
+    Attributes:
+        lanes: how the kernel shares the numbers out.
+        partial: result q of lane l at `partial[q * lanes.count + l]`; the maxima come first.
+    """
+
+    def __init__(self, *, maxima: int, sums: int) -> None:
+        self.lanes = device_lanes()
+        self.partial = ti.ndarray(ti.f32, (maxima + sums) * self.lanes.count)
+        self._maxima, self._quantities = maxima, maxima + sums
+        self._nodes = ti.ndarray(ti.f32, self._quantities * (self.lanes.count // BRANCHES))
+        self._result = ti.ndarray(ti.f32, self._quantities)
+
+    def result(self) -> NDArray[np.float32]:
+        """The maxima, then the sums, (maxima + sums,); waits for the device."""
+        reduce_lanes(self.partial, self.lanes.count, self._quantities, self._maxima, self._nodes, self._result)
+        return self._result.to_numpy()
+
+
+def runs_on_gpu() -> bool:
+    """Whether Taichi, which must have been started, runs on a GPU."""
+    return ti.lang.impl.current_cfg().arch not in (ti.x64, ti.arm64)
+
+
+def device_lanes() -> Lanes:
+    """The lanes that suit the device Taichi runs on."""
+    on_gpu = runs_on_gpu()
+    return Lanes(GPU_LANES if on_gpu else CPU_LANES, on_gpu)
 
 
 @ti.func
 def is_finite(value: ti.f32) -> ti.i32:
     """Whether a number is neither NaN nor infinite; looks at the bits, as `fast_math` folds `x != x` to false."""
     return ti.cast((ti.bit_cast(value, ti.i32) & 0x7F800000) != 0x7F800000, ti.i32)
+
+
+@ti.kernel
+def reduce_lanes(
+    partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats, result: Floats
+):  # fmt: skip
+    """Two more levels of the tree: `BRANCHES` lanes to a node, then all nodes, always in the same order."""
+    node_count = lanes // BRANCHES
+    for n in range(quantities * node_count):
+        q = n // node_count
+        first = q * lanes + n % node_count
+        value = partial[first]
+        for k in range(1, BRANCHES):
+            other = partial[first + k * node_count]
+            value = ti.select(q < maxima, ti.max(value, other), value + other)
+        nodes[n] = value
+    for q in range(quantities):
+        value = nodes[q * node_count]
+        for k in range(1, node_count):
+            other = nodes[q * node_count + k]
+            value = ti.select(q < maxima, ti.max(value, other), value + other)
+        result[q] = value
 
 
 @ti.kernel

@@ -1,50 +1,137 @@
-"""Boundary samples on the device, sorted into the cells of the fluid's grid."""
+"""Boundary samples on the device: those of walls and static bodies, then those of bodies that move."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
-from sim.fluid.boundary_akinci2012 import BoundarySamples
-from sim.neighbors import CellGrid, CellSort
+from sim.cells import CellGrid, CellSort, SortedPoints
+from sim.fluid.boundary_kernels import STATE_WIDTH, place_samples
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from sim.fluid.boundary_akinci2012 import BoundarySamples
 
 EVERYWHERE = 1.0e30
 """Stands for "no limit" where samples are sorted [m]."""
 
 
 class Boundary:
-    """Samples of walls and bodies that do not move.
+    """Samples of walls and bodies, as the sums over neighbours read them.
+
+    The fixed samples come first, sorted by cell; the moving ones follow in the order they were given, body by body.
 
     Attributes:
-        given_count: number of samples given.
-        count: number of samples near enough to the grid to matter.
-        position: (count,) of 3-vectors [m].
-        coordinates: the same as x, y and z [m].
-        psi: rho0 V_b of each sample [kg], (count,).
-        index: row in the samples given of each of these, (count,), on the host.
-        cell_start: cell ranges of the samples.
+        given_count: number of fixed samples given.
+        fixed_count: number of those near enough to the grid to matter.
+        moving_count: number of samples of moving bodies.
+        body_count: number of moving bodies.
+        position: (fixed + moving,) of 3-vectors [m].
+        velocity: (fixed + moving,) of 3-vectors [m/s], 0 for the fixed ones.
+        volume: V_b of each sample [m³], (fixed + moving,).
+        index: row in the fixed samples given of each fixed sample here, (fixed,), on the host.
+        offset: moving samples relative to the centre of mass of their body, in its axes [m], (moving,) of 3-vectors.
+        body: number of the body of each moving sample, (moving,), int32.
+        body_start: first moving sample of each body, (bodies + 1,), on the host.
+        reach: largest distance of a sample from the centre of mass of its body [m], (bodies,), on the host.
     """
 
-    def __init__(self, samples: BoundarySamples, grid: CellGrid, spacing: float, rest_density: float) -> None:
-        psi = rest_density * samples.volumes(spacing)
+    def __init__(
+        self, fixed: BoundarySamples, moving: BoundarySamples, *, body_count: int, grid: CellGrid, spacing: float
+    ) -> None:
+        if (np.diff(moving.body) < 0).any() or moving.body.max(initial=-1) >= body_count:
+            raise ValueError(f"moving samples must be given body by body, numbered from 0 to {body_count - 1}")
         low = np.array(grid.origin)
         high = low + grid.cell_size * np.array(grid.shape)
-        near = np.flatnonzero(((samples.positions >= low) & (samples.positions <= high)).all(axis=1))
-        self.given_count, self.count = len(samples.positions), len(near)
-        position, ids = _device_array(samples.positions[near], 3), _device_array(near.astype(np.int32))
-        cells = CellSort(grid, self.count)
-        cells.sort(position, ids, self.count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3)
-        self.cell_start = cells.cell_start
-        self.index: NDArray[np.int64] = near[cells.order.to_numpy()[: self.count]]
-        sorted_positions = samples.positions[self.index]
-        self.position = _device_array(sorted_positions, 3)
-        self.coordinates = tuple(_device_array(np.ascontiguousarray(sorted_positions[:, axis])) for axis in range(3))
-        self.psi = _device_array(psi[self.index].astype(np.float32))
+        near = np.flatnonzero(((fixed.positions >= low) & (fixed.positions <= high)).all(axis=1))
+        self.given_count, self.fixed_count, self.moving_count = len(fixed.positions), len(near), len(moving.positions)
+        self.body_count = body_count
+        ids = _device_array(near.astype(np.int32))
+        cells = CellSort(grid, self.fixed_count)
+        cells.sort(_device_array(fixed.positions[near]), ids, self.fixed_count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3)
+        self.index: NDArray[np.int64] = near[cells.order.to_numpy()[: self.fixed_count]]
+        fixed_positions = fixed.positions[self.index]
+        self.fixed_points = SortedPoints(_coordinates(fixed_positions), cells.cell_start)
+
+        volumes = np.concatenate([fixed.volumes(spacing)[self.index], moving.volumes(spacing)])
+        self.position = _device_array(np.concatenate([fixed_positions, moving.positions]))
+        self.velocity = _device_array(np.zeros((self.fixed_count + self.moving_count, 3), dtype=np.float32))
+        self.volume = _device_array(volumes.astype(np.float32))
+
+        self.offset, self.body = _device_array(moving.positions), _device_array(moving.body)
+        self.body_start: NDArray[np.int64] = np.searchsorted(moving.body, np.arange(body_count + 1))
+        distance = np.linalg.norm(moving.positions.astype(np.float64), axis=1)
+        self.reach: NDArray[np.float64] = np.array(
+            [distance[moving.body == body].max(initial=0.0) for body in range(body_count)]
+        )
+        self._states = ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH)
+        self._moving_cells = CellSort(grid, self.moving_count) if self.moving_count else None
+        self._moving_ids = _device_array(np.arange(self.moving_count, dtype=np.int32))
+        self._moving_position = ti.Vector.ndarray(3, ti.f32, max(self.moving_count, 1))
+        self._moving_points: SortedPoints | None = None
+        self.moving_index = self._moving_cells.order if self._moving_cells else self._moving_ids
+
+    @property
+    def count(self) -> int:
+        """Samples of walls and of all bodies."""
+        return self.fixed_count + self.moving_count
+
+    def place(
+        self,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        angular_velocity: NDArray[np.float64],
+    ) -> None:
+        """Put the moving samples where their bodies are, at the velocity of that point of the body.
+
+        Args:
+            position: centres of mass [m], (bodies, 3).
+            rotation: from body to world axes, (bodies, 3, 3).
+            velocity: of the centres of mass [m/s], (bodies, 3).
+            angular_velocity: [rad/s], (bodies, 3).
+        """
+        states = np.concatenate([position, rotation.reshape(-1, 9), velocity, angular_velocity], axis=1)
+        self._states.from_numpy(np.ascontiguousarray(states, dtype=np.float32).ravel())
+        place_samples(
+            self.offset, self.body, self.moving_count, self.fixed_count, self._states, self.position, self.velocity
+        )
+
+    def sort_moving(self) -> SortedPoints | None:
+        """Sort the moving samples by cell, where they are now; None where there are none.
+
+        `moving_index` then tells the index of each of the sorted.
+        """
+        if self._moving_cells is None:
+            return None
+        positions = np.ascontiguousarray(self.position.to_numpy()[self.fixed_count :])
+        self._moving_position.from_numpy(positions)
+        self._moving_cells.sort(
+            self._moving_position, self._moving_ids, self.moving_count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3
+        )
+        order = self._moving_cells.order.to_numpy()
+        if self._moving_points is None:
+            self._moving_points = SortedPoints(_coordinates(positions[order]), self._moving_cells.cell_start)
+        else:
+            for axis, coordinates in enumerate(self._moving_points.coordinates):
+                coordinates.from_numpy(np.ascontiguousarray(positions[order, axis]))
+        index = (order + self.fixed_count).astype(np.int32)
+        self.moving_index = _device_array(index)
+        return self._moving_points
 
 
-def _device_array(values: NDArray[np.generic], width: int = 1) -> ti.Ndarray:
+def _coordinates(positions: NDArray[np.float32]) -> tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray]:
+    x, y, z = (_device_array(np.ascontiguousarray(positions[:, axis])) for axis in range(3))
+    return x, y, z
+
+
+def _device_array(values: NDArray[np.generic]) -> ti.Ndarray:
     """Device array of these rows; one of zeros where there is none, as kernels take no empty arrays."""
     rows = values if len(values) else np.zeros((1, *values.shape[1:]), dtype=values.dtype)
     dtype = ti.i32 if rows.dtype == np.int32 else ti.f32
-    array = ti.ndarray(dtype, len(rows)) if width == 1 else ti.Vector.ndarray(width, dtype, len(rows))
+    array = ti.ndarray(dtype, len(rows)) if rows.ndim == 1 else ti.Vector.ndarray(3, dtype, len(rows))
     array.from_numpy(np.ascontiguousarray(rows))
     return array

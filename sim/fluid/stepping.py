@@ -1,67 +1,123 @@
 """Moves particles, keeps them behind the walls, and measures the state on the way."""
 
+from dataclasses import dataclass
+
+import numpy as np
 import taichi as ti
 
-from sim.neighbors import Vectors
-from sim.reductions import is_finite
+from sim.cells import Vectors
+from sim.fluid.box import Box
+from sim.reductions import Floats, LaneReduction, is_finite
 
-Motion = ti.types.struct(
-    max_speed_squared=ti.f32,
-    max_acceleration_squared=ti.f32,
-    max_displacement_squared=ti.f32,
-    left=ti.i32,
-    touched=ti.i32,
-    bad=ti.i32,
-)
+MAXIMA, COUNTS = 3, 3
+
+
+@dataclass(frozen=True)
+class MotionSummary:
+    """What the last step did to the particles.
+
+    Attributes:
+        max_speed: largest |v_i|, before a wall stops it [m/s].
+        max_acceleration: largest |a_i| [m/s²].
+        max_displacement: largest way that a particle went [m].
+        left: particles that passed an open face.
+        touched: particles that were put back onto a wall.
+        non_finite: particles with a position or velocity that is NaN or infinite.
+    """
+
+    max_speed: float
+    max_acceleration: float
+    max_displacement: float = 0.0
+    left: int = 0
+    touched: int = 0
+    non_finite: int = 0
+
+
+class ParticleStepper:
+    """Advances the particles by symplectic Euler and measures their motion in the same pass."""
+
+    def __init__(self, box: Box) -> None:
+        self._corners = tuple(ti.math.vec3(*corner) for corner in (*box.walls, *box.openings))
+        self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
+
+    def advance(
+        self, position: ti.Ndarray, velocity: ti.Ndarray, acceleration: ti.Ndarray, count: int, dt: float
+    ) -> MotionSummary:
+        """v_i += dt a_i, x_i += dt v_i; then whoever passed a wall is put back onto it.
+
+        Args:
+            position: of the particles [m], at least (count,) of 3-vectors.
+            velocity: [m/s], likewise.
+            acceleration: [m/s²], likewise.
+            count: number of particles.
+            dt: the step [s].
+        """
+        reduction = self._reduction
+        lanes = reduction.lanes
+        advance_particles(
+            position, velocity, acceleration, count, dt, *self._corners,
+            lanes.count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), reduction.partial,
+        )  # fmt: skip
+        speed, strength, displacement, left, touched, bad = reduction.result()
+        return MotionSummary(
+            max_speed=float(np.sqrt(speed)),
+            max_acceleration=float(np.sqrt(strength)),
+            max_displacement=float(np.sqrt(displacement)),
+            left=int(left),
+            touched=int(touched),
+            non_finite=int(bad),
+        )
 
 
 @ti.kernel
 def advance_particles(
-    position: Vectors,
-    velocity: Vectors,
-    acceleration: Vectors,
-    count: ti.i32,
-    dt: ti.f32,
-    wall_low: ti.math.vec3,
-    wall_high: ti.math.vec3,
-    keep_low: ti.math.vec3,
-    keep_high: ti.math.vec3,
-) -> Motion:
-    """Symplectic Euler: v_i += dt a_i, x_i += dt v_i; then whoever passed a wall is put back onto it.
+    position: Vectors, velocity: Vectors, acceleration: Vectors, count: ti.i32, dt: ti.f32,
+    wall_low: ti.math.vec3, wall_high: ti.math.vec3, keep_low: ti.math.vec3, keep_high: ti.math.vec3,
+    lanes: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
+):  # fmt: skip
+    """Symplectic Euler, then the walls; the partial results of a lane are these.
 
-    Returns:
-        Largest |v|² [m²/s²] and |a|² [m²/s⁴], the speed before a wall stops it, and largest |x - x before|² [m²];
-        how many particles passed an open face, were put back onto a wall, and had a position or velocity that was
-        not finite before the wall. Those that are not finite count neither as gone nor as put back.
+    Largest |v|² [m²/s²], before a wall stops it, largest |a|² [m²/s⁴], and largest |x - x before|² [m²];
+    how many particles passed an open face, were put back onto a wall, and had a position or velocity that was
+    not finite before the wall. Those that are not finite count neither as gone nor as put back.
     """
-    max_speed_squared = 0.0
-    max_acceleration_squared = 0.0
-    max_displacement_squared = 0.0
-    left = 0
-    touched = 0
-    bad = 0
-    for i in range(count):
-        a_i = acceleration[i]
-        v_i = velocity[i] + dt * a_i
-        free = position[i] + dt * v_i
-        # Before the wall: it would turn NaN into a point on itself, and infinite speed into rest.
-        finite = 1
-        for axis in ti.static(range(3)):
-            finite &= is_finite(v_i[axis]) & is_finite(free[axis])
-        ti.atomic_max(max_speed_squared, v_i.norm_sqr())
-        ti.atomic_max(max_acceleration_squared, a_i.norm_sqr())
-        x_i = ti.min(ti.max(free, wall_low), wall_high)
-        for axis in ti.static(range(3)):
-            if x_i[axis] != free[axis]:
-                v_i[axis] = 0.0
-        if finite == 0:
-            bad += 1
-        else:
-            if (x_i != free).any():
-                touched += 1
-            if (x_i < keep_low).any() or (x_i > keep_high).any():
-                left += 1
-        ti.atomic_max(max_displacement_squared, (x_i - position[i]).norm_sqr())
-        position[i] = x_i
-        velocity[i] = v_i
-    return Motion(max_speed_squared, max_acceleration_squared, max_displacement_squared, left, touched, bad)
+    for lane in range(lanes):
+        max_speed_squared = 0.0
+        max_acceleration_squared = 0.0
+        max_displacement_squared = 0.0
+        left = 0.0
+        touched = 0.0
+        bad = 0.0
+        for k in range(items):
+            i = lane * lane_step + k * item_step
+            if i < count:
+                a_i = acceleration[i]
+                x_before = position[i]
+                v_i = velocity[i] + dt * a_i
+                free = x_before + dt * v_i
+                # Before the wall: it would turn NaN into a point on itself, and infinite speed into rest.
+                finite = 1
+                for axis in ti.static(range(3)):
+                    finite &= is_finite(v_i[axis]) & is_finite(free[axis])
+                max_speed_squared = ti.max(max_speed_squared, v_i.norm_sqr())
+                max_acceleration_squared = ti.max(max_acceleration_squared, a_i.norm_sqr())
+                x_i = ti.min(ti.max(free, wall_low), wall_high)
+                for axis in ti.static(range(3)):
+                    if x_i[axis] != free[axis]:
+                        v_i[axis] = 0.0
+                if finite == 0:
+                    bad += 1.0
+                else:
+                    if (x_i != free).any():
+                        touched += 1.0
+                    if (x_i < keep_low).any() or (x_i > keep_high).any():
+                        left += 1.0
+                max_displacement_squared = ti.max(max_displacement_squared, (x_i - x_before).norm_sqr())
+                position[i] = x_i
+                velocity[i] = v_i
+        partial[lane] = max_speed_squared
+        partial[lanes + lane] = max_acceleration_squared
+        partial[2 * lanes + lane] = max_displacement_squared
+        partial[3 * lanes + lane] = left
+        partial[4 * lanes + lane] = touched
+        partial[5 * lanes + lane] = bad

@@ -3,7 +3,8 @@ import pytest
 import taichi as ti
 from scipy.spatial import cKDTree
 
-from sim.neighbors import CellGrid, CellSort, NeighborList, exclusive_scan
+from sim.cells import CellGrid, CellSort, SortedPoints, exclusive_scan
+from sim.neighbors import NeighborList
 
 RADIUS = 0.1
 
@@ -50,35 +51,44 @@ def test_a_box_of_as_many_cells_as_fit_is_taken():
 
 
 def find_neighbors(
-    points: np.ndarray, boundary: np.ndarray
+    points: np.ndarray, boundary: np.ndarray, moving: np.ndarray | None = None, *, stride: int = 1
 ) -> tuple[list[set[int]], list[set[int]], np.ndarray, np.ndarray]:
-    """Neighbours by the device: of fluid, of boundary, with both point sets as sorted."""
+    """Neighbours by the device: of fluid, of boundary, with both point sets as sorted; moving samples come last."""
     grid = CellGrid.covering(np.zeros(3), np.ones(3), RADIUS)
-    sorts, arrays, ordered = [], [], []
-    for cloud in (points, boundary):
+    clouds, orders, ordered = [], [], []
+    for cloud in (points, boundary, moving):
+        if cloud is None:
+            continue
         cells = CellSort(grid, len(cloud))
         cells.sort(device(cloud), device(np.arange(len(cloud), dtype=np.int32)), len(cloud), (-9.0,) * 3, (9.0,) * 3)
-        ordered.append(cloud[cells.order.to_numpy()])
-        sorts.append(cells)
-        arrays.append(tuple(device(ordered[-1][:, axis]) for axis in range(3)))
-    found = NeighborList(grid, len(points), 1)  # room for one neighbour each: has to grow
-    found.build(RADIUS, arrays[0], sorts[0].cell_start, len(points), arrays[1], sorts[1].cell_start)
-    start, middle, end = found.start.to_numpy(), found.boundary_start.to_numpy(), found.end.to_numpy()
+        orders.append(cells.order.to_numpy())
+        ordered.append(cloud[orders[-1]])
+        clouds.append(SortedPoints(tuple(device(ordered[-1][:, axis]) for axis in range(3)), cells.cell_start))
+    found = NeighborList(grid, len(points), stride=stride)
+    index = device((len(boundary) + orders[-1]).astype(np.int32))
+    found.build(RADIUS, clouds[0], len(points), clouds[1], None if moving is None else clouds[2], index)
+    start, near, solid_near = (each.to_numpy() for each in (found.start, found.fluid_count, found.boundary_count))
     indices = found.indices.to_numpy()
-    fluid = [set(indices[start[i] : middle[i]].tolist()) for i in range(len(points))]
-    solid = [set(indices[middle[i] : end[i]].tolist()) for i in range(len(points))]
-    assert sum(map(len, fluid)) == (middle - start[:-1]).sum()  # nobody twice
-    assert sum(map(len, solid)) == (end - middle).sum()
-    assert (end <= start[1:]).all()
-    assert (start[1:] > start[:-1]).all()  # the list writes a candidate before it knows whether to keep it
-    return fluid, solid, ordered[0], ordered[1]
+    places = [start[i] + stride * np.arange(near[i] + solid_near[i]) for i in range(len(points))]
+    taken = np.concatenate(places)
+    assert len(np.unique(taken)) == len(taken)  # no place twice
+    assert taken.max(initial=0) < found.length
+    fluid = [set(indices[places[i][: near[i]]].tolist()) for i in range(len(points))]
+    solid = [set(indices[places[i][near[i] :]].tolist()) for i in range(len(points))]
+    assert sum(map(len, fluid)) == near.sum()  # nobody twice
+    assert sum(map(len, solid)) == solid_near.sum()
+    samples = ordered[1] if moving is None else np.concatenate([ordered[1], moving])
+    return fluid, solid, ordered[0], samples
 
 
-def test_neighbors_equal_those_of_a_search_tree(taichi_cpu):
+@pytest.mark.parametrize("stride", [1, 32])
+@pytest.mark.parametrize("moving_count", [0, 300])
+def test_neighbors_equal_those_of_a_search_tree(taichi_cpu, stride, moving_count):
     rng = np.random.default_rng(3)
     points = rng.uniform(0.0, 1.0, (2000, 3)).astype(np.float32)
     boundary = rng.uniform(-0.1, 1.1, (800, 3)).astype(np.float32)
-    fluid, solid, points, boundary = find_neighbors(points, boundary)
+    moving = rng.uniform(0.3, 0.6, (moving_count, 3)).astype(np.float32) if moving_count else None
+    fluid, solid, points, boundary = find_neighbors(points, boundary, moving, stride=stride)
     tree, boundary_tree = cKDTree(points), cKDTree(boundary)
     # Pairs whose distance is the radius to float32 rounding may fall on either side; this seed has none.
     assert fluid == [set(near) - {i} for i, near in enumerate(tree.query_ball_point(points, RADIUS))]

@@ -9,7 +9,7 @@ import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.fluid.boundary_akinci2012 import sink_samples
-from sim.fluid.particle_fluid import estimate_bytes
+from sim.fluid.memory import estimate_bytes
 from sim.fluid.wcsph import expected_sound_speed
 from sim.scene import DomainParameters
 

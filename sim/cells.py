@@ -1,0 +1,218 @@
+"""Points sorted into the cells of a grid: a counting sort, the same whatever the number of threads.
+
+The cells are numbered along x first, so that the three cells of a row are one contiguous range of the sorted points.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
+Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Vectors = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
+Cells = ti.types.vector(3, ti.i32)
+
+SCAN_BLOCK = 1024
+MAX_CELLS = 2**28
+"""Most cells of a grid: 1 GiB for each of its int32 arrays, however few the particles."""
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """Cubic cells that cover a box, with one more layer of cells around it.
+
+    Attributes:
+        origin: lower corner of the outermost cells [m].
+        cell_size: edge of a cell, at least the search radius [m].
+        shape: number of cells along x, y, z.
+    """
+
+    origin: tuple[float, float, float]
+    cell_size: float
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def covering(cls, low: NDArray[np.floating], high: NDArray[np.floating], cell_size: float) -> "CellGrid":
+        """The grid for a box from `low` to `high` [m].
+
+        Raises:
+            ValueError: the box holds more than `MAX_CELLS` cells, wherever the points are.
+        """
+        size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
+        shape = np.maximum(np.ceil(size / cell_size), 1.0) + 2.0
+        if not shape.prod() <= MAX_CELLS:
+            raise ValueError(
+                f"a box of {' x '.join(f'{edge:g}' for edge in size)} m has {shape.prod():.3g} neighbour cells of "
+                f"{cell_size:g} m, more than {MAX_CELLS}; give a smaller domain or a larger particle radius"
+            )
+        origin = np.asarray(low, dtype=np.float64) - cell_size
+        return cls(tuple(origin.tolist()), cell_size, tuple(shape.astype(int).tolist()))
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells, the outer layer included."""
+        nx, ny, nz = self.shape
+        return nx * ny * nz
+
+
+class CellSort:
+    """Sorts points by cell, then by id; drops those outside the box that they must stay in.
+
+    Attributes:
+        cell_start: first sorted point of each cell; entry `cell_count` is the number of points kept, (cells + 2,).
+        order: index before the sort of each sorted point, (capacity,).
+    """
+
+    def __init__(self, grid: CellGrid, capacity: int) -> None:
+        self.grid = grid
+        # One cell more than the grid has takes the points that are dropped.
+        self.cell_start = ti.ndarray(ti.i32, grid.cell_count + 2)
+        self._cursor = ti.ndarray(ti.i32, grid.cell_count + 1)
+        self._block_sums = ti.ndarray(ti.i32, block_count_of(grid.cell_count + 1))
+        self._cell_of = ti.ndarray(ti.i32, max(capacity, 1))
+        self.order = ti.ndarray(ti.i32, max(capacity, 1))
+
+    def sort(
+        self,
+        positions: ti.Ndarray,
+        ids: ti.Ndarray,
+        count: int,
+        keep_low: tuple[float, float, float],
+        keep_high: tuple[float, float, float],
+    ) -> int:
+        """Order the first `count` points; returns how many of them are kept.
+
+        Args:
+            positions: points [m], at least (count,) of 3-vectors.
+            ids: distinct numbers that decide the order within a cell, at least (count,).
+            count: number of points.
+            keep_low: points below this on any axis are dropped [m].
+            keep_high: points above this on any axis are dropped [m].
+        """
+        grid = self.grid
+        dropped = count_points_per_cell(
+            positions,
+            count,
+            ti.math.vec3(*grid.origin),
+            1.0 / grid.cell_size,
+            Cells(*grid.shape),
+            ti.math.vec3(*keep_low),
+            ti.math.vec3(*keep_high),
+            self._cell_of,
+            self._cursor,
+        )
+        exclusive_scan(self._cursor, grid.cell_count + 1, self._block_sums, self.cell_start)
+        order_points_by_cell(self._cell_of, ids, count, grid.cell_count, self.cell_start, self._cursor, self.order)
+        return count - int(dropped)
+
+
+@dataclass(frozen=True)
+class SortedPoints:
+    """Points sorted by cell, as a search reads them.
+
+    Attributes:
+        coordinates: x, y and z [m], separate arrays, which compilers turn into vector code.
+        cell_start: cell ranges, as `CellSort` makes them.
+    """
+
+    coordinates: tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray]
+    cell_start: ti.Ndarray
+
+
+def block_count_of(length: int) -> int:
+    """Blocks of a scan over so many values, at least one."""
+    return max((length + SCAN_BLOCK - 1) // SCAN_BLOCK, 1)
+
+
+@ti.func
+def cell_of_point(point: ti.math.vec3, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells) -> Cells:
+    """Cell of a point, moved inside the outer layer, so that all 27 cells around it exist; a NaN lands there too."""
+    cell = ti.cast(ti.floor((point - origin) * inverse_cell_size), ti.i32)
+    return ti.max(ti.min(cell, shape - 2), 1)
+
+
+@ti.func
+def row_of_cell(cell: Cells, dy: ti.i32, dz: ti.i32, shape: Cells) -> ti.i32:
+    """Index of the cell next to `cell` by (0, dy, dz)."""
+    return ((cell[2] + dz) * shape[1] + cell[1] + dy) * shape[0] + cell[0]
+
+
+@ti.kernel
+def count_points_per_cell(
+    positions: Vectors,
+    count: ti.i32,
+    origin: ti.math.vec3,
+    inverse_cell_size: ti.f32,
+    shape: Cells,
+    keep_low: ti.math.vec3,
+    keep_high: ti.math.vec3,
+    cell_of: Integers,
+    points_in_cell: Integers,
+) -> ti.i32:
+    """Cell of each point and number of points per cell; the last cell counts, and the result is, the dropped ones."""
+    cell_count = shape[0] * shape[1] * shape[2]
+    for cell in range(cell_count + 1):
+        points_in_cell[cell] = 0
+    dropped = 0
+    for i in range(count):
+        x_i = positions[i]
+        cell = row_of_cell(cell_of_point(x_i, origin, inverse_cell_size, shape), 0, 0, shape)
+        if (x_i < keep_low).any() or (x_i > keep_high).any():
+            cell = cell_count
+            dropped += 1
+        cell_of[i] = cell
+        ti.atomic_add(points_in_cell[cell], 1)
+    return dropped
+
+
+@ti.kernel
+def exclusive_scan(values: Integers, length: ti.i32, block_sums: Integers, result: Integers) -> ti.i32:
+    """result[k] = sum of values[:k] for k = 0 ... length; returns the last of them."""
+    block_count = (length + SCAN_BLOCK - 1) // SCAN_BLOCK
+    for block in range(block_count):
+        block_sum = 0
+        for k in range(block * SCAN_BLOCK, ti.min((block + 1) * SCAN_BLOCK, length)):
+            block_sum += values[k]
+        block_sums[block] = block_sum
+    total = 0
+    ti.loop_config(serialize=True)
+    for block in range(block_count):
+        block_sum = block_sums[block]
+        block_sums[block] = total
+        total += block_sum
+    for block in range(block_count):
+        running = block_sums[block]
+        for k in range(block * SCAN_BLOCK, ti.min((block + 1) * SCAN_BLOCK, length)):
+            result[k] = running
+            running += values[k]
+    result[length] = total
+    return total
+
+
+@ti.kernel
+def order_points_by_cell(
+    cell_of: Integers,
+    ids: Integers,
+    count: ti.i32,
+    cell_count: ti.i32,
+    cell_start: Integers,
+    cursor: Integers,
+    order: Integers,
+):
+    """Put the points of a cell next to each other, by id: threads race for the slots, the insertion sort settles it."""
+    for cell in range(cell_count + 1):
+        cursor[cell] = cell_start[cell]
+    for i in range(count):
+        slot = ti.atomic_add(cursor[cell_of[i]], 1)
+        order[slot] = i
+    for cell in range(cell_count):
+        first = cell_start[cell]
+        for k in range(first + 1, cell_start[cell + 1]):
+            point = order[k]
+            slot = k
+            while slot > first and ids[order[slot - 1]] > ids[point]:
+                order[slot] = order[slot - 1]
+                slot -= 1
+            order[slot] = point

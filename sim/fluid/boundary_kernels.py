@@ -1,0 +1,26 @@
+"""Kernels that place the boundary samples of moving bodies."""
+
+import taichi as ti
+
+from sim.cells import Floats, Integers, Vectors
+
+STATE_WIDTH = 18
+"""Numbers of a body's state: centre of mass, rotation row by row, velocity, angular velocity."""
+
+
+@ti.kernel
+def place_samples(
+    offset: Vectors, body: Integers, count: ti.i32, first: ti.i32, states: Floats, position: Vectors, velocity: Vectors
+):  # fmt: skip
+    """x_b = x_com + R r_b, v_b = v + omega x R r_b."""
+    for b in range(count):
+        s = body[b] * STATE_WIDTH
+        r = offset[b]
+        arm = ti.math.vec3(0.0)
+        for row in ti.static(range(3)):
+            arm[row] = states[s + 3 + 3 * row] * r[0] + states[s + 4 + 3 * row] * r[1] + states[s + 5 + 3 * row] * r[2]
+        centre = ti.math.vec3(states[s], states[s + 1], states[s + 2])
+        speed = ti.math.vec3(states[s + 12], states[s + 13], states[s + 14])
+        spin = ti.math.vec3(states[s + 15], states[s + 16], states[s + 17])
+        position[first + b] = centre + arm
+        velocity[first + b] = speed + spin.cross(arm)
