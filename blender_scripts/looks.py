@@ -194,6 +194,34 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(shader)
 
 
+def _spray(builder: NodeBuilder, context: LookContext) -> None:
+    """Droplets in the air: too small to refract in a picture, so they are white and let some light straight through."""
+    white = _scattering(builder, _or(context.color, (0.96, 0.98, 1.0)))
+    glint = builder.node("ShaderNodeBsdfGlossy", Roughness=_or(context.roughness, 0.25))
+    fresnel = builder.node("ShaderNodeFresnel", IOR=WATER_IOR)
+    droplet = _mix(builder, fresnel.outputs[0], white, glint)
+    through = builder.node("ShaderNodeBsdfTransparent")
+    share = builder.node("ShaderNodeValue")
+    share.outputs[0].default_value = 0.45
+    builder.surface(_mix(builder, share.outputs[0], droplet, through))
+
+
+def _foam(builder: NodeBuilder, context: LookContext) -> None:
+    """Bubbles packed at the surface, which scatter light in all directions."""
+    builder.surface(_scattering(builder, _or(context.color, (0.93, 0.95, 0.96))))
+
+
+def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
+    """Air in water: mirrors beyond the critical angle of 48.6°, where Fresnel's reflection is total, clear before it.
+
+    Points are hit on their front only, so what passes goes on straight instead of being refracted twice.
+    """
+    fresnel = builder.node("ShaderNodeFresnel", IOR=1.0 / WATER_IOR)
+    mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=_or(context.roughness, 0.0))
+    through = builder.node("ShaderNodeBsdfTransparent", Color=_or(context.color, (0.97, 0.985, 1.0)))
+    builder.surface(_mix(builder, fresnel.outputs[0], through, mirror))
+
+
 def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
     """Thin glass: reflects as glass does, and lets everything else straight through, so that it costs no bounces."""
     fresnel = builder.node("ShaderNodeFresnel", IOR=1.35)
@@ -228,6 +256,9 @@ LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
     "metal": _metal,
     "stone": _stone,
     "glass": _glass,
+    "spray": _spray,
+    "foam": _foam,
+    "bubbles": _bubbles,
     "tank_glass": _tank_glass,
     "tank_edge": _tank_edge,
 }
@@ -244,6 +275,15 @@ def _mix(builder: NodeBuilder, factor: Any, first: Any, second: Any) -> Any:
     builder.link(first.outputs[0], mix.inputs[1])
     builder.link(second.outputs[0], mix.inputs[2])
     return mix
+
+
+def _scattering(builder: NodeBuilder, color: Color) -> Any:
+    """White that glows through: half of the light that meets a particle leaves it on the other side."""
+    half = builder.node("ShaderNodeValue")
+    half.outputs[0].default_value = 0.5
+    back = builder.node("ShaderNodeBsdfDiffuse", Color=color)
+    forth = builder.node("ShaderNodeBsdfTranslucent", Color=color)
+    return _mix(builder, half.outputs[0], back, forth)
 
 
 def _with_clear_shadow(builder: NodeBuilder, shader: Any, *, tint: Color) -> Any:

@@ -25,7 +25,7 @@ if __package__ in (None, ""):
 
 import bpy
 
-from blender_scripts import camera, geometry, lights, looks, png, settings, tank, volumes
+from blender_scripts import camera, geometry, lights, looks, png, points, poses, settings, tank, volumes
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.errors import RenderFailedError, RenderInputError
 
@@ -68,6 +68,7 @@ class SceneRenderer:
         if spec["stage"]["tank"]:
             tank.add_tank(spec)
         self._sequences: list[tuple[dict[str, Any], Any]] = []
+        self._bodies: list[tuple[dict[str, Any], Any]] = []
         for description in spec["objects"]:
             self._add_object(description, spec)
 
@@ -84,8 +85,11 @@ class SceneRenderer:
             path = self._folder / description["file"].replace("{frame}", f"{frame:06d}")
             if description["type"] == "volume_sequence":
                 volumes.load_volume(blender_object.data, path)
+            elif description["type"] == "point_sequence":
+                points.fill_points(blender_object.data, points.read_points(path, description["kind"]))
             else:
                 geometry.fill_mesh(blender_object.data, geometry.read_ply(path))
+        self._place_bodies(frame)
         bpy.context.scene.frame_set(frame)
         outcome = bpy.ops.render.render()
         if "FINISHED" not in outcome:
@@ -94,17 +98,33 @@ class SceneRenderer:
         bpy.data.images["Render Result"].save_render(str(output_path.resolve()), scene=bpy.context.scene)
         png.strip_metadata(output_path)
 
+    def _place_bodies(self, frame: int) -> None:
+        of_file: dict[Path, dict[str, poses.Pose]] = {}
+        for description, blender_object in self._bodies:
+            path = self._folder / description["poses"].replace("{frame}", f"{frame:06d}")
+            if path not in of_file:
+                of_file[path] = poses.read_poses(path)
+            if description["body"] not in of_file[path]:
+                raise RenderInputError(f'the poses {path} have none of "{description["body"]}"')
+            poses.place(blender_object, of_file[path][description["body"]], frame=frame)
+
     def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> None:
         name, kind = description["name"], description["type"]
         material = looks.new_material(name, description["material"], domain_size=_domain_size(spec))
-        if kind == "mesh":
+        if kind in ("mesh", "moving_mesh"):
             blender_object = geometry.new_mesh_object(name, geometry.read_ply(self._folder / description["file"]))
-            blender_object.location = description["position"]
             blender_object.rotation_mode = "QUATERNION"
-            blender_object.rotation_quaternion = description["orientation"]
+            if kind == "mesh":
+                blender_object.location = description["position"]
+                blender_object.rotation_quaternion = description["orientation"]
+            else:
+                self._bodies.append((description, blender_object))
             geometry.keep_sharp_edges(blender_object.data, description["shade_smooth_angle_deg"])
         elif kind == "mesh_sequence":
             blender_object = geometry.new_mesh_object(name, geometry.EMPTY_MESH)
+            self._sequences.append((description, blender_object))
+        elif kind == "point_sequence":
+            blender_object = points.new_points_object(name, material)
             self._sequences.append((description, blender_object))
         else:
             blender_object = volumes.new_volume_object(name)

@@ -5,7 +5,7 @@ The same arrays give the same bytes: HDF5 stores no times here, and groups and a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -38,6 +38,26 @@ class CachedFrame:
     device: str
     bodies: Mapping[str, Snapshot]
     diagnostics: Mapping[str, Diagnostics]
+
+
+@dataclass(frozen=True)
+class FrameNumbers:
+    """What the solvers told of a frame, without any array.
+
+    Attributes:
+        frame: number of the frame.
+        time_s: simulated time [s].
+        device: what computed it.
+        solvers: diagnostics by solver.
+        kinds: what the bodies are, by name; a solver of one body has the body's name. Empty if only some numbers were
+            asked for.
+    """
+
+    frame: int
+    time_s: float
+    device: str
+    solvers: Mapping[str, Diagnostics]
+    kinds: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -74,8 +94,8 @@ def write_frame(path: Path, bodies: Mapping[str, Snapshot], report: FrameReport,
         file.attrs["complete"] = True
 
 
-def read_frame(path: Path, body: str | None = None) -> CachedFrame:
-    """Read one frame, or one body of it.
+def read_frame(path: Path, body: str | None = None, *, kind: BodyKind | None = None) -> CachedFrame:
+    """Read one frame, or one body of it, or its bodies of one kind.
 
     Raises:
         InvalidArtifactError: the file is truncated, damaged or of another format.
@@ -84,15 +104,40 @@ def read_frame(path: Path, body: str | None = None) -> CachedFrame:
         with h5py.File(path, "r") as file:
             _require(path, file, FRAME_FORMAT)
             names = [body] if body is not None else list(file.get("bodies", {}))
+            if kind is not None:
+                names = [name for name in names if file["bodies"][name].attrs["kind"] == kind]
             return CachedFrame(
                 frame=int(file.attrs["frame"]),
                 time_s=float(file.attrs["time_s"]),
                 device=str(file.attrs["device"]),
                 bodies={name: _read_body(file["bodies"][name]) for name in names},
-                diagnostics={
-                    name: {key: float(value) for key, value in group.attrs.items()}
-                    for name, group in file.get("diagnostics", {}).items()
-                },
+                diagnostics=_read_diagnostics(file),
+            )
+    except (OSError, KeyError, RuntimeError) as error:
+        raise InvalidArtifactError(f"{path}: not a readable frame of the cache: {error}") from error
+
+
+def read_numbers(path: Path, only: Collection[str] | None = None) -> FrameNumbers:
+    """Read what the solvers told of a frame, without decoding any array.
+
+    Args:
+        path: the frame.
+        only: names of the diagnostics that are wanted; all if omitted, which takes 2 ms instead of a tenth of that.
+
+    Raises:
+        InvalidArtifactError: the file is truncated, damaged or of another format.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            _require(path, file, FRAME_FORMAT)
+            return FrameNumbers(
+                frame=int(file.attrs["frame"]),
+                time_s=float(file.attrs["time_s"]),
+                device=str(file.attrs["device"]),
+                solvers=_read_diagnostics(file, only),
+                kinds={}
+                if only is not None
+                else {name: str(group.attrs["kind"]) for name, group in file.get("bodies", {}).items()},
             )
     except (OSError, KeyError, RuntimeError) as error:
         raise InvalidArtifactError(f"{path}: not a readable frame of the cache: {error}") from error
@@ -168,6 +213,17 @@ def _read_body(group: h5py.Group) -> Snapshot:
             attributes[key] = tuple(float(item) for item in value) if np.ndim(value) else _plain(value)
     arrays = {key: np.asarray(dataset[()]) for key, dataset in group.items()}
     return Snapshot(cast(BodyKind, str(group.attrs["kind"])), arrays, attributes)
+
+
+def _read_kinds(file: h5py.File) -> dict[str, str]:
+    return {name: str(group.attrs["kind"]) for name, group in file.get("bodies", {}).items()}
+
+
+def _read_diagnostics(file: h5py.File, only: Collection[str] | None = None) -> dict[str, Diagnostics]:
+    return {
+        name: {key: float(group.attrs[key]) for key in (group.attrs if only is None else only) if key in group.attrs}
+        for name, group in file.get("diagnostics", {}).items()
+    }
 
 
 def _plain(value: Any) -> Attribute:

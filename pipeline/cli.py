@@ -13,7 +13,7 @@ from pipeline.commands.arguments import job_options, print_warnings
 from pipeline.commands.inspecting import explain, logs, plan, status
 from pipeline.commands.keeping import clean, verify
 from pipeline.commands.running import rerun, resume, submit
-from pipeline.commands.showing import sheet
+from pipeline.commands.showing import report, sheet
 from pipeline.errors import PipelineError
 
 TEMPLATES = ("dam-break", "drop", "smoke")
@@ -43,7 +43,7 @@ def main() -> None:
     """From a job file to a film of simulated physics, resumable after any crash."""
 
 
-for command in (submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet):
+for command in (submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report):
     main.add_command(command)
 
 

@@ -52,9 +52,19 @@ class JobLayout:
         return self.root / artifact
 
     @property
+    def report(self) -> Path:
+        """What the job took and what its solvers told, for people."""
+        return self.root / "report.html"
+
+    @property
     def inputs(self) -> Path:
         """Copies of the user's own files, such as meshes."""
         return self.root / "inputs"
+
+    @property
+    def poses(self) -> str:
+        """Poses of the moving bodies at a frame, for Blender: path relative to the folder, with {frame}."""
+        return "poses/{frame}.json"
 
     @property
     def checkpoints(self) -> Path:
@@ -81,6 +91,11 @@ class JobLayout:
     def volume(body: str, frame: int) -> ArtifactPath:
         """OpenVDB volume of a smoke at one frame."""
         return ArtifactPath(f"volumes/{body}/{frame:06d}.vdb")
+
+    @staticmethod
+    def whitewater(body: str, frame: int) -> ArtifactPath:
+        """PLY points of a fluid's spray, foam and bubbles at one frame."""
+        return ArtifactPath(f"whitewater/{body}/{frame:06d}.ply")
 
     @staticmethod
     def picture(frame: int) -> ArtifactPath:

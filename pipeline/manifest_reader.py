@@ -80,6 +80,19 @@ class StageCost(NamedTuple):
     bytes_per_artifact: float
 
 
+class StageTiming(NamedTuple):
+    """What all attempts of a stage have taken together."""
+
+    stage: str
+    attempts: int
+    failed: int
+    seconds: float  # one after the other
+    longest_s: float
+    peak_memory_bytes: int | None  # of the largest
+    artifacts: int
+    bytes: int
+
+
 class LastRun(NamedTuple):
     """The last run of the job: the token of its lease, and how it ended."""
 
@@ -206,6 +219,21 @@ class ManifestReader:
             (SUCCEEDED,),
         )
         return {row.stage: row for row in map(StageCost._make, rows)}
+
+    def stage_timings(self) -> list[StageTiming]:
+        """What the attempts of each stage have taken, in the plan's order; stages without an attempt are left out."""
+        rows = self._rows(
+            "WITH made AS (SELECT stage, count(*) AS artifacts, sum(size) AS bytes FROM artifact"
+            "   JOIN task ON task.id = artifact.task GROUP BY stage),"
+            " tried AS (SELECT stage, count(*) AS attempts, sum(coalesce(outcome, ?1) != ?1) AS failed,"
+            "   coalesce(sum(seconds), 0.0) AS seconds, coalesce(max(seconds), 0.0) AS longest,"
+            "   max(peak_memory_bytes) AS peak, min(position) AS place"
+            "   FROM attempt JOIN task ON task.id = attempt.task WHERE position IS NOT NULL GROUP BY stage)"
+            " SELECT stage, attempts, failed, seconds, longest, peak, coalesce(artifacts, 0), coalesce(bytes, 0)"
+            " FROM tried LEFT JOIN made USING (stage) ORDER BY place",
+            (SUCCEEDED,),
+        )
+        return [StageTiming._make(row) for row in rows]
 
     def _rows(self, query: str, parameters: Sequence[object] = ()) -> list[tuple[Any, ...]]:
         """All rows of a query. Damage shows only at the page that it hit, so they are fetched here, under one roof."""

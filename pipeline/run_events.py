@@ -86,6 +86,18 @@ class Observer(Protocol):
         """Something happened."""
 
 
+class Observers:
+    """Several observers; each is told everything, in order."""
+
+    def __init__(self, *observers: Observer) -> None:
+        self._observers = observers
+
+    def notify(self, event: RunEvent) -> None:
+        """Pass it on."""
+        for observer in self._observers:
+            observer.notify(event)
+
+
 class SilentObserver:
     """Watches and says nothing."""
 

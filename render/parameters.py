@@ -69,7 +69,7 @@ class StageParameters(Parameters):
     tank: bool = Field(default=False, description="Show the domain's walls as a glass tank.")
 
 
-Look = Literal["water", "smoke", "rubber", "ceramic", "plastic", "metal", "stone", "glass"]
+Look = Literal["water", "smoke", "rubber", "ceramic", "plastic", "metal", "stone", "glass", "spray", "foam", "bubbles"]
 
 
 class MaterialParameters(Parameters):

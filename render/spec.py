@@ -39,12 +39,34 @@ class MeshObject(Parameters):
     shade_smooth_angle_deg: float = Field(default=40.0, description="Edges sharper than this stay sharp [degrees].")
 
 
+class MovingMeshObject(Parameters):
+    """A mesh that moves as a whole: one PLY file, placed by the poses of each frame."""
+
+    type: Literal["moving_mesh"] = "moving_mesh"
+    name: str
+    file: str
+    body: str = Field(description="Name of the body in the poses; parts of one body share it.")
+    poses: str = Field(description="Path with {frame} of a JSON document; see docs/formats.md.")
+    material: MaterialParameters
+    shade_smooth_angle_deg: float = Field(default=40.0, description="Edges sharper than this stay sharp [degrees].")
+
+
 class MeshSequenceObject(Parameters):
     """A mesh that changes every frame: one PLY file a frame with `vx vy vz` [m/s] and `nx ny nz` per vertex."""
 
     type: Literal["mesh_sequence"] = "mesh_sequence"
     name: str
     file: str = Field(description="Path with {frame}.")
+    material: MaterialParameters
+
+
+class PointSequenceObject(Parameters):
+    """Points that change every frame: one kind of a whitewater PLY file a frame."""
+
+    type: Literal["point_sequence"] = "point_sequence"
+    name: str
+    file: str = Field(description="Path with {frame}.")
+    kind: Literal["spray", "foam", "bubbles"] = Field(description="Which of the file's points are drawn.")
     material: MaterialParameters
 
 
@@ -57,7 +79,10 @@ class VolumeSequenceObject(Parameters):
     material: MaterialParameters
 
 
-SceneObject = Annotated[MeshObject | MeshSequenceObject | VolumeSequenceObject, Field(discriminator="type")]
+SceneObject = Annotated[
+    MeshObject | MovingMeshObject | MeshSequenceObject | PointSequenceObject | VolumeSequenceObject,
+    Field(discriminator="type"),
+]
 
 
 class RenderSpec(Parameters):

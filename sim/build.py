@@ -3,41 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from sim.fluid.parameters import FluidParameters
+from sim.coupling.fluid_rigid import FluidRigidCoupling
+from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
+from sim.fluid.opening import Opening, obstruction
+from sim.fluid.parameters import shared_conflicts
 from sim.rigid.static import StaticBody
 from sim.scene import DomainParameters, SceneParameters
 from sim.shapes.placement import build_solid
-from sim.shapes.sampling import fill_with_particles
-from sim.shapes.solid import Solid
 from sim.smoke.parameters import SmokeParameters
 from sim.solver import Solver
 from sim.world import World
 
-CLEARANCE_IN_SPACINGS = 0.5
-"""A particle's centre keeps half a lattice spacing, its radius, from walls and solids."""
-
-ROUNDING = 1.0e-3
-"""Share of the clearance that a particle may come nearer: lattice points are float32, and a block that rests on a
-body has its first layer exactly at the clearance."""
-
-
-@dataclass(frozen=True)
-class FluidFilling:
-    """The particles that a fluid starts with.
-
-    Attributes:
-        positions: (n, 3) float32 [m].
-        velocities: (n, 3) float32 [m/s].
-    """
-
-    positions: NDArray[np.float32]
-    velocities: NDArray[np.float32]
+if TYPE_CHECKING:
+    from sim.fluid.forces import SPHFluid
+    from sim.rigid.solver import RigidSolver
 
 
 def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
@@ -47,72 +31,83 @@ def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
         ShapeError: a shape cannot be built.
         ValueError: a body cannot start as described.
     """
-    bodies = [StaticBody(parameters) for parameters in scene.rigid]
-    fluids = [_build_fluid(fluid, scene, bodies) for fluid in scene.fluid]
+    bodies = [StaticBody(parameters) for parameters in scene.rigid if parameters.kind == "static"]
+    rigid = _build_rigid(scene)
+    fluids = [_build_fluids(scene, bodies, rigid)] if scene.fluid else []
     smokes = [_build_smoke(smoke, scene, bodies) for smoke in scene.smoke]
-    return World([*fluids, *smokes], frames_per_second=frames_per_second, static_bodies=bodies)
+    solvers: list[Solver] = [*fluids, *([] if rigid is None else [rigid]), *smokes]
+    couplings = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
+    return World(solvers, frames_per_second=frames_per_second, couplings=couplings, static_bodies=bodies)
 
 
-def fill_fluid(fluid: FluidParameters, domain: DomainParameters, solids: Sequence[Solid]) -> FluidFilling:
-    """Fill the fluid's blocks on lattices of spacing 2r, clear of walls, solids and each other.
-
-    A place in two blocks belongs to the first.
-
-    Raises:
-        ShapeError: a block's shape cannot be built.
-        ValueError: a block is left without a particle.
-    """
-    spacing = 2.0 * fluid.particle_radius
-    clearance = CLEARANCE_IN_SPACINGS * spacing
-    positions: list[NDArray[np.float32]] = []
-    velocities: list[NDArray[np.float32]] = []
-    for number, block in enumerate(fluid.block):
-        points = fill_with_particles(build_solid(block), spacing, lower=domain.min, upper=domain.max)
-        for solid in solids:
-            outside = solid.signed_distance(points.astype(np.float64)) >= (1.0 - ROUNDING) * clearance
-            points = points[outside]
-        if positions and len(points):
-            distance, _ = cKDTree(np.concatenate(positions)).query(points, distance_upper_bound=0.9 * spacing)
-            free = ~np.isfinite(distance)
-            points = points[free]
-        if len(points) == 0:
-            raise ValueError(
-                f'fluid "{fluid.name}" block[{number}] has no particle: '
-                "it is outside the domain, inside solids, or filled by the blocks before it"
-            )
-        positions.append(points)
-        velocities.append(np.broadcast_to(np.float32(block.velocity), points.shape))
-    return FluidFilling(np.concatenate(positions), np.ascontiguousarray(np.concatenate(velocities)))
-
-
-def _build_fluid(fluid: FluidParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:
+def _build_fluids(scene: SceneParameters, bodies: Sequence[StaticBody], rigid: RigidSolver | None) -> SPHFluid:
+    """One solver for all fluids, as they share the tank; of moving bodies it has the samples."""
+    from sim.coupling.body_samples import samples_of_moving_bodies
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
-    from sim.fluid.wcsph import WCSPHSolver
+    from sim.fluid.kernels import particle_volume
+    from sim.fluid.solvers import SOLVERS
 
-    spacing = 2.0 * fluid.particle_radius
-    filling = fill_fluid(fluid, scene.domain, [body.solid for body in bodies])
+    if conflicts := shared_conflicts(scene.fluid):
+        number, key, message = conflicts[0]
+        raise ValueError(f'fluid "{scene.fluid[number].name}": {key} {message}')
+    spacing, support = 2.0 * scene.fluid[0].particle_radius, scene.fluid[0].support_in_spacings
+    volume = particle_volume(spacing, support)
+    solids = [body.solid for body in bodies]
+    moving = [build_solid(body) for body in scene.rigid if body.kind != "static"]
+    pipes = [NO_POINTS]
+    for fluid in scene.fluid:
+        for number, emitter in enumerate(fluid.emitter):
+            opening = Opening.of(emitter, spacing, volume)
+            if reason := obstruction(opening, spacing, scene.domain, [*solids, *moving]):
+                raise ValueError(f'fluid "{fluid.name}" emitter[{number}]: {reason}')
+            pipes.append(opening.pipe(spacing))
+    filling = fill_fluids(scene.fluid, scene.domain, [*solids, *moving], np.concatenate(pipes))
     samples = [
         sink_samples(
-            _reachable(body.surface_samples(spacing), scene.domain, spacing), body.solid.signed_distance, spacing
+            _reachable(body.surface_samples(spacing), scene.domain, support * spacing),
+            body.solid.signed_distance,
+            spacing,
+            support,
         )
         for body in bodies
     ]
-    boundary = BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing), *samples)
-    return WCSPHSolver(
-        fluid,
+    boundary = BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples, *pipes)
+    return SOLVERS[scene.fluid[0].solver](
+        scene.fluid,
         domain=scene.domain,
         gravity=scene.gravity,
         positions=filling.positions,
         velocities=filling.velocities,
+        phase=filling.phase,
         boundary=boundary,
+        moving=None if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
+        body_count=len(moving),
+        capacity=particle_capacity(scene.fluid, scene.domain, filling.count_of(len(scene.fluid)), volume),
     )
 
 
-def _reachable(samples: NDArray[np.float32], domain: DomainParameters, spacing: float) -> NDArray[np.float32]:
-    """The samples that fluid in the domain can come near: a body may stand partly or wholly outside."""
-    margin = 2.0 * spacing
+def _reachable(samples: NDArray[np.float32], domain: DomainParameters, margin: float) -> NDArray[np.float32]:
+    """The samples within a margin [m] of the domain, which its fluid may feel: a body may stand partly outside."""
     inside = (samples >= np.asarray(domain.min) - margin) & (samples <= np.asarray(domain.max) + margin)
     return samples[inside.all(axis=1)]
+
+
+def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
+    """The solver of the bodies that move, if there are any."""
+    from sim.rigid.solver import SOLVER_NAME, RigidSolver
+    from sim.rigid.start import check_start
+
+    moving = [body for body in scene.rigid if body.kind != "static"]
+    if not moving:
+        return None
+    if SOLVER_NAME in {body.name for body in (*scene.fluid, *scene.smoke)}:
+        raise ValueError(
+            f'"{SOLVER_NAME}" is what all moving bodies are called together; name the fluid or smoke otherwise'
+        )
+    obstacles = [body for body in scene.rigid if body.kind == "static"]
+    solver = RigidSolver(moving, obstacles=obstacles, domain=scene.domain, gravity=scene.gravity)
+    check_start(solver)
+    return solver
 
 
 def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:

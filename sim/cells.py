@@ -9,12 +9,14 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.launch import fast_launch
+from sim.scan import scan_in_parallel, scan_scratch_length
+
 Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Vectors = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
 Cells = ti.types.vector(3, ti.i32)
 
-SCAN_BLOCK = 1024
 MAX_CELLS = 2**28
 """Most cells of a grid: 1 GiB for each of its int32 arrays, however few the particles."""
 
@@ -70,7 +72,7 @@ class CellSort:
         # One cell more than the grid has takes the points that are dropped.
         self.cell_start = ti.ndarray(ti.i32, grid.cell_count + 2)
         self._cursor = ti.ndarray(ti.i32, grid.cell_count + 1)
-        self._block_sums = ti.ndarray(ti.i32, block_count_of(grid.cell_count + 1))
+        self._scratch = ti.ndarray(ti.i32, scan_scratch_length(grid.cell_count + 1))
         self._cell_of = ti.ndarray(ti.i32, max(capacity, 1))
         self.order = ti.ndarray(ti.i32, max(capacity, 1))
 
@@ -92,19 +94,10 @@ class CellSort:
             keep_high: points above this on any axis are dropped [m].
         """
         grid = self.grid
-        dropped = count_points_per_cell(
-            positions,
-            count,
-            ti.math.vec3(*grid.origin),
-            1.0 / grid.cell_size,
-            Cells(*grid.shape),
-            ti.math.vec3(*keep_low),
-            ti.math.vec3(*keep_high),
-            self._cell_of,
-            self._cursor,
-        )
-        exclusive_scan(self._cursor, grid.cell_count + 1, self._block_sums, self.cell_start)
-        order_points_by_cell(self._cell_of, ids, count, grid.cell_count, self.cell_start, self._cursor, self.order)
+        dropped = sort_points_by_cell(
+            positions, ids, count, grid.origin, 1.0 / grid.cell_size, grid.shape, keep_low, keep_high,
+            self._cell_of, self._cursor, self._scratch, self.cell_start, self.order,
+        )  # fmt: skip
         return count - int(dropped)
 
 
@@ -121,11 +114,6 @@ class SortedPoints:
     cell_start: ti.Ndarray
 
 
-def block_count_of(length: int) -> int:
-    """Blocks of a scan over so many values, at least one."""
-    return max((length + SCAN_BLOCK - 1) // SCAN_BLOCK, 1)
-
-
 @ti.func
 def cell_of_point(point: ti.math.vec3, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells) -> Cells:
     """Cell of a point, moved inside the outer layer, so that all 27 cells around it exist; a NaN lands there too."""
@@ -139,22 +127,21 @@ def row_of_cell(cell: Cells, dy: ti.i32, dz: ti.i32, shape: Cells) -> ti.i32:
     return ((cell[2] + dz) * shape[1] + cell[1] + dy) * shape[0] + cell[0]
 
 
+@fast_launch
 @ti.kernel
-def count_points_per_cell(
-    positions: Vectors,
-    count: ti.i32,
-    origin: ti.math.vec3,
-    inverse_cell_size: ti.f32,
-    shape: Cells,
-    keep_low: ti.math.vec3,
-    keep_high: ti.math.vec3,
-    cell_of: Integers,
-    points_in_cell: Integers,
-) -> ti.i32:
-    """Cell of each point and number of points per cell; the last cell counts, and the result is, the dropped ones."""
+def sort_points_by_cell(
+    positions: Vectors, ids: Integers, count: ti.i32, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells,
+    keep_low: ti.math.vec3, keep_high: ti.math.vec3,
+    cell_of: Integers, cursor: Integers, scratch: Integers, cell_start: Integers, order: Integers,
+) -> ti.i32:  # fmt: skip
+    """Count the points of each cell, sum the counts up, and put the points of a cell next to each other, by id.
+
+    One cell more than the grid has takes the dropped points; returns how many. Threads race for the places in a cell,
+    the insertion sort settles it.
+    """
     cell_count = shape[0] * shape[1] * shape[2]
     for cell in range(cell_count + 1):
-        points_in_cell[cell] = 0
+        cursor[cell] = 0
     dropped = 0
     for i in range(count):
         x_i = positions[i]
@@ -163,45 +150,8 @@ def count_points_per_cell(
             cell = cell_count
             dropped += 1
         cell_of[i] = cell
-        ti.atomic_add(points_in_cell[cell], 1)
-    return dropped
-
-
-@ti.kernel
-def exclusive_scan(values: Integers, length: ti.i32, block_sums: Integers, result: Integers) -> ti.i32:
-    """result[k] = sum of values[:k] for k = 0 ... length; returns the last of them."""
-    block_count = (length + SCAN_BLOCK - 1) // SCAN_BLOCK
-    for block in range(block_count):
-        block_sum = 0
-        for k in range(block * SCAN_BLOCK, ti.min((block + 1) * SCAN_BLOCK, length)):
-            block_sum += values[k]
-        block_sums[block] = block_sum
-    total = 0
-    ti.loop_config(serialize=True)
-    for block in range(block_count):
-        block_sum = block_sums[block]
-        block_sums[block] = total
-        total += block_sum
-    for block in range(block_count):
-        running = block_sums[block]
-        for k in range(block * SCAN_BLOCK, ti.min((block + 1) * SCAN_BLOCK, length)):
-            result[k] = running
-            running += values[k]
-    result[length] = total
-    return total
-
-
-@ti.kernel
-def order_points_by_cell(
-    cell_of: Integers,
-    ids: Integers,
-    count: ti.i32,
-    cell_count: ti.i32,
-    cell_start: Integers,
-    cursor: Integers,
-    order: Integers,
-):
-    """Put the points of a cell next to each other, by id: threads race for the slots, the insertion sort settles it."""
+        ti.atomic_add(cursor[cell], 1)
+    scan_in_parallel(cursor, cell_count + 1, scratch, cell_start)
     for cell in range(cell_count + 1):
         cursor[cell] = cell_start[cell]
     for i in range(count):
@@ -216,3 +166,4 @@ def order_points_by_cell(
                 order[slot] = order[slot - 1]
                 slot -= 1
             order[slot] = point
+    return dropped

@@ -16,16 +16,19 @@ from sim.cells import (
     Floats,
     Integers,
     SortedPoints,
-    block_count_of,
+    Vectors,
     cell_of_point,
-    exclusive_scan,
     row_of_cell,
 )
+from sim.launch import fast_launch
 from sim.reductions import runs_on_gpu
+from sim.scan import scan_in_parallel, scan_scratch_length
 
 GROWTH = 1.25
 WARP = 32
 """Threads of a GPU that read memory together."""
+
+Lengths = ti.types.vector(2, ti.i32)
 
 MAX_LIST_LENGTH = 2**31 - 1
 """Most entries of a neighbour list, as their places are int32."""
@@ -61,7 +64,7 @@ class NeighborList:
         slices = _slice_count(capacity, stride)
         self._slice_room = ti.ndarray(ti.i32, slices)
         self._slice_start = ti.ndarray(ti.i32, slices + 1)
-        self._block_sums = ti.ndarray(ti.i32, block_count_of(slices))
+        self._scratch = ti.ndarray(ti.i32, scan_scratch_length(slices))
 
     def build(
         self,
@@ -91,14 +94,15 @@ class NeighborList:
         search = (
             *points.coordinates, points.cell_start, *fixed.coordinates, fixed.cell_start,
             *movers.coordinates, movers.cell_start, moving is not None, count,
-            ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape), radius,
+            grid.origin, 1.0 / grid.cell_size, grid.shape, radius,
         )  # fmt: skip
-        count_neighbors(*search, self.fluid_count, self.boundary_count)
         slices = _slice_count(count, self.stride)
-        needed = measure_slices(self.fluid_count, self.boundary_count, count, self.stride, slices, self._slice_room)
-        self.length = int(exclusive_scan(self._slice_room, slices, self._block_sums, self._slice_start))
+        self.length, thousands = measure_lists(
+            *search, self.fluid_count, self.boundary_count, self.stride, slices,
+            self._slice_room, self._scratch, self._slice_start,
+        )  # fmt: skip
         # Past the largest int32 the sum is negative; twice as far it would be positive again.
-        if self.length < 0 or needed > 1.5 * MAX_LIST_LENGTH:
+        if self.length < 0 or 1000.0 * thousands > 1.5 * MAX_LIST_LENGTH:
             raise OverflowError(
                 f"{count} particles have more than {MAX_LIST_LENGTH} neighbours within {radius:g} m; "
                 "give fewer particles, or start them farther apart"
@@ -109,6 +113,12 @@ class NeighborList:
             *search, moving_index, self._slice_start, self.stride, self.stride == 1,
             self.start, self.fluid_count, self.boundary_count, self.indices,
         )  # fmt: skip
+
+    def pairs_within(self, radius: float, positions: ti.Ndarray, count: int) -> int:
+        """Ordered pairs of particles that are now nearer than `radius` [m], at most that of the list."""
+        return int(
+            count_pairs(positions, count, self.start, self.fluid_count, self.indices, self.stride, radius * radius)
+        )
 
 
 def list_stride() -> int:
@@ -133,7 +143,7 @@ def count_in_row(
     return near
 
 
-@ti.kernel
+@ti.func
 def count_neighbors(
     x: Floats, y: Floats, z: Floats, cell_start: Integers,
     fixed_x: Floats, fixed_y: Floats, fixed_z: Floats, fixed_cell_start: Integers,
@@ -171,17 +181,28 @@ def count_neighbors(
         boundary_count[i] = boundary_near
 
 
+@fast_launch
 @ti.kernel
-def measure_slices(
-    fluid_count: Integers, boundary_count: Integers, count: ti.i32, stride: ti.i32, slices: ti.i32, room: Integers
-) -> ti.f32:  # fmt: skip
-    """Places that each slice of `stride` particles needs: as many for each as the longest list has.
+def measure_lists(
+    x: Floats, y: Floats, z: Floats, cell_start: Integers,
+    fixed_x: Floats, fixed_y: Floats, fixed_z: Floats, fixed_cell_start: Integers,
+    moving_x: Floats, moving_y: Floats, moving_z: Floats, moving_cell_start: Integers, with_moving: ti.template(),
+    count: ti.i32, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, radius: ti.f32,
+    fluid_count: Integers, boundary_count: Integers, stride: ti.i32, slices: ti.i32,
+    room: Integers, scratch: Integers, slice_start: Integers,
+) -> Lengths:  # fmt: skip
+    """Count neighbours, and lay out the list: each slice of `stride` particles gets `stride` times its longest list.
 
-    Returns their sum, roughly.
+    Returns the places of all slices, as int32, and roughly the thousands of them, which do not overflow.
 
     The count includes the particle itself: the list uses that place to write before it knows whether to keep.
     A particle at NaN is not even near itself, and needs the place too.
     """
+    count_neighbors(
+        x, y, z, cell_start, fixed_x, fixed_y, fixed_z, fixed_cell_start,
+        moving_x, moving_y, moving_z, moving_cell_start, with_moving,
+        count, origin, inverse_cell_size, shape, radius, fluid_count, boundary_count,
+    )  # fmt: skip
     total = 0.0
     for s in range(slices):
         longest = 1
@@ -189,7 +210,8 @@ def measure_slices(
             longest = ti.max(longest, fluid_count[i] + boundary_count[i])
         room[s] = longest * stride
         total += ti.cast(longest * stride, ti.f32)
-    return total
+    length = scan_in_parallel(room, slices, scratch, slice_start)
+    return Lengths(length, ti.cast(total / 1000.0, ti.i32))
 
 
 @ti.func
@@ -216,6 +238,7 @@ def list_row(
     return n
 
 
+@fast_launch
 @ti.kernel
 def list_neighbors(
     x: Floats, y: Floats, z: Floats, cell_start: Integers,
@@ -282,3 +305,19 @@ def list_neighbors(
         start[i] = first_place
         fluid_count[i] = fluid_found
         boundary_count[i] = found - fluid_found
+
+
+@ti.kernel
+def count_pairs(
+    positions: Vectors, count: ti.i32, start: Integers, fluid_count: Integers, indices: Integers, stride: ti.i32,
+    radius_squared: ti.f32,
+) -> ti.i64:  # fmt: skip
+    """Entries of the list that are within the radius."""
+    pairs = ti.cast(0, ti.i64)
+    for i in range(count):
+        near = 0
+        for k in range(fluid_count[i]):
+            x_ij = positions[i] - positions[indices[start[i] + k * stride]]
+            near += ti.cast(x_ij.norm_sqr() < radius_squared, ti.i32)
+        pairs += near
+    return pairs

@@ -10,6 +10,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.launch import fast_launch
+
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 CPU_LANES = 256
@@ -18,6 +20,11 @@ GPU_LANES = 32768
 
 BRANCHES = 128
 """Numbers that one node of the tree takes together."""
+
+MAX_QUANTITIES = 8
+"""Most maxima and sums of one reduction: a kernel returns so many at once, which costs less than to read an array."""
+
+Results = ti.types.vector(MAX_QUANTITIES, ti.f32)
 
 
 @dataclass(frozen=True)
@@ -54,14 +61,23 @@ class LaneReduction:
     def __init__(self, *, maxima: int, sums: int) -> None:
         self.lanes = device_lanes()
         self.partial = ti.ndarray(ti.f32, (maxima + sums) * self.lanes.count)
+        if maxima + sums > MAX_QUANTITIES:
+            raise ValueError(f"a reduction has at most {MAX_QUANTITIES} quantities, not {maxima + sums}")
         self._maxima, self._quantities = maxima, maxima + sums
         self._nodes = ti.ndarray(ti.f32, self._quantities * (self.lanes.count // BRANCHES))
-        self._result = ti.ndarray(ti.f32, self._quantities)
+
+    @property
+    def tree(self) -> tuple[ti.Ndarray, int, int, int, ti.Ndarray]:
+        """What `reduced` takes."""
+        return self.partial, self.lanes.count, self._quantities, self._maxima, self._nodes
 
     def result(self) -> NDArray[np.float32]:
         """The maxima, then the sums, (maxima + sums,); waits for the device."""
-        reduce_lanes(self.partial, self.lanes.count, self._quantities, self._maxima, self._nodes, self._result)
-        return self._result.to_numpy()
+        return self.unpack(reduce_lanes(*self.tree))
+
+    def unpack(self, results: ti.Vector) -> NDArray[np.float32]:
+        """The maxima, then the sums, (maxima + sums,), of what a kernel returned from `reduced`."""
+        return np.array(results[: self._quantities], dtype=np.float32)
 
 
 def runs_on_gpu() -> bool:
@@ -81,11 +97,12 @@ def is_finite(value: ti.f32) -> ti.i32:
     return ti.cast((ti.bit_cast(value, ti.i32) & 0x7F800000) != 0x7F800000, ti.i32)
 
 
-@ti.kernel
-def reduce_lanes(
-    partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats, result: Floats
-):  # fmt: skip
-    """Two more levels of the tree: `BRANCHES` lanes to a node, then all nodes, always in the same order."""
+@ti.func
+def reduced(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats) -> Results:
+    """Two more levels of the tree: `BRANCHES` lanes to a node, then all nodes, always in the same order.
+
+    For the outermost level of a kernel, after the loop over the lanes: its loops then run in parallel.
+    """
     node_count = lanes // BRANCHES
     for n in range(quantities * node_count):
         q = n // node_count
@@ -100,7 +117,19 @@ def reduce_lanes(
         for k in range(1, node_count):
             other = nodes[q * node_count + k]
             value = ti.select(q < maxima, ti.max(value, other), value + other)
-        result[q] = value
+        nodes[q * node_count] = value
+    results = Results(0.0)
+    for q in ti.static(range(MAX_QUANTITIES)):
+        if q < quantities:
+            results[q] = nodes[q * node_count]
+    return results
+
+
+@fast_launch
+@ti.kernel
+def reduce_lanes(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats) -> Results:
+    """The tree alone."""
+    return reduced(partial, lanes, quantities, maxima, nodes)
 
 
 @ti.kernel

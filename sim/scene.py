@@ -38,23 +38,14 @@ def _refuse_cloth(cloth: object) -> object:
     return cloth
 
 
-def _refuse_second_fluid(fluid: object) -> object:
-    if isinstance(fluid, list | tuple) and len(fluid) > 1:
-        raise ValueError(
-            f"one fluid per job in this version, got {len(fluid)}; "
-            "put several volumes of the same fluid into [[fluid.block]]"
-        )
-    return fluid
-
-
 class SceneParameters(Parameters):
     """Everything that decides how the bodies move."""
 
     gravity: Vector3 = Field(default=(0.0, 0.0, -9.81), description="Gravity [m/s²].")
     domain: DomainParameters = Field(default=DomainParameters(), description="The box that the fluid lives in.")
     rigid: tuple[RigidBodyParameters, ...] = Field(default=(), description="Rigid bodies.")
-    fluid: Annotated[tuple[FluidParameters, ...], BeforeValidator(_refuse_second_fluid)] = Field(
-        default=(), description="Particle fluids."
+    fluid: tuple[FluidParameters, ...] = Field(
+        default=(), description="Particle fluids; several share one tank, and the keys that say how it is computed."
     )
     smoke: tuple[SmokeParameters, ...] = Field(default=(), description="Smoke.")
     cloth: Annotated[tuple[Any, ...], BeforeValidator(_refuse_cloth)] = Field(

@@ -50,10 +50,10 @@ class Solver(Protocol):
         """Advance by dt [s]."""
 
     def snapshots(self) -> dict[str, Snapshot]:
-        """What rendering needs, by body name."""
+        """What rendering needs, by body name; arrays that no later substep changes, as they are written meanwhile."""
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """All that `restore` needs to continue bit for bit."""
+        """All that `restore` needs to continue bit for bit; arrays that no later substep changes."""
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint of the same parameters. Raises ValueError when it does not fit."""
@@ -69,9 +69,19 @@ class Solver(Protocol):
 
 
 class Coupling(Protocol):
-    """Exchanges momentum between two solvers."""
+    """Exchanges momentum between two solvers, which share their substeps.
+
+    Attributes:
+        bodies: names of the two; the first takes its substep before the second.
+    """
 
     bodies: tuple[str, str]
 
     def exchange(self, dt: float) -> None:
-        """Apply equal and opposite impulses for a step of dt [s]."""
+        """Between the two substeps of dt [s]: hand the impulses of the first to the second."""
+
+    def follow(self, dt: float) -> None:
+        """After both substeps of dt [s]: tell the first where the second is now."""
+
+    def resume(self) -> None:
+        """After both were restored from a checkpoint: make up for what the solvers do not save."""

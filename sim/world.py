@@ -45,7 +45,9 @@ class FrameReport:
 class World:
     """Owns the loop over substeps; solvers own their arrays.
 
-    Solvers that a coupling connects share their substeps; the others advance at their own step. Every group lands
+    Solvers that a coupling connects share their substeps; the others advance at their own step. A substep takes the
+    solvers in the order given: a coupling exchanges impulses right before its second solver's turn, and tells the first
+    what became of the second when all have had theirs. Every group lands
     exactly on the frame: with dt_max stable, the rest of the frame is cut into n = ceil(rest / dt_max) equal steps,
     one is taken, and the division is made anew for what is left.
     """
@@ -63,6 +65,10 @@ class World:
         self._solvers = {solver.name: solver for solver in solvers}
         self._couplings = tuple(couplings)
         self._static_bodies = tuple(static_bodies)
+        order = list(self._solvers)
+        for first, second in (coupling.bodies for coupling in self._couplings):
+            if order.index(first) >= order.index(second):
+                raise ValueError(f'"{first}" must stand before "{second}", which it is coupled to, among the solvers')
         self._groups = _coupled_groups(self._solvers, self._couplings)
 
     @property
@@ -114,6 +120,8 @@ class World:
             if not own:
                 raise ValueError(f'the checkpoint holds nothing for "{name}"')
             solver.restore(own)
+        for coupling in self._couplings:
+            coupling.resume()
         self.frame = frame
 
     def _advance_group(self, group: Sequence[Solver], couplings: Sequence[Coupling]) -> tuple[int, float]:
@@ -124,9 +132,12 @@ class World:
             left = self._steps_left(remaining, stable_dt, taken, group)
             dt = remaining / left
             for solver in group:
+                for coupling in couplings:
+                    if coupling.bodies[1] == solver.name:
+                        coupling.exchange(dt)
                 solver.substep(dt)
             for coupling in couplings:
-                coupling.exchange(dt)
+                coupling.follow(dt)
             remaining = remaining - dt if left > 1 else 0.0
             taken += 1
             smallest_dt = min(smallest_dt, dt)

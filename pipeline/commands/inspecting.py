@@ -74,7 +74,7 @@ def plan(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path
 @submitted_job_argument
 @json_option
 def status(job: str, output: Path, as_json: bool) -> None:
-    """Say how far a job is, whether it runs, and what failed.
+    """Say how far a job is, whether it runs, what failed, and what the solvers tell.
 
     \b
     pipeline status quickstart
@@ -82,11 +82,13 @@ def status(job: str, output: Path, as_json: bool) -> None:
     """
     from pipeline.lease import live_holder
     from pipeline.manifest_reader import ManifestReader
+    from pipeline.solver_numbers import simulation_numbers
 
     layout = find_job(job, output)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         summary, failures, events = manifest.summary(), manifest.failures(), manifest.events(limit=5)
     holder = live_holder(layout.lease)
+    numbers = simulation_numbers(layout)
     if as_json:
         click.echo(
             json.dumps(
@@ -96,6 +98,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
                     "stages": {stage.stage: dict(stage.counts) for stage in summary},
                     "failures": [_attempt_as_json(attempt) for attempt in failures],
                     "events": [event._asdict() for event in events],
+                    "simulation": numbers.as_json(),
                 },
                 indent=1,
             )
@@ -108,6 +111,10 @@ def status(job: str, output: Path, as_json: bool) -> None:
             for state, count in stage.counts.items()
         )
         click.echo(f"  {stage.stage:>9}  {counts}")
+    for line in numbers.lines():
+        click.echo(f"  {line}")
+    for sentence in numbers.warnings():
+        click.secho(f"  warning: {sentence}", fg="yellow")
     for attempt in failures[:10]:
         click.secho(f"  {attempt.task} {attempt.outcome}: {attempt.message}", fg="red")
     if len(failures) > 10:

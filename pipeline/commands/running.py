@@ -175,15 +175,24 @@ def _run_once(
     from pipeline.executors.processes import ProcessExecutor, WorkerLimits
     from pipeline.progress import ProgressObserver, open_display
     from pipeline.resources import machine_capacity
+    from pipeline.run_events import Observers
     from pipeline.runner import run_job
+    from pipeline.solver_numbers import SolverWatch
 
     capacity = machine_capacity(gpus=GPU_TASKS)
     if cores is not None:
         capacity = replace(capacity, cores=min(cores, capacity.cores))
     limits = WorkerLimits(stall_timeout_s=STALL_TIMEOUT_S)
-    with ProgressObserver(open_display()) as observer, ProcessExecutor(limits) as executor:
+    with ProgressObserver(open_display()) as progress, ProcessExecutor(limits) as executor:
+        solvers = SolverWatch(layout, lambda sentence: progress.display.say(f"warning: {sentence}", style="yellow"))
         return run_job(
-            job, layout, executor=executor, job_text=job_text, observer=observer, rerun=rerun, capacity=capacity
+            job,
+            layout,
+            executor=executor,
+            job_text=job_text,
+            observer=Observers(progress, solvers),
+            rerun=rerun,
+            capacity=capacity,
         )
 
 
@@ -202,6 +211,7 @@ def _watch(busy: JobBusyError, layout: JobLayout, job_text: str | None) -> None:
 
 def _report(job: Job, layout: JobLayout, outcome: Outcome) -> None:
     from pipeline.scheduler import JobOutcome
+    from pipeline.solver_numbers import simulation_numbers
 
     film = layout.path(layout.movie())
     if outcome.kind is not JobOutcome.SUCCEEDED:
@@ -217,6 +227,21 @@ def _report(job: Job, layout: JobLayout, outcome: Outcome) -> None:
             f"{film}: {job.frame_count} frames, {job.frame_count / (job.movie.playback_fps or job.fps):.3g} s of film, "
             f"in {wording.duration(outcome.seconds)}"
         )
+    if outcome.ran or outcome.failures:
+        print_warnings([str(each) for each in simulation_numbers(layout).warnings()])
+        _write_report(layout)
+
+
+def _write_report(layout: JobLayout) -> None:
+    """Leave the report in the job's folder. That it cannot be written is said, and changes nothing about the run."""
+    from pipeline.report.writing import write_report
+
+    try:
+        write_report([layout], layout.report)
+    except (OSError, PipelineError) as error:
+        print_warnings([f"no report was written: {error}"])
+    else:
+        click.echo(f"report: {layout.report}", err=True)
 
 
 def _stages_to_run(job: Job, layout: JobLayout) -> frozenset[str]:

@@ -1,4 +1,4 @@
-"""Commands that show what a job has made: sheet."""
+"""Commands that show what a job has made: sheet, report."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.arguments import find_job, submitted_job_argument
+from pipeline.commands.arguments import find_job, output_option, submitted_job_argument
 from pipeline.errors import PipelineError
-from pipeline.layout import JobLayout
 
 
 @click.command()
@@ -30,6 +29,7 @@ def sheet(job: str, output: Path, pictures: int, columns: int, target: Path | No
     """
     from PIL import Image
 
+    from pipeline.committed_pictures import committed_pictures, evenly_spread
     from render.errors import InvalidFileError
     from render.sheet import contact_sheet
 
@@ -47,17 +47,32 @@ def sheet(job: str, output: Path, pictures: int, columns: int, target: Path | No
     click.echo(path)
 
 
-def committed_pictures(layout: JobLayout) -> list[Path]:
-    """The frames that have their receipt, first to last: a file without one may be half a frame."""
-    folder = layout.path(layout.picture(0)).parent
-    receipts = sorted((layout.receipts / folder.name).glob("[0-9]*.png.json"))
-    return [folder / receipt.name.removesuffix(".json") for receipt in receipts]
+@click.command()
+@click.argument("jobs", metavar="JOB...", nargs=-1, required=True)
+@output_option
+@click.option(
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Where to write it; JOB/report.html if omitted, which several jobs cannot.",
+)
+def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
+    """Write what a job took and what its solvers told into one HTML file: timings, plots, pictures, warnings.
 
+    Several jobs are compared in the same plots. Submitting a job writes its report at the end. Works while it runs.
 
-def evenly_spread(frames: list[Path], count: int) -> list[Path]:
-    """At most so many of the frames, the first and the last among them."""
-    if len(frames) <= count:
-        return frames
-    if count == 1:
-        return frames[-1:]
-    return [frames[round(index * (len(frames) - 1) / (count - 1))] for index in range(count)]
+    \b
+    pipeline report quickstart
+    pipeline report bunny-wcsph bunny-dfsph --to energy.html
+    """
+    from pipeline.report.writing import write_report
+
+    layouts = [find_job(job, output) for job in jobs]
+    if target is None and len(layouts) > 1:
+        raise click.UsageError("say where to write the comparison: --to comparison.html")
+    path = layouts[0].report if target is None else target
+    try:
+        write_report(layouts, path)
+    except OSError as error:
+        raise PipelineError(f"cannot write {path}: {error.strerror}") from error
+    click.echo(path)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import JobFileError
 from pipeline.job.loading import LoadedJob, read_job
-from pipeline.job.looks import BODY, parts_of
+from pipeline.job.looks import BODY, WHITEWATER, parts_of
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
@@ -30,6 +30,7 @@ def check_job(job: Job, *, memory_bytes: int | None = None) -> Findings:
     """
     findings = Findings()
     _check_bodies(job, findings)
+    _check_whitewater(job, findings)
     _check_materials(job, findings)
     _check_faces(job, findings)
     _check_time(job, findings)
@@ -58,8 +59,10 @@ def _shares_space(smoke: SmokeParameters, job: Job) -> bool:
 def _check_bodies(job: Job, findings: Findings) -> None:
     if not job.body_names:
         findings.error((), "has no body; add [[fluid]], [[smoke]] or [[rigid]]")
-    elif not job.fluid and not job.smoke:
+    elif not job.fluid and not job.smoke and all(body.kind == "static" for body in job.rigid):
         findings.warn((), "has neither fluid nor smoke, so nothing will move")
+    if job.smoke and any(body.kind != "static" for body in job.rigid):
+        findings.warn((), "smoke passes through bodies that move in this version; only static ones are in its way")
     if job.fluid and any(_shares_space(smoke, job) for smoke in job.smoke):
         findings.warn((), "fluid and smoke do not act on each other in this version")
     # Names become file names, and some file systems do not tell upper from lower case.
@@ -70,10 +73,19 @@ def _check_bodies(job: Job, findings: Findings) -> None:
         taken.setdefault(name.casefold(), path)
 
 
+def _check_whitewater(job: Job, findings: Findings) -> None:
+    fluids = [fluid.name for fluid in job.fluid]
+    for name in job.whitewater:
+        if name not in fluids:
+            hint = suggestion(name, fluids) or (f"; fluids are {', '.join(fluids)}" if fluids else "; add [[fluid]]")
+            findings.error(("whitewater", name), f'no fluid is named "{name}"{hint}')
+
+
 def _check_materials(job: Job, findings: Findings) -> None:
     kinds = {name: kind for _, kind, name in named_bodies(job)}
     for body in job.rigid:
         kinds |= {f"{body.name}.{part}": "rigid" for part in parts_of(body.shape.type) if part != BODY}
+    kinds |= {f"{fluid}.{part}": "fluid" for fluid in job.whitewater for part in WHITEWATER}
     for name, material in job.material.items():
         path: KeyPath = ("material", name)
         if name not in kinds:

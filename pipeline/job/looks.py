@@ -27,6 +27,9 @@ NATURAL_MATERIALS: dict[str, dict[str, MaterialParameters]] = {
 PAINTED_LOOKS = ("rubber", "plastic", "ceramic")
 """A body of another look, of metal or glass, is of one piece: its parts take the body's material."""
 
+WHITEWATER = {part: MaterialParameters(look=part) for part in ("spray", "foam", "bubbles")}
+"""Materials of the parts of a fluid that has whitewater; each is a look of its own."""
+
 FLUID = MaterialParameters(look="water")
 SMOKE = MaterialParameters(look="smoke")
 SOLID = MaterialParameters(look="plastic")

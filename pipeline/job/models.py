@@ -7,7 +7,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from pipeline.job.looks import BODY, FLUID, NATURAL_MATERIALS, PAINTED_LOOKS, SMOKE, SOLID
+from pipeline.job.looks import BODY, FLUID, NATURAL_MATERIALS, PAINTED_LOOKS, SMOKE, SOLID, WHITEWATER
 from render.parameters import (
     CameraParameters,
     LightParameters,
@@ -22,6 +22,7 @@ from sim.fluid.parameters import FluidParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.scene import SceneParameters
 from sim.smoke.parameters import SmokeParameters
+from sim.whitewater.parameters import WhitewaterParameters
 
 DEFAULT_FRAMES = 120
 MAX_FRAMES = 1_000_000
@@ -38,6 +39,10 @@ class Job(SceneParameters):
     )
     duration: Annotated[float, Field(gt=0.0)] | None = Field(
         default=None, description="Length of the film [s]; give this or frames."
+    )
+    whitewater: dict[str, WhitewaterParameters] = Field(
+        default_factory=dict,
+        description="Spray, foam and bubbles of a fluid, by its name: [whitewater.water]; none if omitted.",
     )
     surface: SurfaceParameters = Field(default=SurfaceParameters(), description="Fluid surfaces.")
     volume: VolumeParameters = Field(default=VolumeParameters(), description="Smoke volumes.")
@@ -66,7 +71,9 @@ class Job(SceneParameters):
         return [body.name for body in self._bodies()]
 
     def material_of(self, body: str, part: str = BODY) -> MaterialParameters:
-        """What a body, or a part of its shape, looks like: from the job file, else as such things usually do."""
+        """What a body, or a part of it or of its whitewater, looks like: from the job file, else as is usual."""
+        if part in WHITEWATER:
+            return self.material.get(f"{body}.{part}", WHITEWATER[part])
         shape = next((rigid.shape.type for rigid in self.rigid if rigid.name == body), "")
         own = self.material.get(body, NATURAL_MATERIALS.get(shape, {}).get(BODY))
         if part != BODY and (own is None or own.look in PAINTED_LOOKS):

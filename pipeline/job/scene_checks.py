@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.job.fluid_checks import check_fluids, check_search_cells, emitted_particles, particle_room
+from pipeline.job.memory_budget import MemoryBudget, memory_budget
 from pipeline.job.models import Job
 from pipeline.job.placements import placements
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, suggestion
-from pipeline.resources import machine_capacity
 from sim.fluid.parameters import FluidParameters
 from sim.scene import DomainParameters
 from sim.shapes.parameters import MeshShape, Placement
@@ -28,7 +29,11 @@ Box = NDArray[np.float64]
 """Lower and upper corner [m], (2, 3)."""
 
 BYTES_PER_PARTICLE = 1024
-"""Upper bound of what the fluid solvers take, neighbour search and snapshot included."""
+"""Upper bound of what the fluid solvers take, neighbour search and snapshots included."""
+BYTES_PER_PARTICLE_ON_GPU = 600
+"""The same without the snapshots, which are the host's."""
+NEIGHBOR_BYTES = 240
+"""The neighbour list's part of that at a support of two spacings; it grows with the cube of the support."""
 BYTES_PER_CELL = 200
 """Upper bound of what the smoke solver takes, multigrid levels and snapshot included."""
 BYTES_PER_SEARCH_CELL = 16
@@ -48,7 +53,8 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
     solids = _build_solids(job, findings)
     _check_rigid_bodies(job, solids, findings)
     _check_camera(job, solids, findings)
-    budget = machine_capacity().memory_bytes if memory_bytes is None else memory_bytes
+    check_fluids(job, solids, findings)
+    budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
     findings.particles = sum(_check_fluid(job, index, solids, budget, findings) for index in range(len(job.fluid)))
     findings.cells = sum(_check_smoke(job, index, solids, budget, findings) for index in range(len(job.smoke)))
 
@@ -140,41 +146,57 @@ def _check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings)
 # --- fluid ---------------------------------------------------------------------------------------------------------
 
 
-def _check_fluid(job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: int, findings: Findings) -> int:
+def _check_fluid(
+    job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: MemoryBudget, findings: Findings
+) -> int:
     """Particles that the fluid will have, about."""
     fluid = job.fluid[index]
     blocks = {path: solid for path, solid in solids.items() if path[:3] == ("fluid", index, "block")}
     obstacles = [solid for path, solid in solids.items() if path[0] == "rigid"]
     spacing = 2.0 * fluid.particle_radius
-    expected = sum(solid.volume for solid in blocks.values()) / spacing**3
-    if expected * BYTES_PER_PARTICLE > budget:
-        possible = budget // BYTES_PER_PARTICLE
+    expected = particle_room(job, fluid, sum(solid.volume for solid in blocks.values()))
+    each = _bytes_per_particle(fluid, on_gpu=budget.on_gpu)
+    if expected * each > budget.bytes:
+        possible = budget.bytes // each
         radius = fluid.particle_radius * (expected / possible) ** (1.0 / 3.0)
+        remedy = ", or give emitters an end_s, or the fluid max_particles" if fluid.emitter else ""
         findings.error(
             ("fluid", index, "particle_radius"),
-            f"{_count(expected)} particles need {_gigabytes(expected * BYTES_PER_PARTICLE)}, this machine has "
-            f"{_gigabytes(budget)}; at most {_count(possible)} fit: use {_rounded_up(radius):g} m or more",
+            f"{_count(expected)} particles need {_gigabytes(expected * each)}, {budget.owner} has "
+            f"{_gigabytes(budget.bytes)}; at most {_count(possible)} fit: "
+            f"use {_rounded_up(radius):g} m or more{remedy}",
         )
         return int(expected)
     _check_domain_size(job.domain, fluid, budget, findings)
     _check_time_step(job, index, findings)
     lattice = _Lattice(_domain_box(job.domain), obstacles, spacing, max(1.0, (expected / COUNTED_PARTICLES) ** (1 / 3)))
-    return sum(_check_block(path, solid, lattice, findings) for path, solid in blocks.items())
+    start = sum(_check_block(path, solid, lattice, findings) for path, solid in blocks.items())
+    most = math.inf if fluid.max_particles is None else max(start, fluid.max_particles)
+    return int(min(start + emitted_particles(job, fluid), most))
 
 
-def _check_domain_size(domain: DomainParameters, fluid: FluidParameters, budget: int, findings: Findings) -> None:
+def _bytes_per_particle(fluid: FluidParameters, *, on_gpu: bool) -> int:
+    base = BYTES_PER_PARTICLE_ON_GPU if on_gpu else BYTES_PER_PARTICLE
+    return base + math.ceil(NEIGHBOR_BYTES * ((fluid.support_in_spacings / 2.0) ** 3 - 1.0))
+
+
+def _check_domain_size(
+    domain: DomainParameters, fluid: FluidParameters, budget: MemoryBudget, findings: Findings
+) -> None:
     """The whole domain is covered by cells for the neighbour search, and its walls by samples, fluid or not."""
     box = _domain_box(domain)
     x, y, z = (box[1] - box[0]) / (2.0 * fluid.particle_radius)
     need = x * y * z / 8.0 * BYTES_PER_SEARCH_CELL + 2.0 * (x * y + y * z + z * x) * BYTES_PER_WALL_SAMPLE
-    if need > budget:
-        radius = _rounded_up(fluid.particle_radius * math.sqrt(need / budget))
+    if need > budget.bytes:
+        radius = _rounded_up(fluid.particle_radius * math.sqrt(need / budget.bytes))
         findings.error(
             ("domain",),
             f"is so large that walls and search cells for particles of {fluid.particle_radius:g} m need "
-            f"{_gigabytes(need)}, this machine has {_gigabytes(budget)}; "
+            f"{_gigabytes(need)}, {budget.owner} has {_gigabytes(budget.bytes)}; "
             f"make it smaller, or particle_radius {radius:g} m",
         )
+    else:
+        check_search_cells(domain, fluid, findings)
 
 
 @dataclass(frozen=True)
@@ -195,7 +217,7 @@ class _Lattice:
 
     def fill(self, solid: Solid) -> tuple[int, int]:
         """How many particles find a free place in the solid, and how many are kept out by obstacles."""
-        from sim.build import ROUNDING
+        from sim.fluid.filling import ROUNDING
         from sim.shapes import fill_with_particles
 
         step = self.spacing * self.coarsening
@@ -252,7 +274,8 @@ def _expected_stable_dt(job: Job, fluid: FluidParameters) -> float:
     """CFL bound [s]: cfl 0.4 d / (c_s + v), with v from the initial speed and a fall through the domain."""
     diagonal = math.dist(job.domain.min, job.domain.max)
     fall = 2.0 * math.hypot(*job.gravity) * diagonal
-    speed = math.sqrt(fall + max(math.hypot(*block.velocity) for block in fluid.block) ** 2)
+    speeds = [math.hypot(*block.velocity) for block in fluid.block] + [emitter.speed for emitter in fluid.emitter]
+    speed = math.sqrt(fall + max(speeds, default=0.0) ** 2)
     sound = fluid.sound_speed or SPEED_OF_SOUND_IN_SPEEDS * speed
     return fluid.cfl * 0.4 * 2.0 * fluid.particle_radius / (sound + speed) if sound + speed > 0.0 else math.inf
 
@@ -260,7 +283,9 @@ def _expected_stable_dt(job: Job, fluid: FluidParameters) -> float:
 # --- smoke ---------------------------------------------------------------------------------------------------------
 
 
-def _check_smoke(job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: int, findings: Findings) -> int:
+def _check_smoke(
+    job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: MemoryBudget, findings: Findings
+) -> int:
     """Cells of the smoke's grid."""
     smoke = job.smoke[index]
     box = _smoke_box(smoke, job.domain)
@@ -276,12 +301,13 @@ def _check_smoke(job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: 
             f"use {extent.min() / 4.0:.3g} m or less",
         )
     cells = float(np.prod(np.ceil(extent / smoke.cell_size)))
-    if cells * BYTES_PER_CELL > budget:
-        possible = budget // BYTES_PER_CELL
+    if cells * BYTES_PER_CELL > budget.bytes:
+        possible = budget.bytes // BYTES_PER_CELL
         size = smoke.cell_size * (cells / possible) ** (1.0 / 3.0)
         findings.error(
             ("smoke", index, "cell_size"),
-            f"{_count(cells)} cells need {_gigabytes(cells * BYTES_PER_CELL)}, this machine has {_gigabytes(budget)}; "
+            f"{_count(cells)} cells need {_gigabytes(cells * BYTES_PER_CELL)}, "
+            f"{budget.owner} has {_gigabytes(budget.bytes)}; "
             f"at most {_count(possible)} fit: use {_rounded_up(size):g} m or more",
         )
     for path, solid in solids.items():

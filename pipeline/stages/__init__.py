@@ -9,12 +9,14 @@ from pipeline.stages.render import RenderStage
 from pipeline.stages.simulate import SimulateStage
 from pipeline.stages.surface import SurfaceStage
 from pipeline.stages.volume import VolumeStage
+from pipeline.stages.whitewater import WhitewaterStage
 
 STAGES: tuple[Stage, ...] = (
     BodiesStage(),
     SimulateStage(),
     SurfaceStage(),
     VolumeStage(),
+    WhitewaterStage(),
     RenderStage(),
     MovieStage(),
 )

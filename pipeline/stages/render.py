@@ -8,6 +8,7 @@ from math import cos, prod, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.cache import read_frame
 from pipeline.errors import StageUnavailableError
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
@@ -16,7 +17,18 @@ from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import tool_version
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
-from render.spec import MeshObject, MeshSequenceObject, RenderSpec, SceneObject, VolumeSequenceObject
+from render.point_clouds import KINDS
+from render.poses import write_poses
+from render.spec import (
+    MeshObject,
+    MeshSequenceObject,
+    MovingMeshObject,
+    PointSequenceObject,
+    RenderSpec,
+    SceneObject,
+    VolumeSequenceObject,
+)
+from sim.rigid.parameters import RigidBodyParameters
 
 if TYPE_CHECKING:
     from render.blender import Renderer
@@ -92,6 +104,7 @@ class RenderStage:
         def validate(path: Path) -> None:
             validate_picture(path, job.render.resolution)
 
+        _write_poses(context, task.frame)
         try:
             with context.committing(task.outputs[0], validate) as path:
                 renderer.render(task.frame, path)
@@ -104,21 +117,23 @@ class RenderStage:
 def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
     """The job as Blender sees it; paths are relative to the job's folder."""
     objects: list[SceneObject] = [
-        MeshObject(
-            name=body.name if part == BODY else f"{body.name}.{part}",
-            file=layout.body_mesh(body.name, part),
-            position=body.position,
-            orientation=_orientation(body.rotation_deg),
-            material=job.material_of(body.name, part),
-        )
-        for body in job.rigid
-        for part in parts_of(body.shape.type)
+        _body_object(job, layout, body, part) for body in job.rigid for part in parts_of(body.shape.type)
     ]
     objects += [
         MeshSequenceObject(
             name=fluid.name, file=f"surfaces/{fluid.name}/{{frame}}.ply", material=job.material_of(fluid.name)
         )
         for fluid in job.fluid
+    ]
+    objects += [
+        PointSequenceObject(
+            name=f"{fluid}.{kind}",
+            file=f"whitewater/{fluid}/{{frame}}.ply",
+            kind=kind,
+            material=job.material_of(fluid, kind),
+        )
+        for fluid in job.whitewater
+        for kind in KINDS
     ]
     objects += [
         VolumeSequenceObject(
@@ -136,6 +151,21 @@ def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
         objects=tuple(objects),
         render=job.render,
     )
+
+
+def _body_object(job: Job, layout: JobLayout, body: RigidBodyParameters, part: str) -> SceneObject:
+    """A static body stands where the job puts it; the others are where the poses of the frame say."""
+    name = body.name if part == BODY else f"{body.name}.{part}"
+    file, material = layout.body_mesh(body.name, part), job.material_of(body.name, part)
+    if body.kind == "static":
+        orientation = _orientation(body.rotation_deg)
+        return MeshObject(name=name, file=file, position=body.position, orientation=orientation, material=material)
+    return MovingMeshObject(name=name, file=file, body=body.name, poses=layout.poses, material=material)
+
+
+def moving_bodies(job: Job) -> tuple[str, ...]:
+    """Names of the bodies whose pose changes from frame to frame."""
+    return tuple(body.name for body in job.rigid if body.kind != "static")
 
 
 @cache
@@ -158,7 +188,23 @@ def _blender_version(executable: str | None) -> str:
 def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:
     surfaces = [layout.surface(fluid.name, frame) for fluid in job.fluid]
     volumes = [layout.volume(smoke.name, frame) for smoke in job.smoke]
-    return surfaces + volumes or [layout.frame_cache(frame)]
+    points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+    # The cache changes with every change of the simulation, so it is an input only where something of it is drawn.
+    cached = [layout.frame_cache(frame)] if moving_bodies(job) or not surfaces + volumes else []
+    return surfaces + volumes + points + cached
+
+
+def _write_poses(context: TaskContext, frame: int) -> None:
+    """Put the frame's poses where Blender finds them; they are no artifact, but a form of the cached frame."""
+    layout, bodies = context.layout, moving_bodies(context.job)
+    if not bodies:
+        return
+    cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies
+    path = layout.root / layout.poses.replace("{frame}", f"{frame:06d}")
+    path.parent.mkdir(exist_ok=True)
+    part = path.with_name(f".{path.name}.part.{context.attempt}")
+    write_poses(part, frame, {name: cached[name].arrays for name in bodies})
+    part.replace(path)
 
 
 def _orientation(rotation_deg: tuple[float, float, float]) -> tuple[float, float, float, float]:

@@ -1,9 +1,17 @@
-"""Simulate: the world, frame by frame, into the HDF5 cache, with checkpoints to continue from."""
+"""Simulate: the world, frame by frame, into the HDF5 cache, with checkpoints to continue from.
+
+Frames and checkpoints are written while the next frame is computed; see docs/decisions/0015-asynchronous-frames.md.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from math import ceil, inf, prod
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.cache import Checkpoint, read_checkpoint, read_frame, validate_frame, write_checkpoint, write_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
@@ -13,14 +21,26 @@ from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import bodies_by_content, tool_version
+from pipeline.stages.ordered_writer import WAITING, OrderedWriter
 from pipeline.task import Resources, Task, TaskId
 from sim.scene import SceneParameters
+from sim.snapshots import Snapshot
 from sim.world import FrameReport, World
 
 CHECKPOINT_INTERVAL_S = 30.0
 """Wall time between checkpoints: what a crash costs at most, against well under 1 % of the time spent writing."""
 
 CHECKPOINTS_KEPT = 2
+
+SNAPSHOTS_AT_ONCE = 4 + WAITING
+"""The one that is written, what is read back of it, the ones that wait for that, the newest before it finds a place in
+the queue, and what goes into its making."""
+WORKER_BYTES = 800_000_000
+"""Interpreter, compiler and the driver's share of the host's memory; an estimate, on the safe side."""
+BYTES_PER_PARTICLE = 80
+"""A checkpoint's position, velocity, number and reference position, and sorting; a frame takes 32."""
+BYTES_PER_CELL = 24
+"""Five float32 in a frame, five with ghosts in a checkpoint."""
 
 
 class SimulateStage:
@@ -93,23 +113,24 @@ class _Simulation:
         self._require_device_of_committed_frames(wanted)
         self._continue_from_checkpoint(before=missing[0])
         print(f"device {self._device}, starting at frame {self._world.frame}", flush=True)
-        if self._world.frame in wanted:
-            self._commit(FrameReport(0, 0.0, {}, {}, self._world.diagnostics()))
-        while self._world.frame < last:
-            if self._context.stop_requested():
-                self._save_checkpoint()
-                return
-            report = self._world.advance_frame()
-            if report.frame in wanted:
-                self._commit(report)
-            self._context.progress(report.frame + 1, last + 1, _describe(report))
-            if time.monotonic() - self._checkpointed_at > CHECKPOINT_INTERVAL_S:
-                self._save_checkpoint()
-        self._save_checkpoint()
+        with OrderedWriter() as writer:
+            if self._world.frame in wanted:
+                first = FrameReport(0, 0.0, {}, {}, self._world.diagnostics())
+                writer.submit(partial(self._commit, first, self._world.snapshots()))
+            while self._world.frame < last:
+                if self._context.stop_requested():
+                    break
+                report = self._world.advance_frame()
+                if report.frame in wanted:
+                    writer.submit(partial(self._commit, report, self._world.snapshots()))
+                self._context.progress(report.frame + 1, last + 1, _describe(report))
+                if time.monotonic() - self._checkpointed_at > CHECKPOINT_INTERVAL_S:
+                    self._hand_in_checkpoint(writer)
+            self._hand_in_checkpoint(writer)
 
-    def _commit(self, report: FrameReport) -> None:
+    def _commit(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
         with self._context.committing(self._context.task.outputs[report.frame], validate_frame) as path:
-            write_frame(path, self._world.snapshots(), report, device=self._device)
+            write_frame(path, bodies, report, device=self._device)
 
     def _require_device_of_committed_frames(self, missing: Collection[int]) -> None:
         """Devices differ in their rounding, and the flow amplifies that: their frames do not fit together."""
@@ -145,37 +166,49 @@ class _Simulation:
                 self._last_checkpoint = checkpoint.frame
                 return
 
-    def _save_checkpoint(self) -> None:
+    def _hand_in_checkpoint(self, writer: OrderedWriter) -> None:
+        """Have the present state saved, after all frames so far: one that was ahead of them would lose them."""
+        self._checkpointed_at = time.monotonic()
+        frame = self._world.frame
+        if frame not in (0, self._last_checkpoint):
+            self._last_checkpoint = frame
+            writer.submit(partial(self._save_checkpoint, frame, self._world.checkpoint()))
+
+    def _save_checkpoint(self, frame: int, arrays: Mapping[str, NDArray[np.generic]]) -> None:
         """Write aside, decode, rename; then drop older ones but the newest two.
 
         Later ones, left by a run that had come further, stay: they are of the same fingerprint.
         """
-        self._checkpointed_at = time.monotonic()
-        frame = self._world.frame
-        if frame in (0, self._last_checkpoint):
-            return
         path = self._folder / f"{frame:06d}.h5"
         part = self._folder / f".{path.name}.part.{self._context.attempt}"
-        write_checkpoint(part, Checkpoint(frame, self._context.fingerprint, self._device, self._world.checkpoint()))
+        write_checkpoint(part, Checkpoint(frame, self._context.fingerprint, self._device, arrays))
         read_checkpoint(part)
         sync(part)
         part.replace(path)
         sync(self._folder)
-        self._last_checkpoint = frame
         so_far = sorted(each for each in self._folder.glob("[0-9]*.h5") if each.name <= path.name)
         for old in so_far[:-CHECKPOINTS_KEPT]:
             old.unlink()
 
 
 def _resources(job: Job) -> Resources:
-    """All cores where the CPU computes, so that it runs alone; one core and the GPU where that does.
+    """All cores where the CPU computes, so that it runs alone; where the GPU does, that, one core and the frames' room.
 
     A device that does not work here is no matter of the plan, but an obstacle to running it.
     """
     from sim.runtime import resolve_device
 
     device = resolve_device("auto") if job.device == "auto" else job.device
-    return Resources(cores=0) if device == "cpu" else Resources(cores=1, gpus=1)
+    memory_bytes = WORKER_BYTES + SNAPSHOTS_AT_ONCE * _snapshot_bytes(job)
+    return Resources(cores=0) if device == "cpu" else Resources(cores=1, memory_bytes=memory_bytes, gpus=1)
+
+
+def _snapshot_bytes(job: Job) -> int:
+    """Upper bound of what a snapshot or a checkpoint takes: no fluid holds more than fills the domain."""
+    domain = prod(high - low for low, high in zip(job.domain.min, job.domain.max, strict=True))
+    particles = sum(min(domain / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf) for fluid in job.fluid)
+    cells = sum(domain / smoke.cell_size**3 for smoke in job.smoke)
+    return ceil(particles * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL)
 
 
 def _describe(report: FrameReport) -> str:

@@ -8,12 +8,13 @@ import numpy as np
 import taichi as ti
 
 from sim.cells import CellGrid, CellSort, SortedPoints
-from sim.fluid.boundary_kernels import STATE_WIDTH, place_samples
+from sim.fluid.boundary_kernels import STATE_WIDTH, order_samples, place_samples, take_samples
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sim.fluid.boundary_akinci2012 import BoundarySamples
+    from sim.solver import Arrays
 
 EVERYWHERE = 1.0e30
 """Stands for "no limit" where samples are sorted [m]."""
@@ -37,10 +38,19 @@ class Boundary:
         body: number of the body of each moving sample, (moving,), int32.
         body_start: first moving sample of each body, (bodies + 1,), on the host.
         reach: largest distance of a sample from the centre of mass of its body [m], (bodies,), on the host.
+        states: of the bodies, as `place` takes them: centre of mass, rotation, velocity and angular velocity of the
+            first, then of the next, float32 (`boundary_kernels.STATE_WIDTH`).
     """
 
     def __init__(
-        self, fixed: BoundarySamples, moving: BoundarySamples, *, body_count: int, grid: CellGrid, spacing: float
+        self,
+        fixed: BoundarySamples,
+        moving: BoundarySamples,
+        *,
+        body_count: int,
+        grid: CellGrid,
+        spacing: float,
+        support_in_spacings: float,
     ) -> None:
         if (np.diff(moving.body) < 0).any() or moving.body.max(initial=-1) >= body_count:
             raise ValueError(f"moving samples must be given body by body, numbered from 0 to {body_count - 1}")
@@ -56,7 +66,9 @@ class Boundary:
         fixed_positions = fixed.positions[self.index]
         self.fixed_points = SortedPoints(_coordinates(fixed_positions), cells.cell_start)
 
-        volumes = np.concatenate([fixed.volumes(spacing)[self.index], moving.volumes(spacing)])
+        volumes = np.concatenate(
+            [fixed.volumes(spacing, support_in_spacings)[self.index], moving.volumes(spacing, support_in_spacings)]
+        )
         self.position = _device_array(np.concatenate([fixed_positions, moving.positions]))
         self.velocity = _device_array(np.zeros((self.fixed_count + self.moving_count, 3), dtype=np.float32))
         self.volume = _device_array(volumes.astype(np.float32))
@@ -67,12 +79,15 @@ class Boundary:
         self.reach: NDArray[np.float64] = np.array(
             [distance[moving.body == body].max(initial=0.0) for body in range(body_count)]
         )
-        self._states = ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH)
+        self.states = ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH)
+        self._reference_states = self.states.to_numpy()
         self._moving_cells = CellSort(grid, self.moving_count) if self.moving_count else None
         self._moving_ids = _device_array(np.arange(self.moving_count, dtype=np.int32))
         self._moving_position = ti.Vector.ndarray(3, ti.f32, max(self.moving_count, 1))
-        self._moving_points: SortedPoints | None = None
-        self.moving_index = self._moving_cells.order if self._moving_cells else self._moving_ids
+        self._moving_points = (
+            SortedPoints(_coordinates(moving.positions), self._moving_cells.cell_start) if self._moving_cells else None
+        )
+        self.moving_index = _device_array(np.zeros(self.moving_count, dtype=np.int32))
 
     @property
     def count(self) -> int:
@@ -95,9 +110,25 @@ class Boundary:
             angular_velocity: [rad/s], (bodies, 3).
         """
         states = np.concatenate([position, rotation.reshape(-1, 9), velocity, angular_velocity], axis=1)
-        self._states.from_numpy(np.ascontiguousarray(states, dtype=np.float32).ravel())
+        if self.body_count:
+            self._place(np.ascontiguousarray(states, dtype=np.float32).ravel())
+
+    def checkpoint(self) -> dict[str, NDArray[np.float32]]:
+        """Where the bodies are, and where they were when the moving samples were sorted last."""
+        return {"body_states": self.states.to_numpy(), "reference_body_states": self._reference_states.copy()}
+
+    def restore_reference(self, arrays: Arrays) -> None:
+        """Put the bodies where they were when the moving samples were sorted before the checkpoint."""
+        self._place(arrays["reference_body_states"])
+
+    def restore(self, arrays: Arrays) -> None:
+        """Put the bodies where they were at the checkpoint."""
+        self._place(arrays["body_states"])
+
+    def _place(self, states: NDArray[np.generic]) -> None:
+        self.states.from_numpy(np.ascontiguousarray(states))
         place_samples(
-            self.offset, self.body, self.moving_count, self.fixed_count, self._states, self.position, self.velocity
+            self.offset, self.body, self.moving_count, self.fixed_count, self.states, self.position, self.velocity
         )
 
     def sort_moving(self) -> SortedPoints | None:
@@ -105,21 +136,16 @@ class Boundary:
 
         `moving_index` then tells the index of each of the sorted.
         """
-        if self._moving_cells is None:
+        if self._moving_cells is None or self._moving_points is None:
             return None
-        positions = np.ascontiguousarray(self.position.to_numpy()[self.fixed_count :])
-        self._moving_position.from_numpy(positions)
-        self._moving_cells.sort(
-            self._moving_position, self._moving_ids, self.moving_count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3
-        )
-        order = self._moving_cells.order.to_numpy()
-        if self._moving_points is None:
-            self._moving_points = SortedPoints(_coordinates(positions[order]), self._moving_cells.cell_start)
-        else:
-            for axis, coordinates in enumerate(self._moving_points.coordinates):
-                coordinates.from_numpy(np.ascontiguousarray(positions[order, axis]))
-        index = (order + self.fixed_count).astype(np.int32)
-        self.moving_index = _device_array(index)
+        self._reference_states = self.states.to_numpy()
+        count, first = self.moving_count, self.fixed_count
+        take_samples(self.position, first, count, self._moving_position)
+        self._moving_cells.sort(self._moving_position, self._moving_ids, count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3)
+        order_samples(
+            self._moving_position, self._moving_cells.order, count, first,
+            *self._moving_points.coordinates, self.moving_index,
+        )  # fmt: skip
         return self._moving_points
 
 

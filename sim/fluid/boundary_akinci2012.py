@@ -39,10 +39,12 @@ class BoundarySamples:
     Attributes:
         positions: samples [m], (m, 3), float32.
         body: number of the body of each sample, (m,), int32; the domain's walls are one body.
+        factor: on the volume of each sample [-], (m,); 1 if omitted.
     """
 
     positions: NDArray[np.float32]
     body: NDArray[np.int32]
+    factor: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3 or self.body.shape != self.positions.shape[:1]:
@@ -60,13 +62,14 @@ class BoundarySamples:
             return cls(np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int32))
         return cls(np.concatenate(bodies).astype(np.float32).reshape(-1, 3), np.concatenate(numbers))
 
-    def volumes(self, spacing: float) -> NDArray[np.float64]:
+    def volumes(self, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> NDArray[np.float64]:
         """Volume V_b of each sample [m³], (m,); a fluid's Psi_b is rho0 V_b.
 
         Args:
             spacing: particle spacing of the fluid [m].
+            support_in_spacings: support radius of its kernel.
         """
-        support = SUPPORT_IN_SPACINGS * spacing
+        support = support_in_spacings * spacing
         volumes = np.empty(len(self.positions), dtype=np.float64)
         for body in np.unique(self.body):
             members = np.flatnonzero(self.body == body)
@@ -77,11 +80,13 @@ class BoundarySamples:
             sums = np.full(len(members), evaluate(0.0, support))
             for end in (0, 1):
                 sums += np.bincount(pairs[:, end], weights=weights, minlength=len(members))
-            volumes[members] = wall_calibration().volume_factor / sums
-        return volumes
+            volumes[members] = wall_calibration(support_in_spacings).volume_factor / sums
+        return volumes if self.factor is None else self.factor * volumes
 
 
-def domain_wall_samples(domain: DomainParameters, spacing: float) -> NDArray[np.float32]:
+def domain_wall_samples(
+    domain: DomainParameters, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS
+) -> NDArray[np.float32]:
     """Samples of the domain's closed faces [m], (m, 3): a lattice 0.95 spacings outside of each face.
 
     Neighbouring walls share their edges and corners, and every sample lies there once. A wall reaches one layer
@@ -90,8 +95,9 @@ def domain_wall_samples(domain: DomainParameters, spacing: float) -> NDArray[np.
     Args:
         domain: the box and its open faces.
         spacing: particle spacing of the fluid [m].
+        support_in_spacings: support radius of its kernel; the samples lie deeper where it is wider than usual.
     """
-    depth = (wall_calibration().standoff_in_spacings - 0.5) * spacing
+    depth = (wall_calibration(support_in_spacings).standoff_in_spacings - 0.5) * spacing
     low, high = np.array(domain.min) - depth, np.array(domain.max) + depth
     # Whole numbers of intervals, so the lattice meets both ends; the sample volumes even out the small stretch.
     intervals = np.maximum(np.round((high - low) / spacing), 1).astype(int)
@@ -102,7 +108,12 @@ def domain_wall_samples(domain: DomainParameters, spacing: float) -> NDArray[np.
     return samples.astype(np.float32)
 
 
-def sink_samples(samples: NDArray[np.floating], signed_distance: SignedDistance, spacing: float) -> NDArray[np.float32]:
+def sink_samples(
+    samples: NDArray[np.floating],
+    signed_distance: SignedDistance,
+    spacing: float,
+    support_in_spacings: float = SUPPORT_IN_SPACINGS,
+) -> NDArray[np.float32]:
     """Move samples of a body's surface 0.95 spacings inside, so that fluid at rest touches the surface, (m, 3) [m].
 
     Where a body is thinner than twice that, its samples stop at the middle, and fluid keeps a gap.
@@ -111,8 +122,9 @@ def sink_samples(samples: NDArray[np.floating], signed_distance: SignedDistance,
         samples: points on the surface [m], (m, 3).
         signed_distance: distance of points (k, 3) to the surface [m], (k,); negative inside.
         spacing: particle spacing of the fluid [m].
+        support_in_spacings: support radius of its kernel; the samples sink deeper where it is wider than usual.
     """
-    depth = (wall_calibration().standoff_in_spacings - 0.5) * spacing
+    depth = (wall_calibration(support_in_spacings).standoff_in_spacings - 0.5) * spacing
     points = np.array(samples, dtype=np.float64)
     distance = signed_distance(points)
     step = 0.05 * spacing

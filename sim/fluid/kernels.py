@@ -8,6 +8,7 @@ support radius). The piecewise polynomial w is evaluated without branches as
 which equals 1 - 6q² + 6q³ for q < 1/2, 2 (1 - q)³ for q < 1, and 0 beyond.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 
@@ -15,8 +16,13 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-SUPPORT_IN_SPACINGS = 2
-"""Support radius over lattice spacing: 4r over 2r."""
+from sim.reductions import runs_on_gpu
+
+TINY_DISTANCE = 1.0e-12
+"""Keeps x/|x| finite where two particles coincide; their force is then 0 [m]."""
+
+SUPPORT_IN_SPACINGS = 2.0
+"""Usual support radius over lattice spacing: 4r over 2r."""
 
 
 @ti.func
@@ -35,6 +41,24 @@ def spline_slope(q: ti.f32) -> ti.f32:
     return 24.0 * inner * inner - 6.0 * outer * outer
 
 
+@ti.func
+def inverse_distance(r_squared: ti.f32) -> ti.f32:
+    """1/|x| from |x|², finite at 0: `r_squared * inverse_distance(r_squared)` is |x|.
+
+    GPUs have an instruction for it, and none for the square root: sums over neighbours take a tenth less time.
+    """
+    return ti.rsqrt(r_squared + TINY_DISTANCE * TINY_DISTANCE)
+
+
+@ti.func
+def distance(r_squared: ti.f32) -> ti.f32:
+    """|x| from |x|², in the way that is fastest on the device: a CPU would divide to invert."""
+    r = ti.sqrt(r_squared)
+    if ti.static(runs_on_gpu()):
+        r = r_squared * inverse_distance(r_squared)
+    return r
+
+
 def normalization(support_radius: float) -> float:
     """sigma = 8 / (pi h³) [1/m³]."""
     return 8.0 / (np.pi * support_radius**3)
@@ -47,20 +71,28 @@ def evaluate(distance: NDArray[np.floating] | float, support_radius: float) -> N
     return normalization(support_radius) * (2.0 * outer**3 - 8.0 * inner**3)
 
 
-def lattice_offsets() -> NDArray[np.float64]:
+def evaluate_slope(distance: NDArray[np.floating] | float, support_radius: float) -> NDArray[np.float64]:
+    """dW/dr at a distance [m] on the host, in float64 [1/m⁴]."""
+    q = np.asarray(distance, dtype=np.float64) / support_radius
+    outer, inner = np.maximum(1.0 - q, 0.0), np.maximum(0.5 - q, 0.0)
+    return normalization(support_radius) / support_radius * (24.0 * inner**2 - 6.0 * outer**2)
+
+
+def lattice_offsets(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> NDArray[np.float64]:
     """Cubic lattice points within the support of the origin, itself included, in spacings, (n, 3)."""
-    axis = np.arange(-SUPPORT_IN_SPACINGS, SUPPORT_IN_SPACINGS + 1, dtype=np.float64)
+    axis = _lattice_axis(support_in_spacings)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    return points[np.linalg.norm(points, axis=1) < SUPPORT_IN_SPACINGS]
+    return points[np.linalg.norm(points, axis=1) < support_in_spacings]
 
 
-def particle_volume(spacing: float) -> float:
+def particle_volume(spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
     """Volume V of a particle [m³] with which a filled lattice has exactly rest density: V = 1 / sum_j W_ij.
 
-    It is d³ to 0.03 %; see docs/decisions/0010-particle-volume.md.
+    It is d³ to 0.03 % at the usual support, and to 0.2 % at any from 2 to 4 spacings; see
+    docs/decisions/0010-particle-volume.md.
     """
-    distances = np.linalg.norm(lattice_offsets(), axis=1) * spacing
-    return float(1.0 / evaluate(distances, SUPPORT_IN_SPACINGS * spacing).sum())
+    distances = np.linalg.norm(lattice_offsets(support_in_spacings), axis=1) * spacing
+    return float(1.0 / evaluate(distances, support_in_spacings * spacing).sum())
 
 
 @dataclass(frozen=True)
@@ -77,41 +109,53 @@ class WallCalibration:
 
 
 @cache
-def wall_calibration() -> WallCalibration:
+def wall_calibration(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> WallCalibration:
     """The distance and the factor with which a half-space of lattice is at rest density and in equilibrium.
 
-    A particle of the first layer misses the density that one more layer would give, sum_j V W_ij, and its push,
+    A particle of the first layer misses the density that more layers would give, sum_j V W_ij, and their push,
     sum_j V (p_i/rho_i² + p_j/rho_j²) grad W_ij: with equal pressures twice what a boundary force with p_i/rho_i² alone
-    gives. So the samples need gamma V_b sum_b W(D) = V sum_j W(d) and gamma V_b sum_b W'(D) = 2 V sum_j W'(d): the
-    logarithmic slope of the samples' field at distance D is twice that of a fluid layer at d. Bisection finds D, about
-    1.45 d. A smaller factor with nearer samples (gamma = 0.7 at D = d, Band et al. 2018) has the density right and
-    half of the push; fluid then sinks into the wall.
+    gives. So the samples need gamma V_b sum_b W(D) = V sum_j W and gamma V_b sum_b W'(D) = 2 V sum_j W', the sums over
+    the layers that are missing: the logarithmic slope of the samples' field at distance D is twice theirs. Bisection
+    finds D, about 1.45 d. A smaller factor with nearer samples (gamma = 0.7 at D = d, Band et al. 2018) has the density
+    right and half of the push; fluid then sinks into the wall.
+
+    Only one layer is missing at the usual support of 2 spacings. A wider one reaches past the first layer of particles,
+    whose density and push stay right; of the second's density the samples then leave out up to 7 % (at 4 spacings).
     """
-    low, high = 1.0, 1.0 + 0.95 * (SUPPORT_IN_SPACINGS - 1.0)
-    fluid_field, fluid_slope = _layer_field(1.0, shifts=1)
+    low, high = 1.0, 1.0 + 0.95 * (support_in_spacings - 1.0)
+    missing = [
+        _layer_field(distance, support_in_spacings, shifts=1) for distance in np.arange(1.0, support_in_spacings)
+    ]
+    fluid_field, fluid_slope = np.sum(missing, axis=0)
     target = 2.0 * fluid_slope / fluid_field
     for _ in range(60):
         middle = 0.5 * (low + high)
-        field, slope = _layer_field(middle)
+        field, slope = _layer_field(middle, support_in_spacings)
         low, high = (low, middle) if slope / field < target else (middle, high)
-    field, _ = _layer_field(low)
-    samples_sum, _ = _layer_field(0.0, shifts=1)
-    factor = fluid_field / field * samples_sum * particle_volume(1.0)
-    return WallCalibration(standoff_in_spacings=low, volume_factor=factor)
+    field, _ = _layer_field(low, support_in_spacings)
+    samples_sum, _ = _layer_field(0.0, support_in_spacings, shifts=1)
+    factor = fluid_field / field * samples_sum * particle_volume(1.0, support_in_spacings)
+    return WallCalibration(standoff_in_spacings=low, volume_factor=float(factor))
 
 
-def _layer_field(distance: float, *, shifts: int = 8) -> tuple[float, float]:
+def _lattice_axis(half_width: float) -> NDArray[np.float64]:
+    """Whole numbers as far from 0 as a support of `half_width` spacings reaches."""
+    reach = math.ceil(half_width)
+    return np.arange(-reach, reach + 1, dtype=np.float64)
+
+
+def _layer_field(distance: float, support_in_spacings: float, *, shifts: int = 8) -> tuple[float, float]:
     """Sum of W over one square lattice layer at a distance [spacings], and its slope.
 
     Averaged over so many sideways shifts along each side, as fluid beside a wall lies anywhere between its samples.
     """
-    axis = np.arange(-SUPPORT_IN_SPACINGS - 1, SUPPORT_IN_SPACINGS + 2, dtype=np.float64)
+    axis = _lattice_axis(support_in_spacings + 1.0)
     shift = np.arange(shifts) / shifts
     offsets = (axis[:, None] + shift[None, :]).ravel()
     in_plane = np.hypot(offsets[:, None], offsets[None, :])
 
     def field(height: float) -> float:
-        return float(evaluate(np.hypot(in_plane, height), SUPPORT_IN_SPACINGS).sum()) / shifts**2
+        return float(evaluate(np.hypot(in_plane, height), support_in_spacings).sum()) / shifts**2
 
     step = 1.0e-4
     return field(distance), (field(distance + step) - field(distance - step)) / (2.0 * step)

@@ -2,24 +2,48 @@
 
 from __future__ import annotations
 
+from sim.fluid.kernels import SUPPORT_IN_SPACINGS
 from sim.neighbors import GROWTH
 
 EXPECTED_NEIGHBORS = 48
-"""Places in the neighbour list per particle, with the skin, and on a GPU the padding of its slices."""
+"""Places in the neighbour list per particle, with the skin, and on a GPU the padding of its slices, at the usual
+support radius; they grow with its cube."""
 
 
-def estimate_bytes(particle_count: int, boundary_count: int, cell_count: int) -> int:
+IMPLICIT_PRESSURE_BYTES = 40
+"""What DFSPH and PCISPH have more of a particle than WCSPH: pressures, their acceleration, diagonal and errors."""
+
+IMPLICIT_VISCOSITY_BYTES = 124
+"""Nine vectors of conjugate gradients, and the change that is kept from step to step with its place in the sort."""
+
+AKINCI2013_BYTES = 12
+"""The normals of the colour field."""
+
+
+def estimate_bytes(
+    particle_count: int,
+    boundary_count: int,
+    cell_count: int,
+    *,
+    support_in_spacings: float = SUPPORT_IN_SPACINGS,
+    extra_bytes: int = 0,
+) -> int:
     """Memory of a particle fluid on its device [bytes], for planning.
 
     Args:
         particle_count: most particles that there can be.
         boundary_count: samples of walls and bodies.
         cell_count: cells of the search for neighbours, which cover the whole domain.
+        support_in_spacings: support radius of the kernel.
+        extra_bytes: of a particle, for what the plain solver does not have: the constants above.
     """
     vector, number = 12, 4
     state = 2 * (2 * vector + 2 * number) + vector  # position, velocity, id and phase, sorted from and to; reference
     results = vector + 2 * number  # acceleration, density, pressure
-    search = 5 * number + EXPECTED_NEIGHBORS * GROWTH * number  # cell, order, start, two counts; the list itself
+    entries = EXPECTED_NEIGHBORS * (support_in_spacings / SUPPORT_IN_SPACINGS) ** 3
+    search = 5 * number + entries * GROWTH * number  # cell, order, start, two counts; the list itself
     boundary = 3 * vector + 3 * number  # position, coordinates and velocity; volume, cell, order
     cell = 3 * number  # where its particles and its samples start; the cursor of the sort
-    return int(particle_count * (state + results + search) + boundary_count * boundary + cell_count * cell)
+    return int(
+        particle_count * (state + results + search + extra_bytes) + boundary_count * boundary + cell_count * cell
+    )

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from typing import Annotated, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field, model_validator
 
 from sim.parameters import NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
-
-
-def _refuse_absent_solvers(solver: object) -> object:
-    if solver in ("dfsph", "pcisph"):
-        raise ValueError(f'solver "{solver}" is not in this version; use solver = "wcsph"')
-    return solver
 
 
 class FluidBlockParameters(Placement):
@@ -22,35 +17,159 @@ class FluidBlockParameters(Placement):
     velocity: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Initial velocity [m/s].")
 
 
+class DiscOpening(Parameters):
+    """A round opening."""
+
+    type: Literal["disc"]
+    radius: Positive = Field(description="Radius [m].")
+
+
+class RectangleOpening(Parameters):
+    """A rectangular opening; its first side is horizontal, along y where the emitter points up or down."""
+
+    type: Literal["rectangle"]
+    size: tuple[Positive, Positive] = Field(description="Lengths of its sides [m].")
+
+
+class EmitterParameters(Parameters):
+    """An opening from which fluid flows into the domain."""
+
+    shape: Annotated[DiscOpening | RectangleOpening, Field(discriminator="type")] = Field(
+        description="The opening: a disc or a rectangle."
+    )
+    position: Vector3 = Field(description="Centre of the opening [m].")
+    direction: Vector3 = Field(description="Where the fluid flows, of any length but 0 [-].")
+    speed: Positive = Field(description="Speed of the inflow [m/s]; the flow is speed times area.")
+    start_s: NonNegative = Field(default=0.0, description="When it starts to emit [s].")
+    end_s: Positive | None = Field(default=None, description="When it stops [s]; never if omitted.")
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Self:
+        if not any(self.direction):
+            raise ValueError("direction must not be (0, 0, 0)")
+        if self.end_s is not None and self.end_s <= self.start_s:
+            raise ValueError(f"end_s must be after start_s = {self.start_s:g} s, got {self.end_s:g} s")
+        return self
+
+
 class FluidParameters(Parameters):
-    """A fluid: its material, its discretization and the volumes it fills at the start."""
+    """A fluid: its material, its discretization, the volumes it fills at the start and where more flows in."""
 
     name: str = Field(description="Name of the fluid, unique in the job.", pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
-    solver: Annotated[Literal["wcsph"], BeforeValidator(_refuse_absent_solvers)] = Field(
-        default="wcsph", description="wcsph: weakly compressible SPH (Becker & Teschner 2007)."
+    solver: Literal["wcsph", "dfsph", "pcisph"] = Field(
+        default="wcsph",
+        description="wcsph: weakly compressible SPH (Becker & Teschner 2007); dfsph: divergence-free SPH (Bender & "
+        "Koschier 2015); pcisph: predictive-corrective incompressible SPH (Solenthaler & Pajarola 2009).",
     )
-    block: tuple[FluidBlockParameters, ...] = Field(min_length=1, description="Volumes filled at the start.")
+    block: tuple[FluidBlockParameters, ...] = Field(default=(), description="Volumes filled at the start.")
+    emitter: tuple[EmitterParameters, ...] = Field(default=(), description="Openings from which fluid flows in.")
+    max_particles: Annotated[int, Field(ge=1, le=2**31 - 1)] | None = Field(
+        default=None,
+        description="Most particles of this fluid [-]; its emitters stop there. What the domain holds if omitted.",
+    )
     particle_radius: Positive = Field(
         default=0.01, description="Particle radius r [m]; lattice spacing is 2r, support radius 4r."
+    )
+    support_in_spacings: Annotated[float, Field(ge=2.0, le=4.0)] = Field(
+        default=2.0,
+        description="Support radius h of the kernel over the lattice spacing 2r [-]: 2 gives 32 neighbours, 4 gives "
+        "250 and smoother fields, at eight times the cost; walls are matched best at 2.",
     )
     rest_density: Positive = Field(default=1000.0, description="Rest density [kg/m³].")
     viscosity: NonNegative = Field(default=1.0e-6, description="Kinematic viscosity nu [m²/s]; water 1e-6.")
     artificial_viscosity: NonNegative = Field(
         default=0.05,
-        description="Artificial viscosity alpha (Monaghan 1992) [-]; steadies the pressure, 0 switches it off.",
+        description="Artificial viscosity alpha (Monaghan 1992) [-]; steadies the pressure, 0 switches it off. Its "
+        "speed is that of sound in wcsph, and the largest expected one, a tenth of it, in dfsph and pcisph.",
+    )
+    viscosity_solver: Literal["auto", "explicit", "implicit"] = Field(
+        default="auto",
+        description="explicit: forces of the step before, short steps where the fluid is stiff; implicit: a linear "
+        "system in every step (Weiler et al. 2018); auto: implicit where viscosity would limit the time step.",
+    )
+    surface_tension_model: Literal["becker_teschner2007", "akinci2013"] = Field(
+        default="becker_teschner2007",
+        description="becker_teschner2007: cohesion alone; akinci2013: cohesion that keeps particles apart, and forces "
+        "that make the surface small.",
     )
     surface_tension: NonNegative = Field(
-        default=0.0, description="Cohesion kappa of Becker & Teschner 2007 [m³/s²]; 0 switches it off."
+        default=0.0,
+        description="Strength; 0 switches it off. becker_teschner2007: cohesion kappa [m³/s²]; "
+        "akinci2013: surface tension sigma [N/m], 0.072 for water.",
+    )
+    adhesion: NonNegative = Field(
+        default=0.0,
+        description="Pull of walls and bodies as a multiple of the fluid's own cohesion [-], akinci2013 only.",
     )
     wall_friction: NonNegative = Field(
         default=0.0, description="Viscosity against walls and bodies, as a multiple of the fluid's own [-]."
     )
     sound_speed: Positive | None = Field(
         default=None,
-        description="Numerical speed of sound [m/s]; ten times the largest expected speed if omitted.",
+        description="Numerical speed of sound of wcsph [m/s]; ten times the largest expected speed if omitted.",
+    )
+    density_tolerance: Positive = Field(
+        default=1.0e-4,
+        le=0.1,
+        description="Mean error of the density, relative to the rest density, at which the pressure solves of dfsph "
+        "and pcisph stop [-].",
+    )
+    divergence_tolerance: Positive = Field(
+        default=1.0e-3,
+        le=0.1,
+        description="Mean relative compression in a step at which the divergence solve of dfsph stops [-].",
+    )
+    max_iterations: Annotated[int, Field(ge=3, le=100_000)] = Field(
+        default=100,
+        description="Most iterations of a pressure solve of dfsph and pcisph [-]; a solve that reaches it is counted.",
     )
     dt: Literal["adaptive"] | Positive = Field(
         default="adaptive",
         description='Time step [s], or "adaptive": the largest that the CFL condition allows.',
     )
     cfl: Positive = Field(default=1.0, le=2.0, description="Factor on the CFL time step [-].")
+
+    @model_validator(mode="after")
+    def _comes_from_somewhere(self) -> Self:
+        if not self.block and not self.emitter:
+            raise ValueError("has neither a block nor an emitter; add [[fluid.block]] or [[fluid.emitter]]")
+        if self.sound_speed is not None and self.solver != "wcsph":
+            raise ValueError(f'sound_speed is for solver = "wcsph"; remove it, as "{self.solver}" has none')
+        if self.adhesion and self.surface_tension_model != "akinci2013":
+            raise ValueError('adhesion needs surface_tension_model = "akinci2013"; remove it or name that model')
+        return self
+
+
+OWN_KEYS = frozenset(
+    ("name", "block", "emitter", "max_particles", "rest_density", "viscosity", "surface_tension", "adhesion")
+)
+"""What each fluid of a tank has of its own; all else is shared, as they share particles, steps and walls."""
+
+LARGEST_DENSITY_CONTRAST = 10.0
+"""Largest rest density over the smallest in one tank. At 10 a light fluid stays at rest on a heavy one, and a heavy
+one sinks through a light one; water and air (1000) would need another formulation."""
+
+
+def shared_conflicts(fluids: Sequence[FluidParameters]) -> list[tuple[int, str, str]]:
+    """Why fluids cannot share a tank: number of the fluid, its key, and a sentence, for each reason."""
+    conflicts = []
+    for number, fluid in enumerate(fluids[1:], start=1):
+        for key in FluidParameters.model_fields:
+            own, first = getattr(fluid, key), getattr(fluids[0], key)
+            if key not in OWN_KEYS and own != first:
+                conflicts.append(
+                    (number, key, f'is {_written(own)}, but {_written(first)} in fluid[0] "{fluids[0].name}"; '
+                     "all fluids of a tank share it")
+                )  # fmt: skip
+        lightest, heaviest = sorted((fluid.rest_density, fluids[0].rest_density))
+        if heaviest > LARGEST_DENSITY_CONTRAST * lightest:
+            conflicts.append(
+                (number, "rest_density", f"is {fluid.rest_density:g} kg/m³, and {fluids[0].rest_density:g} kg/m³ in "
+                 f'fluid[0] "{fluids[0].name}"; densities in a tank may differ by a factor of '
+                 f"{LARGEST_DENSITY_CONTRAST:g} at most")
+            )  # fmt: skip
+    return conflicts
+
+
+def _written(value: object) -> str:
+    return f'"{value}"' if isinstance(value, str) else "omitted" if value is None else f"{value:g}"

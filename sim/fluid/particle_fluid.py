@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import taichi as ti
 
 from sim.cells import CellGrid
+from sim.fluid.body_forces import BodyForces
 from sim.fluid.boundary import Boundary
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.box import Box, check_particles
-from sim.fluid.kernels import SUPPORT_IN_SPACINGS, normalization, particle_volume
+from sim.fluid.checkpoints import check_checkpoint
+from sim.fluid.emitter import Emission
+from sim.fluid.kernels import normalization, particle_volume
 from sim.fluid.particles import ParticleSet
 from sim.fluid.phases import Phases
 from sim.fluid.stepping import MotionSummary, ParticleStepper
@@ -30,21 +34,6 @@ if TYPE_CHECKING:
 SKIN = 0.1
 """How much farther than the support the neighbour list reaches [support radii]: more means fewer rebuilds, and more
 pairs in every step. Measurements: docs/performance.md."""
-
-CHECKPOINT_ARRAYS = {
-    "position": ("float32", "vector"),
-    "velocity": ("float32", "vector"),
-    "particle_id": ("int32", "scalar"),
-    "phase": ("int32", "scalar"),
-    "reference_position": ("float32", "vector"),
-    "travelled": ("float64", "number"),
-    "boundary_travelled": ("float64", "number"),
-    "max_speed": ("float64", "number"),
-    "max_acceleration": ("float64", "number"),
-    "particles_removed": ("int64", "number"),
-    "next_particle_id": ("int64", "number"),
-}
-"""Type of each array of a checkpoint, and whether it has a vector or scalar per particle, or one number in all."""
 
 
 class ParticleFluid(ABC):
@@ -100,8 +89,8 @@ class ParticleFluid(ABC):
         self.name = "+".join(self.phases.names)
         self.gravity = gravity
         self.spacing = 2.0 * self.parameters.particle_radius
-        self.support_radius = SUPPORT_IN_SPACINGS * self.spacing
-        self.particle_volume = particle_volume(self.spacing)
+        self.support_radius = self.parameters.support_in_spacings * self.spacing
+        self.particle_volume = particle_volume(self.spacing, self.parameters.support_in_spacings)
         self.particles_removed = 0
         self._first_bad: str | None = None
         self._travelled = self._boundary_travelled = 0.0
@@ -118,10 +107,16 @@ class ParticleFluid(ABC):
             body_count=body_count,
             grid=self._grid,
             spacing=self.spacing,
+            support_in_spacings=self.parameters.support_in_spacings,
         )
+        self.body_forces = BodyForces(self.boundary, self._grid, self._search_radius)
         count = len(positions)
         self._particles = ParticleSet(self._grid, max(count, capacity or 0), carried=self.carried)
         self._density = ti.ndarray(ti.f32, self._particles.capacity)
+        self._emission = Emission(
+            self.phases.parameters, spacing=self.spacing, particle_volume=self.particle_volume, grid=self._grid
+        )
+        self._without_neighbors = False
         self._next_particle_id = count
         self._particles.load(
             {
@@ -133,6 +128,7 @@ class ParticleFluid(ABC):
         )
         largest = float(np.sqrt((np.asarray(velocities, dtype=np.float64) ** 2).sum(axis=1).max(initial=0.0)))
         self._motion = MotionSummary(max_speed=largest, max_acceleration=float(np.linalg.norm(gravity)))
+        self._expect_inflow()
         self.begin_frame(0.0)
         self._find_neighbors()
 
@@ -162,6 +158,7 @@ class ParticleFluid(ABC):
         self._wall_contacts = 0
         self._neighbor_searches = 0
         self._substeps = 0
+        self._emission.begin_frame()
 
     def move_bodies(
         self,
@@ -218,9 +215,12 @@ class ParticleFluid(ABC):
         """The particles in the order of the neighbour list, and the positions that it was made from."""
         return {
             **self._particles.host_arrays(),
+            **self.boundary.checkpoint(),
+            **self._emission.checkpoint(),
             "reference_position": np.stack([self._host(axis) for axis in self._particles.reference], axis=1),
             "travelled": np.array([self._travelled], dtype=np.float64),
             "boundary_travelled": np.array([self._boundary_travelled], dtype=np.float64),
+            "boundary_speed": np.array([self._boundary_speed], dtype=np.float64),
             "max_speed": np.array([self._motion.max_speed], dtype=np.float64),
             "max_acceleration": np.array([self._motion.max_acceleration], dtype=np.float64),
             "particles_removed": np.array([self.particles_removed], dtype=np.int64),
@@ -233,16 +233,22 @@ class ParticleFluid(ABC):
         Raises:
             ValueError: the arrays are not a checkpoint of this fluid.
         """
-        self._check_checkpoint(arrays)
-        # The neighbour list has to be made from the positions it was made from before, then the particles move on.
+        check_checkpoint(
+            arrays, self.name, capacity=self.capacity, carried=self.carried, body_states=self.boundary.states.shape
+        )
+        # The neighbour list has to be made from the positions it was made from before, then all move on.
         self._particles.load({**arrays, "position": arrays["reference_position"]})
+        self.boundary.restore_reference(arrays)
         self._find_neighbors()
         self._particles.load(arrays)
+        self.boundary.restore(arrays)
+        self._boundary_speed = float(arrays["boundary_speed"][0])
         self._travelled = float(arrays["travelled"][0])
         self._boundary_travelled = float(arrays["boundary_travelled"][0])
         self._motion = MotionSummary(float(arrays["max_speed"][0]), float(arrays["max_acceleration"][0]))
         self.particles_removed = int(arrays["particles_removed"][0])
         self._next_particle_id = int(arrays["next_particle_id"][0])
+        self._emission.restore(arrays)
         self._peak_speed = self._motion.max_speed
         self._first_bad = None
 
@@ -272,6 +278,7 @@ class ParticleFluid(ABC):
             "max_compression": float(self._host(self._density).max(initial=0.0)) - 1.0,
             "particle_count": float(self.particle_count),
             "particles_removed": float(self.particles_removed),
+            **self._emission.diagnostics(),
             "wall_contacts": float(self._wall_contacts),
             "neighbor_searches": float(self._neighbor_searches),
             "substeps": float(self._substeps),
@@ -319,17 +326,26 @@ class ParticleFluid(ABC):
 
     def _advance_particles(self, acceleration: ti.Ndarray, dt: float) -> None:
         particles = self._particles
+        self._emission.drive(particles, acceleration)
         self._motion = self._stepper.advance(particles.position, particles.velocity, acceleration, particles.count, dt)
+        emitted = self._emission.advance(particles, dt, self._next_particle_id)
+        self._next_particle_id += emitted
+        self._without_neighbors |= emitted > 0
         self._first_bad = self._first_bad or self._bad_motion()
         self._peak_speed = max(self._peak_speed, self._motion.max_speed)
+        self._expect_inflow()
         self._travelled += self._motion.max_displacement
         self._wall_contacts += self._motion.touched
         self._substeps += 1
 
+    def _expect_inflow(self) -> None:
+        """Let the next time step be right for what flows in during it."""
+        self._motion = replace(self._motion, max_speed=max(self._motion.max_speed, self._emission.speed))
+
     def _update_neighbors(self) -> None:
-        """Find the neighbours anew once a pair could have closed the skin between them, or a particle has left."""
+        """Find the neighbours anew once a pair could have closed the skin between them, or particles left or came."""
         closed = self._travelled + max(self._travelled, self._boundary_travelled)
-        if self._motion.left or closed > self._search_radius - self.support_radius:
+        if self._without_neighbors or self._motion.left or closed > self._search_radius - self.support_radius:
             self._find_neighbors()
 
     def _find_neighbors(self) -> None:
@@ -344,7 +360,9 @@ class ParticleFluid(ABC):
             moving,
             self.boundary.moving_index,
         )
+        self.body_forces.find_particles(particles.sorted_points)
         self._travelled = self._boundary_travelled = 0.0
+        self._without_neighbors = False
         self._neighbor_searches += 1
 
     def _host(self, array: ti.Ndarray) -> NDArray[np.generic]:
@@ -352,21 +370,3 @@ class ParticleFluid(ABC):
 
     def _by_id(self) -> NDArray[np.int64]:
         return np.argsort(self._host(self._particles.particle_id))
-
-    def _check_checkpoint(self, arrays: Arrays) -> None:
-        expected = CHECKPOINT_ARRAYS | dict.fromkeys(self.carried, ("float32", "scalar"))
-        missing = sorted(set(expected) - set(arrays))
-        if missing:
-            raise ValueError(f'not a checkpoint of "{self.name}": it lacks {", ".join(missing)}')
-        count = len(arrays["particle_id"])
-        if count > self._particles.capacity:
-            raise ValueError(
-                f'the checkpoint has {count} particles, "{self.name}" has room for {self._particles.capacity}'
-            )
-        for name, (dtype, width) in expected.items():
-            shape = {"vector": (count, 3), "scalar": (count,), "number": (1,)}[width]
-            found = arrays[name]
-            if found.shape != shape or found.dtype != dtype:
-                raise ValueError(
-                    f'checkpoint of "{self.name}": {name} must be {dtype} {shape}, got {found.dtype} {found.shape}'
-                )

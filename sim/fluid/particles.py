@@ -7,6 +7,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cells import CellGrid, CellSort, Floats, Integers, SortedPoints, Vectors
+from sim.launch import fast_launch
 from sim.neighbors import NeighborList, list_stride
 
 HostArrays = Mapping[str, NDArray[np.generic]]
@@ -71,15 +72,38 @@ class ParticleSet:
             values = arrays.get(name, np.zeros(self.count, dtype=np.float32))
             array.from_numpy(_padded(values, self.capacity))
 
-    def append(self, arrays: HostArrays) -> None:
+    def append_layer(
+        self,
+        places: ti.Ndarray,
+        moved: ti.math.vec3,
+        velocity: ti.math.vec3,
+        phase: int,
+        free: ti.Ndarray,
+        order: ti.Ndarray,
+        count: int,
+        added: int,
+        first_id: int,
+    ) -> None:
         """Add particles behind the others, their carried scalars 0; they have no neighbours before the next sort.
 
         Args:
-            arrays: as for `load`.
+            places: where they are [m], (count,) of 3-vectors.
+            moved: and how far they all have moved from there [m].
+            velocity: of all of them [m/s].
+            phase: which of the fluids they are of.
+            free: 1 for the places to take, else 0, (count,).
+            order: number of taken places before each, (count,).
+            count: number of places.
+            added: number of places taken; there must be room for them.
+            first_id: id of the first of them.
         """
-        present = self.host_arrays()
-        new = {**arrays, **{name: np.zeros(len(arrays["particle_id"]), np.float32) for name in self.carried}}
-        self.load({name: np.concatenate([present[name], new[name]]) for name in present})
+        append_particles(
+            places, moved, velocity, phase, free, order, count, self.count, first_id,
+            self.position, self.velocity, self.particle_id, self.phase,
+        )  # fmt: skip
+        for values in self.carried.values():
+            clear_scalars(values, self.count, added)
+        self.count += added
 
     def host_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Copies of what `load` takes, in the order of the particles."""
@@ -133,6 +157,7 @@ def _padded(rows: NDArray[np.generic], length: int) -> NDArray[np.generic]:
     return padded
 
 
+@fast_launch
 @ti.kernel
 def reorder_particles(
     order: Integers, count: ti.i32,
@@ -153,8 +178,34 @@ def reorder_particles(
         reference_z[k] = x_i[2]
 
 
+@fast_launch
 @ti.kernel
 def reorder_scalars(order: Integers, count: ti.i32, values: Floats, values_out: Floats):
     """Move one carried quantity to where the sort puts the particles."""
     for k in range(count):
         values_out[k] = values[order[k]]
+
+
+@fast_launch
+@ti.kernel
+def append_particles(
+    places: Vectors, moved: ti.math.vec3, inflow: ti.math.vec3, number: ti.i32, free: Integers, order: Integers,
+    count: ti.i32, first: ti.i32, first_id: ti.i32,
+    position: Vectors, velocity: Vectors, particle_id: Integers, phase: Integers,
+):  # fmt: skip
+    """Write the particles of the free places behind the first ones."""
+    for k in range(count):
+        if free[k] != 0:
+            i = first + order[k]
+            position[i] = places[k] + moved
+            velocity[i] = inflow
+            particle_id[i] = first_id + order[k]
+            phase[i] = number
+
+
+@fast_launch
+@ti.kernel
+def clear_scalars(values: Floats, first: ti.i32, count: ti.i32):
+    """Set a carried quantity of new particles to 0."""
+    for i in range(first, first + count):
+        values[i] = 0.0

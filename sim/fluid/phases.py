@@ -30,9 +30,9 @@ class Phases:
         self.names = tuple(fluid.name for fluid in parameters)
         self.rest_densities = np.array([fluid.rest_density for fluid in parameters])
         self.viscosities = np.array([fluid.viscosity for fluid in parameters])
-        self.rest_density = _device(self.rest_densities)
-        self.dynamic_viscosity = _device(self.rest_densities * self.viscosities)
-        self.surface_tension = _device(np.array([fluid.surface_tension for fluid in parameters]))
+        self.rest_density = device_table(self.rest_densities)
+        self.dynamic_viscosity = device_table(self.rest_densities * self.viscosities)
+        self.surface_tension = device_table(np.array([fluid.surface_tension for fluid in parameters]))
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -48,7 +48,8 @@ class Phases:
         return float(self.rest_densities.max() / self.rest_densities.min())
 
 
-def _device(values: np.ndarray) -> ti.Ndarray:
+def device_table(values: np.ndarray) -> ti.Ndarray:
+    """A number for each fluid, float32, on the device."""
     array = ti.ndarray(ti.f32, len(values))
     array.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
     return array

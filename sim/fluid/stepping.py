@@ -7,7 +7,8 @@ import taichi as ti
 
 from sim.cells import Vectors
 from sim.fluid.box import Box
-from sim.reductions import Floats, LaneReduction, is_finite
+from sim.launch import fast_launch
+from sim.reductions import Floats, LaneReduction, Results, is_finite, reduced
 
 MAXIMA, COUNTS = 3, 3
 
@@ -37,7 +38,7 @@ class ParticleStepper:
     """Advances the particles by symplectic Euler and measures their motion in the same pass."""
 
     def __init__(self, box: Box) -> None:
-        self._corners = tuple(ti.math.vec3(*corner) for corner in (*box.walls, *box.openings))
+        self._corners = (*box.walls, *box.openings)
         self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
 
     def advance(
@@ -54,11 +55,11 @@ class ParticleStepper:
         """
         reduction = self._reduction
         lanes = reduction.lanes
-        advance_particles(
+        results = advance_particles(
             position, velocity, acceleration, count, dt, *self._corners,
-            lanes.count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), reduction.partial,
+            lanes.items(count), lanes.lane_step(count), lanes.item_step(), *reduction.tree,
         )  # fmt: skip
-        speed, strength, displacement, left, touched, bad = reduction.result()
+        speed, strength, displacement, left, touched, bad = reduction.unpack(results)
         return MotionSummary(
             max_speed=float(np.sqrt(speed)),
             max_acceleration=float(np.sqrt(strength)),
@@ -69,13 +70,15 @@ class ParticleStepper:
         )
 
 
+@fast_launch
 @ti.kernel
 def advance_particles(
     position: Vectors, velocity: Vectors, acceleration: Vectors, count: ti.i32, dt: ti.f32,
     wall_low: ti.math.vec3, wall_high: ti.math.vec3, keep_low: ti.math.vec3, keep_high: ti.math.vec3,
-    lanes: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
-):  # fmt: skip
-    """Symplectic Euler, then the walls; the partial results of a lane are these.
+    items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
+    partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
+) -> Results:  # fmt: skip
+    """Symplectic Euler, then the walls; returns these.
 
     Largest |v|² [m²/s²], before a wall stops it, largest |a|² [m²/s⁴], and largest |x - x before|² [m²];
     how many particles passed an open face, were put back onto a wall, and had a position or velocity that was
@@ -121,3 +124,4 @@ def advance_particles(
         partial[3 * lanes + lane] = left
         partial[4 * lanes + lane] = touched
         partial[5 * lanes + lane] = bad
+    return reduced(partial, lanes, quantities, maxima, nodes)

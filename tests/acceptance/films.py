@@ -55,6 +55,8 @@ shape = {{ type = "box", size = [0.24, 0.24, 0.2] }}
 position = [0.0, 0.0, 0.32]
 velocity = [0.0, 0.0, -3.0]
 
+[whitewater.water]
+
 [[smoke]]
 name = "plume"
 min = [-0.3, -0.3, 0.0]

@@ -151,6 +151,10 @@ def test_job_that_cannot_be_meant_is_refused_with_this_line(text, expected, tmp_
     ("text", "expected"),
     [
         (HEAD + BALL, "dam.toml: has neither fluid nor smoke, so nothing will move"),
+        (
+            HEAD + BALL + 'kind = "kinematic"\n' + PLUME,
+            "dam.toml: smoke passes through bodies that move in this version; only static ones are in its way",
+        ),
         (HEAD + WATER + PLUME, "dam.toml: fluid and smoke do not act on each other in this version"),
         (
             HEAD + WATER.replace("0.5]", "0.0]"),

@@ -117,13 +117,13 @@ BAD = {
             'did you mean "final"?'
         ],
     ),
-    "solver of a later version": (
-        f'name = "dam"\n{FLUID}'.replace('"water"', '"water"\nsolver = "dfsph"'),
-        ['dam.toml:5 fluid[0].solver: solver "dfsph" is not in this version; use solver = "wcsph"'],
+    "speed of sound for a solver without one": (
+        f'name = "dam"\n{FLUID}'.replace('"water"', '"water"\nsolver = "dfsph"\nsound_speed = 20'),
+        ['dam.toml:3 fluid[0]: sound_speed is for solver = "wcsph"; remove it, as "dfsph" has none'],
     ),
-    "moving body": (
+    "body without a density": (
         'name = "dam"\n[[rigid]]\nname = "r"\nkind = "dynamic"\nshape = {type = "sphere", radius = 1}',
-        ['dam.toml:4 rigid[0].kind: dynamic bodies are not simulated by this version; use kind = "static"'],
+        ["dam.toml:2 rigid[0]: density is missing; a dynamic body needs one, such as 600 kg/m³ for wood"],
     ),
     "cloth": (
         'name = "dam"\n[[cloth]]\nname = "flag"',
@@ -140,7 +140,7 @@ BAD = {
     ),
     "fluid without a block": (
         'name = "dam"\n[[fluid]]\nname = "w"\nblock = []',
-        ["dam.toml:4 fluid[0].block: must hold at least 1, got 0"],
+        ["dam.toml:2 fluid[0]: has neither a block nor an emitter; add [[fluid.block]] or [[fluid.emitter]]"],
     ),
     "text without quotes": (
         "name = dam",

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from pipeline.cli import main
-from pipeline.commands.showing import evenly_spread
+from pipeline.committed_pictures import evenly_spread
 
 
 @pytest.fixture

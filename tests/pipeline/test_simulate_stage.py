@@ -1,20 +1,26 @@
-"""The simulation as a task, run for real in this process: which device its frames come from."""
+"""The simulation as a task, run for real: which device its frames come from, and what a kill or a full disk leaves."""
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
+import killed_simulation
 import pytest
 
-from pipeline.cache import read_frame
-from pipeline.executors.base import Assignment, Failed, Finished, TaskEvent
-from pipeline.executors.inline import InlineExecutor
-from pipeline.job.loading import load_job
+from pipeline.artifacts import is_committed, sweep_parts
+from pipeline.cache import read_frame, write_frame
+from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.layout import JobLayout
-from pipeline.stages.simulate import SimulateStage
+from pipeline.task import FailureKind
 from sim import runtime
+
+PROJECT = Path(__file__).resolve().parents[2]
 
 JOB = """
 name = "drop"
@@ -29,25 +35,11 @@ position = [0.0, 0.0, 0.3]
 """
 
 
-def simulate(layout: JobLayout, *, frames: int) -> TaskEvent:
-    """Run the task until it ends; returns how it ended."""
+def simulate(layout: JobLayout, *, frames: int, attempt: int = 1) -> TaskEvent:
+    """Run the task of a job of so many frames until it ends; returns how it ended."""
     layout.root.mkdir(exist_ok=True)
     layout.job_file.write_text(JOB.format(frames=frames))
-    (task,) = SimulateStage().plan(load_job(layout.job_file), layout)
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    assignment = Assignment(
-        task=task,
-        attempt=1,
-        fingerprint="f",
-        inputs={},
-        threads=threads,  # as every other test of this process that starts Taichi
-        job_file=layout.job_file,
-        root=layout.root,
-        stages="pipeline.stages:STAGES",
-    )
-    with InlineExecutor() as executor:
-        executor.submit(assignment)
-        return executor.wait(0.0)[-1]
+    return killed_simulation.simulate(layout, attempt=attempt)
 
 
 @pytest.fixture
@@ -76,3 +68,47 @@ def test_frames_of_the_same_device_are_continued_without_a_checkpoint(layout: Jo
     shutil.rmtree(layout.checkpoints)
     assert isinstance(simulate(layout, frames=3), Finished)
     assert read_frame(layout.path(layout.frame_cache(2))).device == "cpu"
+
+
+def frames_of(layout: JobLayout, count: int) -> list[bytes]:
+    return [layout.path(layout.frame_cache(frame)).read_bytes() for frame in range(count)]
+
+
+@pytest.mark.parametrize("write", ["write_frame", "write_checkpoint"])
+def test_killed_in_the_middle_of_a_write_it_continues_to_the_same_frames(layout: JobLayout, write: str) -> None:
+    """Frames are written while later ones are computed: what is killed has computed more than it has written."""
+    undisturbed = JobLayout(layout.root.with_name("undisturbed"))
+    assert isinstance(simulate(undisturbed, frames=6), Finished)
+    layout.root.mkdir()
+    layout.job_file.write_text(JOB.format(frames=6))
+    script = Path(killed_simulation.__file__)
+    killed = subprocess.run(
+        [sys.executable, script, layout.root, write, "3"],
+        env={**os.environ, "PYTHONPATH": str(PROJECT)},
+        timeout=120,
+        check=False,
+    )
+    assert killed.returncode == -signal.SIGKILL
+    committed = [frame for frame in range(6) if is_committed(layout, layout.frame_cache(frame), "f")]
+    assert committed == ([0, 1, 2] if write == "write_frame" else [0, 1, 2, 3])
+    # A checkpoint ahead of the frames would have to be thrown away, and the work before it be done again.
+    assert sorted(path.name for path in layout.checkpoints.glob("[0-9]*.h5")) == ["000001.h5", "000002.h5"]
+    sweep_parts(layout)
+    assert isinstance(simulate(layout, frames=6, attempt=2), Finished)
+    assert "starting at frame 2" in layout.log(killed_simulation.TASK, 2).read_text()
+    assert frames_of(layout, 6) == frames_of(undisturbed, 6)
+
+
+def test_a_disk_that_is_full_for_a_frame_is_told_as_such(layout: JobLayout, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill_up(path: Path, bodies, report, **options) -> None:
+        if report.frame == 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write_frame(path, bodies, report, **options)
+
+    with monkeypatch.context() as full_disk:
+        full_disk.setattr("pipeline.stages.simulate.write_frame", fill_up)
+        ended = simulate(layout, frames=6)
+    assert isinstance(ended, Failed)
+    assert ended.kind is FailureKind.DISK_FULL
+    assert not list(layout.checkpoints.glob("*.h5"))  # it would be ahead of the frames
+    assert isinstance(simulate(layout, frames=6, attempt=2), Finished)

@@ -44,7 +44,7 @@ def digests(of: Job) -> dict[str, str]:
 def test_every_frame_gets_its_surface_volume_and_picture():
     tasks = plan_job(job(), LAYOUT, STAGES)
     count = {stage.name: sum(task.stage == stage.name for task in tasks) for stage in STAGES}
-    assert count == {"bodies": 1, "simulate": 1, "surface": 40, "volume": 40, "render": 40, "movie": 3}
+    assert count == {"bodies": 1, "simulate": 1, "surface": 40, "volume": 40, "whitewater": 0, "render": 40, "movie": 3}
 
 
 def test_a_picture_waits_for_its_own_frame_only():
@@ -104,7 +104,7 @@ def test_nothing_stands_in_the_way_of_a_job_on_this_machine_but_what_is_said(mon
 def test_a_device_that_does_not_work_here_is_planned_all_the_same(monkeypatch, device):
     monkeypatch.setattr("sim.runtime.available_devices", lambda: {"cpu": "ok"})
     (simulate,) = (task for task in plan_job(job(device=device), LAYOUT, STAGES) if task.stage == "simulate")
-    assert simulate.resources == Resources(cores=1, gpus=1)
+    assert (simulate.resources.cores, simulate.resources.gpus) == (1, 1)
 
 
 def test_a_device_left_open_takes_the_resources_of_the_one_that_works(monkeypatch):
@@ -113,7 +113,18 @@ def test_a_device_left_open_takes_the_resources_of_the_one_that_works(monkeypatc
         return next(task.resources for task in plan_job(job(device="auto"), LAYOUT, STAGES) if task.id == "simulate")
 
     assert resources({"cpu": "ok"}) == Resources(cores=0)
-    assert resources({"cpu": "ok", "cuda": "ok"}) == Resources(cores=1, gpus=1)
+    with_gpu = resources({"cpu": "ok", "cuda": "ok"})
+    assert (with_gpu.cores, with_gpu.gpus) == (1, 1)
+
+
+def test_frames_on_their_way_to_the_disk_are_counted_in_memory():
+    def need(radius: float) -> int:
+        fluid = {**TANK["fluid"][0], "particle_radius": radius}
+        tasks = plan_job(job(device="cuda", fluid=[fluid]), LAYOUT, STAGES)
+        return next(task.resources.memory_bytes for task in tasks if task.stage == "simulate")
+
+    particles = 1.0 / 0.01**3  # all that fit into the domain of 1 m³
+    assert need(0.005) - need(0.05) > 3 * 32 * 0.99 * particles  # three frames of 32 bytes a particle
 
 
 def test_a_job_simulated_on_a_gpu_elsewhere_is_rendered_on_a_machine_without_one():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from sim.build import build_world, fill_fluid
-from sim.fluid.parameters import FluidParameters
+from sim.build import build_world
+from sim.fluid.filling import fill_fluids
 from sim.rigid.static import StaticBody
 from sim.scene import SceneParameters
 
@@ -19,8 +19,7 @@ def scene(*blocks: dict, rigid: tuple[dict, ...] = ()) -> SceneParameters:
 
 
 def filling(scene: SceneParameters):
-    fluid: FluidParameters = scene.fluid[0]
-    return fill_fluid(fluid, scene.domain, [StaticBody(body).solid for body in scene.rigid])
+    return fill_fluids(scene.fluid, scene.domain, [StaticBody(body).solid for body in scene.rigid])
 
 
 def box(size: tuple[float, float, float], position: tuple[float, float, float], **more) -> dict:

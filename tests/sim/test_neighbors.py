@@ -3,7 +3,7 @@ import pytest
 import taichi as ti
 from scipy.spatial import cKDTree
 
-from sim.cells import CellGrid, CellSort, SortedPoints, exclusive_scan
+from sim.cells import CellGrid, CellSort, SortedPoints
 from sim.neighbors import NeighborList
 
 RADIUS = 0.1
@@ -14,15 +14,6 @@ def device(values: np.ndarray) -> ti.Ndarray:
     array = ti.ndarray(dtype, len(values)) if values.ndim == 1 else ti.Vector.ndarray(3, dtype, len(values))
     array.from_numpy(np.ascontiguousarray(values))
     return array
-
-
-@pytest.mark.parametrize("length", [1, 1023, 1024, 1025, 5000])
-def test_exclusive_scan_equals_numpy(taichi_cpu, length):
-    values = np.random.default_rng(1).integers(0, 9, length).astype(np.int32)
-    result = ti.ndarray(ti.i32, length + 1)
-    total = exclusive_scan(device(values), length, ti.ndarray(ti.i32, length // 1024 + 1), result)
-    np.testing.assert_array_equal(result.to_numpy(), np.concatenate([[0], np.cumsum(values)]))
-    assert total == values.sum()
 
 
 def test_sort_orders_by_cell_then_id_and_drops_what_is_outside(taichi_cpu):

@@ -51,9 +51,16 @@ class Spring:
     def __init__(self, *bodies: str) -> None:
         self.bodies = bodies
         self.exchanged: list[float] = []
+        self.followed: list[float] = []
 
     def exchange(self, dt: float) -> None:
         self.exchanged.append(dt)
+
+    def follow(self, dt: float) -> None:
+        self.followed.append(dt)
+
+    def resume(self) -> None:
+        self.followed.clear()
 
 
 @pytest.mark.parametrize("dt", [1.0, 1 / 60, 0.0166, 1.0e-3, 7.7e-4])
@@ -81,6 +88,7 @@ def test_coupled_solvers_share_substeps_and_others_keep_their_own():
     # Ten steps of a tenth of a frame: rounding only.
     assert len(spring.exchanged) == 10
     assert sum(spring.exchanged) == pytest.approx(1 / 60, rel=1e-12)
+    assert spring.followed == spring.exchanged
 
 
 def test_ten_frames_equal_five_then_restore_then_five():
@@ -117,3 +125,9 @@ def test_divergence_names_body_frame_time_and_quantity():
 def test_a_collapsing_step_ends_instead_of_running_for_ever():
     with pytest.raises(SimulationDivergedError, match="stable time step fell"):
         World([Oscillator("a", 1.0e-12)], frames_per_second=60).advance_frame()
+
+
+def test_a_coupling_needs_its_first_solver_first():
+    solvers = [Oscillator("second", 1.0), Oscillator("first", 1.0)]
+    with pytest.raises(ValueError, match='"first" must stand before "second"'):
+        World(solvers, frames_per_second=60, couplings=[Spring("first", "second")])

@@ -5,15 +5,15 @@ from collections.abc import Callable
 import pytest
 from small_fluids import lattice, make_fluid
 
-from sim.fluid.wcsph import WCSPHSolver
+from sim.fluid.forces import SPHFluid
 from sim.scene import DomainParameters
 
 
 @pytest.fixture
-def dam_break(taichi_cpu: str) -> Callable[..., WCSPHSolver]:
+def dam_break(taichi_cpu: str) -> Callable[..., SPHFluid]:
     """A dam of 6 x 6 x 10 particles at the end of a short channel."""
 
-    def build(**parameters: object) -> WCSPHSolver:
+    def build(**parameters: object) -> SPHFluid:
         domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.4, 0.12, 0.4))
         return make_fluid(domain, lattice((0.0, 0.0, 0.0), (0.12, 0.12, 0.2), 0.02), **parameters)
 

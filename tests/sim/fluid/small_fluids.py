@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
+from sim.fluid.forces import SPHFluid
 from sim.fluid.parameters import FluidParameters
-from sim.fluid.wcsph import WCSPHSolver
+from sim.fluid.solvers import SOLVERS
 from sim.scene import DomainParameters
 
 EARTH = (0.0, 0.0, -9.81)
@@ -26,17 +27,19 @@ def make_fluid(
     velocities: NDArray[np.float32] | None = None,
     gravity: tuple[float, float, float] = EARTH,
     bodies: Sequence[NDArray[np.float32]] = (),
+    capacity: int | None = None,
     **parameters: object,
-) -> WCSPHSolver:
+) -> SPHFluid:
     material = FluidParameters.model_validate(
         {"name": "water", "block": [{"shape": {"type": "box", "size": (1, 1, 1)}}], **parameters}
     )
     walls = domain_wall_samples(domain, 2.0 * material.particle_radius)
-    return WCSPHSolver(
+    return SOLVERS[material.solver](
         material,
         domain=domain,
         gravity=gravity,
         positions=positions,
         velocities=np.zeros_like(positions) if velocities is None else velocities,
         boundary=BoundarySamples.of_bodies(walls, *bodies),
+        capacity=capacity,
     )

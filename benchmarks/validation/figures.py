@@ -1,0 +1,280 @@
+"""Draws the figures: small, light, one colour a solver, measurements and theory in black."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmarks.validation.checks import CaseResult
+
+COLOURS = {"wcsph": "#2a6fbb", "dfsph": "#d1652b", "pcisph": "#2f8f5b", "rigid": "#2a6fbb"}
+TITLES = {"wcsph": "WCSPH", "dfsph": "DFSPH", "pcisph": "PCISPH", "rigid": "rigid body"}
+THEORY = "#222222"
+SHADES = ("#2a6fbb", "#d1652b", "#2f8f5b", "#8a5fb0")
+
+mpl.rcParams.update(
+    {
+        "svg.fonttype": "none",
+        "svg.hashsalt": "validation",
+        "font.family": "sans-serif",
+        "font.sans-serif": ["DejaVu Sans"],
+        "font.size": 8.5,
+        "axes.grid": True,
+        "grid.color": "#e2e2e2",
+        "grid.linewidth": 0.6,
+        "axes.edgecolor": "#888888",
+        "axes.linewidth": 0.7,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.titlesize": 9,
+        "legend.frameon": False,
+        "legend.fontsize": 8,
+        "lines.linewidth": 1.5,
+    }
+)
+
+
+def _panels(count: int, *, width: float = 3.4, height: float = 2.7) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(width * count, height), layout="constrained")
+    return figure, [figure.add_subplot(1, count, number + 1) for number in range(count)]
+
+
+def _label(axes: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.set_title(title, loc="left")
+    if legend:
+        axes.legend()
+
+
+def _style(result: CaseResult) -> dict[str, Any]:
+    return {"color": COLOURS[result.solver], "label": TITLES[result.solver]}
+
+
+def _order_line(axes: Axes, spacings: Sequence[float], largest: float, order: int) -> None:
+    """A dashed line of that slope beside the errors."""
+    line = [largest * (spacing / max(spacings)) ** order for spacing in spacings]
+    axes.plot(spacings, line, "--", color=THEORY, linewidth=1.0, label=f"order {order}")
+
+
+def _refinement(axes: Axes, results: Sequence[CaseResult], counts: str, order: int, x: str, y: str) -> None:
+    for result in results:
+        spacings = [1.0 / count for count in result.series[counts]]
+        axes.loglog(spacings, result.series["errors"], "o-", markersize=4, **_style(result))
+    largest = max(max(result.series["errors"]) for result in results)
+    _order_line(axes, spacings, largest, order)
+    axes.set_xticks(spacings, [f"1/{round(1 / spacing)}" for spacing in spacings], minor=False)
+    axes.set_xticks([], minor=True)
+    _label(axes, x, y, "refinement")
+
+
+def draw_kernel(results: Sequence[CaseResult]) -> Figure:
+    """Shape of the kernel, and the order of smoothing."""
+    figure, (shape, order) = _panels(2)
+    series = results[0].series
+    shape.plot(series["q"], series["w"], color=COLOURS["wcsph"])
+    _label(shape, "|x| / h", "W pi h³ / 8", "cubic spline", legend=False)
+    spacings = [1.0 / count for count in series["spacings"]]
+    order.loglog(spacings, series["smoothing"], "o-", color=COLOURS["wcsph"], label="smoothed sine")
+    _order_line(order, spacings, max(series["smoothing"]), 2)
+    order.set_xticks(spacings, [f"1/{round(1 / spacing)}" for spacing in spacings], minor=False)
+    order.set_xticks([], minor=True)
+    _label(order, "spacing / wavelength", "relative error", "refinement")
+    return figure
+
+
+def draw_hydrostatic(results: Sequence[CaseResult]) -> Figure:
+    """Pressure over depth, force on the floor over time, refinement."""
+    figure, (profile, force, order) = _panels(3)
+    for result in results:
+        finest = max(result.series["layers"])
+        style = _style(result)
+        profile.plot(result.series[f"pressure_{finest}"], result.series[f"depth_{finest}"], "o", markersize=3, **style)
+        force.plot(result.series["times"], result.series["forces"], linewidth=0.8, **style)
+    profile.plot([0.0, 1.0], [0.0, 1.0], color=THEORY, linewidth=1.0, label="rho g (H - z)")
+    profile.invert_yaxis()
+    _label(profile, "p / rho g H", "depth / H", "pressure, mean of 1 s")
+    force.axhline(1.0, color=THEORY, linewidth=1.0)
+    force.set_ylim(0.7, 1.3)
+    _label(force, "time [s]", "force on the floor / weight", "force")
+    _refinement(order, results, "layers", 1, "spacing / H", "rms error / rho g H")
+    return figure
+
+
+def draw_dam_break(results: Sequence[CaseResult]) -> Figure:
+    """Fronts of all solvers and experiments, and of one solver at all resolutions."""
+    from benchmarks.validation.dam_break import experiments
+
+    figure, (solvers, resolutions) = _panels(2, width=4.2, height=3.2)
+    marks = dict(zip(experiments(), "sov", strict=True))
+    names = {
+        "martin_moyce_2.25in": "Martin & Moyce, 2.25 in",
+        "martin_moyce_1.125in": "Martin & Moyce, 1.125 in",
+        "koshizuka_oka": "Koshizuka & Oka",
+    }
+    for axes in (solvers, resolutions):
+        for name, (times, fronts) in experiments().items():
+            axes.plot(times, fronts, marks[name], color=THEORY, markersize=4, fillstyle="none", label=names[name])
+        axes.set_xlim(0.0, 4.0)
+        axes.set_ylim(1.0, 6.5)
+    for result in results:
+        finest = max(result.series["columns"])
+        solvers.plot(result.series[f"times_{finest}"], result.series[f"fronts_{finest}"], **_style(result))
+    shown = results[0]
+    for count, shade in zip(shown.series["columns"], ("#a9c8ea", "#5f9bd6", "#1d4f86"), strict=True):
+        resolutions.plot(
+            shown.series[f"times_{count}"], shown.series[f"fronts_{count}"], color=shade, label=f"width / {count}"
+        )
+    _label(solvers, "T = t (2 g / width)^(1/2)", "front / width", f"solvers, spacing width / {finest}")
+    _label(resolutions, "T", "front / width", f"{TITLES[shown.solver]}, refinement")
+    return figure
+
+
+def draw_elliptical_drop(results: Sequence[CaseResult]) -> Figure:
+    """Semi-axes and kinetic energy over time, refinement."""
+    figure, (axes, energy, order) = _panels(3)
+    for result in results:
+        finest = max(result.series["resolutions"])
+        times = [1e3 * time for time in result.series[f"times_{finest}"]]
+        axes.plot(times, result.series[f"along_{finest}"], **_style(result))
+        axes.plot(times, result.series[f"across_{finest}"], color=COLOURS[result.solver])
+        energy.plot(times, result.series[f"energies_{finest}"], **_style(result))
+    for name in ("exact_along", "exact_across"):
+        label = "exact" if name == "exact_along" else None
+        axes.plot(times[1:], results[0].series[name], ":", color=THEORY, label=label)
+    _label(axes, "time [ms]", "semi-axis [m]", "semi-axes")
+    energy.axhline(1.0, color=THEORY, linewidth=1.0)
+    _label(energy, "time [ms]", "kinetic energy / that of the start", "energy")
+    _refinement(order, results, "resolutions", 1, "spacing / R", "error of the long axis")
+    return figure
+
+
+def draw_viscosity(results: Sequence[CaseResult]) -> Figure:
+    """Decay of the wave along an axis and along a diagonal, refinement."""
+    figure, (decay, order) = _panels(2)
+    for result in results:
+        for name, dash in (("axis", "-"), ("diagonal", "--")):
+            decay.semilogy(
+                result.series["times"], result.series[f"amplitudes_{name}"], dash, color=COLOURS[result.solver]
+            )
+        decay.plot([], [], **_style(result))
+    times = results[0].series["times"]
+    decay.semilogy(times, [2.718281828**-time for time in times], ":", color=THEORY, label="exp(-nu k² t)")
+    decay.minorticks_off()
+    decay.set_yticks([0.92, 0.94, 0.96, 0.98, 1.0], ["0.92", "0.94", "0.96", "0.98", "1"])
+    _label(decay, "nu k² t", "amplitude", "axis (solid), diagonal (dashed)")
+    _refinement(order, results, "resolutions", 2, "spacing / wavelength", "error of the rate")
+    return figure
+
+
+def draw_free_momentum(results: Sequence[CaseResult]) -> Figure:
+    """Drift over steps."""
+    figure, (linear, angular) = _panels(2)
+    for axes, name in ((linear, "linear"), (angular, "angular")):
+        for result in results:
+            # A drift of exactly zero has no place on a logarithmic axis.
+            drifts = [max(drift, 1e-10) for drift in result.series[name]]
+            axes.semilogy(result.series["times"], drifts, **_style(result))
+        axes.axhline(1e-5, color=THEORY, linewidth=1.0, linestyle="--", label="bound")
+        axes.set_ylim(1e-10, 1e-4)
+        _label(axes, "time [s]", "relative drift", f"{name} momentum")
+    return figure
+
+
+def draw_rigid_motion(results: Sequence[CaseResult]) -> Figure:
+    """Energy of a free rotation, the racket's flips, refinement."""
+    figure, (energy, racket, order) = _panels(3)
+    series = results[0].series
+    energy.plot(series["times"], [1e6 * each for each in series["energies"]], color=COLOURS["rigid"], linewidth=0.8)
+    _label(energy, "time [s]", "energy / that of the start - 1  [1e-6]", "rotation without torque", legend=False)
+    racket.plot(series["racket_times"], series["racket_spin"], color=COLOURS["rigid"])
+    _label(racket, "time [s]", "spin about the middle axis / start", "tennis racket", legend=False)
+    order.loglog(series["steps"], series["errors"], "o-", color=COLOURS["rigid"], label="after 2 s")
+    _order_line(order, series["steps"], max(series["errors"]), 2)
+    order.set_xticks(series["steps"], [f"{1e3 * step:g}" for step in series["steps"]], minor=False)
+    order.set_xticks([], minor=True)
+    _label(order, "time step [ms]", "error of the spin [rad/s]", "refinement")
+    return figure
+
+
+def draw_rigid_contacts(results: Sequence[CaseResult]) -> Figure:
+    """Bounces, the slope, the stack."""
+    figure, (bounce, slope, stack) = _panels(3)
+    series = results[0].series
+    for restitution, shade in zip(series["restitutions"], SHADES, strict=False):
+        bounce.plot(
+            series[f"times_{restitution:g}"], series[f"path_{restitution:g}"], color=shade, label=f"e = {restitution:g}"
+        )
+        bounce.axhline(restitution**2, color=shade, linewidth=0.7, linestyle=":")
+    _label(bounce, "time [s]", "height / h", "bounce; dotted: e²")
+    slope.plot(series["slope_times"], series["slope_ways"], color=SHADES[0], label="mu = 0.2")
+    slope.plot(series["slope_times"], series["stuck_ways"], color=SHADES[1], label="mu = 0.8")
+    exact = [0.5 * 9.81 * (0.5 - 0.2 * 0.8660254) * time**2 for time in series["slope_times"]]
+    slope.plot(series["slope_times"], exact, ":", color=THEORY, label="theory")
+    _label(slope, "time [s]", "way down the slope [m]", "slope of 30°")
+    stack.plot(series["stack_times"], [1e6 * way for way in series["stack_ways"]], color=SHADES[0])
+    stack.set_ylim(bottom=0.0)
+    _label(stack, "time [s]", "farthest way of a box [micrometres]", "stack of five", legend=False)
+    return figure
+
+
+def draw_buoyancy(results: Sequence[CaseResult]) -> Figure:
+    """Force on held spheres by size, speed of released ones, way of a neutral one, draught of boxes."""
+    figure, (held, released, neutral, afloat) = _panels(4, width=3.0)
+    dashes = ("-", "--", ":")
+    for result in results:
+        series, style, colour = result.series, _style(result), COLOURS[result.solver]
+        held.plot(series["sizes"], series["held"], "o-", markersize=4, **style)
+        neutral.plot(series["neutral_times"], [1e3 * way for way in series["neutral_ways"]], **style)
+        for density, dash in zip(result.settings["released_densities"], dashes, strict=False):
+            times = [1e3 * time for time in series["released_times"]]
+            released.plot(times, series[f"released_{density:g}"], dash, color=colour)
+        for density, dash in zip(result.settings["floating_densities"], dashes, strict=False):
+            draughts = [1e3 * draught for draught in series[f"afloat_{density:g}"]]
+            afloat.plot(series["afloat_times"], draughts, dash, color=colour, linewidth=1.0)
+    held.axhline(1.0, color=THEORY, linewidth=1.0)
+    held.set_ylim(0.85, 1.15)
+    _label(held, "radius / spacing", "force / rho g V", "held sphere")
+    released.plot([0.0, times[-1]], [0.0, 1e-3 * times[-1]], color=THEORY, linewidth=1.0, label="theory")
+    for density, dash in zip(results[0].settings["released_densities"], dashes, strict=False):
+        released.plot([], [], dash, color="#777777", label=f"{density:g} kg/m³")
+    _label(released, "time [ms]", "speed / acceleration of theory [s]", "released sphere")
+    neutral.axhline(1e3 * results[0].settings["spacing_m"], color=THEORY, linewidth=1.0, linestyle="--")
+    _label(neutral, "time [s]", "way [mm]; dashed: one spacing", "neutral sphere", legend=False)
+    for density, dash in zip(results[0].settings["floating_densities"], dashes, strict=False):
+        exact = 1e3 * density / 1000.0 * results[0].settings["box_m"][2]
+        afloat.axhline(exact, color=THEORY, linewidth=1.0)
+        afloat.plot([], [], dash, color="#777777", label=f"{density:g} kg/m³")
+    _label(afloat, "time [s]", "draught [mm]; black: theory", "floating box")
+    return figure
+
+
+def draw_bunny_energy(results: Sequence[CaseResult]) -> Figure:
+    """Mechanical and kinetic energy over time."""
+    figure, (total, kinetic) = _panels(2, width=4.2, height=3.0)
+    for result in results:
+        total.plot(result.series["times"], result.series["kept"], **_style(result))
+        kinetic.plot(result.series["times"], result.series["kinetic"], **_style(result))
+    for axes in (total, kinetic):
+        axes.set_ylim(bottom=0.0)
+    _label(total, "time [s]", "energy / that of the start", "mechanical energy")
+    _label(kinetic, "time [s]", "kinetic energy / energy of the start", "kinetic energy")
+    return figure
+
+
+DRAWINGS: dict[str, Callable[[Sequence[CaseResult]], Figure]] = {
+    "kernel": draw_kernel,
+    "hydrostatic": draw_hydrostatic,
+    "dam-break": draw_dam_break,
+    "elliptical-drop": draw_elliptical_drop,
+    "viscosity": draw_viscosity,
+    "free-momentum": draw_free_momentum,
+    "buoyancy": draw_buoyancy,
+    "bunny-energy": draw_bunny_energy,
+    "rigid-motion": draw_rigid_motion,
+    "rigid-contacts": draw_rigid_contacts,
+}

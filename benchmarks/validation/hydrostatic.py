@@ -1,0 +1,104 @@
+"""A column of water at rest: its pressure is rho g (H - z) and the floor bears its weight."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from benchmarks.validation.checks import CaseResult, Check, fitted_order
+from benchmarks.validation.fluids import EARTH, FLUID_SOLVERS, GRAVITY, WATER, advance, lattice, make_fluid, state_of
+from sim.fluid.boundary_akinci2012 import domain_wall_samples
+from sim.scene import DomainParameters
+
+if TYPE_CHECKING:
+    pass
+
+SOLVERS = FLUID_SOLVERS
+HEIGHT, SIDE, DURATION = 0.2, 0.1, 2.0
+"""Of the column [m], and how long it stands [s]."""
+
+SETTLED = 1.0
+"""From here on the sound of the start is averaged away [s]."""
+
+LAYERS = (8, 16, 32)
+QUICK_LAYERS = (8, 16)
+
+
+def stand(solver: str, layers: int) -> dict[str, Any]:
+    """Let a column of so many layers of particles stand; profile, force on the floor and speeds."""
+    spacing = HEIGHT / layers
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(SIDE, SIDE, 2.0 * HEIGHT))
+    fluid = make_fluid(solver, domain, lattice((0.0,) * 3, (SIDE, SIDE, HEIGHT), spacing), spacing=spacing)
+    floor = domain_wall_samples(domain, spacing)[:, 2] < 0.0
+    before = fluid.diagnostics()
+    weight = before["mass"] * GRAVITY
+    surface = before["mass"] / (WATER * SIDE**2)
+    times, forces, speeds, heights, pressures = [], [], [], [], []
+    for time in advance(fluid, DURATION, cuts=200):
+        position, velocity = state_of(fluid)
+        times.append(time)
+        speeds.append(float(np.sqrt((velocity**2).sum(axis=1).mean())))
+        forces.append(-float(fluid.boundary_forces()[floor, 2].sum()) / weight)
+        if time > SETTLED:
+            heights.append(position[:, 2])
+            pressures.append(fluid.pressures())
+    height, pressure = np.mean(heights, axis=0), np.mean(pressures, axis=0)
+    after = fluid.diagnostics()
+    scale = WATER * GRAVITY * surface
+    layer = np.clip((height / surface * layers).astype(int), 0, layers - 1)
+    means = np.array([pressure[layer == k].mean() for k in range(layers)])
+    middles = np.array([height[layer == k].mean() for k in range(layers)])
+    exact = WATER * GRAVITY * (surface - middles)
+    settled = np.array(times) > SETTLED
+    return {
+        "times": times,
+        "speeds": speeds,
+        "forces": forces,
+        "depth": ((surface - middles) / surface).tolist(),
+        "pressure": (means / scale).tolist(),
+        "force": float(np.mean(np.array(forces)[settled])),
+        "slope": float(np.polyfit(surface - middles, means, 1)[0]) / (WATER * GRAVITY),
+        "error": float(np.sqrt(np.mean((means - exact) ** 2)) / scale),
+        "rest_speed": float(np.mean(np.array(speeds)[settled])) / np.sqrt(GRAVITY * HEIGHT),
+        "energy_gain": (
+            sum(after[name] - before[name] for name in ("kinetic_energy", "potential_energy")) / (weight * HEIGHT)
+        ),
+        "wall_contacts": after["wall_contacts"],
+        "particles": fluid.particle_count,
+    }
+
+
+def run(solver: str, *, quick: bool = False) -> CaseResult:
+    """The column at several resolutions."""
+    layers = QUICK_LAYERS if quick else LAYERS
+    runs = [stand(solver, count) for count in layers]
+    finest = runs[-1]
+    order = fitted_order([1.0 / count for count in layers], [each["error"] for each in runs])
+    checks = [
+        Check("force on the floor over the weight", finest["force"], 1.0, 0.01, "the design's 1 %; mean of 1 s"),
+        Check("slope of the pressure over rho g", finest["slope"], 1.0, 2.0 / layers[-1],
+              "first order: two layers' worth; the density of 26 neighbours in disorder is overestimated"),
+        Check("error of the pressure profile over rho g H (rms)", finest["error"], 0.0, 1.0 / layers[-1],
+              "first order: half a layer at floor and surface each"),
+        Check("order of that error under refinement", order, 1.5, 0.8,
+              "first at floor and free surface, second inside: 0.7 to 2.3 pass"),
+        Check("rms speed at rest over sqrt(g H)", finest["rest_speed"], 0.0, 0.03,
+              "what moves is under a thousandth of the energy that the column has to give, m g H/2"),
+        Check("energy gained over m g H", max(0.0, finest["energy_gain"]), 0.0, 1e-4,
+              "float32 sums; it may lose any"),
+        Check("particles put back by a wall", finest["wall_contacts"], 0.0, 0.0, "a count"),
+    ]  # fmt: skip
+    series = {"layers": list(layers), "errors": [each["error"] for each in runs]}
+    for count, each in zip(layers, runs, strict=True):
+        series |= {f"{name}_{count}": each[name] for name in ("depth", "pressure")}
+    series |= {name: finest[name] for name in ("times", "speeds", "forces")}
+    settings = {
+        "height_m": HEIGHT,
+        "side_m": SIDE,
+        "duration_s": DURATION,
+        "gravity": EARTH,
+        "layers": list(layers),
+        "particles": [each["particles"] for each in runs],
+    }
+    return CaseResult("hydrostatic", solver, settings, checks, series)

@@ -1,0 +1,143 @@
+"""What a report tells of a job, gathered from its folder."""
+
+from __future__ import annotations
+
+import tempfile
+from base64 import b64encode
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.committed_pictures import committed_pictures, evenly_spread
+from pipeline.errors import PipelineError
+from pipeline.job.loading import load_job
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.manifest_reader import ManifestReader, StageTiming
+from pipeline.report.panels import JobNumbers
+from pipeline.solver_numbers import Warned, simulation_numbers
+from pipeline.task import TaskState
+
+SHEET_PICTURES, SHEET_COLUMNS = 12, 4
+SHEET_WIDTH = 1200
+"""At most [pixels]; small pictures are not enlarged."""
+
+
+@dataclass(frozen=True)
+class JobReport:
+    """A job as its report shows it.
+
+    Attributes:
+        job: the job as submitted.
+        title: its name, or its folder where another job of the report has the same name.
+        done: finished tasks.
+        total: planned tasks.
+        outcome: how the last run ended, or None.
+        timings: what each stage has taken.
+        numbers: what the solvers told.
+        warnings: what they warned of.
+        unreadable: frames of the cache that cannot be read.
+        sheet: its pictures side by side, as the bytes of a WebP picture; None before there are any.
+    """
+
+    job: Job
+    title: str
+    done: int
+    total: int
+    outcome: str | None
+    timings: tuple[StageTiming, ...]
+    numbers: JobNumbers
+    warnings: tuple[Warned, ...]
+    unreadable: tuple[int, ...]
+    sheet: bytes | None
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """The job in a few words."""
+        job, frames = self.job, self.numbers.frames
+        width, height = job.render.resolution
+        facts = {
+            "frames": f"{job.frame_count}, {job.frame_count / job.fps:.3g} s at {job.fps:g} fps",
+            "simulated": f"{len(frames)} frames" + (f" on {frames[-1].device}" if frames else ""),
+            "tasks": f"{self.done:,} of {self.total:,} done"
+            + (f", last run {self.outcome}" if self.outcome is not None else ""),
+            "pictures": f"{width} × {height}, {job.render.quality} quality",
+        }
+        for fluid in job.fluid:
+            count = frames[-1].solvers.get(fluid.name, {}).get("particle_count") if frames else None
+            particles = f"{count:,.0f} particles of" if count is not None else "particles of"
+            facts[fluid.name] = f"{fluid.solver.upper()}, {particles} radius {fluid.particle_radius:g} m"
+        for smoke in job.smoke:
+            facts[smoke.name] = f"smoke, cells of {smoke.cell_size:g} m"
+        return facts
+
+    def as_json(self) -> dict[str, object]:
+        """All numbers for machines."""
+        frames = self.numbers.frames
+        return {
+            "name": self.title,
+            "fps": self.job.fps,
+            "frame_count": self.job.frame_count,
+            "tasks": {"done": self.done, "total": self.total},
+            "stages": [timing._asdict() for timing in self.timings],
+            "warnings": [each.as_json() for each in self.warnings],
+            "unreadable_frames": list(self.unreadable),
+            "frame": [frame.frame for frame in frames],
+            "time_s": [frame.time_s for frame in frames],
+            "solvers": {
+                solver: {name: self.numbers.series(solver, name) for name in self.numbers.names(solver)}
+                for solver in self.numbers.solvers
+            },
+            "total_mechanical_energy": self.numbers.total_energy(),
+        }
+
+
+def gather(layout: JobLayout, *, title: str) -> JobReport:
+    """Look at a job's folder.
+
+    Args:
+        layout: the folder of a submitted job.
+        title: what to call the job.
+
+    Raises:
+        PipelineError: the job file or the manifest cannot be used, or a picture is damaged.
+    """
+    job = load_job(layout.job_file)
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        summary, timings, last = manifest.summary(), manifest.stage_timings(), manifest.last_run()
+    finished = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
+    simulation = simulation_numbers(layout, history=True)
+    return JobReport(
+        job=job,
+        title=title,
+        done=sum(stage.counts.get(state, 0) for stage in summary for state in finished),
+        total=sum(stage.total for stage in summary),
+        outcome=last.outcome,
+        timings=tuple(timings),
+        numbers=JobNumbers(title, simulation.frames),
+        warnings=tuple(simulation.warnings()),
+        unreadable=simulation.unreadable,
+        sheet=_sheet(layout, picture_width=job.render.resolution[0]),
+    )
+
+
+def as_data(picture: bytes) -> str:
+    """A WebP picture as an address that holds it."""
+    return f"data:image/webp;base64,{b64encode(picture).decode()}"
+
+
+def _sheet(layout: JobLayout, *, picture_width: int) -> bytes | None:
+    from render.errors import InvalidFileError
+    from render.sheet import contact_sheet
+
+    pictures = committed_pictures(layout)
+    if not pictures:
+        return None
+    chosen = evenly_spread(pictures, SHEET_PICTURES)
+    width = min(SHEET_WIDTH, SHEET_COLUMNS * (picture_width + 8))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "sheet.webp")
+        try:
+            contact_sheet(chosen, path, columns=SHEET_COLUMNS, width=width)
+        except (InvalidFileError, ValueError) as error:
+            raise PipelineError(f"cannot put the frames of {layout.root} on a sheet: {error}") from error
+        return path.read_bytes()

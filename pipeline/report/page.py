@@ -1,0 +1,168 @@
+"""The report's page: HTML with its style, charts, pictures and numbers inside. Pure."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from pipeline import wording
+from pipeline.manifest_reader import StageTiming
+from pipeline.plan import frame_ranges
+from pipeline.report.chart import line_chart, swatch
+from pipeline.report.job_report import JobReport, as_data
+from pipeline.report.panels import Panel, panels_of
+
+
+def page(reports: Sequence[JobReport], *, written: str) -> str:
+    """The page of one job, or of several in the same charts.
+
+    Args:
+        reports: the jobs; titles differ.
+        written: when, in words.
+    """
+    title = " and ".join(report.title for report in reports)
+    found = panels_of([report.numbers for report in reports])
+    sections = [_section(f"Solvers{_over(reports)}", _charts(found.panels, found.zero))]
+    if len(reports) > 1:
+        sections.insert(0, _section("Energy kept", _energies(reports)))
+    body = [
+        f"<header><h1>{escape(title)}</h1><p>{escape(written)}</p></header>",
+        *(_job(report) for report in reports),
+        *sections,
+    ]
+    data = _json({"written": written, "jobs": [report.as_json() for report in reports]})
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<style>{_STYLE}</style>\n</head>\n<body>\n"
+        + "\n".join(body)
+        + f'\n<script type="application/json" id="numbers">{data}</script>\n</body>\n</html>\n'
+    )
+
+
+def _over(reports: Sequence[JobReport]) -> str:
+    return "" if len(reports) == 1 else " in comparison"
+
+
+def _job(report: JobReport) -> str:
+    facts = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in report.facts.items())
+    parts = [f"<h2>{escape(report.title)}</h2><dl>{facts}</dl>", _warnings(report)]
+    if report.sheet is not None:
+        parts.append(f'<img class="sheet" src="{as_data(report.sheet)}" alt="frames of {escape(report.title)}">')
+    if report.timings:
+        parts.append(_timings(report.timings))
+    return f"<section>{''.join(parts)}</section>"
+
+
+def _warnings(report: JobReport) -> str:
+    sentences = [str(each) for each in report.warnings]
+    if report.unreadable:
+        frames = frame_ranges(report.unreadable, range(report.unreadable[-1] + 1))
+        sentences.append(f"frames of the cache that cannot be read: {frames}")
+    items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
+    return f'<ul class="warnings">{items}</ul>' if items else '<p class="quiet">No warnings.</p>'
+
+
+def _timings(timings: Sequence[StageTiming]) -> str:
+    most = max(timing.seconds for timing in timings) or 1.0
+    rows = "".join(
+        f"<tr><th>{escape(timing.stage)}</th><td>{timing.attempts:,}</td><td>{timing.failed:,}</td>"
+        f'<td class="bar"><span style="width:{100.0 * timing.seconds / most:.1f}%"></span>'
+        f"{wording.duration(timing.seconds)}</td><td>{wording.duration(timing.longest_s)}</td>"
+        f"<td>{wording.size(timing.peak_memory_bytes) if timing.peak_memory_bytes else '–'}</td>"
+        f"<td>{timing.artifacts:,}</td><td>{wording.size(timing.bytes)}</td></tr>"
+        for timing in timings
+    )
+    head = "".join(
+        f"<th>{name}</th>"
+        for name in ("stage", "attempts", "failed", "time of all", "longest", "peak memory", "files", "size")
+    )
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+
+
+def _energies(reports: Sequence[JobReport]) -> str:
+    """What became of the mechanical energy of each job, from its first frame to its last."""
+    rows = []
+    for report in reports:
+        energies = [energy for energy in report.numbers.total_energy() if math.isfinite(energy)]
+        if energies:
+            first, last = energies[0], energies[-1]
+            rows.append(
+                f"<tr><th>{escape(report.title)}</th><td>{first:.5g} J</td><td>{last:.5g} J</td>"
+                f"<td>{first - last:.5g} J</td></tr>"
+            )
+    if not rows:
+        return '<p class="quiet">No solver tells its mechanical energy.</p>'
+    head = "<th>job</th><th>first frame</th><th>last frame</th><th>lost</th>"
+    return (
+        f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+        '<p class="quiet">Kinetic, potential and elastic energy of all bodies. Particles and bodies that leave the '
+        "domain take theirs along.</p>"
+    )
+
+
+def _charts(panels: Iterable[Panel], zero: Sequence[str]) -> str:
+    figures = "".join(_figure(panel) for panel in panels)
+    if not figures:
+        return '<p class="quiet">No frame has been simulated yet.</p>'
+    note = f'<p class="quiet">Zero in every frame: {escape("; ".join(zero))}.</p>' if zero else ""
+    return f'<div class="charts">{figures}</div>{note}'
+
+
+def _figure(panel: Panel) -> str:
+    unit = f" [{panel.unit}]" if panel.unit else ""
+    legend = "".join(f"<li>{swatch(line)}{escape(line.label)}</li>" for line in panel.lines)
+    chart = line_chart(panel.lines, x_label="simulated time [s]", may_be_logarithmic=panel.logarithmic)
+    return f"<figure><figcaption>{escape(panel.title + unit)}</figcaption><ul>{legend}</ul>{chart}</figure>"
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>{content}</section>"
+
+
+def _json(data: object) -> str:
+    """JSON that may stand in a script element: no markup in it, and null for numbers that are not finite."""
+    text = json.dumps(_finite(data), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
+
+
+def _finite(data: object) -> object:
+    if isinstance(data, float):
+        return data if math.isfinite(data) else None
+    if isinstance(data, dict):
+        return {key: _finite(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_finite(value) for value in data]
+    return data
+
+
+_STYLE = """
+:root { color-scheme: light dark; --paper: #fcfcfb; --ink: #1d1d1b; --soft: #62615c; --rule: #dddcd6; --bar: #cfe0f5;
+  --warn: #8a4b00; --c0: #2a78d6; --c1: #d9541e; --c2: #12875f; --c3: #a86f00; --c4: #b93c7f; --c5: #4a3aa7;
+  --c6: #6b6b66; --c7: #c22f2f; }
+@media (prefers-color-scheme: dark) { :root { --paper: #171716; --ink: #ecebe6; --soft: #a3a29b; --rule: #3a3936;
+  --bar: #24456b; --warn: #f0b45c; --c0: #5a9fee; --c1: #f07c4a; --c2: #35b98a; --c3: #d9a02c; --c4: #e578b0;
+  --c5: #a196f0; --c6: #a9a8a1; --c7: #f07373; } }
+body { margin: 0 auto; max-width: 86rem; padding: 1.5rem; background: var(--paper); color: var(--ink);
+  font: 15px/1.45 system-ui, sans-serif; }
+h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .6rem; }
+header p, .quiet { color: var(--soft); margin: .3rem 0; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.2rem; margin: 0 0 .8rem; }
+dt { color: var(--soft); } dd { margin: 0; }
+.warnings { color: var(--warn); padding-left: 1.2rem; }
+.sheet { max-width: 100%; display: block; margin: .8rem 0; border-radius: 4px; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .25rem .8rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
+th:first-child { text-align: left; } thead th { color: var(--soft); font-weight: 500; }
+.bar { position: relative; min-width: 9rem; } .bar span { position: absolute; inset: 3px auto 3px 0;
+  background: var(--bar); border-radius: 2px; z-index: -1; }
+.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr)); gap: 1.6rem; }
+figure { margin: 0; } figcaption { font-weight: 600; }
+figure ul { list-style: none; margin: .2rem 0; padding: 0; display: flex; flex-wrap: wrap; gap: .1rem 1rem;
+  font-size: 13px; color: var(--soft); }
+figure > svg { width: 100%; height: auto; display: block; } .swatch { width: 28px; height: 8px; margin-right: .4rem; }
+.line { fill: none; stroke-width: 1.8; stroke-linejoin: round; stroke-linecap: round; }
+.grid { stroke: var(--rule); } .axis { stroke: var(--soft); } .tick { fill: var(--soft); font-size: 11.5px; }
+""" + " ".join(f".c{index} {{ stroke: var(--c{index}); }}" for index in range(8))

@@ -1,0 +1,160 @@
+"""Whitewater: spray, foam and bubbles of each fluid, from frame to frame of the cache."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+from pipeline.cache import read_frame
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.parameter_set import ParameterSet
+from pipeline.stages.base import TaskContext
+from pipeline.stages.inputs import by_content, tool_version
+from pipeline.task import ArtifactPath, Resources, Task, TaskId
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from sim.shapes import LevelSet
+    from sim.snapshots import Snapshot
+    from sim.whitewater.cloud import WhitewaterCloud
+    from sim.whitewater.obstacles import MovingObstacle
+
+CORES = 2
+"""Threads of the neighbour sums; the rest of a frame is numpy's, which takes one."""
+
+WORKER_BYTES = 600_000_000
+BYTES_PER_PARTICLE = 400
+
+
+class WhitewaterStage:
+    """One PLY a fluid and frame, each from that of the frame before and the fluid at both frames.
+
+    So the frames of a fluid are made one after the other, each as soon as its own frame is cached. It always computes
+    on the CPU: the clouds are the same wherever the simulation ran.
+    """
+
+    name = "whitewater"
+    version = 1
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task a frame of each fluid that has whitewater."""
+        return [
+            Task(
+                id=TaskId(f"whitewater/{fluid}/{frame:06d}"),
+                stage=self.name,
+                inputs=_inputs(layout, fluid, frame),
+                outputs=(layout.whitewater(fluid, frame),),
+                parameters=parameters,
+                subject=fluid,
+                frame=frame,
+                resources=resources,
+            )
+            for fluid, parameters, resources in (
+                (fluid, self._parameters(job, fluid), _resources(job, fluid)) for fluid in job.whitewater
+            )
+            for frame in range(job.frame_count)
+        ]
+
+    def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
+        """None: the simulation needs the same packages."""
+        return []
+
+    def run(self, context: TaskContext) -> None:
+        """Make one frame of one fluid's whitewater."""
+        from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
+
+        cloud = _next_cloud(context)
+        with context.committing(context.task.outputs[0], validate_point_cloud) as path:
+            write_point_cloud(
+                path, PointCloud(cloud.position, cloud.velocity, cloud.radius, cloud.lifetime, cloud.kind)
+            )
+        context.progress(1, 1, f"{len(cloud)} particles")
+
+    def _parameters(self, job: Job, fluid: str) -> ParameterSet:
+        return ParameterSet.of(
+            stage=self.name,
+            version=self.version,
+            tools={name: tool_version(name) for name in ("taichi", "libigl", "numpy", "scipy")},
+            whitewater=job.whitewater[fluid],
+            fps=job.fps,
+            gravity=job.gravity,
+            domain=job.domain,
+            rigid=[{"name": body.name, "shape": by_content(body).shape, "scale": body.scale} for body in job.rigid],
+        )
+
+
+def _inputs(layout: JobLayout, fluid: str, frame: int) -> tuple[ArtifactPath, ...]:
+    if frame == 0:
+        return (layout.frame_cache(0),)
+    return layout.frame_cache(frame - 1), layout.frame_cache(frame), layout.whitewater(fluid, frame - 1)
+
+
+def _resources(job: Job, fluid: str) -> Resources:
+    """How many particles the fluid has is not known before the simulation has filled its blocks."""
+    return Resources(cores=CORES, memory_bytes=WORKER_BYTES + BYTES_PER_PARTICLE * job.whitewater[fluid].max_particles)
+
+
+def _next_cloud(context: TaskContext) -> WhitewaterCloud:
+    from render.point_clouds import read_point_cloud
+    from sim.runtime import initialize
+    from sim.whitewater.cloud import WhitewaterCloud
+
+    task, job = context.task, context.job
+    assert task.frame is not None
+    if task.frame == 0:
+        return WhitewaterCloud.empty()
+    initialize("cpu", threads=context.threads)
+    from sim.whitewater.motion import FluidState
+    from sim.whitewater.solver import WhitewaterSolver
+
+    before, now = (_fluid_and_bodies(context.layout.path(cached), task.subject) for cached in task.inputs[:2])
+    last = read_point_cloud(context.layout.path(task.inputs[2]))
+    particle_radius = now[task.subject].number("particle_radius")
+    solver = WhitewaterSolver(
+        job.whitewater[task.subject], domain=job.domain, gravity=job.gravity, frames_per_second=job.fps
+    )
+    cloud, report = solver.advance_frame(
+        WhitewaterCloud(last.position, last.velocity, last.radius, last.lifetime, last.kind),
+        FluidState.of_snapshot(before[task.subject]),
+        FluidState.of_snapshot(now[task.subject]),
+        frame=task.frame,
+        particle_radius=particle_radius,
+        bodies=_bodies(job, before, now, particle_radius),
+    )
+    print(f"{len(cloud)} particles, {report.generated} of them new, in {report.substeps} substeps", flush=True)
+    if report.not_generated:
+        print(f"{report.not_generated} particles had no room below max_particles", flush=True)
+    return cloud
+
+
+def _fluid_and_bodies(path: Path, fluid: str) -> dict[str, Snapshot]:
+    """What whitewater reads of a cached frame; smoke would take longer than all of it."""
+    return {**read_frame(path, kind="rigid").bodies, **read_frame(path, fluid).bodies}
+
+
+def _bodies(
+    job: Job, before: Mapping[str, Snapshot], now: Mapping[str, Snapshot], particle_radius: float
+) -> list[MovingObstacle]:
+    from sim.shapes.parameters import Placement
+    from sim.whitewater.obstacles import MovingObstacle, Pose
+
+    return [
+        MovingObstacle(
+            _level_set(Placement(shape=body.shape, scale=body.scale).model_dump_json(), particle_radius),
+            Pose.of_snapshot(before[body.name]),
+            Pose.of_snapshot(now[body.name]),
+        )
+        for body in job.rigid
+    ]
+
+
+@cache
+def _level_set(placement: str, particle_radius: float) -> LevelSet:
+    """Distances of a shape, its placement given as JSON; kept, as sampling a mesh takes longer than a frame."""
+    from sim.shapes.parameters import Placement
+    from sim.whitewater.obstacles import sample_at_rest
+
+    return sample_at_rest(Placement.model_validate_json(placement), particle_radius)

@@ -1,0 +1,38 @@
+"""Poses of a frame's rigid bodies, as the JSON document that `blender_scripts/poses.py` reads; docs/formats.md."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+POSES_VERSION = 1
+
+
+def write_poses(path: Path, frame: int, bodies: Mapping[str, Mapping[str, NDArray[np.generic]]]) -> None:
+    """Write the poses of one frame; the same poses give the same bytes.
+
+    Args:
+        path: the document.
+        frame: number of the frame.
+        bodies: for each body `position` (3,) of its mesh's origin [m], `orientation` (4,) as a unit quaternion w, x,
+            y, z, `velocity` (3,) of that origin [m/s], `angular_velocity` (3,) about the world's axes [rad/s].
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+    document = {
+        "version": POSES_VERSION,
+        "frame": frame,
+        "bodies": {
+            name: {key: np.asarray(arrays[key], dtype=np.float64).tolist() for key in _KEYS}
+            for name, arrays in bodies.items()
+        },
+    }
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+_KEYS = ("position", "orientation", "velocity", "angular_velocity")

@@ -1,0 +1,1 @@
+"""Couplings: what two solvers exchange in every step."""

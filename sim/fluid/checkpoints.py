@@ -1,0 +1,55 @@
+"""What a checkpoint of a particle fluid holds, and whether arrays are one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sim.solver import Arrays
+
+CHECKPOINT_ARRAYS = {
+    "position": ("float32", "vector"),
+    "velocity": ("float32", "vector"),
+    "particle_id": ("int32", "scalar"),
+    "phase": ("int32", "scalar"),
+    "reference_position": ("float32", "vector"),
+    "travelled": ("float64", "number"),
+    "boundary_travelled": ("float64", "number"),
+    "boundary_speed": ("float64", "number"),
+    "body_states": ("float32", "bodies"),
+    "reference_body_states": ("float32", "bodies"),
+    "max_speed": ("float64", "number"),
+    "max_acceleration": ("float64", "number"),
+    "particles_removed": ("int64", "number"),
+    "next_particle_id": ("int64", "number"),
+}
+"""Type of each array of a checkpoint, and whether it has a vector or scalar per particle, one number in all, or the
+states of all moving bodies."""
+
+
+def check_checkpoint(
+    arrays: Arrays, fluid: str, *, capacity: int, carried: tuple[str, ...], body_states: tuple[int, ...]
+) -> None:
+    """Raise ValueError for arrays that are no checkpoint of a particle fluid.
+
+    Args:
+        arrays: by name.
+        fluid: its name.
+        capacity: particles that it has room for.
+        carried: scalars per particle that its solver keeps.
+        body_states: shape of the states of its moving bodies.
+    """
+    expected = CHECKPOINT_ARRAYS | dict.fromkeys(carried, ("float32", "scalar"))
+    missing = sorted(set(expected) - set(arrays))
+    if missing:
+        raise ValueError(f'not a checkpoint of "{fluid}": it lacks {", ".join(missing)}')
+    count = len(arrays["particle_id"])
+    if count > capacity:
+        raise ValueError(f'the checkpoint has {count} particles, "{fluid}" has room for {capacity}')
+    shapes = {"vector": (count, 3), "scalar": (count,), "number": (1,), "bodies": body_states}
+    for name, (dtype, width) in expected.items():
+        found = arrays[name]
+        if found.shape != shapes[width] or found.dtype != dtype:
+            raise ValueError(
+                f'checkpoint of "{fluid}": {name} must be {dtype} {shapes[width]}, got {found.dtype} {found.shape}'
+            )

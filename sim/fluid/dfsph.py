@@ -1,0 +1,117 @@
+"""Divergence-free SPH (Bender & Koschier 2015) with the boundaries of Akinci et al. 2012."""
+
+from typing import Any
+
+import taichi as ti
+
+from sim.fluid.implicit_fluid import ImplicitFluid, SolveRecord, momentum
+from sim.fluid.kernels import lattice_offsets
+from sim.fluid.pressure_kernels import add_scaled, measure_divergence, predict_compression, relax_pressure
+from sim.solver import Diagnostics
+
+LEAST_ITERATIONS, LEAST_DIVERGENCE_ITERATIONS = 2, 1
+"""Iterations of the density and the divergence solve in any case (Bender & Koschier 2015, algorithms 3 and 2)."""
+
+LEAST_FILLED = 20.0 / 26.0
+"""Share of a lattice's neighbours without which a particle is at a free surface: it has room, and no divergence."""
+
+
+class DFSPHSolver(ImplicitFluid):
+    """A fluid without divergence and without compression, by two pressure solves a step.
+
+    With rho_i relative to the rest density and (D v)_i its rate of change (`sim.fluid.pressure_kernels`):
+
+    1. rho_i = V sum_j W_ij + sum_b V_b W_ib, and 1/A_ii, the factor alpha_i/rho_i of the paper (eq. 9)
+    2. divergence solve: P with dt (D v)_i <= 0 for v + dt a^p(P) (algorithm 2), not where neighbours are missing
+    3. a_i = gravity, viscosity, cohesion
+    4. density solve: P with rho_i + dt (D v)_i <= 1 for v + dt (a + a^p(P)) (algorithm 3)
+    5. v_i += dt (a_i + a_i^p), x_i += dt v_i
+
+    kappa of the paper is P_i/rho_i here, and dt² A_ii P_i what that pressure takes away of the compression. Three
+    things differ from the paper; docs/decisions/0016-implicit-pressure.md has the measurements. The pressures are
+    iterated themselves, at least 0, so that a solve is one linear complementarity problem, and that of the density
+    solve is what one would measure; it starts from that of the step before. Relaxation has momentum (`momentum`). And
+    of a compression that a particle has already, from walls or the error of linearization, a step takes back a part
+    only (`_correction`), as it turns into speed.
+
+    Momentum of fluid pairs is conserved to rounding. `pressures` and `boundary_forces` are those of the density solve;
+    the divergence solve adds impulses that are small but where fluid hits something.
+    """
+
+    carried = ("pressure",)
+
+    def __init__(self, *args: Any, **keywords: Any) -> None:
+        """Take particles, walls and bodies, as `ParticleFluid` does."""
+        super().__init__(*args, **keywords)
+        self._divergence_pressure = ti.ndarray(ti.f32, self.capacity)
+        self._least_neighbors = LEAST_FILLED * (len(lattice_offsets(self.parameters.support_in_spacings)) - 1)
+
+    def begin_frame(self, time_s: float) -> None:
+        """Restart the counters of the frame."""
+        super().begin_frame(time_s)
+        self._divergence_solves = SolveRecord()
+
+    def substep(self, dt: float) -> None:
+        """Advance by dt [s]."""
+        self._compute_density()
+        self._correct_divergence(dt)
+        self._compute_acceleration(None)
+        self._react_on_bodies(None, dt)
+        self._apply_implicit_viscosity(self._acceleration, dt)
+        self._correct_density(dt)
+        self._advance_particles(self._acceleration, dt)
+        self._update_neighbors()
+
+    def diagnostics(self) -> Diagnostics:
+        """As for every implicit fluid, with the iterations and errors of the divergence solves."""
+        common, record = super().diagnostics(), self._divergence_solves
+        return {
+            **common,
+            "divergence_iterations": record.mean_iterations,
+            "divergence_error": record.worst_error,
+            "not_converged": common["not_converged"] + record.not_converged,
+        }
+
+    @property
+    def _pressure_term(self) -> ti.Ndarray:
+        return self._particles.carried["pressure"]
+
+    def _correct_divergence(self, dt: float) -> None:
+        particles, boundary = self._particles, self.boundary
+        measure_divergence(
+            particles.position, particles.velocity, self._inverse_diagonal, particles.count, *self._list,
+            boundary.position, boundary.velocity, boundary.volume, boundary.moving_count > 0,
+            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt, self._least_neighbors, self._relaxation,
+            self._compression, self._divergence_pressure, self._relaxed_before,
+        )  # fmt: skip
+        self._divergence_pressure = self._solve(
+            self._divergence_solves, self._divergence_pressure, dt,
+            least=LEAST_DIVERGENCE_ITERATIONS, tolerance=self.parameters.divergence_tolerance,
+        )  # fmt: skip
+        self._react_on_bodies(self._divergence_pressure, dt, with_friction=False)
+        add_scaled(particles.velocity, self._pressure_acceleration, dt, particles.count)
+
+    def _correct_density(self, dt: float) -> None:
+        particles, boundary = self._particles, self.boundary
+        predict_compression(
+            particles.position, particles.velocity, self._acceleration, self._density, particles.count, *self._list,
+            boundary.position, boundary.velocity, boundary.volume, boundary.moving_count > 0,
+            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt, self._correction(dt), self._compression,
+        )  # fmt: skip
+        self._start_from(particles.carried["pressure"])
+        particles.carried["pressure"] = self._solve(
+            self._density_solves, particles.carried["pressure"], dt,
+            least=LEAST_ITERATIONS, tolerance=self.parameters.density_tolerance,
+        )  # fmt: skip
+        self._react_on_bodies(particles.carried["pressure"], dt, with_friction=False)
+        add_scaled(self._acceleration, self._pressure_acceleration, 1.0, particles.count)
+
+    def _relax(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
+        particles, boundary = self._particles, self.boundary
+        relax_pressure(
+            particles.position, self._pressure_acceleration, self._compression, self._inverse_diagonal,
+            particles.count, *self._list,
+            boundary.position, self._boundary_response, boundary.volume, boundary.moving_count > 0,
+            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt**2, self._relaxation,
+            momentum(iteration), pressure, self._relaxed_before, self._next_pressure, self._remaining,
+        )  # fmt: skip

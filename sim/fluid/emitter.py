@@ -1,0 +1,224 @@
+"""Inflow: layers of particles that leave their openings at an exact rate."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.cells import CellGrid, Cells, Integers, Vectors, cell_of_point, row_of_cell
+from sim.fluid.opening import NOZZLE_LAYERS, Opening
+from sim.fluid.parameters import FluidParameters
+from sim.fluid.particles import ParticleSet
+from sim.launch import fast_launch
+from sim.scan import exclusive_scan, scan_scratch_length
+
+EDGE_IN_SPACINGS = 0.1
+"""How much wider than its opening a nozzle is: the outermost places of a layer may lie on its edge."""
+
+BLOCKED_IN_SPACINGS = 0.9
+"""No particle is put nearer to another one than this share of a spacing, or of the distance of layers if less."""
+
+
+class Emission:
+    """The emitters of all fluids of a tank.
+
+    Layer n of an opening leaves at start + n T, T = layer distance / speed, and is put where it is by then at the end
+    of the first step after that: neither the rate nor the lattice depends on the steps. Where a particle of a layer
+    would be too near to another one it is dropped, and counted. A layer that does not fit under the cap of its fluid,
+    or into the arrays, is not emitted, and its particles are counted.
+
+    Attributes:
+        time_s: simulated time [s].
+        emitted: particles emitted since the start.
+        blocked: particles dropped in this frame as their place was taken.
+        capped: particles not emitted in this frame as there are too many.
+    """
+
+    def __init__(
+        self, fluids: Sequence[FluidParameters], *, spacing: float, particle_volume: float, grid: CellGrid
+    ) -> None:
+        """Take the emitters of these fluids.
+
+        Raises:
+            ValueError: an opening is too narrow.
+        """
+        self.time_s = 0.0
+        self.emitted = self.blocked = self.capped = 0
+        self._fluids, self._spacing, self._grid = tuple(fluids), spacing, grid
+        self._phase = [number for number, fluid in enumerate(fluids) for _ in fluid.emitter]
+        self.openings = [Opening.of(emitter, spacing, particle_volume) for fluid in fluids for emitter in fluid.emitter]
+        self._places = [_device_points(opening.points) for opening in self.openings]
+        self._layers = np.zeros(len(self.openings), dtype=np.int64)
+        most = max((len(opening.points) for opening in self.openings), default=1)
+        self._free = ti.ndarray(ti.i32, most)
+        self._order = ti.ndarray(ti.i32, most + 1)
+        self._scratch = ti.ndarray(ti.i32, scan_scratch_length(most))
+
+    def begin_frame(self) -> None:
+        """Restart the counters of the frame."""
+        self.blocked = self.capped = 0
+
+    @property
+    def speed(self) -> float:
+        """Largest speed of what flows in now or will [m/s]."""
+        return max((opening.speed for opening in self.openings if self.time_s < opening.end_s), default=0.0)
+
+    def drive(self, particles: ParticleSet, acceleration: ti.Ndarray) -> None:
+        """Give all particles in a nozzle the velocity of its inflow, and no acceleration."""
+        for opening in self.openings:
+            depth = NOZZLE_LAYERS * opening.layer_distance
+            if opening.start_s <= self.time_s < opening.end_s + depth / opening.speed:
+                drive_nozzle(
+                    particles.position, particles.velocity, acceleration, particles.count,
+                    opening.centre, opening.velocity, opening.axes[0], opening.axes[1],
+                    opening.half_size[0] + EDGE_IN_SPACINGS * self._spacing,
+                    opening.half_size[1] + EDGE_IN_SPACINGS * self._spacing, int(opening.is_round),
+                    depth * opening.speed,
+                )  # fmt: skip
+
+    def advance(self, particles: ParticleSet, dt: float, first_id: int) -> int:
+        """Let a step of time pass, and put the layers that have left by now among the particles.
+
+        The cells of the particles must be those of the last search for neighbours.
+
+        Args:
+            particles: of all fluids, already advanced.
+            dt: the step [s].
+            first_id: id of the next particle.
+
+        Returns:
+            How many particles were emitted.
+        """
+        if not self.openings:
+            return 0
+        self.time_s += dt
+        before = self.emitted
+        for number, opening in enumerate(self.openings):
+            for layer in range(self._layers[number], opening.layers_due(self.time_s)):
+                self._layers[number] = layer + 1
+                self._emit_layer(number, layer, particles, first_id + self.emitted - before)
+        return self.emitted - before
+
+    def diagnostics(self) -> dict[str, float]:
+        """What the emitters did; nothing where there are none."""
+        if not self.openings:
+            return {}
+        return {
+            "particles_emitted": float(self.emitted),
+            "emission_blocked": float(self.blocked),
+            "emission_capped": float(self.capped),
+        }
+
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """State of the emitters; nothing where there are none."""
+        if not self.openings:
+            return {}
+        return {
+            "emission_time": np.array([self.time_s]),
+            "emission_count": np.array([self.emitted], dtype=np.int64),
+            "emission_layers": self._layers.copy(),
+        }
+
+    def restore(self, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a checkpoint.
+
+        Raises:
+            ValueError: it lacks the state of the emitters, or is of other ones.
+        """
+        for name, array in self.checkpoint().items():
+            found = arrays.get(name)
+            if found is None or found.shape != array.shape or found.dtype != array.dtype:
+                raise ValueError(f"not a checkpoint of these emitters: {name} must be {array.dtype} {array.shape}")
+        if self.openings:
+            self.time_s = float(arrays["emission_time"][0])
+            self.emitted = int(arrays["emission_count"][0])
+            self._layers[:] = arrays["emission_layers"]
+
+    def _emit_layer(self, number: int, layer: int, particles: ParticleSet, first_id: int) -> None:
+        opening, phase, places = self.openings[number], self._phase[number], self._places[number]
+        count = len(opening.points)
+        if count > self._room(phase, particles):
+            self.capped += count
+            return
+        moved = ti.math.vec3(*(opening.layer_at(layer, self.time_s)[0] - opening.points[0]))
+        grid = self._grid
+        find_free_places(
+            places, count, moved, particles.position, particles.cells.cell_start,
+            ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape),
+            BLOCKED_IN_SPACINGS * min(self._spacing, opening.layer_distance), self._free,
+        )  # fmt: skip
+        added = exclusive_scan(self._free, count, self._scratch, self._order)
+        particles.append_layer(
+            places, moved, ti.math.vec3(*opening.velocity), phase, self._free, self._order, count, added, first_id
+        )
+        self.emitted += added
+        self.blocked += count - added
+
+    def _room(self, phase: int, particles: ParticleSet) -> int:
+        """Particles that may still come of a fluid."""
+        room = particles.capacity - particles.count
+        cap = self._fluids[phase].max_particles
+        if cap is None:
+            return room
+        present = count_phase(particles.phase, particles.count, phase) if len(self._fluids) > 1 else particles.count
+        return min(room, cap - int(present))
+
+
+def _device_points(points: NDArray[np.float64]) -> ti.Ndarray:
+    array = ti.Vector.ndarray(3, ti.f32, len(points))
+    array.from_numpy(points.astype(np.float32))
+    return array
+
+
+@fast_launch
+@ti.kernel
+def drive_nozzle(
+    position: Vectors, velocity: Vectors, acceleration: Vectors, count: ti.i32,
+    centre: ti.math.vec3, inflow: ti.math.vec3, first: ti.math.vec3, second: ti.math.vec3,
+    half_first: ti.f32, half_second: ti.f32, is_round: ti.i32, reach: ti.f32,
+):  # fmt: skip
+    """v_i = velocity of the inflow, a_i = 0, in a disc or a rectangle and as deep as depth times speed is `reach`."""
+    for i in range(count):
+        from_centre = position[i] - centre
+        depth = from_centre.dot(inflow)
+        if depth > 0.0 and depth < reach:
+            u = from_centre.dot(first) / half_first
+            v = from_centre.dot(second) / half_second
+            inside = ti.max(ti.abs(u), ti.abs(v)) < 1.0
+            if is_round != 0:
+                inside = u * u + v * v < 1.0
+            if inside:
+                velocity[i] = inflow
+                acceleration[i] = ti.math.vec3(0.0)
+
+
+@fast_launch
+@ti.kernel
+def find_free_places(
+    places: Vectors, count: ti.i32, moved: ti.math.vec3, position: Vectors, cell_start: Integers,
+    origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, clearance: ti.f32, free: Integers,
+):  # fmt: skip
+    """1 for each place without a particle nearer than the clearance, else 0.
+
+    Particles have moved by less than the skin since they were sorted; a cell is wider than both together.
+    """
+    for k in range(count):
+        x_k = places[k] + moved
+        cell = cell_of_point(x_k, origin, inverse_cell_size, shape)
+        near = 0
+        for dz in range(-1, 2):
+            for dy in range(-1, 2):
+                row = row_of_cell(cell, dy, dz, shape)
+                for j in range(cell_start[row - 1], cell_start[row + 2]):
+                    near += ti.cast((position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)
+        free[k] = ti.cast(near == 0, ti.i32)
+
+
+@ti.kernel
+def count_phase(phase: Integers, count: ti.i32, wanted: ti.i32) -> ti.i32:
+    """Particles of a fluid; a sum of integers, exact in any order."""
+    total = 0
+    for i in range(count):
+        total += ti.cast(phase[i] == wanted, ti.i32)
+    return total

@@ -1,0 +1,142 @@
+"""The particles that the fluids of a tank start with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sim.fluid.opening import Opening
+from sim.shapes.placement import build_solid
+from sim.shapes.sampling import fill_with_particles
+
+if TYPE_CHECKING:
+    from sim.fluid.parameters import FluidParameters
+    from sim.scene import DomainParameters
+    from sim.shapes.solid import Solid
+
+CLEARANCE_IN_SPACINGS = 0.5
+"""A particle's centre keeps half a lattice spacing, its radius, from walls and solids."""
+
+TAKEN_IN_SPACINGS = 0.9
+"""A place is taken where a particle is nearer than this; particles as near as that push each other apart at once."""
+
+PIPE_CLEARANCE_IN_SPACINGS = 1.4
+"""Distance of the particles from the samples of a pipe; at 1.45 spacings they are at rest."""
+
+NO_POINTS = np.empty((0, 3))
+
+FULL_DOMAIN = 1.1
+"""Particles that a domain holds at most over those that fill it at rest; emitters stop there."""
+
+ROUNDING = 1.0e-3
+"""Share of the clearance that a particle may come nearer: lattice points are float32, and a block that rests on a
+body has its first layer exactly at the clearance."""
+
+
+@dataclass(frozen=True)
+class FluidFilling:
+    """The particles that the fluids of a tank start with.
+
+    Attributes:
+        positions: (n, 3) float32 [m].
+        velocities: (n, 3) float32 [m/s].
+        phase: which of the fluids each particle is of, (n,) int32.
+    """
+
+    positions: NDArray[np.float32]
+    velocities: NDArray[np.float32]
+    phase: NDArray[np.int32]
+
+    def count_of(self, fluids: int) -> NDArray[np.int64]:
+        """Particles of each of so many fluids, (k,)."""
+        return np.bincount(self.phase, minlength=fluids)
+
+
+def fill_fluids(
+    fluids: Sequence[FluidParameters],
+    domain: DomainParameters,
+    solids: Sequence[Solid],
+    pipes: NDArray[np.floating] = NO_POINTS,
+) -> FluidFilling:
+    """Fill the blocks of all fluids on lattices of spacing 2r, clear of walls, solids and each other.
+
+    A place in two blocks belongs to the first, of the first fluid that has it.
+
+    Args:
+        fluids: of the tank.
+        domain: that they are in.
+        solids: what is in the way.
+        pipes: boundary samples of the emitters' pipes [m], (m, 3); fluid keeps its distance from them too.
+
+    Raises:
+        ShapeError: a block's shape cannot be built.
+        ValueError: a block is left without a particle.
+    """
+    positions: list[NDArray[np.float32]] = [np.empty((0, 3), dtype=np.float32)]
+    velocities: list[NDArray[np.float32]] = [np.empty((0, 3), dtype=np.float32)]
+    phase: list[NDArray[np.int32]] = [np.empty(0, dtype=np.int32)]
+    for index, fluid in enumerate(fluids):
+        spacing = 2.0 * fluid.particle_radius
+        for number, block in enumerate(fluid.block):
+            points = fill_with_particles(build_solid(block), spacing, lower=domain.min, upper=domain.max)
+            points = free_places(points, spacing, solids, np.concatenate(positions))
+            if len(pipes) and len(points):
+                points = points[cKDTree(pipes).query(points)[0] > PIPE_CLEARANCE_IN_SPACINGS * spacing]
+            if len(points) == 0:
+                raise ValueError(
+                    f'fluid "{fluid.name}" block[{number}] has no particle: '
+                    "it is outside the domain, inside solids, or filled by the blocks before it"
+                )
+            positions.append(points)
+            velocities.append(np.broadcast_to(np.float32(block.velocity), points.shape))
+            phase.append(np.full(len(points), index, dtype=np.int32))
+    return FluidFilling(np.concatenate(positions), np.concatenate(velocities), np.concatenate(phase))
+
+
+def free_places(
+    points: NDArray[np.float32], spacing: float, solids: Sequence[Solid], taken: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """The points that are neither in a solid nor where a particle is, (m, 3) [m].
+
+    Args:
+        points: lattice points [m], (n, 3).
+        spacing: of the particles [m].
+        solids: what is in the way.
+        taken: particles that are there already [m], (k, 3).
+    """
+    clearance = (1.0 - ROUNDING) * CLEARANCE_IN_SPACINGS * spacing
+    for solid in solids:
+        points = points[solid.signed_distance(points.astype(np.float64)) >= clearance]
+    if len(taken) and len(points):
+        distance, _ = cKDTree(taken).query(points, distance_upper_bound=TAKEN_IN_SPACINGS * spacing)
+        points = points[~np.isfinite(distance)]
+    return points
+
+
+def particle_capacity(
+    fluids: Sequence[FluidParameters], domain: DomainParameters, filled: NDArray[np.int64], particle_volume: float
+) -> int:
+    """Most particles that there can be: those at the start, and what emitters may add to a domain that is not full.
+
+    Args:
+        fluids: of the tank.
+        domain: that they are in.
+        filled: particles of each fluid at the start, (k,).
+        particle_volume: of a particle [m³].
+
+    Raises:
+        ValueError: an opening is too narrow.
+    """
+    spacing = 2.0 * fluids[0].particle_radius
+    total = 0.0
+    for fluid, count in zip(fluids, filled.tolist(), strict=True):
+        most = count + sum(Opening.of(emitter, spacing, particle_volume).total_particles() for emitter in fluid.emitter)
+        total += max(count, min(most, math.inf if fluid.max_particles is None else fluid.max_particles))
+    full = FULL_DOMAIN * math.prod(np.subtract(domain.max, domain.min)) / particle_volume
+    return max(int(filled.sum()), int(min(total, full)))

@@ -1,0 +1,224 @@
+"""The opening of an emitter: where in it the particles of a layer are, and how far layers are apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.fluid.parameters import DiscOpening
+
+if TYPE_CHECKING:
+    from sim.fluid.parameters import EmitterParameters
+    from sim.scene import DomainParameters
+    from sim.shapes.solid import Solid
+
+NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35
+"""How near particles of a layer, and layers, may be to each other: nearer, they would burst from the opening."""
+
+NOZZLE_LAYERS = 2
+"""Depth of the nozzle in layers: whoever is in it moves at the speed of the inflow, whatever pushes. Two layers are a
+support radius deep: a particle that leaves has a whole lattice behind it, and pressure cannot push the flow back."""
+
+PIPE_STANDOFF_IN_SPACINGS = 0.95
+"""How far outside the nozzle the samples of its pipe are: where those of a wall are that touches the fluid."""
+
+LATTICES_TRIED = 41
+"""Lattice constants between 0.9 and 1.1 spacings that are tried for a disc."""
+
+CELL_MISMATCH = 0.05
+"""By how much the area of a disc and that of the lattice cells in it may differ."""
+
+GRAVITY_FREE_AXIS = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A layer of particles in an opening, from which one layer after the other moves off.
+
+    Attributes:
+        centre: of the opening [m], (3,).
+        axes: unit vectors along its sides, (3,) each.
+        half_size: half the lengths of the sides of what a layer fills, or twice its radius [m].
+        is_round: it is a disc.
+        points: centres of the particles of a layer as it is in the opening [m], (n, 3).
+        velocity: of the inflow [m/s], (3,).
+        layer_distance: from one layer to the next [m]: the volume of a layer over the area of the opening, so that the
+            flow is exactly speed times area.
+        start_s: when the first layer leaves [s].
+        end_s: no layer leaves from then on [s].
+    """
+
+    centre: NDArray[np.float64]
+    axes: tuple[NDArray[np.float64], NDArray[np.float64]]
+    half_size: tuple[float, float]
+    is_round: bool
+    points: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    layer_distance: float
+    start_s: float
+    end_s: float
+
+    @classmethod
+    def of(cls, emitter: EmitterParameters, spacing: float, particle_volume: float) -> Opening:
+        """The opening of an emitter, for particles of this spacing [m] and volume [m³].
+
+        Raises:
+            ValueError: it is too narrow for particles of this spacing.
+        """
+        direction = np.array(emitter.direction, dtype=np.float64)
+        direction /= np.linalg.norm(direction)
+        layer = _best_layer(emitter, spacing, particle_volume)
+        if layer is None:
+            raise ValueError(
+                f"is too narrow for particles {spacing:g} m apart; enlarge it or use a smaller particle_radius"
+            )
+        axes = _axes_across(direction)
+        # A particle begins half a layer in front of the opening: its volume is then wholly inside the domain.
+        centre = np.array(emitter.position, dtype=np.float64)
+        points = centre + 0.5 * layer.distance * direction + layer.places @ np.stack(axes)
+        return cls(
+            centre=centre,
+            axes=axes,
+            half_size=_half_size(emitter, layer.places, spacing),
+            is_round=isinstance(emitter.shape, DiscOpening),
+            points=points,
+            velocity=emitter.speed * direction,
+            layer_distance=layer.distance,
+            start_s=emitter.start_s,
+            end_s=math.inf if emitter.end_s is None else emitter.end_s,
+        )
+
+    @property
+    def speed(self) -> float:
+        """Of the inflow [m/s]."""
+        return float(np.linalg.norm(self.velocity))
+
+    def pipe(self, spacing: float) -> NDArray[np.float64]:
+        """Boundary samples of a short pipe around the nozzle [m], (m, 3).
+
+        It keeps surrounding fluid from flowing into the gap that opens behind a layer before the next one fills it.
+
+        Args:
+            spacing: of the particles [m].
+        """
+        depths = np.arange(0.0, NOZZLE_LAYERS * self.layer_distance, spacing)
+        rim = _rim(tuple(half + PIPE_STANDOFF_IN_SPACINGS * spacing for half in self.half_size), self.is_round, spacing)
+        around = self.centre + rim @ np.stack(self.axes)
+        return (around[None] + depths[:, None, None] * (self.velocity / self.speed)).reshape(-1, 3)
+
+    def layers_due(self, time_s: float) -> int:
+        """Layers that have left the opening by a time [s]."""
+        if time_s < self.start_s:
+            return 0
+        # The last layer is the last that leaves before the end, which is no time of an emission itself.
+        passed = (min(time_s, self.end_s) - self.start_s) * self.speed / self.layer_distance
+        return math.ceil(passed * (1.0 - 1.0e-12)) if time_s >= self.end_s else math.floor(passed) + 1
+
+    def layer_at(self, layer: int, time_s: float) -> NDArray[np.float64]:
+        """Where the particles of a layer are that has moved on freely since it left [m], (n, 3)."""
+        moved_s = time_s - self.start_s - layer * self.layer_distance / self.speed
+        return self.points + moved_s * self.velocity
+
+    def total_particles(self) -> float:
+        """Particles of all its layers; infinite where it never ends."""
+        return math.inf if math.isinf(self.end_s) else float(len(self.points) * self.layers_due(self.end_s))
+
+
+def obstruction(opening: Opening, spacing: float, domain: DomainParameters, solids: list[Solid]) -> str | None:
+    """Why fluid cannot enter here, or None: particles of the opening outside the domain, or in a solid."""
+    outside = ((opening.points < domain.min) | (opening.points > domain.max)).any(axis=1)
+    if outside.any():
+        return (
+            f"{np.count_nonzero(outside)} of the {len(outside)} places of its opening are outside the domain; "
+            "move it in, or let it point inwards"
+        )
+    inside = np.zeros(len(opening.points), dtype=bool)
+    for solid in solids:
+        inside |= solid.signed_distance(opening.points) < 0.25 * spacing
+    if inside.any():
+        return f"{np.count_nonzero(inside)} of the {len(inside)} places of its opening are in a solid body; move it out"
+    return None
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """Places in the plane of an opening [m], (n, 2), and how near neighbours in it are; distance of the layers [m]."""
+
+    places: NDArray[np.float64]
+    nearest: float
+    distance: float
+
+
+def _best_layer(emitter: EmitterParameters, spacing: float, particle_volume: float) -> _Layer | None:
+    """The layer whose particles, and layers, keep farthest apart; None where all are too near or too far."""
+    shape = emitter.shape
+    if isinstance(shape, DiscOpening):
+        layers, area = _disc_layers(shape.radius, spacing), math.pi * shape.radius**2
+    else:
+        layers, area = _rectangle_layers(shape.size, spacing), shape.size[0] * shape.size[1]
+    best = None
+    for places, nearest in layers:
+        distance = len(places) * particle_volume / area
+        is_possible = min(nearest, distance) >= NEAREST_IN_SPACINGS * spacing
+        if is_possible and distance <= FARTHEST_IN_SPACINGS * spacing:
+            layer = _Layer(places, nearest, distance)
+            best = max(best or layer, layer, key=lambda each: min(each.nearest, each.distance))
+    return best
+
+
+def _rectangle_layers(sides: tuple[float, float], spacing: float) -> Iterator[tuple[NDArray[np.float64], float]]:
+    """Lattices that fit a rectangle, stretched or squeezed, and their smaller spacing."""
+    for counts in product(*((math.floor(side / spacing), math.ceil(side / spacing)) for side in sides)):
+        if min(counts) < 1:
+            continue
+        x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(counts, sides, strict=True))
+        gaps = [side / n for n, side in zip(counts, sides, strict=True) if n > 1]
+        yield np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2), min(gaps, default=math.inf)
+
+
+def _disc_layers(radius: float, spacing: float) -> Iterator[tuple[NDArray[np.float64], float]]:
+    """Square lattices cut out of a disc, around one of their points or between four, and their spacing."""
+    for shift in (0.0, 0.5):
+        for constant in np.linspace(0.9, 1.1, LATTICES_TRIED) * spacing:
+            reach = math.ceil(radius / constant) + 1
+            axis = (np.arange(-reach, reach + 1) + shift) * constant
+            points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+            points = points[np.hypot(points[:, 0], points[:, 1]) <= radius]
+            # Its cells have to fill the disc, or the jet would be denser or thinner than the fluid.
+            if len(points) and abs(math.log(len(points) * constant**2 / (math.pi * radius**2))) < CELL_MISMATCH:
+                yield points, float(constant) if len(points) > 1 else math.inf
+
+
+def _half_size(emitter: EmitterParameters, places: NDArray[np.float64], spacing: float) -> tuple[float, float]:
+    shape = emitter.shape
+    if isinstance(shape, DiscOpening):
+        # The outermost particles of a disc may lie nearer to its edge, or farther from it, than half a spacing.
+        radius = float(np.hypot(places[:, 0], places[:, 1]).max()) + 0.5 * spacing
+        return radius, radius
+    return 0.5 * shape.size[0], 0.5 * shape.size[1]
+
+
+def _rim(half_size: tuple[float, ...], is_round: bool, spacing: float) -> NDArray[np.float64]:
+    """Points along a circle or the sides of a rectangle, about a spacing apart [m], (n, 2)."""
+    if is_round:
+        angle = np.linspace(0.0, 2.0 * np.pi, math.ceil(2.0 * np.pi * half_size[0] / spacing), endpoint=False)
+        return half_size[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    counts = [math.ceil(2.0 * half / spacing) for half in half_size]
+    x, y = (half * np.linspace(-1.0, 1.0, count, endpoint=False) for half, count in zip(half_size, counts, strict=True))
+    along_x, along_y = np.stack([x, np.full_like(x, -half_size[1])], 1), np.stack([np.full_like(y, half_size[0]), y], 1)
+    return np.concatenate([along_x, along_y, -along_x, -along_y])
+
+
+def _axes_across(direction: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two unit vectors across a direction; the first is horizontal."""
+    sideways = np.cross(GRAVITY_FREE_AXIS, direction)
+    if np.linalg.norm(sideways) < 1.0e-6:
+        sideways = np.array([0.0, 1.0, 0.0])
+    first = sideways / np.linalg.norm(sideways)
+    return first, np.cross(direction, first)

@@ -1,0 +1,277 @@
+"""Kernels of the implicit pressure solves: relative density, its rate of change, and the pressure that corrects it.
+
+With D the matrix of the rates of change, D rho_i/Dt = (D v)_i relative to the rest density,
+
+    (D v)_i = sum_j V (v_i - v_j) . grad W_ij + sum_b V_b (v_i - v_b) . grad W_ib,
+
+the forces of pressure are F = -V D^T P with P_i = p_i/(rho_i/rho0)², and what a step of dt changes by them is
+-dt² A P, A = V D M^-1 D^T: symmetric and positive semi-definite, whatever the masses M.
+"""
+
+import taichi as ti
+
+from sim.cells import Floats, Integers, Vectors
+from sim.fluid.kernels import spline, spline_slope
+from sim.launch import fast_launch
+
+TINY_DISTANCE = 1.0e-12
+"""Keeps x_ij/|x_ij| finite where two particles coincide; their force is then 0 [m]."""
+
+NOT_SOLVED = -1.0e6
+"""Relative compression of a particle that takes no part in a solve: so much room that its pressure stays 0."""
+
+
+@ti.func
+def slope_over_distance(r: ti.f32, inverse_support: ti.f32) -> ti.f32:
+    """Factor on (sigma/h) x_ij of grad W_ij."""
+    return spline_slope(r * inverse_support) / (r + TINY_DISTANCE)
+
+
+@fast_launch
+@ti.kernel
+def measure_density_and_diagonal(
+    position: Vectors, phase: Integers, count: ti.i32,
+    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
+    boundary_position: Vectors, boundary_volume: Floats, rest_density: Floats, several: ti.template(),
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, least_diagonal: ti.f32,
+    density: Floats, inverse_diagonal: Floats,
+):  # fmt: skip
+    """Relative density, and 1/A_ii [kg/m], 0 where A_ii is below the least.
+
+    A_ii = |sum_j V grad W_ij + sum_b V_b grad W_ib|²/rho0_i + sum_j V² |grad W_ij|²/rho0_j, which in one fluid is
+    rho_i/alpha_i of Bender & Koschier 2015, eq. 9, in the unit of this P.
+    """
+    gradient_factor = sigma * inverse_support
+    ti.loop_config(block_dim=128)
+    for i in range(count):
+        x_i = position[i]
+        own = 0
+        if ti.static(several):
+            own = phase[i]
+        inverse_rho0 = 1.0 / rest_density[own]
+        weight_sum = 1.0  # w(0): the particle itself
+        gradient_sum = ti.math.vec3(0.0)
+        square_sum = 0.0
+        first = start[i]
+        for k in range(fluid_count[i]):
+            j = neighbors[first + k * stride]
+            x_ij = x_i - position[j]
+            r = x_ij.norm()
+            weight_sum += spline(r * inverse_support)
+            slope = spline_slope(r * inverse_support)
+            gradient_sum += slope / (r + TINY_DISTANCE) * x_ij
+            lightness = inverse_rho0
+            if ti.static(several):
+                lightness = 1.0 / rest_density[phase[j]]
+            square_sum += slope * slope * lightness
+        boundary_sum = 0.0
+        boundary_gradient = ti.math.vec3(0.0)
+        first += fluid_count[i] * stride
+        for k in range(boundary_count[i]):
+            b = neighbors[first + k * stride]
+            x_ib = x_i - boundary_position[b]
+            r = x_ib.norm()
+            boundary_sum += boundary_volume[b] * spline(r * inverse_support)
+            boundary_gradient += boundary_volume[b] * slope_over_distance(r, inverse_support) * x_ib
+        density[i] = sigma * (volume * weight_sum + boundary_sum)
+        diagonal = (volume * gradient_sum + boundary_gradient).norm_sqr() * inverse_rho0 + volume * volume * square_sum
+        diagonal *= gradient_factor * gradient_factor
+        inverse_diagonal[i] = ti.select(diagonal > least_diagonal, 1.0 / ti.max(diagonal, least_diagonal), 0.0)
+
+
+@fast_launch
+@ti.kernel
+def predict_compression(
+    position: Vectors, velocity: Vectors, acceleration: Vectors, density: Floats, count: ti.i32,
+    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
+    boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, with_moving: ti.template(),
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt: ti.f32, correction: ti.f32, compression: Floats,
+):  # fmt: skip
+    """Relative compression s_i = dt (D v*)_i + (rho_i - 1) that a step without pressure leads to; v* = v + dt a.
+
+    Where rho_i > 1 already, only the share `correction` of that counts.
+    """
+    gradient_factor = sigma * inverse_support
+    ti.loop_config(block_dim=128)
+    for i in range(count):
+        x_i = position[i]
+        v_i = velocity[i] + dt * acceleration[i]
+        fluid_sum = 0.0
+        first = start[i]
+        for k in range(fluid_count[i]):
+            j = neighbors[first + k * stride]
+            x_ij = x_i - position[j]
+            v_ij = v_i - velocity[j] - dt * acceleration[j]
+            fluid_sum += v_ij.dot(x_ij) * slope_over_distance(x_ij.norm(), inverse_support)
+        boundary_sum = 0.0
+        first += fluid_count[i] * stride
+        for k in range(boundary_count[i]):
+            b = neighbors[first + k * stride]
+            x_ib = x_i - boundary_position[b]
+            v_ib = v_i
+            if ti.static(with_moving):
+                v_ib -= boundary_velocity[b]
+            boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(x_ib.norm(), inverse_support)
+        excess = density[i] - 1.0
+        compression[i] = (
+            dt * gradient_factor * (volume * fluid_sum + boundary_sum)
+            + ti.min(excess, 0.0)
+            + correction * ti.max(excess, 0.0)
+        )
+
+
+@fast_launch
+@ti.kernel
+def measure_divergence(
+    position: Vectors, velocity: Vectors, inverse_diagonal: Floats, count: ti.i32,
+    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
+    boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, with_moving: ti.template(),
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt: ti.f32, least_neighbors: ti.f32, relaxation: ti.f32,
+    compression: Floats, pressure: Floats, relaxed_before: Floats,
+):  # fmt: skip
+    """Relative compression s_i = dt (D v)_i, and the first relaxation of it from P = 0.
+
+    With fewer neighbours than the least a particle is `NOT_SOLVED`.
+    """
+    gradient_factor = sigma * inverse_support
+    ti.loop_config(block_dim=128)
+    for i in range(count):
+        x_i, v_i = position[i], velocity[i]
+        near = 0.0
+        fluid_sum = 0.0
+        first = start[i]
+        for k in range(fluid_count[i]):
+            j = neighbors[first + k * stride]
+            x_ij = x_i - position[j]
+            r = x_ij.norm()
+            fluid_sum += (v_i - velocity[j]).dot(x_ij) * slope_over_distance(r, inverse_support)
+            near += ti.cast(r * inverse_support < 1.0, ti.f32)
+        boundary_sum = 0.0
+        first += fluid_count[i] * stride
+        for k in range(boundary_count[i]):
+            b = neighbors[first + k * stride]
+            x_ib = x_i - boundary_position[b]
+            r = x_ib.norm()
+            v_ib = v_i
+            if ti.static(with_moving):
+                v_ib -= boundary_velocity[b]
+            boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(r, inverse_support)
+            near += ti.cast(r * inverse_support < 1.0, ti.f32)
+        s_i = dt * gradient_factor * (volume * fluid_sum + boundary_sum)
+        if near < least_neighbors:
+            s_i = NOT_SOLVED
+        p_i = relaxation / (dt * dt) * inverse_diagonal[i] * ti.max(s_i, 0.0)
+        compression[i] = s_i
+        pressure[i] = p_i
+        relaxed_before[i] = p_i
+
+
+@fast_launch
+@ti.kernel
+def accelerate_by_pressure(
+    position: Vectors, phase: Integers, pressure: Floats, count: ti.i32,
+    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
+    boundary_position: Vectors, boundary_volume: Floats, rest_density: Floats, several: ti.template(),
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, acceleration: Vectors,
+):  # fmt: skip
+    """a_i = -1/rho0_i [sum_j V (P_i + P_j) grad W_ij + sum_b V_b P_i grad W_ib]; boundary samples have no own P."""
+    ti.loop_config(block_dim=128)
+    for i in range(count):
+        x_i, pressure_i = position[i], pressure[i]
+        own = 0
+        if ti.static(several):
+            own = phase[i]
+        fluid_sum = ti.math.vec3(0.0)
+        first = start[i]
+        for k in range(fluid_count[i]):
+            j = neighbors[first + k * stride]
+            x_ij = x_i - position[j]
+            fluid_sum += (pressure_i + pressure[j]) * slope_over_distance(x_ij.norm(), inverse_support) * x_ij
+        boundary_sum = ti.math.vec3(0.0)
+        if pressure_i > 0.0:
+            first += fluid_count[i] * stride
+            for k in range(boundary_count[i]):
+                b = neighbors[first + k * stride]
+                x_ib = x_i - boundary_position[b]
+                boundary_sum += boundary_volume[b] * slope_over_distance(x_ib.norm(), inverse_support) * x_ib
+        acceleration[i] = (
+            -sigma * inverse_support / rest_density[own] * (volume * fluid_sum + pressure_i * boundary_sum)
+        )
+
+
+@fast_launch
+@ti.kernel
+def relax_pressure(
+    position: Vectors, acceleration: Vectors, compression: Floats, inverse_diagonal: Floats, count: ti.i32,
+    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
+    boundary_position: Vectors, boundary_response: Vectors, boundary_volume: Floats, with_moving: ti.template(),
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt_squared: ti.f32, relaxation: ti.f32, momentum: ti.f32,
+    pressure: Floats, relaxed_before: Floats, next_pressure: Floats, remaining: Floats,
+):  # fmt: skip
+    """The compression that the accelerations leave, and the pressure to try next.
+
+    remaining = s + dt² D a, relaxed = max(P + omega/(dt² A_ii) remaining, 0), next = relaxed + momentum (relaxed -
+    relaxed before), at least 0.
+
+    Args:
+        acceleration: by the pressure.
+        boundary_response: acceleration of the moving samples by it.
+        relaxed_before: from the iteration before; exchanged for the new one.
+    """
+    gradient_factor = sigma * inverse_support
+    ti.loop_config(block_dim=128)
+    for i in range(count):
+        x_i, a_i = position[i], acceleration[i]
+        fluid_sum = 0.0
+        first = start[i]
+        for k in range(fluid_count[i]):
+            j = neighbors[first + k * stride]
+            x_ij = x_i - position[j]
+            a_ij = a_i - acceleration[j]
+            fluid_sum += a_ij.dot(x_ij) * slope_over_distance(x_ij.norm(), inverse_support)
+        boundary_sum = 0.0
+        first += fluid_count[i] * stride
+        for k in range(boundary_count[i]):
+            b = neighbors[first + k * stride]
+            x_ib = x_i - boundary_position[b]
+            a_ib = a_i
+            if ti.static(with_moving):
+                a_ib -= boundary_response[b]
+            boundary_sum += boundary_volume[b] * a_ib.dot(x_ib) * slope_over_distance(x_ib.norm(), inverse_support)
+        left = compression[i] + dt_squared * gradient_factor * (volume * fluid_sum + boundary_sum)
+        relaxed = ti.max(pressure[i] + relaxation / dt_squared * inverse_diagonal[i] * left, 0.0)
+        next_pressure[i] = ti.max(relaxed + momentum * (relaxed - relaxed_before[i]), 0.0)
+        relaxed_before[i] = relaxed
+        remaining[i] = left
+
+
+@fast_launch
+@ti.kernel
+def copy_scalars(source: Floats, count: ti.i32, target: Floats):
+    """target_i = source_i."""
+    for i in range(count):
+        target[i] = source[i]
+
+
+@fast_launch
+@ti.kernel
+def add_scaled(vector: Vectors, other: Vectors, factor: ti.f32, count: ti.i32):
+    """vector_i += factor other_i."""
+    for i in range(count):
+        vector[i] += factor * other[i]
+
+
+@fast_launch
+@ti.kernel
+def sum_errors(
+    remaining: Floats, pressure: Floats, inverse_diagonal: Floats, dt_squared: ti.f32, count: ti.i32,
+    lanes: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
+):  # fmt: skip
+    """Sums by lanes of |compression left|; where that is negative, no more of it than taking P_i away would change."""
+    for lane in range(lanes):
+        total = 0.0
+        for k in range(items):
+            i = lane * lane_step + k * item_step
+            if i < count and inverse_diagonal[i] > 0.0:
+                total += ti.abs(ti.max(remaining[i], -pressure[i] * dt_squared / inverse_diagonal[i]))
+        partial[lane] = total

@@ -1,0 +1,215 @@
+"""What contacts do to bodies in a step: impacts, resting, friction, and moving overlapping bodies apart."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, solve_positions, solve_velocities
+from sim.rigid.contacts import Contacts, Indices, Key, key_set
+from sim.rigid.states import MovingBodies
+from sim.solver import Arrays
+
+Array = NDArray[np.float64]
+
+SLOWEST_BOUNCE = 0.02
+"""Bodies that approach more slowly do not bounce [m/s]; nor those that gravity gave that speed within two steps."""
+
+SEPARATION_TIME_S = 0.02
+"""Overlaps decay within about this time: the longest that nobody sees, and no more than a fifth a step."""
+
+LARGEST_SEPARATION = 0.2
+SLOP = 1.0e-6
+"""Overlap that stays [m]: below what anybody sees, above what rounding makes."""
+
+WEIGHT_TOLERANCE = 1.0e-4
+"""Of the speed that gravity gives in a step: what the last sweep may still change. In 10 s a body creeps by microns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """How surfaces rub and rebound, by number of the body; a wall is like whatever touches it.
+
+    Attributes:
+        friction: [-], (n,).
+        restitution: [-], (n,).
+    """
+
+    friction: Array
+    restitution: Array
+
+    def of_pairs(self, first: Indices, second: Indices) -> tuple[Array, Array]:
+        """Friction, the geometric mean, and restitution, the larger of two, of pairs of bodies, (k,) each."""
+        partner = np.where(second == len(self.friction), first, second)  # the domain follows the bodies
+        return (
+            np.sqrt(self.friction[first] * self.friction[partner]),
+            np.maximum(self.restitution[first], self.restitution[partner]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What the contacts of a step did besides changing velocities.
+
+    Attributes:
+        extra_velocity: added to the velocity in this step's change of poses only [m/s], (n, 3).
+        extra_angular_velocity: [rad/s], (n, 3).
+        is_touched: bodies that got an impulse, (n,) bool.
+        iterations: sweeps of the solver.
+        converged: whether it converged.
+    """
+
+    extra_velocity: Array
+    extra_angular_velocity: Array
+    is_touched: NDArray[np.bool_]
+    iterations: int
+    converged: bool
+
+
+class ContactResponse:
+    """Resolves the contacts of a step, starting from the impulses of the step before.
+
+    Args:
+        surfaces: of all bodies.
+        gravity: [m/s²].
+    """
+
+    def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
+        self._surfaces, self._gravity = surfaces, gravity
+        self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), 1.0)
+
+    @property
+    def last_keys(self) -> frozenset[Key]:
+        """The contacts of the last step."""
+        return self._last_keys
+
+    def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float) -> Outcome:
+        """Change the velocities of the bodies so that contacts hold, bounce and rub over a step of dt [s].
+
+        A contact with a gap may close within the step: w_n >= -gap / dt (speculative, so that nothing tunnels).
+        """
+        n = len(bodies)
+        if not len(contacts):
+            self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), dt)
+            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=bool), 0, True)
+        system = ContactSystem.build(contacts, bodies.position, bodies.inverse_mass, bodies.inverse_inertia())
+        free = system.velocities(bodies.velocity, bodies.angular_velocity)
+        friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
+        bounce = self._find_bounces(contacts, bodies, free[:, 0], restitution, dt)
+        least = np.where(bounce.happens, bounce.velocity, -np.maximum(contacts.gap, 0.0) / dt)
+        tolerance = RELATIVE_TOLERANCE * float(np.abs(free).max()) + WEIGHT_TOLERANCE * dt * float(
+            np.linalg.norm(self._gravity)
+        )
+        solution = solve_velocities(
+            system,
+            free,
+            least_normal=least,
+            friction=friction,
+            start=self._starting_impulses(contacts, system, dt),
+            tolerance=tolerance,
+        )
+        change = system.body_velocities(solution.impulses)
+        bodies.velocity, bodies.angular_velocity = bodies.velocity + change[0], bodies.angular_velocity + change[1]
+        in_world = np.einsum("kc,kci->ki", solution.impulses, system.axes)
+        self._keep(contacts.keys, np.where(bounce.happens[:, None], 0.0, in_world), dt)
+
+        normal_velocity = system.velocities(bodies.velocity, bodies.angular_velocity)[:, 0]
+        extra, iterations, converged = self._separate(contacts, system, bounce, normal_velocity, dt)
+        touched = np.zeros(n + 1, dtype=bool)
+        pushed = solution.impulses[:, 0] > 0.0
+        for body in (contacts.first, contacts.second):
+            touched[np.minimum(body[pushed], n)] = True
+        return Outcome(*extra, touched[:n], solution.iterations + iterations, solution.converged and converged)
+
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """The impulses that the next step starts from."""
+        return {
+            "contact_keys": self._keys.copy(),
+            "contact_impulses": self._impulses.copy(),
+            "contact_dt": np.array([self._dt]),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from a checkpoint. Raises ValueError when an array is missing."""
+        for name in ("contact_keys", "contact_impulses", "contact_dt"):
+            if name not in arrays:
+                raise ValueError(f"checkpoint of the rigid bodies: {name} is missing")
+        keys = np.asarray(arrays["contact_keys"]).astype(np.int64).reshape(-1, 3)
+        impulses = np.asarray(arrays["contact_impulses"]).astype(np.float64).reshape(-1, 3)
+        self._keep(keys, impulses, float(arrays["contact_dt"][0]))
+
+    def _keep(self, keys: Indices, impulses: Array, dt: float) -> None:
+        self._keys, self._impulses, self._dt = keys, impulses, dt
+        self._row_of = {(first, second, feature): row for row, (first, second, feature) in enumerate(keys.tolist())}
+        self._last_keys = key_set(keys)
+
+    def _starting_impulses(self, contacts: Contacts, system: ContactSystem, dt: float) -> Array:
+        """The impulses of the same contacts in the last step, scaled to this one, along the axes, (k, 3)."""
+        rows = np.array([self._row_of.get((a, b, feature), -1) for a, b, feature in contacts.keys.tolist()])
+        if not np.any(rows >= 0):
+            return np.zeros((len(contacts), 3))
+        in_world = np.where((rows >= 0)[:, None], (dt / self._dt) * self._impulses[rows], 0.0)
+        impulses: Array = np.einsum("kci,ki->kc", system.axes, in_world)
+        return impulses
+
+    def _find_bounces(
+        self, contacts: Contacts, bodies: MovingBodies, approach: Array, restitution: Array, dt: float
+    ) -> _Bounces:
+        """Contacts that close within the step fast enough to bounce, and what their bounce leads to.
+
+        Against what cannot move the instant of the impact counts: gravity acts before and after it, and the gap is
+        passed down and up at different speeds. Without that a ball would come back to e² h0 only to first order in
+        dt. Between free bodies gravity cancels, and an impulse at the start of the step keeps all momenta exactly.
+        """
+        free = np.append(bodies.is_free, False)
+        n = len(bodies)
+        first_free, second_free = free[np.minimum(contacts.first, n)], free[np.minimum(contacts.second, n)]
+        one_sided = first_free != second_free
+        pull = contacts.normal @ self._gravity
+        acceleration = np.where(first_free, pull, 0.0) - np.where(second_free, pull, 0.0)
+        gap = np.maximum(contacts.gap, 0.0)
+        before = approach - dt * acceleration
+        under_root = before**2 - 2.0 * acceleration * gap
+        falls = -before + np.sqrt(np.maximum(under_root, 0.0))
+        hits = (under_root >= 0.0) & (falls > 0.0)
+        time_s = np.where(hits, 2.0 * gap / np.where(hits, falls, 1.0), np.inf)
+        hits &= time_s <= dt
+        time_s = np.where(hits, time_s, 0.0)
+        impact = before + acceleration * time_s
+        slowest = max(SLOWEST_BOUNCE, 2.0 * dt * float(np.linalg.norm(self._gravity)))
+        happens = hits & (restitution > 0.0) & (impact < -slowest)
+        rest = dt - time_s
+        velocity = -restitution * impact + acceleration * rest
+        displacement = -gap - restitution * impact * rest + 0.5 * acceleration * rest**2
+        return _Bounces(happens, velocity, displacement, happens & one_sided & (contacts.gap > 0.0))
+
+    def _separate(
+        self, contacts: Contacts, system: ContactSystem, bounce: _Bounces, normal_velocity: Array, dt: float
+    ) -> tuple[tuple[Array, Array], int, bool]:
+        """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
+        overlap = -contacts.gap - SLOP
+        n = system.jacobian.shape[2]
+        if not np.any(bounce.is_placed) and not np.any(overlap > 0.0):
+            return (np.zeros((n, 3)), np.zeros((n, 3))), 0, True
+        rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
+        # Contacts that do not overlap may close by what the velocities leave of their gaps.
+        wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)
+        wanted = np.where(overlap > 0.0, wanted, np.minimum(wanted, 0.0))
+        wanted = np.where(bounce.is_placed, bounce.displacement / dt - normal_velocity, wanted)
+        tolerance = WEIGHT_TOLERANCE * float(np.abs(wanted).max())
+        solution = solve_positions(system, wanted, two_sided=bounce.is_placed, tolerance=tolerance)
+        return system.body_velocities(solution.impulses), solution.iterations, solution.converged
+
+
+@dataclass(frozen=True, eq=False)
+class _Bounces:
+    """Of every contact, (k,) each: whether it bounces, its normal velocity [m/s] and displacement [m] at the end of
+    the step, and whether it is brought there."""
+
+    happens: NDArray[np.bool_]
+    velocity: Array
+    displacement: Array
+    is_placed: NDArray[np.bool_]

@@ -1,0 +1,144 @@
+"""Paths of kinematic bodies, with velocities that are their exact derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.rigid import rotation
+from sim.rigid.parameters import RigidBodyParameters
+
+Array = NDArray[np.float64]
+
+
+class Motion(NamedTuple):
+    """Pose and velocity of the shape's origin at one time.
+
+    Attributes:
+        position: [m], (3,).
+        orientation: unit quaternion w, x, y, z, (4,).
+        velocity: [m/s], (3,).
+        angular_velocity: about world axes [rad/s], (3,).
+    """
+
+    position: Array
+    orientation: Array
+    velocity: Array
+    angular_velocity: Array
+
+
+class Path(Protocol):
+    """Where a kinematic body is."""
+
+    def at(self, time_s: float) -> Motion:
+        """Its motion at a simulated time [s]."""
+
+
+class SteadyPath:
+    """Constant velocity and angular velocity from a starting pose."""
+
+    def __init__(self, position: Array, orientation: Array, velocity: Array, angular_velocity: Array) -> None:
+        self._start = Motion(position, orientation, velocity, angular_velocity)
+
+    def at(self, time_s: float) -> Motion:
+        """Its motion at a simulated time [s]."""
+        turned = rotation.exponential(time_s * self._start.angular_velocity)
+        return self._start._replace(
+            position=self._start.position + time_s * self._start.velocity,
+            orientation=rotation.product(turned, self._start.orientation),
+        )
+
+
+class KeyframePath:
+    """A path through keyframes; at rest before the first and after the last.
+
+    Positions are cubic Hermite splines with the tangents of a parabola through three neighbours (Catmull-Rom on
+    uneven times). Orientations are the cumulative Bézier form of the same on unit quaternions (Kim, Kim & Shin 1995,
+    "A general construction scheme for unit quaternion curves with simple high order derivatives"). Both are once
+    continuously differentiable, the two ends included, where velocities are zero. Linear paths run straight, and
+    along great arcs (slerp), at constant velocity in every interval.
+
+    Args:
+        times: ascending [s], (n,).
+        positions: [m], (n, 3).
+        orientations: unit quaternions, (n, 4); the shorter way between neighbours is taken.
+        linear: whether velocities are constant between keyframes.
+    """
+
+    def __init__(self, times: Sequence[float], positions: Array, orientations: Array, *, linear: bool) -> None:
+        self._times = np.asarray(times, dtype=np.float64)
+        self._positions, self._orientations, self._linear = positions, orientations, linear
+        # Rotation vectors from one keyframe to the next in the axes of the first, which are also those of the second.
+        self._turns = rotation.logarithm(rotation.product(rotation.conjugate(orientations[:-1]), orientations[1:]))
+        self._velocities = self._tangents(np.diff(positions, axis=0))
+        self._angular_velocities = self._tangents(self._turns)
+
+    def at(self, time_s: float) -> Motion:
+        """Its motion at a simulated time [s]."""
+        if time_s < self._times[0] or time_s >= self._times[-1]:
+            end = 0 if time_s < self._times[0] else -1
+            return Motion(self._positions[end].copy(), self._orientations[end].copy(), np.zeros(3), np.zeros(3))
+        k = int(np.searchsorted(self._times, time_s, side="right")) - 1
+        span = float(self._times[k + 1] - self._times[k])
+        s = (time_s - float(self._times[k])) / span
+        turn, step = self._turns[k], self._positions[k + 1] - self._positions[k]
+        if self._linear:
+            orientation = rotation.product(self._orientations[k], rotation.exponential(s * turn))
+            spin = rotation.rotated(self._orientations[k], turn / span)
+            return Motion(self._positions[k] + s * step, orientation, step / span, spin)
+        position, velocity = self._hermite(k, s, span)
+        orientation, spin = self._bezier(k, s, span)
+        return Motion(position, orientation, velocity, spin)
+
+    def _tangents(self, steps: Array) -> Array:
+        """Derivatives at the keyframes, (n, 3), from the steps between them (n - 1, 3)."""
+        tangents = np.zeros((len(self._times), 3))
+        spans = np.diff(self._times)[:, None]
+        slopes = steps / spans
+        tangents[1:-1] = (spans[1:] * slopes[:-1] + spans[:-1] * slopes[1:]) / (spans[1:] + spans[:-1])
+        return tangents
+
+    def _hermite(self, k: int, s: float, span: float) -> tuple[Array, Array]:
+        step = self._positions[k + 1] - self._positions[k]
+        start, end = span * self._velocities[k], span * self._velocities[k + 1]
+        bend = 3.0 * step - 2.0 * start - end
+        twist = start + end - 2.0 * step
+        position = self._positions[k] + s * (start + s * (bend + s * twist))
+        return position, (start + s * (2.0 * bend + 3.0 * s * twist)) / span
+
+    def _bezier(self, k: int, s: float, span: float) -> tuple[Array, Array]:
+        """q(s) = q_k exp(b1 w1) exp(b2 w2) exp(b3 w3), with cumulative Bernstein polynomials b of degree 3."""
+        first, last = span * self._angular_velocities[k] / 3.0, span * self._angular_velocities[k + 1] / 3.0
+        without_ends = rotation.product(
+            rotation.exponential(-first),
+            rotation.product(rotation.exponential(self._turns[k]), rotation.exponential(-last)),
+        )
+        vectors = np.stack([first, rotation.logarithm(without_ends), last])
+        weights = (1.0 - (1.0 - s) ** 3, s * s * (3.0 - 2.0 * s), s**3)
+        rates = (3.0 * (1.0 - s) ** 2, 6.0 * s * (1.0 - s), 3.0 * s * s)
+        orientation, spin = self._orientations[k], np.zeros(3)
+        for vector, weight, rate in zip(vectors, weights, rates, strict=True):
+            # A factor turns about its own fixed vector, given in the axes reached by the factors before it.
+            spin = spin + rotation.rotated(orientation, rate * vector)
+            orientation = rotation.product(orientation, rotation.exponential(weight * vector))
+        return rotation.normalized(orientation), spin / span
+
+
+def path_of(parameters: RigidBodyParameters) -> Path:
+    """The path of a kinematic body: through its keyframes, or steady."""
+    if not parameters.keyframe:
+        return SteadyPath(
+            np.asarray(parameters.position, dtype=np.float64),
+            rotation.from_degrees(parameters.rotation_deg),
+            np.asarray(parameters.velocity, dtype=np.float64),
+            np.asarray(parameters.angular_velocity, dtype=np.float64),
+        )
+    return KeyframePath(
+        [keyframe.time_s for keyframe in parameters.keyframe],
+        np.array([keyframe.position for keyframe in parameters.keyframe], dtype=np.float64),
+        np.stack([rotation.from_degrees(keyframe.rotation_deg) for keyframe in parameters.keyframe]),
+        linear=parameters.interpolation == "linear",
+    )

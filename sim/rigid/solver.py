@@ -1,0 +1,379 @@
+"""Rigid bodies that move: gravity, contacts with each other and with walls, and kinematic paths."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.parameters import Vector3
+from sim.rigid import rotation
+from sim.rigid.collision import CollisionDetector
+from sim.rigid.contact_response import ContactResponse, Surfaces
+from sim.rigid.contacts import Contacts, Poses
+from sim.rigid.free_motion import rotate_freely
+from sim.rigid.geometry import BodyGeometry
+from sim.rigid.keyframes import Path, path_of
+from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.states import Inertia, MovingBodies
+from sim.rigid.walls import walls_of
+from sim.scene import DomainParameters
+from sim.shapes.solid import Points
+from sim.snapshots import Snapshot
+from sim.solver import Arrays, Diagnostics
+
+Array = NDArray[np.float64]
+
+LARGEST_DT = 2.0e-3
+"""Largest step [s]: a stack of boxes is held to a micrometre, and a frame at 60 fps costs nine steps."""
+
+LARGEST_ADVANCE = 0.25
+"""How far surfaces may get in a step, in half shortest edges of the smallest dynamic body."""
+
+LARGEST_TURN = 0.1
+"""How far bodies may turn in a step [rad]: rotation errs by about a tenth of its square."""
+
+LOST_DISTANCE = 10.0
+"""A dynamic body farther from the domain's centre, in diagonals, is stopped: it fell out of sight."""
+
+SOLVER_NAME = "rigid"
+
+RUNAWAY_SPEED = 1.0e4
+"""No rigid body of a film moves at thirty times the speed of sound [m/s]."""
+
+
+class RigidSolver:
+    """All dynamic and kinematic bodies of a scene; static bodies and the domain's closed faces are obstacles.
+
+    State in float64 on the host. One substep: gravity, contact impulses from the poses at its start, then the poses.
+    Free flight is exact for constant gravity, and angular momentum is kept to round-off (`free_motion`). Impulses of
+    contacts are equal and opposite at one point, so that contacts change neither the linear nor the angular momentum
+    of bodies that nothing else holds.
+
+    Approximate: shapes touch as unions of balls (`geometry.Balls`), which rounds sharp corners by 2 % of the shortest
+    edge; friction has one coefficient for sticking and sliding. Unsupported: rolling friction, joints.
+
+    Attributes:
+        bodies: state of the moving bodies.
+        all_names, all_geometries: of the moving bodies, then of the static ones.
+        walls: closed faces of the domain.
+
+    Args:
+        parameters: the moving bodies, in the order of the job.
+        obstacles: the static ones.
+        domain: its closed faces are walls.
+        gravity: [m/s²].
+
+    Raises:
+        ShapeError: a shape cannot be built.
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[RigidBodyParameters],
+        *,
+        obstacles: Sequence[RigidBodyParameters] = (),
+        domain: DomainParameters,
+        gravity: Vector3,
+    ) -> None:
+        self.name = SOLVER_NAME
+        self._gravity = np.asarray(gravity, dtype=np.float64)
+        self._geometries = _geometries_of(parameters)
+        self._paths: dict[int, Path] = {
+            number: path_of(body) for number, body in enumerate(parameters) if body.kind == "kinematic"
+        }
+        self.bodies = _starting_bodies(parameters, self._geometries)
+        self._place_kinematic_bodies(0.0)
+
+        fixed = _geometries_of(obstacles)
+        self._fixed_position, self._fixed_rotation = _poses_of_obstacles(obstacles, fixed)
+        everybody = [*parameters, *obstacles]
+        self.all_names = tuple(body.name for body in everybody)
+        self.all_geometries = (*self._geometries, *fixed)
+        self.walls = tuple(walls_of(domain))
+        can_move = np.concatenate([self.bodies.is_dynamic, np.zeros(len(fixed), dtype=bool)])
+        self._detector = CollisionDetector(self.all_geometries, can_move, self.walls)
+        surfaces = Surfaces(
+            friction=np.array([body.friction for body in everybody]),
+            restitution=np.array([body.restitution for body in everybody]),
+        )
+        self._response = ContactResponse(surfaces, self._gravity)
+        corners = np.array([domain.min, domain.max])
+        self._domain_centre, self._domain_diagonal = (
+            corners.mean(axis=0),
+            float(np.linalg.norm(np.ptp(corners, axis=0))),
+        )
+        self._radius = np.array([geometry.radius for geometry in self._geometries])
+        dynamic = np.flatnonzero(self.bodies.is_dynamic)
+        smallest = min((self._geometries[number].shortest_edge for number in dynamic), default=math.inf)
+        self._largest_advance = LARGEST_ADVANCE * 0.5 * smallest
+        self._time_s = 0.0
+        self.begin_frame(0.0)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was repaired or assumed to build the moving bodies' shapes, one sentence each."""
+        return tuple(warning for geometry in self._geometries for warning in geometry.warnings)
+
+    # --- what a coupling needs of the bodies ------------------------------------------------------------------------
+
+    @property
+    def solids(self) -> tuple[BodyGeometry, ...]:
+        """Of each moving body, its shape at rest (`solid`) and its centre of mass in that frame."""
+        return tuple(self._geometries)
+
+    def body_samples(self, index: int, spacing: float) -> Points:
+        """Evenly spread points on a body's surface, relative to its centre of mass, in its axes [m], (m, 3)."""
+        return self._geometries[index].samples(spacing)
+
+    def signed_distance_in_body_frame(self, index: int) -> Callable[[Points], NDArray[np.float64]]:
+        """The exact distance to a body's surface [m], negative inside, of points in the frame of `body_samples`."""
+        return self._geometries[index].signed_distance
+
+    def poses(self) -> Poses:
+        """Where all bodies are now: moving, static, and the domain."""
+        return Poses(
+            np.concatenate([self.bodies.position, self._fixed_position]),
+            np.concatenate([self.bodies.rotation(), self._fixed_rotation]),
+        )
+
+    def max_surface_speed(self) -> float:
+        """Upper bound of the speed of any surface point [m/s]."""
+        return float(np.max(self._surface_speeds(), initial=0.0))
+
+    # --- the step ---------------------------------------------------------------------------------------------------
+
+    def stable_dt(self) -> float:
+        """Largest step [s] in which surfaces move and bodies turn little enough; gravity's part counts."""
+        spin = float(np.max(np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1)), initial=0.0))
+        dt = LARGEST_DT if spin == 0.0 else min(LARGEST_DT, LARGEST_TURN / spin)
+        if not math.isfinite(self._largest_advance):
+            return dt
+        # v dt + g dt² is the largest advance.
+        speed, acceleration = self.max_surface_speed(), float(np.linalg.norm(self._gravity))
+        root = speed + math.sqrt(speed**2 + 4.0 * acceleration * self._largest_advance)
+        return min(dt, 2.0 * self._largest_advance / root) if root > 0.0 else dt
+
+    def substep(self, dt: float) -> None:
+        """Advance by dt [s]."""
+        bodies = self.bodies
+        before = (bodies.position.copy(), bodies.orientation.copy())
+        free = bodies.is_free[:, None]
+        bodies.velocity = bodies.velocity + np.where(free, dt * self._gravity, 0.0)
+        self._set_mean_velocities_of_kinematic_bodies(dt)
+        contacts = self._find_contacts(dt)
+        outcome = self._response.resolve(contacts, bodies, dt)
+        self._count(contacts, outcome.iterations, outcome.converged)
+
+        # A body in free flight moves by the mean of its velocities, which is exact; one in contact by the new one,
+        # which is the velocity that the contacts allow.
+        flying = free & ~outcome.is_touched[:, None]
+        velocity = bodies.velocity - np.where(flying, 0.5 * dt * self._gravity, 0.0)
+        bodies.position = bodies.position + dt * np.where(free, velocity + outcome.extra_velocity, 0.0)
+        spin = bodies.angular_momentum()
+        if outcome.extra_angular_velocity.any():
+            turned = rotation.product(rotation.exponential(dt * outcome.extra_angular_velocity), bodies.orientation)
+            bodies.orientation = np.where(free, rotation.normalized(turned), bodies.orientation)
+        bodies.set_angular_momentum(spin)
+        rotate_freely(bodies, dt)
+        self._time_s += dt
+        self._place_kinematic_bodies(self._time_s)
+        self._detector.follow(self._with_obstacles(self._surface_motion_since(*before)))
+        self._stop_lost_bodies()
+
+    def begin_frame(self, time_s: float) -> None:
+        """A frame starts at simulated time `time_s` [s]."""
+        self._time_s = time_s
+        self._detector.forget()  # so that a run that continues here does the same
+        self._contact_count = self._iterations = self._not_converged = 0
+        self._max_penetration = 0.0
+
+    def _find_contacts(self, dt: float) -> Contacts:
+        return self._detector.find(
+            self.poses(), self._with_obstacles(dt * self._surface_speeds()), self._response.last_keys
+        )
+
+    def _with_obstacles(self, motion: Array) -> Array:
+        """Motion of the moving bodies, and none of all others."""
+        return np.concatenate([motion, np.zeros(len(self._fixed_position))])
+
+    def _surface_motion_since(self, position: Array, orientation: Array) -> Array:
+        """Upper bound of how far surface points got [m], (n,); a turn by an angle a moves quaternions by 2 sin(a/4)."""
+        moved = np.sqrt(np.square(self.bodies.position - position).sum(axis=1))
+        turned = np.sqrt(np.square(self.bodies.orientation - orientation).sum(axis=1))
+        motion: Array = moved + 2.0 * turned * self._radius
+        return motion
+
+    def _surface_speeds(self) -> Array:
+        spin = np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1))
+        speeds: Array = np.sqrt(np.square(self.bodies.velocity).sum(axis=1)) + spin * self._radius
+        return speeds
+
+    def _place_kinematic_bodies(self, time_s: float) -> None:
+        for number, path in self._paths.items():
+            motion = path.at(time_s)
+            arm = rotation.rotated(motion.orientation, self._geometries[number].centre_of_mass)
+            self.bodies.position[number] = motion.position + arm
+            self.bodies.orientation[number] = motion.orientation
+            self.bodies.velocity[number] = motion.velocity + np.cross(motion.angular_velocity, arm)
+            self.bodies.angular_velocity[number] = motion.angular_velocity
+
+    def _set_mean_velocities_of_kinematic_bodies(self, dt: float) -> None:
+        """Contacts see how kinematic bodies will have moved by the end of the step."""
+        for number, path in self._paths.items():
+            end = path.at(self._time_s + dt)
+            arm = rotation.rotated(end.orientation, self._geometries[number].centre_of_mass)
+            self.bodies.velocity[number] = (end.position + arm - self.bodies.position[number]) / dt
+            turn = rotation.product(end.orientation, rotation.conjugate(self.bodies.orientation[number]))
+            self.bodies.angular_velocity[number] = rotation.logarithm(turn) / dt
+
+    def _stop_lost_bodies(self) -> None:
+        away = np.sqrt(np.square(self.bodies.position - self._domain_centre).sum(axis=1))
+        lost = self.bodies.is_free & (away > LOST_DISTANCE * self._domain_diagonal)
+        if lost.any():
+            self.bodies.is_lost |= lost
+            self.bodies.velocity[lost] = 0.0
+            self.bodies.angular_velocity[lost] = 0.0
+
+    def _count(self, contacts: Contacts, iterations: int, converged: bool) -> None:
+        self._contact_count = len(contacts)
+        self._iterations += iterations
+        self._not_converged += not converged
+        self._max_penetration = max(self._max_penetration, -float(np.min(contacts.gap, initial=0.0)))
+
+    # --- what goes out ----------------------------------------------------------------------------------------------
+
+    def snapshots(self) -> dict[str, Snapshot]:
+        """The pose of each body's own mesh at rest, and the velocity of the mesh's origin."""
+        bodies = self.bodies
+        turned = bodies.rotation()
+        snapshots = {}
+        for number, name in enumerate(bodies.names):
+            arm = -turned[number] @ self._geometries[number].centre_of_mass
+            arrays = {
+                "position": bodies.position[number] + arm,
+                "orientation": bodies.orientation[number].copy(),
+                "velocity": bodies.velocity[number] + np.cross(bodies.angular_velocity[number], arm),
+                "angular_velocity": bodies.angular_velocity[number].copy(),
+            }
+            snapshots[name] = Snapshot("rigid", arrays, {})
+        return snapshots
+
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """Poses, velocities, the clock, and the impulses that the next contacts start from."""
+        return {
+            **{name: getattr(self.bodies, name).copy() for name in _STATE},
+            **self._response.checkpoint(),
+            "clock": np.array([self._time_s]),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from a checkpoint.
+
+        Raises:
+            ValueError: an array is missing or has another shape.
+        """
+        expected = {**{name: getattr(self.bodies, name).shape for name in _STATE}, "clock": (1,)}
+        for name, shape in expected.items():
+            if name not in arrays or arrays[name].shape != shape:
+                found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
+                raise ValueError(f"checkpoint of the rigid bodies: {name} must have shape {shape}, got {found}")
+        self._response.restore(arrays)
+        for name in _STATE:
+            setattr(self.bodies, name, np.array(arrays[name], dtype=getattr(self.bodies, name).dtype))
+        self._time_s = float(arrays["clock"][0])
+
+    def diagnostics(self) -> Diagnostics:
+        """Totals over the dynamic bodies that are not lost, and the contacts of the frame.
+
+        `angular_momentum_*` [kg m²/s] is about the world's origin, `potential_energy` [J] is zero there; `contacts`
+        is their number in the last substep, `max_penetration` [m] the worst of the frame, `iterations` their sum over
+        the frame, `bodies_lost` the number of bodies stopped far outside of the domain.
+        """
+        bodies, free = self.bodies, self.bodies.is_free
+        mass = bodies.mass[free]
+        momentum = mass[:, None] * bodies.velocity[free]
+        spin = bodies.angular_momentum()[free]
+        angular = spin + np.cross(bodies.position[free], momentum)
+        kinetic = 0.5 * (np.sum(momentum * bodies.velocity[free]) + np.sum(spin * bodies.angular_velocity[free]))
+        return {
+            "mass": float(mass.sum()),
+            **{f"momentum_{axis}": float(value) for axis, value in zip("xyz", momentum.sum(axis=0), strict=True)},
+            **{
+                f"angular_momentum_{axis}": float(value) for axis, value in zip("xyz", angular.sum(axis=0), strict=True)
+            },
+            "kinetic_energy": float(kinetic),
+            "potential_energy": -float(np.sum(mass[:, None] * self._gravity * bodies.position[free])),
+            "max_speed": self.max_surface_speed(),
+            "contacts": float(self._contact_count),
+            "max_penetration": self._max_penetration,
+            "iterations": float(self._iterations),
+            "not_converged": float(self._not_converged),
+            "bodies_lost": float(np.count_nonzero(bodies.is_lost)),
+        }
+
+    def first_bad_quantity(self) -> str | None:
+        """The first body with a value that is no number, or a velocity beyond all reason."""
+        for quantity in _STATE[:4]:
+            bad = ~np.isfinite(getattr(self.bodies, quantity)).all(axis=1)
+            if bad.any():
+                return f'{quantity} of "{self.bodies.names[int(np.argmax(bad))]}" is not finite'
+        speeds = self._surface_speeds()
+        fastest = int(np.argmax(speeds))
+        if speeds[fastest] > RUNAWAY_SPEED:
+            return f'the speed of "{self.bodies.names[fastest]}" is {speeds[fastest]:.3g} m/s'
+        return None
+
+
+_STATE = ("position", "orientation", "velocity", "angular_velocity", "is_lost")
+
+
+def _geometries_of(parameters: Sequence[RigidBodyParameters]) -> list[BodyGeometry]:
+    """The geometry of each body; bodies of one shape and scale share it.
+
+    Raises:
+        ShapeError: a shape cannot be built.
+    """
+    known: dict[tuple[object, float], BodyGeometry] = {}
+    geometries = []
+    for body in parameters:
+        key = (body.shape, body.scale)
+        if key not in known:
+            known[key] = BodyGeometry(body)
+        geometries.append(known[key])
+    return geometries
+
+
+def _starting_bodies(parameters: Sequence[RigidBodyParameters], geometries: Sequence[BodyGeometry]) -> MovingBodies:
+    """The bodies at time zero; kinematic ones still at their placement."""
+    inertias, positions, orientations = [], [], []
+    for body, geometry in zip(parameters, geometries, strict=True):
+        if body.density is None:
+            inertias.append(Inertia(math.inf, np.eye(3)))
+        else:
+            properties = geometry.mass_properties(body.density)
+            inertias.append(Inertia(properties.mass, properties.inertia))
+        orientation = rotation.from_degrees(body.rotation_deg)
+        positions.append(np.asarray(body.position) + rotation.rotated(orientation, geometry.centre_of_mass))
+        orientations.append(orientation)
+    return MovingBodies(
+        [body.name for body in parameters],
+        inertias,
+        position=np.array(positions),
+        orientation=np.array(orientations),
+        velocity=np.array([body.velocity for body in parameters]),
+        angular_velocity=np.array([body.angular_velocity for body in parameters]),
+    )
+
+
+def _poses_of_obstacles(
+    obstacles: Sequence[RigidBodyParameters], geometries: Sequence[BodyGeometry]
+) -> tuple[Array, Array]:
+    """Centres of mass [m], (n + 1, 3), and rotations, (n + 1, 3, 3), of the static bodies and, last, of the domain."""
+    positions, rotations = np.zeros((len(obstacles) + 1, 3)), np.tile(np.eye(3), (len(obstacles) + 1, 1, 1))
+    for number, (body, geometry) in enumerate(zip(obstacles, geometries, strict=True)):
+        rotations[number] = rotation.matrices(rotation.from_degrees(body.rotation_deg))
+        positions[number] = np.asarray(body.position) + rotations[number] @ geometry.centre_of_mass
+    return positions, rotations

@@ -1,0 +1,66 @@
+"""Whether bodies can start where the job puts them: dynamic ones overlap neither others nor walls."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.rigid.collision import CollisionDetector
+from sim.rigid.solver import RigidSolver
+
+START_OVERLAP = 0.01
+"""Share of the smaller body's shortest edge by which bodies may overlap: positions in a job file are rounded."""
+
+
+def check_start(solver: RigidSolver) -> None:
+    """Refuse dynamic bodies that start in other bodies or behind walls; touching is fine.
+
+    Raises:
+        ValueError: every pair that overlaps, with the depth and what to do.
+    """
+    problems = [*_overlaps(solver), *_behind_walls(solver)]
+    if problems:
+        raise ValueError("; ".join(problems))
+
+
+def _overlaps(solver: RigidSolver) -> list[str]:
+    """Pairs of bodies of which one is dynamic, with the exact distance of the balls found to overlap."""
+    poses = solver.poses()
+    is_dynamic = np.zeros(len(solver.all_geometries), dtype=bool)
+    is_dynamic[: len(solver.bodies)] = solver.bodies.is_dynamic
+    detector = CollisionDetector(solver.all_geometries, is_dynamic, ())
+    detector.find(poses, np.zeros(len(poses.position)), frozenset())
+    deepest: dict[tuple[int, int], float] = {}
+    found = detector.found
+    for row, (first, second, _) in enumerate(found.keys().tolist()):
+        owner, other = int(found.owner[row]), int(found.other[row])
+        centre = poses.position[owner] + poses.rotation[owner] @ found.centre[row]
+        in_other = (centre - poses.position[other]) @ poses.rotation[other]
+        depth = float(found.radius[row] - solver.all_geometries[other].signed_distance(in_other[None])[0])
+        deepest[first, second] = max(depth, deepest.get((first, second), 0.0))
+    problems = []
+    for (first, second), depth in deepest.items():
+        smaller = min(solver.all_geometries[number].shortest_edge for number in (first, second))
+        if depth > START_OVERLAP * smaller:
+            names = solver.all_names[first], solver.all_names[second]
+            problems.append(
+                f'rigid bodies "{names[0]}" and "{names[1]}" start {depth:.3g} m deep in each other; '
+                "move them apart by that much"
+            )
+    return problems
+
+
+def _behind_walls(solver: RigidSolver) -> list[str]:
+    poses = solver.poses()
+    problems = []
+    for number in np.flatnonzero(solver.bodies.is_dynamic):
+        geometry = solver.all_geometries[number]
+        centres = poses.position[number][:, None] + poses.rotation[number] @ geometry.balls.centres
+        for wall in solver.walls:
+            height = wall.side * (centres[wall.axis] - wall.offset) - geometry.balls.radii
+            depth = -float(np.min(height, initial=0.0, where=wall.is_beside(centres)))
+            if depth > START_OVERLAP * geometry.shortest_edge:
+                problems.append(
+                    f'rigid body "{solver.all_names[number]}" starts {depth:.3g} m behind the wall {wall.name} of the '
+                    "domain; move it inward by that much, or add the face to domain.open_faces"
+                )
+    return problems

@@ -1,0 +1,60 @@
+"""Run a job's simulation, a checkpoint after every frame, and be killed in the middle of a write.
+
+python killed_simulation.py FOLDER write_frame|write_checkpoint FRAME
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+from pipeline.executors.base import Assignment
+from pipeline.executors.inline import InlineExecutor
+from pipeline.job.loading import load_job
+from pipeline.layout import JobLayout
+from pipeline.stages import simulate as stage
+from pipeline.task import TaskId
+
+TASK = TaskId("simulate")
+
+
+def simulate(layout: JobLayout, *, attempt: int = 1) -> Any:
+    """Run the task until it ends; returns how it ended."""
+    (task,) = stage.SimulateStage().plan(load_job(layout.job_file), layout)
+    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    assignment = Assignment(
+        task=task,
+        attempt=attempt,
+        fingerprint="f",
+        inputs={},
+        threads=threads,  # as every other test of this process that starts Taichi
+        job_file=layout.job_file,
+        root=layout.root,
+        stages="pipeline.stages:STAGES",
+    )
+    with InlineExecutor() as executor:
+        executor.submit(assignment)
+        return executor.wait(0.0)[-1]
+
+
+def kill_in(write: str, frame: int) -> None:
+    """Have this process killed once the stage has written half of what it writes of a frame."""
+    original = getattr(stage, write)
+
+    def write_half(path: Path, *arguments: Any, **options: Any) -> None:
+        original(path, *arguments, **options)
+        number = arguments[1].frame if write == "write_frame" else arguments[0].frame
+        if number == frame:
+            os.truncate(path, path.stat().st_size // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    setattr(stage, write, write_half)
+    stage.CHECKPOINT_INTERVAL_S = -1.0
+
+
+if __name__ == "__main__":
+    kill_in(sys.argv[2], int(sys.argv[3]))
+    simulate(JobLayout(Path(sys.argv[1])))

@@ -1,0 +1,147 @@
+"""Jobs whose fluids cannot be meant together, or whose emitters cannot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.job.checks import check_job
+from pipeline.job.fluid_checks import CELL_IN_SUPPORTS, MOST_CELLS, particle_room
+from pipeline.job.loading import read_job
+
+HEAD = 'name = "tank"\nframes = 60\n'
+WATER = """
+[[fluid]]
+name = "water"
+particle_radius = 0.02
+[[fluid.block]]
+shape = { type = "box", size = [1.0, 1.0, 0.2] }
+position = [0.0, 0.0, 0.1]
+"""
+OIL = """
+[[fluid]]
+name = "oil"
+particle_radius = 0.02
+rest_density = 900.0
+[[fluid.block]]
+shape = { type = "box", size = [1.0, 1.0, 0.2] }
+position = [0.0, 0.0, 0.3]
+"""
+JET = """
+[[fluid]]
+name = "jet"
+particle_radius = 0.02
+[[fluid.emitter]]
+shape = { type = "disc", radius = 0.1 }
+position = [0.0, 0.0, 0.9]
+direction = [0.0, 0.0, -1.0]
+speed = 1.0
+"""
+
+
+def checked(text: str, tmp_path: Path, *, memory_bytes: int | None = None):
+    path = tmp_path / "tank.toml"
+    path.write_text(text)
+    loaded = read_job(path)
+    findings = check_job(loaded.job, memory_bytes=memory_bytes)
+    lines = [loaded.source.describe_all(found) for found in (findings.errors, findings.warnings)]
+    return lines[0], lines[1], findings
+
+
+@pytest.mark.parametrize("text", [HEAD + WATER + OIL, HEAD + JET, HEAD + WATER + JET])
+def test_fluids_that_go_together_pass_without_a_word(text, tmp_path):
+    errors, warnings, findings = checked(text, tmp_path)
+    assert errors == warnings == []
+    assert findings.particles > 300
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            HEAD + WATER + OIL.replace("0.02", "0.01"),
+            'tank.toml:13 fluid[1].particle_radius: is 0.01, but 0.02 in fluid[0] "water"; '
+            "all fluids of a tank share it",
+        ),
+        (
+            HEAD + WATER + OIL.replace("900.0", "50.0"),
+            'tank.toml:14 fluid[1].rest_density: is 50 kg/m³, and 1000 kg/m³ in fluid[0] "water"; '
+            "densities in a tank may differ by a factor of 10 at most",
+        ),
+        (
+            HEAD + JET.replace("0.0, -1.0", "0.0, 1.0").replace("0.9]", "1.0]"),
+            "tank.toml:7 fluid[0].emitter[0]: 21 of the 21 places of its opening are outside the domain; "
+            "move it in, or let it point inwards",
+        ),
+        (
+            HEAD + JET.replace("radius = 0.1", "radius = 0.01"),
+            "tank.toml:8 fluid[0].emitter[0].shape: is too narrow for particles 0.04 m apart; "
+            "enlarge it or use a smaller particle_radius",
+        ),
+        (
+            HEAD + WATER + "[domain]\nmin = [-40, -40, 0]\nmax = [40, 40, 100]",
+            "tank.toml:10 domain: has 9.47e+08 cells for the search of neighbours of 0.02 m particles, "
+            "more than 2.68e+08; make it smaller, or particle_radius 0.032 m",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_with_a_remedy(text, expected, tmp_path):
+    errors, _, _ = checked(text, tmp_path, memory_bytes=10**15)
+    assert expected in errors
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            HEAD + WATER + OIL.replace("0.3]", "0.22]"),
+            "tank.toml:15 fluid[1].block[0]: shares 40 % of its volume with fluid[0].block[0]; "
+            'that belongs to "water", the first of the two',
+        ),
+        (
+            HEAD + JET + "start_s = 3.0",
+            "tank.toml:12 fluid[0].emitter[0].start_s: starts at 3 s, after the film's end at 1 s",
+        ),
+        (
+            HEAD + JET.replace("speed = 1.0", "speed = 1000.0"),
+            "tank.toml:11 fluid[0].emitter[0].speed: 1000 m/s crosses the whole domain within a frame; "
+            "the time steps will be very short",
+        ),
+    ],
+)
+def test_what_is_hardly_meant_is_warned_of(text, expected, tmp_path):
+    _, warnings, _ = checked(text, tmp_path)
+    assert expected in warnings
+
+
+def test_an_emitter_in_a_solid_body_is_refused(tmp_path):
+    ball = '[[rigid]]\nname = "ball"\nshape = { type = "sphere", radius = 0.2 }\nposition = [0.0, 0.0, 0.9]\n'
+    errors, _, _ = checked(HEAD + ball + JET, tmp_path)
+    assert any("places of its opening are in a solid body; move it out" in error for error in errors)
+
+
+def test_memory_counts_what_emitters_may_add(tmp_path):
+    # The domain of 1 m³ holds 15,625 particles of 4 cm, and an endless jet may fill it.
+    endless, _, _ = checked(HEAD + JET, tmp_path, memory_bytes=8_000_000)
+    assert any("or give emitters an end_s, or the fluid max_particles" in error for error in endless)
+    capped, _, _ = checked(
+        HEAD + JET.replace("[[fluid.e", "max_particles = 3000\n[[fluid.e"), tmp_path, memory_bytes=8_000_000
+    )
+    assert capped == []
+
+
+def test_the_room_is_that_of_the_simulation(tmp_path):
+    _, _, _ = checked(HEAD + JET + "end_s = 0.5", tmp_path)
+    job = read_job(tmp_path / "tank.toml").job
+    # 1 m/s through pi 0.1² m² for half a second, in particles of 0.04³ m³; whole layers of 21.
+    assert particle_room(job, job.fluid[0], 0.0) == pytest.approx(np.pi * 0.01 * 0.5 / 0.04**3, abs=21)
+
+
+def test_the_limits_are_those_of_the_simulation():
+    from sim.cells import MAX_CELLS
+    from sim.fluid.particle_fluid import SKIN
+
+    assert MOST_CELLS == MAX_CELLS
+    assert 1.0 + SKIN == CELL_IN_SUPPORTS

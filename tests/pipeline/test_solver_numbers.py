@@ -1,0 +1,123 @@
+"""What the solvers tell of a job: the last frame's numbers, and warnings counted over all frames."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from numbered_frames import commit, submitted
+
+from pipeline.cache import read_numbers
+from pipeline.cli import main
+from pipeline.executors.base import Committed
+from pipeline.layout import JobLayout
+from pipeline.quantities import quantity
+from pipeline.solver_numbers import SolverWatch, simulation_numbers
+from pipeline.task import TaskId
+
+
+@pytest.fixture
+def layout(tmp_path) -> JobLayout:
+    return submitted(tmp_path / "tank")
+
+
+def status(layout: JobLayout, *options: str) -> str:
+    result = CliRunner().invoke(main, ["status", str(layout.root), *options])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_status_shows_the_last_frames_numbers_with_their_units(layout):
+    commit(layout, 0, density_error=0.5)
+    commit(layout, 1, iterations=3.0, density_error=8.1e-4, particle_count=12500.0, momentum_z=-2.5, odd_number=7.25)
+    text = status(layout)
+    assert "water, frame 1 at 0.01667 s:" in text
+    for item in (
+        "substeps 12",
+        "smallest time step 0.00125 s",
+        "iterations 3",
+        "density error 0.081 %",
+        "particles 12,500",
+        "momentum z -2.5 kg m/s",
+        "odd number 7.25",  # a name that nobody has told the program about
+    ):
+        assert item in text.replace("\n    ", " ")
+    assert "warning" not in text
+
+
+def test_solves_that_hit_their_limit_are_counted_with_their_frames(layout):
+    for frame, count in enumerate([0, 1, 0, 0, 2, 1, 0]):
+        commit(layout, frame, not_converged=float(count))
+    assert "warning: water: 4 solves hit their iteration limit, frames 1, 4-5" in status(layout)
+
+
+def test_one_solve_that_hit_its_limit_is_one(layout):
+    commit(layout, 12, not_converged=1.0)
+    assert "warning: water: 1 solve hit its iteration limit, frame 12\n" in status(layout)
+
+
+def test_what_is_counted_since_the_start_is_not_counted_again_in_every_frame(layout):
+    for frame, total in enumerate([0, 0, 1, 1, 3, 3]):
+        commit(layout, frame, bodies_lost=float(total))
+    assert "warning: water: 3 bodies fell out of sight and were stopped, frames 2, 4\n" in status(layout)
+
+
+def test_status_for_machines_has_all_of_it(layout):
+    commit(layout, 0, not_converged=2.0)
+    commit(layout, 1, kinetic_energy=4.0)
+    told = json.loads(status(layout, "--json"))["simulation"]
+    assert told["frame"] == 1
+    assert told["solvers"] == {"water": {"substeps": 12, "smallest_dt_s": 1.25e-3, "kinetic_energy": 4.0}}
+    assert told["warnings"] == [
+        {
+            "solver": "water",
+            "name": "not_converged",
+            "count": 2,
+            "frames": [0],
+            "text": "water: 2 solves hit their iteration limit, frame 0",
+        }
+    ]
+
+
+def test_status_of_a_job_without_frames_says_nothing_of_solvers(layout):
+    assert "frame" not in status(layout)
+    assert json.loads(status(layout, "--json"))["simulation"]["frame"] is None
+
+
+def test_frames_of_an_earlier_version_of_the_simulation_do_not_count(layout):
+    for frame in range(3):
+        commit(layout, frame, fingerprint="old", not_converged=1.0)
+    commit(layout, 0, fingerprint="new", not_converged=0.0)
+    numbers = simulation_numbers(layout)
+    assert [each.frame for each in numbers.frames] == [0]
+    assert numbers.warnings() == []
+
+
+def test_a_frame_that_cannot_be_read_is_said(layout):
+    commit(layout, 0)
+    commit(layout, 1)
+    layout.path(layout.frame_cache(1)).write_bytes(b"gone")
+    text = status(layout)
+    assert "water, frame 0" in text
+    assert "frames of the cache that cannot be read: 1; see: pipeline verify" in text
+
+
+def test_only_the_numbers_that_are_asked_for_are_read(layout):
+    receipt = commit(layout, 0, not_converged=1.0, mass=2.0)
+    numbers = read_numbers(layout.path(receipt.artifact), ["not_converged", "not_there"])
+    assert numbers.solvers == {"water": {"not_converged": 1.0}}
+
+
+def test_a_run_tells_a_warning_once_when_it_first_happens(layout):
+    said: list[str] = []
+    watch = SolverWatch(layout, said.append)
+    for frame, count in enumerate([0, 3, 1]):
+        receipt = commit(layout, frame, not_converged=float(count))
+        watch.notify(Committed(TaskId("simulate"), 1, receipt))
+    assert said == ["water: 3 solves hit their iteration limit, frame 1; later ones are counted: pipeline status"]
+
+
+def test_the_mass_of_smoke_is_no_kilogram():
+    assert quantity("mass").text(2.0) == "2 kg"
+    assert quantity("mass", of_kind="smoke").text(2.0) == "2 m³"

@@ -1,0 +1,250 @@
+"""Moving bodies in real pictures: each frame's pose is where the body is drawn, and its motion is what is blurred."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blender_scenes import (
+    RENDER_FRAMES,
+    RESOLUTION,
+    read,
+    redness,
+    run_python,
+    spec_of,
+    sphere,
+    write_blender_stand_in,
+    write_mesh,
+)
+
+from pipeline.cache import write_frame
+from pipeline.executors.base import Assignment, Finished
+from pipeline.executors.inline import InlineExecutor
+from pipeline.job.loading import load_job
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.stages import render as render_stage
+from pipeline.stages.render import RenderStage
+from pipeline.task import Task
+from render.blender import open_renderer
+from render.parameters import MaterialParameters
+from render.poses import write_poses
+from render.spec import MovingMeshObject
+from render.system_libraries import missing_libraries
+from sim.snapshots import Snapshot
+from sim.world import FrameReport
+
+pytestmark = pytest.mark.skipif(
+    find_spec("bpy") is None or bool(missing_libraries()),
+    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
+)
+
+PIXELS_PER_METRE = RESOLUTION[0] * 50.0 / 36.0 / 2.5
+"""In the plane y = 0: a lens of 50 mm on a sensor of 36 mm, seen from 2.5 m."""
+
+# Fully rough, so that no highlight hides the colour.
+RED = MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0)
+BALL = MovingMeshObject(name="ball", file="ball.ply", body="ball", poses="poses/{frame}.json", material=RED)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+ABOUT_Y_90 = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+CENTRE = (0.0, 0.0, 0.5)
+
+
+def pose(position=CENTRE, orientation=UPRIGHT, velocity=(0, 0, 0), angular_velocity=(0, 0, 0)):
+    arrays = {
+        "position": position,
+        "orientation": orientation,
+        "velocity": velocity,
+        "angular_velocity": angular_velocity,
+    }
+    return {"ball": {key: np.array(value, dtype=np.float64) for key, value in arrays.items()}}
+
+
+POSES = [
+    pose(),
+    pose(position=(0.4, 0.0, 0.7)),
+    pose(velocity=(24.0, 0.0, 0.0)),
+    pose(),  # after a flight: nothing of its motion is left
+    pose(orientation=ABOUT_Y_90),
+    pose(angular_velocity=(0.0, -2.0 * np.pi * 20.0, 0.0)),  # a third of a turn in a frame
+]
+OFF_CENTRE = np.array([0.25, 0.0, 0.0])
+"""Where the mesh is from its own origin [m], so that turning the body moves it."""
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory) -> tuple[Path, str]:
+    """A small ball beside its mesh's origin, every frame drawn in one process; and what that printed."""
+    folder = tmp_path_factory.mktemp("moving")
+    positions, triangles = sphere((0.0, 0.0, 0.0), 0.1)
+    write_mesh(folder / "ball.ply", positions + OFF_CENTRE, triangles)
+    (folder / "poses").mkdir()
+    for frame, poses in enumerate(POSES):
+        write_poses(folder / f"poses/{frame:06d}.json", frame, poses)
+    write_poses(folder / "poses/000007.json", 7, {"duck": POSES[0]["ball"]})
+    (folder / "poses/000008.json").write_text('{"version": 1, "frame": 8, "bodies": {"ball": {"position": [0, 0]}}}')
+    spec_of(BALL, samples=32).write(folder / "spec.json")
+    return folder, run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0,1,2,3,4,5,6,7,8")
+
+
+def weight(folder: Path, frame: int) -> np.ndarray:
+    """How much of each pixel is ball: redness beyond that of the grey stage, which is up to 0.33."""
+    return np.clip(redness(read(folder / f"{frame}.png")) - 0.36, 0.0, None)
+
+
+def centroid(folder: Path, frame: int) -> np.ndarray:
+    """Where the ball is [m] in the plane y = 0, x and z."""
+    red = weight(folder, frame)
+    rows, columns = np.indices(red.shape)
+    x = (red * (columns + 0.5 - RESOLUTION[0] / 2)).sum() / red.sum()
+    z = (red * (RESOLUTION[1] / 2 - rows - 0.5)).sum() / red.sum()
+    return np.array([x, z]) / PIXELS_PER_METRE + [0.0, 0.5]
+
+
+# Weighed by redness, the centroid of a ball of 7 pixels is good to half a pixel; its shaded lower half is paler.
+HALF_A_PIXEL = 0.5 / PIXELS_PER_METRE
+
+
+def test_the_body_is_where_the_pose_of_the_frame_says(pictures):
+    folder, _ = pictures
+    assert centroid(folder, 0) == pytest.approx([0.25, 0.5], abs=HALF_A_PIXEL)
+    assert centroid(folder, 1) == pytest.approx([0.65, 0.7], abs=HALF_A_PIXEL)
+
+
+def test_the_orientation_turns_the_mesh_about_its_origin(pictures):
+    # A quarter of a turn about y takes x to -z.
+    assert centroid(pictures[0], 4) == pytest.approx([0.0, 0.25], abs=HALF_A_PIXEL)
+
+
+def spread(folder: Path, frame: int) -> np.ndarray:
+    """Standard deviations of the ball's pixels [m] along x and z."""
+    red = weight(folder, frame)
+    rows, columns = np.indices(red.shape)
+    return (
+        np.array([np.sqrt(np.cov(axis.ravel(), aweights=red.ravel())) for axis in (columns, rows)]) / PIXELS_PER_METRE
+    )
+
+
+def test_blur_is_along_the_velocity_and_centred_on_the_pose(pictures):
+    folder, _ = pictures
+    travelled = 24.0 * 0.5 / 60.0  # velocity, shutter of half a frame
+    assert centroid(folder, 2) == pytest.approx([0.25, 0.5], abs=HALF_A_PIXEL)
+    still, flying = spread(folder, 0), spread(folder, 2)
+    # Even smearing over a length L adds L²/12 to the variance; the threshold takes some of the pale ends away.
+    assert np.sqrt(flying[0] ** 2 - still[0] ** 2) == pytest.approx(travelled / np.sqrt(12.0), rel=0.3)
+    assert flying[1] == pytest.approx(still[1], rel=0.15)
+
+
+def test_motion_is_not_carried_over_to_the_next_frame(pictures):
+    folder, _ = pictures
+    assert (folder / "3.png").read_bytes() == (folder / "0.png").read_bytes()
+
+
+def test_a_spinning_body_is_blurred_along_its_arc(pictures):
+    folder, _ = pictures
+    # 60 degrees while the shutter is open, and 0.25 m from the axis: the ball is smeared over 0.26 m along z.
+    still, spinning = spread(folder, 0), spread(folder, 5)
+    chord = 2.0 * 0.25 * np.sin(np.radians(30.0))
+    assert np.sqrt(spinning[1] ** 2 - still[1] ** 2) == pytest.approx(chord / np.sqrt(12.0), rel=0.3)
+    assert spinning[0] < 1.3 * still[0]
+
+
+def test_poses_that_are_missing_or_unfit_are_refused_with_their_frame(pictures):
+    refused = [line for line in pictures[1].splitlines() if line.startswith("REFUSED")]
+    assert len(refused) == 3
+    assert "frame 6: cannot read the poses" in refused[0] and "000006.json" in refused[0]
+    assert "frame 7:" in refused[1] and 'none of "ball"' in refused[1]
+    assert "frame 8:" in refused[2] and 'position of "ball" must be 3 finite numbers' in refused[2]
+
+
+def test_an_external_blender_draws_the_same_poses(pictures, tmp_path):
+    folder, _ = pictures
+    renderer = open_renderer(folder / "spec.json", threads=1, blender=str(write_blender_stand_in(tmp_path)))
+    try:
+        renderer.render(5, tmp_path / "external.png")
+    finally:
+        renderer.close()
+    assert (tmp_path / "external.png").read_bytes() == (folder / "5.png").read_bytes()
+
+
+def test_poses_that_are_not_finite_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_poses(tmp_path / "0.json", 0, pose(position=(np.nan, 0, 0)))
+
+
+JOB = """
+name = "flight"
+frames = 3
+[camera]
+position = [0.0, -2.5, 0.5]
+look_at = [0.0, 0.0, 0.5]
+[[rigid]]
+name = "ball"
+kind = "kinematic"
+shape = {{ type = "sphere", radius = 0.1 }}
+position = [-0.4, 0.0, 0.5]
+velocity = [24.0, 0.0, 0.0]
+[[rigid]]
+name = "rock"
+shape = {{ type = "sphere", radius = 0.05 }}
+position = [0.0, 0.0, 0.9]
+[material.ball]
+look = "plastic"
+color = [0.8, 0.02, 0.02]
+roughness = 1.0
+[material.rock]
+look = "plastic"
+color = [0.1, 0.3, 0.8]
+[render]
+resolution = [64, 36]
+quality = "draft"
+samples = 32
+denoise = false
+device = "cpu"
+blender = '{blender}'
+"""
+
+
+def test_a_job_is_drawn_with_the_poses_of_its_cache(tmp_path):
+    layout = JobLayout(tmp_path / "flight")
+    layout.root.mkdir()
+    layout.job_file.write_text(JOB.format(blender=write_blender_stand_in(tmp_path)))
+    positions, triangles = sphere((0.0, 0.0, 0.0), 0.1)
+    for body in ("ball", "rock"):
+        write_mesh(layout.path(layout.body_mesh(body)), positions, triangles)
+    task = RenderStage().plan(load_job(layout.job_file), layout)[2]
+    assert task.inputs == ("meshes/ball.ply", "meshes/rock.ply", "cache/000002.h5")
+    arrays = pose(position=(0.4, 0.0, 0.5), velocity=(24.0, 0.0, 0.0))["ball"]
+    rock = Snapshot("rigid", pose(position=(0.0, 0.0, 0.9))["ball"], {})
+    cache = layout.path(layout.frame_cache(2))
+    cache.parent.mkdir()
+    write_frame(
+        cache, {"ball": Snapshot("rigid", arrays, {}), "rock": rock}, FrameReport(2, 2 / 60, {}, {}, {}), device="cpu"
+    )
+    with InlineExecutor() as executor:
+        executor.submit(Assignment(task, 1, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES"))
+        ended = executor.wait(0.0)[-1]
+    render_stage._close_renderers()
+    assert isinstance(ended, Finished), ended
+    layout.path(layout.picture(2)).rename(tmp_path / "2.png")
+    assert centroid(tmp_path, 2) == pytest.approx([0.4, 0.5], abs=HALF_A_PIXEL)
+    assert spread(tmp_path, 2)[0] > 1.3 * spread(tmp_path, 2)[1]  # blurred along x, as it flies
+    document = json.loads((layout.root / "poses/000002.json").read_text())
+    assert list(document["bodies"]) == ["ball"]  # what never moves is in the scene, and costs nothing here
+
+
+def test_a_job_of_static_bodies_does_not_read_the_cache_to_draw():
+    def task(kind: str, **motion: object) -> Task:
+        rigid = {"name": "ball", "kind": kind, "shape": {"type": "sphere", "radius": 0.1}, **motion}
+        fluid = {"name": "water", "block": [{"shape": {"type": "box", "size": (0.1, 0.1, 0.1)}}]}
+        job = Job.model_validate({"name": "a", "frames": 1, "rigid": [rigid], "fluid": [fluid]}, strict=False)
+        return RenderStage().plan(job, JobLayout(Path("a")))[0]
+
+    assert task("static").inputs == ("meshes/ball.ply", "surfaces/water/000000.ply")
+    moving = task("dynamic", density=500.0)
+    assert moving.inputs == ("meshes/ball.ply", "surfaces/water/000000.ply", "cache/000000.h5")
+    # Where a moving body starts is the simulation's business; its pictures change only if its poses do.
+    assert moving.parameters.digest == task("dynamic", density=500.0, position=(0.1, 0.0, 0.0)).parameters.digest

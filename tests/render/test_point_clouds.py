@@ -1,0 +1,108 @@
+"""Whitewater files: round trips, and every way in which one can be wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from render.errors import InvalidFileError
+from render.point_clouds import KINDS, PointCloud, read_point_cloud, validate_point_cloud, write_point_cloud
+
+FIELDS = ("position", "velocity", "radius", "lifetime", "kind")
+
+
+def some_points(count: int = 50) -> PointCloud:
+    random = np.random.default_rng(0)
+    return PointCloud(
+        position=random.normal(size=(count, 3)).astype(np.float32),
+        velocity=random.normal(size=(count, 3)).astype(np.float32),
+        radius=random.uniform(0.001, 0.002, count).astype(np.float32),
+        lifetime=random.uniform(0, 2, count).astype(np.float32),
+        kind=random.integers(0, len(KINDS), count).astype(np.uint8),
+    )
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "points.ply"
+    write_point_cloud(path, some_points())
+    return path
+
+
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_a_cloud_reads_back_as_written(tmp_path, count):
+    path, cloud = tmp_path / "points.ply", some_points(count)
+    write_point_cloud(path, cloud)
+    validate_point_cloud(path)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(read_point_cloud(path), name), getattr(cloud, name))
+
+
+def test_other_software_reads_the_file(file):
+    loaded = trimesh.load(file, process=False)
+    np.testing.assert_array_equal(loaded.vertices, some_points().position)
+    data = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(data["lifetime"], some_points().lifetime)
+    np.testing.assert_array_equal(data["kind"], some_points().kind)
+
+
+def test_the_same_arrays_give_the_same_bytes_whatever_their_memory_order(file, tmp_path):
+    cloud = some_points()
+    write_point_cloud(tmp_path / "other.ply", replace(cloud, position=np.asfortranarray(cloud.position)))
+    assert (tmp_path / "other.ply").read_bytes() == file.read_bytes()
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_arrays_that_do_not_fit_together_are_refused(tmp_path, name):
+    cloud = some_points()
+    with pytest.raises(ValueError, match="a row of each"):
+        write_point_cloud(tmp_path / "points.ply", replace(cloud, **{name: getattr(cloud, name)[:-1]}))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("position", np.nan, "position of point 7 is not finite"),
+        ("velocity", np.inf, "velocity of point 7 is not finite"),
+        ("lifetime", np.nan, "lifetime of point 7 is not finite"),
+        ("radius", 0.0, "radius of point 7 is not positive"),
+        ("kind", 3, "kind of point 7 is 3, of 0 to 2"),
+    ],
+)
+def test_values_that_make_no_sense_are_found(tmp_path, name, value, said):
+    cloud, path = some_points(), tmp_path / "points.ply"
+    getattr(cloud, name)[7] = value
+    write_point_cloud(path, cloud)
+    with pytest.raises(InvalidFileError, match=said):
+        validate_point_cloud(path)
+
+
+@pytest.mark.parametrize("change", [-1, 1])
+def test_a_file_of_another_size_is_refused(file, change):
+    content = file.read_bytes()
+    file.write_bytes(content[:change] if change < 0 else content + b"\0")
+    with pytest.raises(InvalidFileError, match="its header promises"):
+        validate_point_cloud(file)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [(b"little", b"big"), (b"float radius", b"double radius"), (b"vertex 50", b"vertex 050")]
+)
+def test_another_layout_is_refused(file, old, new):
+    content = file.read_bytes()
+    assert old in content
+    file.write_bytes(content.replace(old, new))
+    with pytest.raises(InvalidFileError, match="not a point cloud of the expected layout"):
+        validate_point_cloud(file)
+
+
+def test_a_triangle_mesh_is_no_cloud(tmp_path):
+    from render.meshes import write_ply
+
+    write_ply(tmp_path / "mesh.ply", np.eye(3), [[0, 1, 2]])
+    with pytest.raises(InvalidFileError):
+        read_point_cloud(tmp_path / "mesh.ply")

@@ -1,0 +1,43 @@
+"""Coupled steps give the same bits whatever the number of threads."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+STEP_AND_PRINT_DIGEST = """
+import hashlib, sys
+from sim.runtime import initialize
+initialize("cpu", threads=int(sys.argv[1]))
+from coupled_tanks import Tank
+from sim.scene import DomainParameters
+domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.36, 0.36, 0.6))
+ball = {"kind": "dynamic", "density": 300.0, "shape": {"type": "sphere", "radius": 0.09}}
+tank = Tank(
+    [{**ball, "position": (0.15, 0.18, 0.28), "velocity": (0.0, 0.0, -1.0)}],
+    domain=domain, water=((0.0, 0.0, 0.0), (0.36, 0.36, 0.2)), solver=sys.argv[2], wall_friction=1.0,
+)
+for _ in range(40):
+    tank.step()
+digest = hashlib.sha256()
+for name, array in sorted(tank.world.checkpoint().items()):
+    digest.update(array.tobytes())
+print(digest.hexdigest(), float(abs(tank.coupling.force).max()) > 0.0)
+"""
+
+
+def test_fluid_and_bodies_do_not_depend_on_the_number_of_threads():
+    here = Path(__file__).resolve().parent
+    for solver in ("wcsph", "dfsph"):
+        digests = [
+            subprocess.run(
+                [sys.executable, "-c", STEP_AND_PRINT_DIGEST, str(threads), solver],
+                env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[2]), str(here)])},
+                capture_output=True,
+                text=True,
+                check=True,
+            ).stdout
+            for threads in (1, 2)
+        ]
+        assert digests[0].split()[1] == "True"
+        assert digests[0] == digests[1]

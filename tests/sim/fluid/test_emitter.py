@@ -1,0 +1,184 @@
+"""Inflow: rate, lattice, pressure, caps, checkpoints."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from small_fluids import EVERY_FACE, lattice, make_fluid
+
+from sim.build import build_world
+from sim.fluid.filling import PIPE_CLEARANCE_IN_SPACINGS
+from sim.fluid.opening import Opening, obstruction
+from sim.fluid.parameters import EmitterParameters
+from sim.scene import DomainParameters, SceneParameters
+from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
+
+SPACING = 0.02
+OPEN_SPACE = DomainParameters(min=(-0.3, -0.3, -1.0), max=(0.3, 0.3, 0.5), open_faces=EVERY_FACE)
+BASIN = DomainParameters(min=(-0.1, -0.1, 0.0), max=(0.1, 0.1, 0.4))
+NOTHING = np.empty((0, 3), dtype=np.float32)
+DISC = {"shape": {"type": "disc", "radius": 0.07}, "position": (0, 0, 0.4), "direction": (0, 0, -2), "speed": 1.5}
+SLOT = {
+    "shape": {"type": "rectangle", "size": (0.13, 0.09)},
+    "position": (0.15, 0, 0.3),
+    "direction": (1, 0, -1),
+    "speed": 0.8,
+}
+FROM_BELOW = {
+    "shape": {"type": "rectangle", "size": (0.08, 0.08)},
+    "position": (0, 0, 0),
+    "direction": (0, 0, 1),
+    "speed": 0.5,
+}
+
+
+def opening_of(emitter: dict, spacing: float = SPACING) -> Opening:
+    return Opening.of(EmitterParameters.model_validate(emitter), spacing, spacing**3)
+
+
+def jet(*emitters: dict, domain=OPEN_SPACE, gravity=(0.0, 0.0, 0.0), positions=NOTHING, **more):
+    pipes = [opening_of(emitter).pipe(SPACING) for emitter in emitters]
+    return make_fluid(domain, positions, gravity=gravity, bodies=pipes, emitter=emitters, capacity=4000, **more)
+
+
+def run(fluid, duration_s: float, steps: int | None = None) -> None:
+    """Advance by a duration in equal steps, or in stable ones."""
+    left = duration_s
+    while left > 1.0e-12:
+        dt = duration_s / steps if steps else min(fluid.stable_dt(), left)
+        fluid.substep(dt)
+        left -= dt
+        assert fluid.first_bad_quantity() is None
+
+
+@pytest.mark.parametrize(("emitter", "area"), [(DISC, math.pi * 0.07**2), (SLOT, 0.13 * 0.09)])
+def test_the_flow_is_speed_times_area(taichi_cpu, emitter, area):
+    fluid, duration_s = jet(emitter), 0.2
+    run(fluid, duration_s)
+    opening = opening_of(emitter)
+    expected = emitter["speed"] * area * duration_s / SPACING**3
+    # Layers are whole: one more or less. The volume of a particle is d³ to 0.03 %.
+    assert fluid.diagnostics()["particles_emitted"] == pytest.approx(expected, abs=len(opening.points) + 1)
+    assert len(opening.points) * opening.speed / opening.layer_distance * SPACING**3 == pytest.approx(
+        emitter["speed"] * area, rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("emitter", [DISC, SLOT])
+def test_particles_never_overlap_and_make_rest_density(taichi_cpu, emitter):
+    fluid = jet(emitter)
+    for _ in range(8):
+        run(fluid, 0.02)
+        position = fluid.snapshots()["water"].arrays["position"]
+        distance, _ = cKDTree(position).query(position, k=2)
+        # Within a layer and between layers; a jet without gravity stays the lattice that it was emitted as.
+        assert distance[:, 1].min() > 0.819 * SPACING
+    inside = fluid.snapshots()["water"].arrays["density"].max()
+    # Of a lattice that is stretched by up to 10 % one way and squeezed as much the other.
+    assert inside == pytest.approx(1000.0, rel=0.03)
+
+
+def test_emission_does_not_depend_on_the_steps(taichi_cpu):
+    coarse, fine = jet(DISC), jet(DISC)
+    run(coarse, 0.1, steps=40)
+    run(fine, 0.1, steps=170)
+    a, b = (fluid.snapshots()["water"].arrays for fluid in (coarse, fine))
+    np.testing.assert_array_equal(a["particle_id"], b["particle_id"])
+    # The newest layers are held: they are where their inflow has brought them, to float32 rounding of 1 m.
+    newest = a["particle_id"] > a["particle_id"].max() - 2 * len(opening_of(DISC).points)
+    np.testing.assert_allclose(a["position"][newest], b["position"][newest], atol=1.0e-6)
+
+
+def test_inflow_holds_against_pressure(taichi_cpu):
+    pool = lattice((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2), SPACING)
+    distance, _ = cKDTree(opening_of(FROM_BELOW).pipe(SPACING)).query(pool)
+    in_front = (np.abs(pool[:, :2]).max(axis=1) < 0.05) & (pool[:, 2] < 0.02)
+    pool = pool[(distance > PIPE_CLEARANCE_IN_SPACINGS * SPACING) & ~in_front]
+    fluid = jet(FROM_BELOW, domain=BASIN, gravity=(0.0, 0.0, -9.81), positions=pool)
+    run(fluid, 0.3)
+    now = fluid.diagnostics()
+    # 0.5 m/s for 0.3 s are seven and a half layers of sixteen, the first at once; the pool presses with 2 kPa.
+    assert now["particles_emitted"] == 8 * 16
+    assert now["emission_blocked"] == now["particles_removed"] == 0.0
+
+
+def test_a_blocked_place_stays_empty_and_is_counted(taichi_cpu):
+    pool = lattice((-0.04, -0.04, 0.0), (0.04, 0.04, 0.1), SPACING)
+    fluid = jet(FROM_BELOW, domain=BASIN, positions=pool)
+    fluid.substep(1.0e-4)
+    now = fluid.diagnostics()
+    assert now["emission_blocked"] == 16.0
+    assert now["particles_emitted"] == 0.0
+    fluid.begin_frame(0.0)
+    assert fluid.diagnostics()["emission_blocked"] == 0.0
+
+
+def test_the_cap_is_kept_and_told(taichi_cpu):
+    fluid = jet(DISC, max_particles=150)
+    run(fluid, 0.2)
+    now = fluid.diagnostics()
+    layer = len(opening_of(DISC).points)
+    assert 150 - layer < now["particle_count"] <= 150
+    assert now["emission_capped"] > 0.0
+
+
+def test_emission_ends(taichi_cpu):
+    fluid = jet({**DISC, "start_s": 0.03, "end_s": 0.06})
+    run(fluid, 0.025)
+    assert fluid.particle_count == 0
+    run(fluid, 0.1)
+    opening = opening_of({**DISC, "start_s": 0.03, "end_s": 0.06})
+    assert fluid.diagnostics()["particles_emitted"] == opening.total_particles()
+
+
+def test_a_jet_continues_from_a_checkpoint_bit_for_bit(taichi_cpu):
+    emitters = ({**DISC, "end_s": 0.1}, SLOT)
+    straight, other = jet(*emitters, gravity=(0.0, 0.0, -9.81)), jet(*emitters, gravity=(0.0, 0.0, -9.81))
+    run(straight, 0.07)
+    saved = straight.checkpoint()
+    other.restore(saved)
+    for fluid in (straight, other):
+        run(fluid, 0.06)
+    for name, array in straight.checkpoint().items():
+        np.testing.assert_array_equal(other.checkpoint()[name], array, err_msg=name)
+    with pytest.raises(ValueError, match="not a checkpoint of these emitters"):
+        jet(DISC).restore(saved)
+
+
+def test_particles_at_the_nozzle_are_held_at_its_speed(taichi_cpu):
+    fluid = jet(DISC, gravity=(0.0, 0.0, -9.81))
+    run(fluid, 0.1)
+    arrays = fluid.snapshots()["water"].arrays
+    newest = arrays["particle_id"] >= arrays["particle_id"].max() - len(opening_of(DISC).points) + 1
+    np.testing.assert_array_equal(arrays["velocity"][newest], np.float32([[0.0, 0.0, -1.5]] * int(newest.sum())))
+    assert arrays["velocity"][~newest, 2].min() < -1.6
+
+
+def test_an_opening_narrower_than_a_particle_is_refused():
+    with pytest.raises(ValueError, match=r"too narrow for particles 0\.02 m apart"):
+        opening_of({**DISC, "shape": {"type": "disc", "radius": 0.008}})
+    with pytest.raises(ValueError, match="too narrow"):
+        opening_of({**SLOT, "shape": {"type": "rectangle", "size": (0.2, 0.005)}})
+
+
+def test_an_opening_outside_the_domain_or_in_a_solid_is_told():
+    outward = opening_of({**FROM_BELOW, "direction": (0, 0, -1)})
+    assert "16 of the 16 places of its opening are outside the domain" in obstruction(outward, SPACING, BASIN, [])
+    ball = build_solid(
+        Placement.model_validate({"shape": {"type": "sphere", "radius": 0.05}, "position": (0.0, 0.0, 0.0)})
+    )
+    assert "in a solid body" in obstruction(opening_of(FROM_BELOW), SPACING, BASIN, [ball])
+    assert obstruction(opening_of(FROM_BELOW), SPACING, BASIN, []) is None
+
+
+def test_a_scene_may_have_nothing_but_an_emitter(taichi_cpu):
+    scene = SceneParameters.model_validate(
+        {"domain": {"min": (-0.2, -0.2, 0), "max": (0.2, 0.2, 0.5)}, "fluid": [{"name": "jet", "emitter": [DISC]}]}
+    )
+    world = build_world(scene, frames_per_second=60)
+    assert len(world.snapshots()["jet"].arrays["position"]) == 0
+    for _ in range(3):
+        report = world.advance_frame()
+    assert report.diagnostics["jet"]["particles_emitted"] == report.diagnostics["jet"]["particle_count"] > 0

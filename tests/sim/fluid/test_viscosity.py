@@ -1,0 +1,144 @@
+"""Viscosity, explicit and implicit, against theory."""
+
+import numpy as np
+import pytest
+from scipy.special import jv
+from small_fluids import EVERY_FACE, lattice, make_fluid
+
+from sim.fluid.viscosity_implicit import TOLERANCE, is_implicit
+from sim.scene import DomainParameters
+
+OPEN_SPACE = DomainParameters(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5), open_faces=EVERY_FACE)
+SPACING = 0.02
+RADIUS = 0.2
+WAVE_NUMBER = 5.135622 / RADIUS
+"""J2(k R) = 0: the swirl v = J1(k r) has no shear stress at the free surface of a cylinder, and decays as a whole with
+the rate nu k² (Navier-Stokes in cylindrical coordinates)."""
+
+
+def swirling_cylinder(**parameters):
+    """A free cylinder of 7 layers whose slow swirl is the slowest mode that is not a rotation, and that mode."""
+    points = lattice((-0.3, -0.3, -0.07), (0.3, 0.3, 0.07), SPACING)
+    points = points[np.hypot(points[:, 0], points[:, 1]) < RADIUS]
+    radius = np.hypot(points[:, 0], points[:, 1])
+    around = np.stack([-points[:, 1], points[:, 0], np.zeros(len(points))], axis=1) / radius[:, None]
+    mode = (jv(1, WAVE_NUMBER * radius)[:, None] * around).astype(np.float32)
+    # So slow that the particles do not move: 1e-4 m/s for less than a second.
+    fluid = make_fluid(
+        OPEN_SPACE, points, 1.0e-4 * mode, gravity=(0.0, 0.0, 0.0), artificial_viscosity=0.0, **parameters
+    )
+    return fluid, mode
+
+
+def amplitude(fluid, mode) -> float:
+    velocity = fluid.snapshots()["water"].arrays["velocity"].astype(np.float64)
+    return float((velocity * mode).sum() / (mode**2).sum()) / 1.0e-4
+
+
+@pytest.mark.parametrize("solver", ["explicit", "implicit"])
+def test_a_swirl_decays_as_theory_says(taichi_cpu, solver):
+    viscosity, steps = 0.01, 100
+    # A tenth of the explicit limit, 0.125 d²/nu, so that both are exact in time to 1 %.
+    dt = 0.0125 * SPACING**2 / viscosity
+    fluid, mode = swirling_cylinder(viscosity=viscosity, viscosity_solver=solver, dt=dt)
+    before = amplitude(fluid, mode)
+    for _ in range(steps):
+        fluid.substep(dt)
+    rate = -np.log(amplitude(fluid, mode) / before) / (steps * dt)
+    # Ten particles to the radius, and a surface that is no circle: the discrete operator is right to 10 % there.
+    assert rate == pytest.approx(viscosity * WAVE_NUMBER**2, rel=0.1)
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 100.0])
+def test_a_long_implicit_step_is_that_of_backward_euler(taichi_cpu, stiffness):
+    viscosity, dt = 1.0, stiffness / WAVE_NUMBER**2
+    fluid, mode = swirling_cylinder(viscosity=viscosity, viscosity_solver="implicit", dt=dt)
+    before = amplitude(fluid, mode)
+    fluid.substep(dt)
+    # v' = v/(1 + nu k² dt); the discrete nu k² is right to 10 %, and the iteration to its tolerance.
+    assert amplitude(fluid, mode) / before == pytest.approx(1.0 / (1.0 + stiffness), rel=0.1, abs=3.0 * TOLERANCE)
+    assert fluid.diagnostics()["not_converged"] == 0.0
+
+
+def test_implicit_viscosity_conserves_momentum_and_takes_energy(taichi_cpu):
+    particles = lattice((-0.1,) * 3, (0.1,) * 3, SPACING)
+    velocities = np.random.default_rng(5).normal(0.0, 0.3, particles.shape).astype(np.float32)
+    velocities += np.float32((0.5, 0.0, -0.2))
+    fluid = make_fluid(
+        OPEN_SPACE, particles, velocities, gravity=(0.0, 0.0, 0.0), viscosity=5.0, viscosity_solver="implicit"
+    )
+    position = fluid.snapshots()["water"].arrays["position"].astype(np.float64)
+
+    def angular_momentum():
+        now = fluid.snapshots()["water"].arrays
+        return np.cross(now["position"].astype(np.float64), now["velocity"]).sum(axis=0)
+
+    before, spin = fluid.diagnostics(), angular_momentum()
+    for _ in range(20):
+        fluid.substep(fluid.stable_dt())
+    after = fluid.diagnostics()
+    scale = before["mass"] * 0.6
+    for axis in "xyz":
+        # Pair forces cancel to float32 rounding (6e-8) of each of twenty kicks, wherever the iteration stopped.
+        assert abs(after[f"momentum_{axis}"] - before[f"momentum_{axis}"]) < 1.0e-5 * scale
+    # Pair forces lie along x_ij: the same for the angular momentum, against the sum of |x||v|.
+    lever = np.linalg.norm(position, axis=1) * np.linalg.norm(velocities, axis=1)
+    assert np.abs(angular_momentum() - spin).max() < 1.0e-5 * lever.sum()
+    assert after["kinetic_energy"] < before["kinetic_energy"]
+    assert after["viscosity_iterations"] >= 1.0
+
+
+def test_a_rigid_motion_needs_no_iteration(taichi_cpu):
+    particles = lattice((-0.1,) * 3, (0.1,) * 3, SPACING)
+    velocities = np.broadcast_to(np.float32((3.0, -2.0, 1.0)), particles.shape).copy()
+    fluid = make_fluid(
+        OPEN_SPACE, particles, velocities, gravity=(0.0, 0.0, 0.0), viscosity=100.0, viscosity_solver="implicit"
+    )
+    fluid.substep(1.0e-3)
+    assert fluid.diagnostics()["viscosity_iterations"] == 0.0
+    np.testing.assert_array_equal(fluid.snapshots()["water"].arrays["velocity"], velocities)
+
+
+def test_honey_takes_the_time_step_of_water(dam_break):
+    water = dam_break(viscosity=1.0e-6)
+    honey = dam_break(viscosity=10.0, wall_friction=1.0)
+    assert honey.stable_dt() == pytest.approx(water.stable_dt())
+    start = honey.snapshots()["water"].arrays["position"]
+    for _ in range(200):
+        honey.substep(honey.stable_dt())
+        assert honey.first_bad_quantity() is None
+    for _ in range(200):
+        water.substep(water.stable_dt())
+    assert honey.diagnostics()["not_converged"] == 0.0
+    moved = [np.abs(fluid.snapshots()["water"].arrays["position"] - start).max() for fluid in (honey, water)]
+    # Ten thousand times as viscous as glycerine, and stuck to walls: it creeps while water has fallen.
+    assert moved[0] < 0.1 * moved[1]
+
+
+def test_a_stiff_fluid_continues_from_a_checkpoint_bit_for_bit(dam_break):
+    options = {"viscosity": 1.0, "wall_friction": 0.5, "viscosity_solver": "implicit"}
+    straight, other = dam_break(**options), dam_break(**options)
+    for _ in range(30):
+        straight.substep(straight.stable_dt())
+    other.restore(straight.checkpoint())
+    for _ in range(30):
+        straight.substep(straight.stable_dt())
+        other.substep(other.stable_dt())
+    for name, array in straight.checkpoint().items():
+        np.testing.assert_array_equal(other.checkpoint()[name], array, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("solver", "viscosity", "dt", "expected"),
+    [
+        ("auto", 1.0e-6, "adaptive", False),
+        ("auto", 1.0, "adaptive", True),
+        ("auto", 1.0, 1.0e-5, False),  # 0.125 d²/nu is 5e-5 s
+        ("auto", 1.0, 1.0e-4, True),
+        ("explicit", 1.0, "adaptive", False),
+        ("implicit", 1.0e-6, "adaptive", True),
+        ("implicit", 0.0, "adaptive", False),
+    ],
+)
+def test_viscosity_is_solved_for_where_it_would_shorten_the_step(solver, viscosity, dt, expected):
+    assert is_implicit(solver, viscosity=viscosity, spacing=0.02, speed=30.0, dt=dt, cfl=1.0) is expected

@@ -1,0 +1,211 @@
+"""The rigid solver as the world and a coupling see it: restart, snapshots, starts, meshes."""
+
+import numpy as np
+import pytest
+import trimesh
+from rigid_scenes import advance, ball, body, cube, in_room
+
+from sim.build import build_world
+from sim.rigid import rotation
+from sim.rigid.start import check_start
+from sim.scene import SceneParameters
+from sim.world import World
+
+
+def tumbling_scene() -> SceneParameters:
+    """A box and a cylinder fall on a static ball, beside a paddle that turns on a path."""
+    paddle = body(
+        "paddle",
+        {"type": "box", "size": (0.4, 0.05, 0.1)},
+        kind="kinematic",
+        keyframe=(
+            {"time_s": 0.0, "position": (0, 0.1, 0.1)},
+            {"time_s": 0.4, "position": (0, 0.2, 0.15), "rotation_deg": (0, 0, 80)},
+        ),
+    )
+    return SceneParameters(
+        rigid=(
+            paddle,
+            body("rock", ball(0.1), (0.05, 0, 0.1), kind="static"),
+            body("box", cube(0.1), (0, 0, 0.3), rotation_deg=(20, 30, 10), restitution=0.4),
+            body("can", {"type": "cylinder", "radius": 0.05, "height": 0.1}, (0.1, 0.02, 0.4), rotation_deg=(70, 0, 0)),
+        )
+    )
+
+
+def build(frames: int = 0) -> World:
+    world = build_world(tumbling_scene(), frames_per_second=60)
+    for _ in range(frames):
+        world.advance_frame()
+    return world
+
+
+def test_continued_run_equals_the_uninterrupted_one_bit_for_bit():
+    straight = build(30)
+    interrupted = build(19)
+    assert interrupted.diagnostics()["rigid"]["contacts"] > 0  # impulses to start from are part of the state
+    continued = build()
+    continued.restore(19, interrupted.checkpoint())
+    for _ in range(11):
+        continued.advance_frame()
+    expected, found = straight.checkpoint(), continued.checkpoint()
+    assert expected.keys() == found.keys()
+    for key, array in expected.items():
+        np.testing.assert_array_equal(found[key], array, err_msg=key)
+    assert straight.diagnostics() == continued.diagnostics()
+
+
+def test_two_runs_are_equal_bit_for_bit():
+    first, second = build(12).checkpoint(), build(12).checkpoint()
+    for key, array in first.items():
+        np.testing.assert_array_equal(second[key], array, err_msg=key)
+
+
+def test_checkpoint_of_another_scene_is_refused():
+    other = in_room(body("alone", ball(0.1), (0, 0, 1)))
+    arrays = build().checkpoint()
+    with pytest.raises(ValueError, match=r"position must have shape \(1, 3\), got shape \(3, 3\)"):
+        other.restore({key.removeprefix("rigid/"): array for key, array in arrays.items()})
+
+
+def test_world_has_a_snapshot_of_every_body_and_kinematic_ones_follow_their_path():
+    world = build(24)
+    snapshots = world.snapshots()
+    assert set(snapshots) == {"paddle", "rock", "box", "can"}
+    assert all(snapshot.kind == "rigid" for snapshot in snapshots.values())
+    paddle = snapshots["paddle"].arrays
+    np.testing.assert_allclose(paddle["position"], [0, 0.2, 0.15], atol=1e-12)
+    half = np.deg2rad(80) / 2
+    np.testing.assert_allclose(paddle["orientation"], [np.cos(half), 0, 0, np.sin(half)], atol=1e-12)
+
+
+def test_snapshot_places_the_rest_mesh_where_the_centre_of_mass_says():
+    solver = in_room(
+        body("cone", {"type": "cone", "radius": 0.1, "height": 0.4}, (0.1, 0.2, 2), rotation_deg=(30, 40, 50))
+    )
+    advance(solver, 0.2)
+    arrays = solver.snapshots()["cone"].arrays
+    mesh = solver.solids[0].solid.rest_mesh()
+    placed = mesh.transformed(1.0, rotation.matrices(arrays["orientation"]), arrays["position"])
+    of_mesh = trimesh.triangles.mass_properties(placed.corners)["center_mass"]
+    np.testing.assert_allclose(of_mesh, solver.bodies.position[0], atol=1e-12)
+
+
+def test_samples_and_distances_are_about_the_centre_of_mass():
+    solver = in_room(
+        body("cone", {"type": "cone", "radius": 0.1, "height": 0.4}, (0.1, 0.2, 2), rotation_deg=(30, 0, 0))
+    )
+    samples = solver.body_samples(0, 0.02)
+    assert samples.dtype == np.float64
+    # Samples lie on the facets of the mesh, 160 to the circle: within 0.02 % of the radius inside, in float32.
+    np.testing.assert_allclose(solver.signed_distance_in_body_frame(0)(samples), 0.0, atol=3e-5)
+    assert samples[:, 2].min() == pytest.approx(-0.1, abs=1e-4)  # the base is a quarter of the height below
+    np.testing.assert_allclose(solver.signed_distance_in_body_frame(0)(np.array([[0.0, 0.0, 0.35]])), 0.05, atol=1e-4)
+
+
+def test_ball_of_glued_half_shells_with_a_hole_has_the_mass_of_the_ball_and_rests_on_the_floor(tmp_path):
+    shell = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    kept = shell.faces[shell.triangles_center[:, 2] < 0.093]
+    path = tmp_path / "shell.ply"
+    trimesh.Trimesh(shell.vertices, kept, process=False).export(path)
+    solver = in_room(body("shell", {"type": "mesh", "file": str(path)}, (0, 0, 0.2), friction=0.3))
+    # The facets of this ball miss 1.1 % of its volume, the flat cap 0.6 %, the integration 0.5 %.
+    assert solver.bodies.mass[0] == pytest.approx(500 * 4 / 3 * np.pi * 0.1**3, rel=0.03)
+    advance(solver, 0.6)
+    lowest = (
+        solver.solids[0]
+        .solid.rest_mesh()
+        .transformed(1.0, *(rotation.matrices(a) if a.shape == (4,) else a for a in _pose(solver, "shell")))
+        .vertices[:, 2]
+        .min()
+    )
+    # It stands on balls of 2 % of its size under its vertices.
+    assert lowest == pytest.approx(0.0, abs=2e-3)
+
+
+def _pose(solver, name):
+    arrays = solver.snapshots()[name].arrays
+    return arrays["orientation"], arrays["position"]
+
+
+@pytest.mark.slow
+def test_duck_rocks_on_a_table_without_sinking_or_gaining_energy():
+    table = body("table", {"type": "box", "size": (0.2, 0.4, 0.2)}, (0, 0, 0.1), kind="static")
+    duck = body("duck", {"type": "duck", "length": 0.2}, (0.06, 0, 0.35), rotation_deg=(20, 30, 0))
+    solver = in_room(duck, obstacles=[table])
+    energies = []
+    for _ in range(16):
+        advance(solver, 0.05)
+        energies.append(sum(solver.diagnostics()[kind] for kind in ("kinetic_energy", "potential_energy")))
+    # Free flight keeps the energy to rounding; lifting overlaps of some 0.1 mm gives back 1e-4 of it at most.
+    assert np.all(np.diff(energies) < 2e-4 * energies[0])
+    assert energies[-1] < 0.9 * energies[0]
+    orientation, position = _pose(solver, "duck")
+    mesh = solver.solids[0].solid.rest_mesh()
+    vertices = mesh.transformed(1.0, rotation.matrices(orientation), position).vertices
+    over_table = np.all(np.abs(vertices[:, :2]) < [0.1, 0.2], axis=1)
+    # Contacts stand for the surface within 2 % of the shortest edge, some 2 mm.
+    assert vertices[over_table, 2].min() == pytest.approx(0.2, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "message"),
+    [
+        (
+            [body("a", cube(0.2), (0, 0, 0.1)), body("b", cube(0.2), (0.15, 0, 0.1))],
+            'rigid bodies "a" and "b" start 0.05 m deep in each other; move them apart',
+        ),
+        (
+            [body("a", ball(0.1), (0, 0, 0.1)), body("p", cube(0.2), (0, 0, 0.25), kind="kinematic")],
+            'rigid bodies "a" and "p" start 0.05 m deep in each other',
+        ),
+        ([body("a", cube(0.2), (0, 0, 0.07))], 'rigid body "a" starts 0.03 m behind the wall z- of the domain'),
+        ([body("a", cube(0.2), (1.95, 0, 1))], 'rigid body "a" starts 0.05 m behind the wall x+'),
+    ],
+)
+def test_overlapping_starts_are_refused_with_their_depth(bodies, message):
+    with pytest.raises(ValueError, match=message):
+        check_start(in_room(*bodies))
+
+
+def test_start_in_a_static_body_is_refused():
+    rock = body("rock", ball(0.2), (0, 0, 0.2), kind="static")
+    with pytest.raises(ValueError, match=r'"a" and "rock" start 0\.03'):
+        check_start(in_room(body("a", ball(0.1), (0, 0, 0.47)), obstacles=[rock]))
+
+
+def test_touching_bodies_may_start_and_kinematic_ones_may_overlap_static_ones():
+    rock = body("rock", ball(0.2), (1, 0, 0.2), kind="static")
+    check_start(
+        in_room(
+            body("a", cube(0.2), (0, 0, 0.1)),
+            body("b", cube(0.2), (0.2, 0, 0.1)),
+            body("c", cube(0.2), (0.1, 0, 0.3)),
+            body("mill", cube(0.2), (1, 0, 0.2), kind="kinematic"),
+            obstacles=[rock],
+        )
+    )
+
+
+def test_smoke_by_the_name_of_the_moving_bodies_is_refused():
+    smoke = {"name": "rigid", "source": [{"shape": ball(0.1)}]}
+    with pytest.raises(ValueError, match="name the fluid or smoke otherwise"):
+        build_world(SceneParameters(rigid=tumbling_scene().rigid, smoke=(smoke,)), frames_per_second=60)
+
+
+def test_divergence_names_the_body():
+    solver = in_room(body("good", ball(0.1), (0, 0, 1)), body("bad", ball(0.1), (1, 0, 1)))
+    solver.bodies.velocity[1, 2] = np.nan
+    assert solver.first_bad_quantity() == 'velocity of "bad" is not finite'
+    solver.bodies.velocity[1, 2] = 3e4
+    assert solver.first_bad_quantity() == 'the speed of "bad" is 3e+04 m/s'
+
+
+def test_stable_step_shrinks_with_speed_and_spin():
+    def step(**motion) -> float:
+        return in_room(body("a", ball(0.01), (0, 0, 1), **motion)).stable_dt()
+
+    # A quarter of the radius at 100 m/s; a tenth of a radian at 1000 rad/s. Gravity adds a little to the first.
+    assert step(velocity=(100, 0, 0)) == pytest.approx(0.25 * 0.01 / 100, rel=1e-3)
+    assert step(angular_velocity=(0, 0, 1000)) == pytest.approx(1e-4)
+    assert step() == pytest.approx(2e-3)

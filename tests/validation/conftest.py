@@ -1,0 +1,10 @@
+"""One Taichi for all validation cases."""
+
+import pytest
+
+from sim.runtime import initialize
+
+
+@pytest.fixture(scope="session")
+def taichi_cpu() -> str:
+    return initialize("cpu")

@@ -1,0 +1,22 @@
+"""Every validation case at the size that a test can afford: all of its numbers are as they should be."""
+
+import pytest
+
+from benchmarks.validation.cases import CASES, compute, load_case
+from benchmarks.validation.checks import CaseResult
+
+FAST = {("kernel", "wcsph"), ("free-momentum", "wcsph"), ("inertia", "rigid"), ("viscosity", "wcsph")}
+"""What takes about a second; all others are marked slow."""
+
+RUNS = [
+    pytest.param(case, solver, marks=() if (case, solver) in FAST else pytest.mark.slow, id=f"{case}-{solver}")
+    for case in CASES
+    for solver in load_case(case).solvers
+]
+
+
+@pytest.mark.parametrize(("case", "solver"), RUNS)
+def test_every_number_of_the_case_is_within_its_tolerance(taichi_cpu, case, solver):
+    result: CaseResult = compute(case, solver, quick=True)
+    assert result.checks
+    assert not result.failures, "\n".join(str(check) for check in result.checks)
