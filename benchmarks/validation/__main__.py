@@ -21,13 +21,15 @@ from sim.runtime import initialize
 def main() -> int:
     """Run what the command line names; 1 where a number is not as it should be."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("case", nargs="*", choices=[*CASES, []], help="all if omitted")
+    parser.add_argument("case", nargs="*", metavar="CASE", help=f"{', '.join(CASES)}; all if omitted")
     parser.add_argument("--solver", action="append", choices=[*FLUID_SOLVERS, "rigid"], help="all if omitted")
     parser.add_argument("--quick", action="store_true", help="small; prints the numbers and keeps nothing")
     parser.add_argument("--redraw", action="store_true", help="computes nothing")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--output", type=Path, default=FOLDER, help="folder of figures, numbers and page")
     arguments = parser.parse_args()
+    if unknown := set(arguments.case) - set(CASES):
+        parser.error(f"unknown case {', '.join(sorted(unknown))}; choose from {', '.join(CASES)}")
     names = arguments.case or list(CASES)
     if arguments.redraw:
         for name in names:

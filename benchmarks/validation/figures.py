@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -13,6 +14,9 @@ from benchmarks.validation.checks import CaseResult
 
 COLOURS = {"wcsph": "#2a6fbb", "dfsph": "#d1652b", "pcisph": "#2f8f5b", "rigid": "#2a6fbb"}
 TITLES = {"wcsph": "WCSPH", "dfsph": "DFSPH", "pcisph": "PCISPH", "rigid": "rigid body"}
+MEAN_OF = 20
+"""Samples of a running mean."""
+
 THEORY = "#222222"
 SHADES = ("#2a6fbb", "#d1652b", "#2f8f5b", "#8a5fb0")
 
@@ -43,12 +47,12 @@ def _panels(count: int, *, width: float = 3.4, height: float = 2.7) -> tuple[Fig
     return figure, [figure.add_subplot(1, count, number + 1) for number in range(count)]
 
 
-def _label(axes: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
+def _label(axes: Axes, x: str, y: str, title: str = "", *, legend: bool | str = True) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.set_title(title, loc="left")
     if legend:
-        axes.legend()
+        axes.legend(loc="best" if legend is True else legend)
 
 
 def _style(result: CaseResult) -> dict[str, Any]:
@@ -94,13 +98,14 @@ def draw_hydrostatic(results: Sequence[CaseResult]) -> Figure:
         finest = max(result.series["layers"])
         style = _style(result)
         profile.plot(result.series[f"pressure_{finest}"], result.series[f"depth_{finest}"], "o", markersize=3, **style)
-        force.plot(result.series["times"], result.series["forces"], linewidth=0.8, **style)
+        means = np.convolve(result.series["forces"], np.full(MEAN_OF, 1.0 / MEAN_OF), mode="valid")
+        force.plot(result.series["times"][MEAN_OF - 1 :], means, linewidth=1.0, **style)
     profile.plot([0.0, 1.0], [0.0, 1.0], color=THEORY, linewidth=1.0, label="rho g (H - z)")
     profile.invert_yaxis()
     _label(profile, "p / rho g H", "depth / H", "pressure, mean of 1 s")
     force.axhline(1.0, color=THEORY, linewidth=1.0)
-    force.set_ylim(0.7, 1.3)
-    _label(force, "time [s]", "force on the floor / weight", "force")
+    force.set_ylim(0.9, 1.1)
+    _label(force, "time [s]", "force on the floor / weight", "force, mean of the last 0.2 s")
     _refinement(order, results, "layers", 1, "spacing / H", "rms error / rho g H")
     return figure
 
@@ -148,7 +153,8 @@ def draw_elliptical_drop(results: Sequence[CaseResult]) -> Figure:
         axes.plot(times[1:], results[0].series[name], ":", color=THEORY, label=label)
     _label(axes, "time [ms]", "semi-axis [m]", "semi-axes")
     energy.axhline(1.0, color=THEORY, linewidth=1.0)
-    _label(energy, "time [ms]", "kinetic energy / that of the start", "energy")
+    energy.set_ylim(0.985, 1.001)
+    _label(energy, "time [ms]", "kinetic energy / that of the start", "energy", legend="lower left")
     _refinement(order, results, "resolutions", 1, "spacing / R", "error of the long axis")
     return figure
 
@@ -180,8 +186,8 @@ def draw_free_momentum(results: Sequence[CaseResult]) -> Figure:
             drifts = [max(drift, 1e-10) for drift in result.series[name]]
             axes.semilogy(result.series["times"], drifts, **_style(result))
         axes.axhline(1e-5, color=THEORY, linewidth=1.0, linestyle="--", label="bound")
-        axes.set_ylim(1e-10, 1e-4)
-        _label(axes, "time [s]", "relative drift", f"{name} momentum")
+        axes.set_ylim(1e-10, 1e-2)
+        _label(axes, "time [s]", "relative drift", f"{name} momentum", legend="upper left")
     return figure
 
 
@@ -245,11 +251,11 @@ def draw_buoyancy(results: Sequence[CaseResult]) -> Figure:
     _label(released, "time [ms]", "speed / acceleration of theory [s]", "released sphere")
     neutral.axhline(1e3 * results[0].settings["spacing_m"], color=THEORY, linewidth=1.0, linestyle="--")
     _label(neutral, "time [s]", "way [mm]; dashed: one spacing", "neutral sphere", legend=False)
-    for density, dash in zip(results[0].settings["floating_densities"], dashes, strict=False):
+    for density in results[0].settings["floating_densities"]:
         exact = 1e3 * density / 1000.0 * results[0].settings["box_m"][2]
         afloat.axhline(exact, color=THEORY, linewidth=1.0)
-        afloat.plot([], [], dash, color="#777777", label=f"{density:g} kg/m³")
-    _label(afloat, "time [s]", "draught [mm]; black: theory", "floating box")
+    densities = ", ".join(f"{density:g}" for density in results[0].settings["floating_densities"])
+    _label(afloat, "time [s]", "draught [mm]; black: theory", f"floating box, {densities} kg/m³", legend=False)
     return figure
 
 
@@ -257,7 +263,11 @@ def draw_bunny_energy(results: Sequence[CaseResult]) -> Figure:
     """Mechanical and kinetic energy over time."""
     figure, (total, kinetic) = _panels(2, width=4.2, height=3.0)
     for result in results:
-        total.plot(result.series["times"], result.series["kept"], **_style(result))
+        times = result.series["times"]
+        total.plot(times, result.series["kept"], **_style(result))
+        if "kept_with_equal_viscosity" in result.series:
+            alike = result.series["kept_with_equal_viscosity"]
+            total.plot(times, alike, ":", color=COLOURS[result.solver], label="WCSPH, viscosity of the others")
         kinetic.plot(result.series["times"], result.series["kinetic"], **_style(result))
     for axes in (total, kinetic):
         axes.set_ylim(bottom=0.0)

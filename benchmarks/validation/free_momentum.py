@@ -51,9 +51,9 @@ def run(solver: str, *, quick: bool = False) -> CaseResult:
             drifts[name].append(value)
     checks = [
         Check("drift of linear momentum over m v_rms", max(drifts["linear"]), 0.0, 1e-5,
-              "the design's bound; pair forces cancel but for float32 rounding (6e-8 a kick)"),
+              "the required bound; pair forces cancel but for float32 rounding (6e-8 a kick)"),
         Check("drift of angular momentum over m v_rms r_rms", max(drifts["angular"]), 0.0, 1e-5,
-              "the design's bound; all pair forces are central"),
+              "the required bound; all pair forces are central"),
         Check("particles lost", float(len(particles) - fluid.particle_count), 0.0, 0.0, "a count"),
     ]  # fmt: skip
     settings = {

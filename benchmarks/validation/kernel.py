@@ -38,7 +38,7 @@ def run(solver: str, *, quick: bool = False) -> CaseResult:  # noqa: ARG001  it 
               "symmetry; the slope is a difference quotient with eight digits"),
         Check("volume of a particle over d³", particle_volume(SPACING) / SPACING**3, 1.0, 1e-3,
               "the cubic spline integrates a lattice to 0.03 %"),
-        Check("density inside a filled lattice over rho0", density, 1.0, 1e-3, "the design's 0.1 %"),
+        Check("density inside a filled lattice over rho0", density, 1.0, 1e-3, "the required 0.1 %"),
         Check("order of the smoothing error of a sine", fitted_order([1.0 / n for n in REFINEMENTS], smoothing), 2.0,
               0.1, "an even kernel errs with the square of its width"),
     ]  # fmt: skip

@@ -30,7 +30,7 @@ def run(solver: str, *, quick: bool = False) -> CaseResult:
     checks = [
         *(
             Check(f"height of the first bounce over e² h, e = {restitution:g}", bounce["height"], 1.0, 0.01,
-                  "the design's 1 %; the impact is found to a step, and gravity's part of it is left out")
+                  "the required 1 %; the impact is found to a step, and gravity's part of it is left out")
             for restitution, bounce in bounces.items()
         ),
         Check("largest way of a box of the stack in 5 s", stack["way"], 0.0, 1e-4,

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 MOST_CELLS = 2**28
 """`sim.cells.MAX_CELLS`, which is not imported here as that loads Taichi; a test holds them together."""
-CELL_IN_SUPPORTS = 1.1
-"""Edge of a cell of the search for neighbours over the support radius; from `sim.fluid.particle_fluid`, likewise."""
 OVERLAP_SAMPLES = 20_000
 """Points of a block that are looked at for an overlap with another fluid's."""
 
@@ -89,7 +87,7 @@ def _check_emitter(job: Job, path: KeyPath, opening: Opening, obstacles: Sequenc
 
 def check_search_cells(domain: DomainParameters, fluid: FluidParameters, findings: Findings) -> None:
     """Refuse a domain with more cells for the search of neighbours than can be numbered."""
-    cell = CELL_IN_SUPPORTS * fluid.support_in_spacings * 2.0 * fluid.particle_radius
+    cell = (1.0 + fluid.skin) * fluid.support_in_spacings * 2.0 * fluid.particle_radius
     size = np.subtract(domain.max, domain.min)
     cells = float(np.prod(np.ceil(size / cell) + 2.0))
     if cells > MOST_CELLS:

@@ -17,6 +17,7 @@ from pipeline.job.models import Job
 from pipeline.job.placements import placements
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, suggestion
+from pipeline.job.rigid_checks import check_rigid_start
 from sim.fluid.parameters import FluidParameters
 from sim.scene import DomainParameters
 from sim.shapes.parameters import MeshShape, Placement
@@ -52,6 +53,7 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
     """Note what is wrong with shapes, places and sizes, and how large it all is; `memory_bytes` as in `check_job`."""
     solids = _build_solids(job, findings)
     _check_rigid_bodies(job, solids, findings)
+    check_rigid_start(job, solids, findings)
     _check_camera(job, solids, findings)
     check_fluids(job, solids, findings)
     budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")

@@ -60,7 +60,6 @@ class DFSPHSolver(ImplicitFluid):
         self._apply_implicit_viscosity(self._acceleration, dt)
         self._correct_density(dt)
         self._advance_particles(self._acceleration, dt)
-        self._update_neighbors()
 
     def diagnostics(self) -> Diagnostics:
         """As for every implicit fluid, with the iterations and errors of the divergence solves."""

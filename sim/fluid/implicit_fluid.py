@@ -168,6 +168,7 @@ class ImplicitFluid(SPHFluid):
         return None
 
     def _compute_density(self) -> None:
+        self._update_neighbors()
         particles, boundary, phases = self._particles, self.boundary, self.phases
         measure_density_and_diagonal(
             particles.position, particles.phase, particles.count, *self._list, boundary.position, boundary.volume,

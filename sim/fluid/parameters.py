@@ -129,6 +129,16 @@ class FluidParameters(Parameters):
     )
     cfl: Positive = Field(default=1.0, le=2.0, description="Factor on the CFL time step [-].")
 
+    @property
+    def skin(self) -> float:
+        """How much farther than the support the neighbour list reaches [support radii].
+
+        More means fewer searches, and more pairs in every step (docs/performance.md). DFSPH takes steps in which
+        particles use any skin up, and passes over the pairs many times in each: it searches anew for every step.
+        PCISPH looks at the pairs where they will be.
+        """
+        return 0.0 if self.solver == "dfsph" else 0.1
+
     @model_validator(mode="after")
     def _comes_from_somewhere(self) -> Self:
         if not self.block and not self.emitter:

@@ -31,10 +31,6 @@ if TYPE_CHECKING:
     from sim.scene import DomainParameters
     from sim.solver import Arrays, Diagnostics
 
-SKIN = 0.1
-"""How much farther than the support the neighbour list reaches [support radii]: more means fewer rebuilds, and more
-pairs in every step. Measurements: docs/performance.md."""
-
 
 class ParticleFluid(ABC):
     """Particles of equal volume in a box with walls and openings; one fluid, or several in one tank.
@@ -99,7 +95,7 @@ class ParticleFluid(ABC):
         box = Box.of_domain(domain)
         self._openings = box.openings
         self._stepper = ParticleStepper(box)
-        self._search_radius = (1.0 + SKIN) * self.support_radius
+        self._search_radius = (1.0 + self.parameters.skin) * self.support_radius
         self._grid = CellGrid.covering(np.array(domain.min), np.array(domain.max), self._search_radius)
         self.boundary = Boundary(
             boundary,
@@ -184,10 +180,7 @@ class ParticleFluid(ABC):
         fastest = float(speed.max(initial=0.0))
         self._boundary_travelled += 1.05 * max(fastest, self._boundary_speed) * elapsed_s
         self._boundary_speed = fastest
-        if elapsed_s == 0.0:
-            self._find_neighbors()
-        else:
-            self._update_neighbors()
+        self._without_neighbors |= elapsed_s == 0.0
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Positions, velocities and densities of the particles of each fluid, sorted by particle id."""
@@ -305,7 +298,7 @@ class ParticleFluid(ABC):
 
     @abstractmethod
     def _compute_density(self) -> None:
-        """Fill `_density`, relative to the rest density, for the current positions."""
+        """Fill `_density`, relative to the rest density, for the current positions and their neighbours."""
 
     @property
     def _list(self) -> tuple[Any, ...]:
@@ -343,7 +336,10 @@ class ParticleFluid(ABC):
         self._motion = replace(self._motion, max_speed=max(self._motion.max_speed, self._emission.speed))
 
     def _update_neighbors(self) -> None:
-        """Find the neighbours anew once a pair could have closed the skin between them, or particles left or came."""
+        """Find the neighbours anew where a pair could have closed the skin between them, or particles left or came.
+
+        Whatever reads the neighbours asks for this first; so bodies and particles both have moved by then.
+        """
         closed = self._travelled + max(self._travelled, self._boundary_travelled)
         if self._without_neighbors or self._motion.left or closed > self._search_radius - self.support_radius:
             self._find_neighbors()
@@ -363,6 +359,7 @@ class ParticleFluid(ABC):
         self.body_forces.find_particles(particles.sorted_points)
         self._travelled = self._boundary_travelled = 0.0
         self._without_neighbors = False
+        self._motion = replace(self._motion, left=0)
         self._neighbor_searches += 1
 
     def _host(self, array: ti.Ndarray) -> NDArray[np.generic]:

@@ -62,7 +62,6 @@ class PCISPHSolver(ImplicitFluid):
         self._react_on_bodies(particles.carried["pressure"], dt, with_friction=False)
         add_scaled(self._acceleration, self._pressure_acceleration, 1.0, particles.count)
         self._advance_particles(self._acceleration, dt)
-        self._update_neighbors()
 
     @property
     def _pressure_term(self) -> ti.Ndarray:

@@ -11,20 +11,18 @@ the forces of pressure are F = -V D^T P with P_i = p_i/(rho_i/rho0)², and what 
 import taichi as ti
 
 from sim.cells import Floats, Integers, Vectors
-from sim.fluid.kernels import spline, spline_slope
+from sim.fluid.kernels import distance, inverse_distance, spline, spline_slope
 from sim.launch import fast_launch
-
-TINY_DISTANCE = 1.0e-12
-"""Keeps x_ij/|x_ij| finite where two particles coincide; their force is then 0 [m]."""
 
 NOT_SOLVED = -1.0e6
 """Relative compression of a particle that takes no part in a solve: so much room that its pressure stays 0."""
 
 
 @ti.func
-def slope_over_distance(r: ti.f32, inverse_support: ti.f32) -> ti.f32:
-    """Factor on (sigma/h) x_ij of grad W_ij."""
-    return spline_slope(r * inverse_support) / (r + TINY_DISTANCE)
+def slope_over_distance(r_squared: ti.f32, inverse_support: ti.f32) -> ti.f32:
+    """Factor on (sigma/h) x_ij of grad W_ij; times x_ij it is 0 where two particles coincide."""
+    inverse = inverse_distance(r_squared)
+    return spline_slope(r_squared * inverse * inverse_support) * inverse
 
 
 @fast_launch
@@ -56,10 +54,12 @@ def measure_density_and_diagonal(
         for k in range(fluid_count[i]):
             j = neighbors[first + k * stride]
             x_ij = x_i - position[j]
-            r = x_ij.norm()
-            weight_sum += spline(r * inverse_support)
-            slope = spline_slope(r * inverse_support)
-            gradient_sum += slope / (r + TINY_DISTANCE) * x_ij
+            r_squared = x_ij.norm_sqr()
+            inverse = inverse_distance(r_squared)
+            q = r_squared * inverse * inverse_support
+            weight_sum += spline(q)
+            slope = spline_slope(q)
+            gradient_sum += slope * inverse * x_ij
             lightness = inverse_rho0
             if ti.static(several):
                 lightness = 1.0 / rest_density[phase[j]]
@@ -70,9 +70,9 @@ def measure_density_and_diagonal(
         for k in range(boundary_count[i]):
             b = neighbors[first + k * stride]
             x_ib = x_i - boundary_position[b]
-            r = x_ib.norm()
-            boundary_sum += boundary_volume[b] * spline(r * inverse_support)
-            boundary_gradient += boundary_volume[b] * slope_over_distance(r, inverse_support) * x_ib
+            r_squared = x_ib.norm_sqr()
+            boundary_sum += boundary_volume[b] * spline(distance(r_squared) * inverse_support)
+            boundary_gradient += boundary_volume[b] * slope_over_distance(r_squared, inverse_support) * x_ib
         density[i] = sigma * (volume * weight_sum + boundary_sum)
         diagonal = (volume * gradient_sum + boundary_gradient).norm_sqr() * inverse_rho0 + volume * volume * square_sum
         diagonal *= gradient_factor * gradient_factor
@@ -102,7 +102,7 @@ def predict_compression(
             j = neighbors[first + k * stride]
             x_ij = x_i - position[j]
             v_ij = v_i - velocity[j] - dt * acceleration[j]
-            fluid_sum += v_ij.dot(x_ij) * slope_over_distance(x_ij.norm(), inverse_support)
+            fluid_sum += v_ij.dot(x_ij) * slope_over_distance(x_ij.norm_sqr(), inverse_support)
         boundary_sum = 0.0
         first += fluid_count[i] * stride
         for k in range(boundary_count[i]):
@@ -111,7 +111,7 @@ def predict_compression(
             v_ib = v_i
             if ti.static(with_moving):
                 v_ib -= boundary_velocity[b]
-            boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(x_ib.norm(), inverse_support)
+            boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(x_ib.norm_sqr(), inverse_support)
         excess = density[i] - 1.0
         compression[i] = (
             dt * gradient_factor * (volume * fluid_sum + boundary_sum)
@@ -133,6 +133,7 @@ def measure_divergence(
 
     With fewer neighbours than the least a particle is `NOT_SOLVED`.
     """
+    support_squared = 1.0 / (inverse_support * inverse_support)
     gradient_factor = sigma * inverse_support
     ti.loop_config(block_dim=128)
     for i in range(count):
@@ -143,20 +144,20 @@ def measure_divergence(
         for k in range(fluid_count[i]):
             j = neighbors[first + k * stride]
             x_ij = x_i - position[j]
-            r = x_ij.norm()
-            fluid_sum += (v_i - velocity[j]).dot(x_ij) * slope_over_distance(r, inverse_support)
-            near += ti.cast(r * inverse_support < 1.0, ti.f32)
+            r_squared = x_ij.norm_sqr()
+            fluid_sum += (v_i - velocity[j]).dot(x_ij) * slope_over_distance(r_squared, inverse_support)
+            near += ti.cast(r_squared < support_squared, ti.f32)
         boundary_sum = 0.0
         first += fluid_count[i] * stride
         for k in range(boundary_count[i]):
             b = neighbors[first + k * stride]
             x_ib = x_i - boundary_position[b]
-            r = x_ib.norm()
+            r_squared = x_ib.norm_sqr()
             v_ib = v_i
             if ti.static(with_moving):
                 v_ib -= boundary_velocity[b]
-            boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(r, inverse_support)
-            near += ti.cast(r * inverse_support < 1.0, ti.f32)
+            boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(r_squared, inverse_support)
+            near += ti.cast(r_squared < support_squared, ti.f32)
         s_i = dt * gradient_factor * (volume * fluid_sum + boundary_sum)
         if near < least_neighbors:
             s_i = NOT_SOLVED
@@ -186,14 +187,14 @@ def accelerate_by_pressure(
         for k in range(fluid_count[i]):
             j = neighbors[first + k * stride]
             x_ij = x_i - position[j]
-            fluid_sum += (pressure_i + pressure[j]) * slope_over_distance(x_ij.norm(), inverse_support) * x_ij
+            fluid_sum += (pressure_i + pressure[j]) * slope_over_distance(x_ij.norm_sqr(), inverse_support) * x_ij
         boundary_sum = ti.math.vec3(0.0)
         if pressure_i > 0.0:
             first += fluid_count[i] * stride
             for k in range(boundary_count[i]):
                 b = neighbors[first + k * stride]
                 x_ib = x_i - boundary_position[b]
-                boundary_sum += boundary_volume[b] * slope_over_distance(x_ib.norm(), inverse_support) * x_ib
+                boundary_sum += boundary_volume[b] * slope_over_distance(x_ib.norm_sqr(), inverse_support) * x_ib
         acceleration[i] = (
             -sigma * inverse_support / rest_density[own] * (volume * fluid_sum + pressure_i * boundary_sum)
         )
@@ -228,7 +229,7 @@ def relax_pressure(
             j = neighbors[first + k * stride]
             x_ij = x_i - position[j]
             a_ij = a_i - acceleration[j]
-            fluid_sum += a_ij.dot(x_ij) * slope_over_distance(x_ij.norm(), inverse_support)
+            fluid_sum += a_ij.dot(x_ij) * slope_over_distance(x_ij.norm_sqr(), inverse_support)
         boundary_sum = 0.0
         first += fluid_count[i] * stride
         for k in range(boundary_count[i]):
@@ -237,7 +238,7 @@ def relax_pressure(
             a_ib = a_i
             if ti.static(with_moving):
                 a_ib -= boundary_response[b]
-            boundary_sum += boundary_volume[b] * a_ib.dot(x_ib) * slope_over_distance(x_ib.norm(), inverse_support)
+            boundary_sum += boundary_volume[b] * a_ib.dot(x_ib) * slope_over_distance(x_ib.norm_sqr(), inverse_support)
         left = compression[i] + dt_squared * gradient_factor * (volume * fluid_sum + boundary_sum)
         relaxed = ti.max(pressure[i] + relaxation / dt_squared * inverse_diagonal[i] * left, 0.0)
         next_pressure[i] = ti.max(relaxed + momentum * (relaxed - relaxed_before[i]), 0.0)

@@ -76,7 +76,6 @@ class WCSPHSolver(SPHFluid):
         self._react_on_bodies(self._pressure_terms, dt)
         self._apply_implicit_viscosity(self._acceleration, dt)
         self._advance_particles(self._acceleration, dt)
-        self._update_neighbors()
 
     @property
     def _pressure_term(self) -> ti.Ndarray:
@@ -109,6 +108,7 @@ class WCSPHSolver(SPHFluid):
         }
 
     def _compute_density(self) -> None:
+        self._update_neighbors()
         particles = self._particles
         compute_density_and_pressure(
             particles.position, particles.count, *self._list, self.boundary.position, self.boundary.volume,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.job.checks import check_job
-from pipeline.job.fluid_checks import CELL_IN_SUPPORTS, MOST_CELLS, particle_room
+from pipeline.job.fluid_checks import MOST_CELLS, particle_room
 from pipeline.job.loading import read_job
 
 HEAD = 'name = "tank"\nframes = 60\n'
@@ -139,9 +139,7 @@ def test_the_room_is_that_of_the_simulation(tmp_path):
     assert particle_room(job, job.fluid[0], 0.0) == pytest.approx(np.pi * 0.01 * 0.5 / 0.04**3, abs=21)
 
 
-def test_the_limits_are_those_of_the_simulation():
+def test_the_limit_is_that_of_the_simulation():
     from sim.cells import MAX_CELLS
-    from sim.fluid.particle_fluid import SKIN
 
     assert MOST_CELLS == MAX_CELLS
-    assert 1.0 + SKIN == CELL_IN_SUPPORTS

@@ -168,10 +168,10 @@ def test_restored_bodies_and_fluid_go_on_bit_for_bit(taichi_cpu, solver):
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", sorted(SOLVERS))
 def test_a_neutral_sphere_stays_where_it_is_for_two_seconds(taichi_cpu, solver):
-    tank = submerged_sphere(solver, 1000.0, wall_friction=1.0)
-    tank.settle(0.6)
+    tank = submerged_sphere(solver, 1000.0)
     start = tank.rigid.bodies.position.copy()
-    tank.run(2.0)
-    way = np.linalg.norm(tank.rigid.bodies.position - start)
-    # What the mission asks: one particle diameter.
-    assert way < SPACING, way
+    for _ in range(4):
+        tank.run(0.5)
+        # From the first step on, while the gaps of the filled lattice around it close: half a particle diameter, and
+        # then less. A force that errs by 1 % of the weight would move it by 6 diameters in fluid without friction.
+        assert np.linalg.norm(tank.rigid.bodies.position - start) < SPACING

@@ -81,6 +81,7 @@ def test_a_step_leaves_no_compression_and_pushes_only_where_there_would_be(shake
 def test_pressure_acts_as_the_transposed_matrix(shaken_corner):
     fluid = shaken_corner
     fluid.substep(1.0e-3)
+    fluid._compute_density()
     position = fluid.checkpoint()["position"]
     _, rates = explicit(position, domain_wall_samples(CORNER, SPACING), fluid.particle_volume)
     pressure = fluid._particles.carried["pressure"]
@@ -121,3 +122,16 @@ def test_divergence_iterations_and_errors_are_reported(dam_break):
     state = fluid.diagnostics()
     assert state["divergence_iterations"] >= 1.0
     assert 0.0 <= state["divergence_error"] <= fluid.parameters.divergence_tolerance
+
+
+def test_the_neighbour_list_has_no_skin_and_is_made_anew_for_every_step(shaken_corner):
+    fluid = shaken_corner
+    fluid.begin_frame(0.0)
+    for _ in range(3):
+        fluid.substep(1.0e-3)
+    assert fluid.diagnostics()["neighbor_searches"] == 3.0  # one before the second step, the third and this
+    position = fluid.checkpoint()["position"].astype(np.float64)
+    near = np.linalg.norm(position[:, None] - position[None], axis=-1) < SUPPORT
+    neighbors = fluid._particles.neighbors
+    found = neighbors.fluid_count.to_numpy()[: fluid.particle_count]
+    np.testing.assert_array_equal(found, near.sum(axis=1) - 1)

@@ -49,11 +49,11 @@ def test_neighbours_are_searched_before_a_step_can_go_beyond_their_list(taichi_c
     velocities = np.zeros_like(particles)
     velocities[:, 0] = 0.9
     searches = {}
-    for solver in ("dfsph", "pcisph"):
+    for solver in ("wcsph", "pcisph"):
         fluid = make_fluid(OPEN_SPACE, particles, velocities, gravity=(0.0,) * 3, solver=solver, dt=0.5e-3)
         fluid.begin_frame(0.0)
         for _ in range(24):
             fluid.substep(0.5e-3)
         searches[solver] = fluid.diagnostics()["neighbor_searches"]
     # The skin is 4 mm, 2 mm for each of a pair, and a step goes 0.45 mm: five steps, and four if one looks one ahead.
-    assert searches == {"dfsph": 4.0, "pcisph": 6.0}
+    assert searches == {"wcsph": 4.0, "pcisph": 6.0}
