@@ -135,9 +135,7 @@ def read_numbers(path: Path, only: Collection[str] | None = None) -> FrameNumber
                 time_s=float(file.attrs["time_s"]),
                 device=str(file.attrs["device"]),
                 solvers=_read_diagnostics(file, only),
-                kinds={}
-                if only is not None
-                else {name: str(group.attrs["kind"]) for name, group in file.get("bodies", {}).items()},
+                kinds=_read_kinds(file) if only is None else {},
             )
     except (OSError, KeyError, RuntimeError) as error:
         raise InvalidArtifactError(f"{path}: not a readable frame of the cache: {error}") from error

@@ -16,6 +16,10 @@ DASHES = ("", "7 4", "2 3", "9 3 2 3", "14 4", "4 4 1 4")
 """Of lines of one colour, in order."""
 MAX_POINTS = 1200
 """Two for each of 600 columns: more cannot be told apart at this width."""
+MOST_DIGITS = 9
+"""Of a tick's number: more do not fit to the left of the axis."""
+SMALLEST = 1.0e-290
+"""What is smaller counts as zero: parts of it cannot be told from zero in double precision."""
 LOGARITHMIC_FROM = 30.0
 """Ratio of the largest to the smallest value from which an axis that may be logarithmic is."""
 
@@ -65,6 +69,12 @@ class Axis:
             share = (value - self.low) / (self.high - self.low)
         return self.start + share * (self.end - self.start)
 
+    def labels(self, count: int) -> list[tuple[float, str]]:
+        """Where about so many round numbers lie [pixels], and what they are, told apart."""
+        ticks = self.ticks(count)
+        step = abs(ticks[1] - ticks[0]) if len(ticks) > 1 and not self.logarithmic else None
+        return [(self.place(tick), _number(tick, abs(tick) if step is None else step)) for tick in ticks]
+
     def ticks(self, count: int) -> list[float]:
         """About so many round numbers on the axis."""
         if self.logarithmic:
@@ -94,13 +104,13 @@ def line_chart(lines: Sequence[Line], *, x_label: str, may_be_logarithmic: bool 
     ]
     parts += [
         f'<line class="grid" x1="{LEFT:g}" x2="{WIDTH - RIGHT:g}" y1="{y:.1f}" y2="{y:.1f}"/>'
-        f'<text class="tick" x="{LEFT - 6:g}" y="{y + 3.5:.1f}" text-anchor="end">{_number(value)}</text>'
-        for value, y in ((value, y_axis.place(value)) for value in y_axis.ticks(5))
+        f'<text class="tick" x="{LEFT - 6:g}" y="{y + 3.5:.1f}" text-anchor="end">{number}</text>'
+        for y, number in y_axis.labels(5)
     ]
     parts += [
         f'<line class="axis" x1="{x:.1f}" x2="{x:.1f}" y1="{HEIGHT - BOTTOM:g}" y2="{HEIGHT - BOTTOM + 4:g}"/>'
-        f'<text class="tick" x="{x:.1f}" y="{HEIGHT - BOTTOM + 16:g}" text-anchor="middle">{_number(value)}</text>'
-        for value, x in ((value, x_axis.place(value)) for value in x_axis.ticks(8))
+        f'<text class="tick" x="{x:.1f}" y="{HEIGHT - BOTTOM + 16:g}" text-anchor="middle">{number}</text>'
+        for x, number in x_axis.labels(8)
     ]
     base = HEIGHT - BOTTOM
     parts.append(f'<line class="axis" x1="{LEFT:g}" x2="{WIDTH - RIGHT:g}" y1="{base:g}" y2="{base:g}"/>')
@@ -128,7 +138,7 @@ def swatch(line: Line) -> str:
 
 def _y_axis(values: Sequence[float], *, may_be_logarithmic: bool) -> Axis:
     bottom, top = HEIGHT - BOTTOM, TOP
-    positive = [value for value in values if value > 0.0]
+    positive = [value for value in values if value > SMALLEST]
     if may_be_logarithmic and positive and min(values) >= 0.0 and max(positive) >= LOGARITHMIC_FROM * min(positive):
         first, last = math.floor(math.log10(min(positive))), math.ceil(math.log10(max(positive)))
         return Axis(10.0**first, 10.0**last, bottom, top, logarithmic=True)
@@ -142,8 +152,8 @@ def _y_axis(values: Sequence[float], *, may_be_logarithmic: bool) -> Axis:
 
 def _linear(low: float, high: float, start: float, end: float) -> Axis:
     """An axis that ends on round numbers where that costs little room, and has an extent in any case."""
-    if high - low <= 1e-12 * max(abs(low), abs(high)):
-        margin = 0.5 * abs(high) or 1.0
+    if high - low <= max(1e-12 * max(abs(low), abs(high)), SMALLEST):
+        margin = 0.5 * abs(high) if abs(high) > SMALLEST else 1.0
         low, high = (low - margin, high + margin)
     step = _round_step((high - low) / 5)
     if start > end:  # the y axis, from bottom to top
@@ -157,9 +167,12 @@ def _round_step(least: float) -> float:
     return next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least * (1.0 - 1e-9))
 
 
-def _number(value: float) -> str:
-    """A tick's number: short, and the same zero for both signs of it."""
-    text = f"{value:.4g}" if abs(value) > 1e-12 else "0"
+def _number(value: float, step: float) -> str:
+    """A tick's number: as short as tells it from one a step away, and the same zero for both signs of it."""
+    if abs(value) < 1e-6 * step or value == 0.0:
+        return "0"
+    digits = 1 + math.floor(math.log10(abs(value))) - math.floor(math.log10(step) + 1e-9)
+    text = f"{value:.{min(max(4, digits), MOST_DIGITS)}g}"
     mantissa, exponent_sign, exponent = text.partition("e")
     return f"{mantissa}e{int(exponent)}" if exponent_sign else mantissa
 

@@ -1,9 +1,10 @@
-"""What stages need to know about the world outside the job's folder: tool versions and the user's own files."""
+"""What stages need to know before they run: tool versions, the user's own files, and how large the scene may be."""
 
 from __future__ import annotations
 
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from math import inf, prod
 from pathlib import Path
 from typing import TypeVar
 
@@ -51,6 +52,17 @@ def bodies_by_content(scene: SceneParameters) -> dict[str, object]:
         "fluid": [fluid.model_copy(update={"block": tuple(map(by_content, fluid.block))}) for fluid in scene.fluid],
         "smoke": [smoke.model_copy(update={"source": tuple(map(by_content, smoke.source))}) for smoke in scene.smoke],
     }
+
+
+def domain_volume(scene: SceneParameters) -> float:
+    """Volume of the domain [m³]."""
+    return prod(high - low for low, high in zip(scene.domain.min, scene.domain.max, strict=True))
+
+
+def most_particles(scene: SceneParameters) -> float:
+    """Upper bound of the number of fluid particles: no fluid holds more than fills the domain."""
+    volume = domain_volume(scene)
+    return sum(min(volume / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf) for fluid in scene.fluid)
 
 
 def _content_name(file: str) -> str:

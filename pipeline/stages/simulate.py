@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
-from math import ceil, inf, prod
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import bodies_by_content, tool_version
+from pipeline.stages.inputs import bodies_by_content, domain_volume, most_particles, tool_version
 from pipeline.stages.ordered_writer import WAITING, OrderedWriter
 from pipeline.task import Resources, Task, TaskId
 from sim.scene import SceneParameters
@@ -205,10 +205,8 @@ def _resources(job: Job) -> Resources:
 
 def _snapshot_bytes(job: Job) -> int:
     """Upper bound of what a snapshot or a checkpoint takes: no fluid holds more than fills the domain."""
-    domain = prod(high - low for low, high in zip(job.domain.min, job.domain.max, strict=True))
-    particles = sum(min(domain / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf) for fluid in job.fluid)
-    cells = sum(domain / smoke.cell_size**3 for smoke in job.smoke)
-    return ceil(particles * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL)
+    cells = sum(domain_volume(job) / smoke.cell_size**3 for smoke in job.smoke)
+    return ceil(most_particles(job) * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL)
 
 
 def _describe(report: FrameReport) -> str:

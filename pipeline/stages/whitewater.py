@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from math import ceil
 from typing import TYPE_CHECKING
 
 from pipeline.cache import read_frame
@@ -10,7 +11,7 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import by_content, tool_version
+from pipeline.stages.inputs import by_content, most_particles, tool_version
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
 
 if TYPE_CHECKING:
@@ -27,17 +28,20 @@ CORES = 2
 
 WORKER_BYTES = 600_000_000
 BYTES_PER_PARTICLE = 400
+"""Of the cloud."""
+BYTES_PER_FLUID_PARTICLE = 350
+"""Two snapshots, their motion, and what a substep makes of it; measured with 1 and 3 million, without a cloud."""
 
 
 class WhitewaterStage:
-    """One PLY a fluid and frame, each from that of the frame before and the fluid at both frames.
+    """One PLY a fluid and frame, each from that of the frame before and the fluids of the tank at both frames.
 
     So the frames of a fluid are made one after the other, each as soon as its own frame is cached. It always computes
     on the CPU: the clouds are the same wherever the simulation ran.
     """
 
     name = "whitewater"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame of each fluid that has whitewater."""
@@ -66,12 +70,13 @@ class WhitewaterStage:
         """Make one frame of one fluid's whitewater."""
         from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
 
-        cloud = _next_cloud(context)
+        cloud, not_generated = _next_cloud(context)
         with context.committing(context.task.outputs[0], validate_point_cloud) as path:
             write_point_cloud(
                 path, PointCloud(cloud.position, cloud.velocity, cloud.radius, cloud.lifetime, cloud.kind)
             )
-        context.progress(1, 1, f"{len(cloud)} particles")
+        lacking = f", {not_generated} more had no room below max_particles" if not_generated else ""
+        context.progress(1, 1, f"{len(cloud)} particles{lacking}")
 
     def _parameters(self, job: Job, fluid: str) -> ParameterSet:
         return ParameterSet.of(
@@ -93,11 +98,13 @@ def _inputs(layout: JobLayout, fluid: str, frame: int) -> tuple[ArtifactPath, ..
 
 
 def _resources(job: Job, fluid: str) -> Resources:
-    """How many particles the fluid has is not known before the simulation has filled its blocks."""
-    return Resources(cores=CORES, memory_bytes=WORKER_BYTES + BYTES_PER_PARTICLE * job.whitewater[fluid].max_particles)
+    """An upper bound: how many particles there are is not known before the simulation has filled its blocks."""
+    cloud = BYTES_PER_PARTICLE * job.whitewater[fluid].max_particles
+    return Resources(CORES, memory_bytes=WORKER_BYTES + cloud + ceil(BYTES_PER_FLUID_PARTICLE * most_particles(job)))
 
 
-def _next_cloud(context: TaskContext) -> WhitewaterCloud:
+def _next_cloud(context: TaskContext) -> tuple[WhitewaterCloud, int]:
+    """The task's cloud, and how many particles it has not for lack of room."""
     from render.point_clouds import read_point_cloud
     from sim.runtime import initialize
     from sim.whitewater.cloud import WhitewaterCloud
@@ -105,12 +112,12 @@ def _next_cloud(context: TaskContext) -> WhitewaterCloud:
     task, job = context.task, context.job
     assert task.frame is not None
     if task.frame == 0:
-        return WhitewaterCloud.empty()
+        return WhitewaterCloud.empty(), 0
     initialize("cpu", threads=context.threads)
     from sim.whitewater.motion import FluidState
     from sim.whitewater.solver import WhitewaterSolver
 
-    before, now = (_fluid_and_bodies(context.layout.path(cached), task.subject) for cached in task.inputs[:2])
+    before, now = (_fluids_and_bodies(context.layout.path(cached)) for cached in task.inputs[:2])
     last = read_point_cloud(context.layout.path(task.inputs[2]))
     particle_radius = now[task.subject].number("particle_radius")
     solver = WhitewaterSolver(
@@ -118,21 +125,22 @@ def _next_cloud(context: TaskContext) -> WhitewaterCloud:
     )
     cloud, report = solver.advance_frame(
         WhitewaterCloud(last.position, last.velocity, last.radius, last.lifetime, last.kind),
-        FluidState.of_snapshot(before[task.subject]),
-        FluidState.of_snapshot(now[task.subject]),
+        FluidState.of_snapshots([before[fluid.name] for fluid in job.fluid]),
+        FluidState.of_snapshots([now[fluid.name] for fluid in job.fluid]),
         frame=task.frame,
         particle_radius=particle_radius,
         bodies=_bodies(job, before, now, particle_radius),
+        sources=FluidState.of_snapshots([now[task.subject]]).particle_id if len(job.fluid) > 1 else None,
     )
     print(f"{len(cloud)} particles, {report.generated} of them new, in {report.substeps} substeps", flush=True)
     if report.not_generated:
         print(f"{report.not_generated} particles had no room below max_particles", flush=True)
-    return cloud
+    return cloud, report.not_generated
 
 
-def _fluid_and_bodies(path: Path, fluid: str) -> dict[str, Snapshot]:
+def _fluids_and_bodies(path: Path) -> dict[str, Snapshot]:
     """What whitewater reads of a cached frame; smoke would take longer than all of it."""
-    return {**read_frame(path, kind="rigid").bodies, **read_frame(path, fluid).bodies}
+    return {**read_frame(path, kind="rigid").bodies, **read_frame(path, kind="fluid").bodies}
 
 
 def _bodies(

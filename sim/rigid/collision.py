@@ -177,7 +177,7 @@ class CollisionDetector:
                     outward=outward,
                 )
             )
-        return _reduced(AnchoredContacts.joined(candidates), poses, last) if candidates else []
+        return _reduced(AnchoredContacts.joined(candidates), poses, last, margin) if candidates else []
 
     def _at_walls(self, body: int, poses: Poses, margin: float, last: frozenset[Key]) -> list[AnchoredContacts]:
         """Contacts of a body with the walls."""
@@ -208,7 +208,7 @@ class CollisionDetector:
                 anchor=wall.offset * wall.side * normals,
                 outward=normals,
             )
-            found += _reduced(candidates, poses, last)
+            found += _reduced(candidates, poses, last, margin)
         return found
 
 
@@ -221,5 +221,5 @@ def _transform(rotation: Array, points: Array, shift: Array) -> Array:
     return moved
 
 
-def _reduced(candidates: AnchoredContacts, poses: Poses, last: frozenset[Key]) -> list[AnchoredContacts]:
-    return [candidates.chosen(reduce_manifold(candidates.at(poses), last))]
+def _reduced(candidates: AnchoredContacts, poses: Poses, last: frozenset[Key], margin: float) -> list[AnchoredContacts]:
+    return [candidates.chosen(reduce_manifold(candidates.at(poses), last, margin=margin))]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sim.rigid.collision import CollisionDetector
@@ -11,18 +13,35 @@ START_OVERLAP = 0.01
 """Share of the smaller body's shortest edge by which bodies may overlap: positions in a job file are rounded."""
 
 
+class StartProblem(NamedTuple):
+    """Why a body cannot start where it is.
+
+    Attributes:
+        body: its name.
+        sentence: what is wrong, by how much, and what to do.
+    """
+
+    body: str
+    sentence: str
+
+
 def check_start(solver: RigidSolver) -> None:
     """Refuse dynamic bodies that start in other bodies or behind walls; touching is fine.
 
     Raises:
         ValueError: every pair that overlaps, with the depth and what to do.
     """
-    problems = [*_overlaps(solver), *_behind_walls(solver)]
+    problems = start_problems(solver)
     if problems:
-        raise ValueError("; ".join(problems))
+        raise ValueError("; ".join(problem.sentence for problem in problems))
 
 
-def _overlaps(solver: RigidSolver) -> list[str]:
+def start_problems(solver: RigidSolver) -> list[StartProblem]:
+    """Dynamic bodies that start in other bodies or behind walls; of a pair, one that moves."""
+    return [*_overlaps(solver), *_behind_walls(solver)]
+
+
+def _overlaps(solver: RigidSolver) -> list[StartProblem]:
     """Pairs of bodies of which one is dynamic, with the exact distance of the balls found to overlap."""
     poses = solver.poses()
     is_dynamic = np.zeros(len(solver.all_geometries), dtype=bool)
@@ -42,14 +61,15 @@ def _overlaps(solver: RigidSolver) -> list[str]:
         smaller = min(solver.all_geometries[number].shortest_edge for number in (first, second))
         if depth > START_OVERLAP * smaller:
             names = solver.all_names[first], solver.all_names[second]
-            problems.append(
+            sentence = (
                 f'rigid bodies "{names[0]}" and "{names[1]}" start {depth:.3g} m deep in each other; '
                 "move them apart by that much"
             )
+            problems.append(StartProblem(names[0], sentence))
     return problems
 
 
-def _behind_walls(solver: RigidSolver) -> list[str]:
+def _behind_walls(solver: RigidSolver) -> list[StartProblem]:
     poses = solver.poses()
     problems = []
     for number in np.flatnonzero(solver.bodies.is_dynamic):
@@ -59,8 +79,10 @@ def _behind_walls(solver: RigidSolver) -> list[str]:
             height = wall.side * (centres[wall.axis] - wall.offset) - geometry.balls.radii
             depth = -float(np.min(height, initial=0.0, where=wall.is_beside(centres)))
             if depth > START_OVERLAP * geometry.shortest_edge:
-                problems.append(
-                    f'rigid body "{solver.all_names[number]}" starts {depth:.3g} m behind the wall {wall.name} of the '
-                    "domain; move it inward by that much, or add the face to domain.open_faces"
+                name = solver.all_names[number]
+                sentence = (
+                    f'rigid body "{name}" starts {depth:.3g} m behind the wall {wall.name} of the domain; '
+                    "move it inward by that much, or add the face to domain.open_faces"
                 )
+                problems.append(StartProblem(name, sentence))
     return problems

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ Float32Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FluidState:
-    """Particles of a fluid at one moment.
+    """Particles of a fluid, or of all fluids of a tank, at one moment.
 
     Attributes:
         particle_id: (n,) int32, ascending.
@@ -27,14 +28,15 @@ class FluidState:
     velocity: Float32Array
 
     @classmethod
-    def of_snapshot(cls, snapshot: Snapshot) -> FluidState:
-        """The particles of a fluid's snapshot."""
-        arrays = snapshot.arrays
-        return cls(
-            np.ascontiguousarray(arrays["particle_id"], np.int32),
-            np.ascontiguousarray(arrays["position"], np.float32),
-            np.ascontiguousarray(arrays["velocity"], np.float32),
+    def of_snapshots(cls, fluids: Sequence[Snapshot]) -> FluidState:
+        """The particles of all fluids of a tank, whose ids differ."""
+        particle_id = np.concatenate([fluid.arrays["particle_id"] for fluid in fluids]).astype(np.int32)
+        order = np.argsort(particle_id)
+        position, velocity = (
+            np.concatenate([fluid.arrays[name] for fluid in fluids]).astype(np.float32)[order]
+            for name in ("position", "velocity")
         )
+        return cls(particle_id[order], position, velocity)
 
 
 class FluidMotion:

@@ -70,29 +70,43 @@ class WhitewaterSolver:
         frame: int,
         particle_radius: float,
         bodies: Sequence[MovingObstacle] = (),
+        sources: NDArray[np.int32] | None = None,
     ) -> tuple[WhitewaterCloud, WhitewaterReport]:
         """The cloud of the next frame.
 
         Args:
             cloud: of the frame before.
-            begin: the fluid at the frame before.
-            end: the fluid at this frame.
+            begin: all fluids of the tank at the frame before.
+            end: all fluids at this frame.
             frame: number of this frame.
-            particle_radius: of the fluid [m].
+            particle_radius: of the fluids [m].
             bodies: rigid bodies between the two frames.
+            sources: ids of the fluid particles that make whitewater, those of one fluid, (n,); all if omitted. The
+                others are around it like its own: under another fluid there is neither a crest nor spray.
         """
         motion = FluidMotion(begin, end, self._frame_dt)
         field = FluidField(motion.bounds(), particle_radius, len(end.position))
         obstacles = Obstacles(self._domain, bodies, self._frame_dt)
         substeps = self._substep_count(motion.max_speed(), field.support_radius)
         dt = self._frame_dt / substeps
+        is_source = None if sources is None else np.isin(motion.particle_id, sources)
         generated = not_generated = 0
         for substep in range(substeps):
             share = (substep + 1) / substeps
             fluid = motion.at(share)
             field.update(fluid)
             cloud = self._move(cloud, field, obstacles, share, dt)
-            born, missed = self._generate(fluid, field, dt, len(cloud), particle_radius, Moment(frame, substep))
+            room = max(0, self._parameters.max_particles - len(cloud))
+            rate = self._generation_rate(fluid, field, is_source)
+            born, missed = generate(
+                fluid,
+                rate,
+                dt,
+                particle_radius=particle_radius,
+                room=room,
+                moment=Moment(frame, substep),
+                parameters=self._parameters,
+            )
             cloud = cloud.joined(self._settled(born, field, obstacles, share))
             generated, not_generated = generated + len(born), not_generated + missed
         return cloud, WhitewaterReport(substeps, generated, not_generated)
@@ -169,20 +183,12 @@ class WhitewaterSolver:
         changed[bubble] = terminal + decay * lag
         return moved, changed
 
-    def _generate(
-        self, fluid: FluidState, field: FluidField, dt: float, present: int, particle_radius: float, moment: Moment
-    ) -> tuple[WhitewaterCloud, int]:
-        parameters = self._parameters
-        trapped_air, wave_crest = field.potentials(parameters.min_speed)
-        return generate(
-            fluid,
-            generation_rate(fluid.velocity, trapped_air, wave_crest, parameters),
-            dt,
-            particle_radius=particle_radius,
-            room=max(0, parameters.max_particles - present),
-            moment=moment,
-            parameters=parameters,
-        )
+    def _generation_rate(
+        self, fluid: FluidState, field: FluidField, is_source: NDArray[np.bool_] | None
+    ) -> Float64Array:
+        trapped_air, wave_crest = field.potentials(self._parameters.min_speed)
+        rate = generation_rate(fluid.velocity, trapped_air, wave_crest, self._parameters)
+        return rate if is_source is None else np.where(is_source, rate, 0.0)
 
     def _settled(self, born: WhitewaterCloud, field: FluidField, obstacles: Obstacles, share: float) -> WhitewaterCloud:
         """New particles outside of solids, as what they are."""

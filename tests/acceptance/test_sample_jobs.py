@@ -17,7 +17,7 @@ TINY = {
     "drop_on_bunny_wcsph": {"fluid.water.particle_radius": 0.05, "fluid.water.dt": 1.0e-3},
     "duck_in_pool_pcisph": {"fluid.water.particle_radius": 0.05},
     "floating_bodies": {"fluid.water.particle_radius": 0.025},
-    "honey": {"fluid.honey.particle_radius": 0.0015},
+    "honey": {"fluid.honey.particle_radius": 0.0014},
     "quickstart": {"fluid.water.particle_radius": 0.02, "smoke.plume.cell_size": 0.06},
 }
 

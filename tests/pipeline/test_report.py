@@ -73,6 +73,30 @@ def test_ticks_are_round_numbers(low, high, ticks):
     assert Axis(low, high, 0.0, 100.0).ticks(5) == pytest.approx(ticks)
 
 
+def labels_of(values: list[float], **options) -> list[str]:
+    """Numbers at the y axis, from the bottom."""
+    chart = line_chart([Line("mass", range(len(values)), values)], x_label="s", **options)
+    return re.findall(r'text-anchor="end">([^<]+)</text>', chart)[:-1]
+
+
+def test_ticks_of_what_hardly_changes_can_be_told_apart():
+    assert labels_of([125.0001, 125.0002, 125.0003])[:2] == ["125.0001", "125.00015"]
+
+
+def test_ticks_of_tiny_errors_are_not_called_zero():
+    labels = labels_of([1e-15, 1e-8, 1e-3], may_be_logarithmic=True)
+    assert labels[0] == "1e-15"
+    assert "0" not in labels
+
+
+@pytest.mark.parametrize("values", [[0.0, 5e-324], [0.0, 5e-324, 1.0], [0.0, -0.0]])
+@pytest.mark.parametrize("may_be_logarithmic", [False, True])
+def test_what_is_as_good_as_zero_does_no_harm(values, may_be_logarithmic):
+    labels = labels_of(values, may_be_logarithmic=may_be_logarithmic)
+    assert "0" in labels
+    assert len(set(labels)) == len(labels)
+
+
 def test_errors_over_decades_get_a_logarithmic_axis_and_zeros_leave_gaps():
     values = [1.0, 0.1, 0.0, 0.01, 0.001]
     runs = polylines(chart(Line("a", [0.0, 1.0, 2.0, 3.0, 4.0], values), logarithmic=True))

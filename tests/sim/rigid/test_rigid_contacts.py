@@ -213,8 +213,26 @@ def test_heap_of_many_shapes_settles_without_overlap():
     solver = in_room(*bodies, domain=tank)
     energy = sum(solver.diagnostics()[kind] for kind in ("kinetic_energy", "potential_energy"))
     advance(solver, 1.5)
+    # Of an impact at 3 m/s, 6 mm a step, a few contacts are foreseen; what else meets overlaps for a moment, by a third
+    # of that step at most. Chaotic: 0.3 to 1.3 mm for different starts.
+    assert solver.diagnostics()["max_penetration"] < 2.0e-3
+    solver.begin_frame(1.5)
+    advance(solver, 0.1)
     diagnostics = solver.diagnostics()
-    # A contact's plane stands for a curved surface over the trusted motion: overlap stays below 2 % of the smallest.
-    assert diagnostics["max_penetration"] < 0.02 * 0.06
+    assert diagnostics["max_penetration"] < 1e-5  # at rest: the micrometre that is left alone, and microns of creeping
     assert diagnostics["kinetic_energy"] + diagnostics["potential_energy"] < 0.5 * energy
     assert np.all(solver.bodies.position[:, 2] > 0.0)
+
+
+def test_bunny_on_its_side_comes_to_rest_on_the_bumps_that_it_stands_on():
+    """Without all of them among its contacts it sinks in between, is lifted out, and never stops rolling."""
+    # Half a degree and half a millimetre from where it lies, on three points.
+    lying = {"position": (0.0, 0.0, 0.041), "rotation_deg": (95.7, 8.0, 3.3)}
+    solver = in_room(body("bunny", {"type": "bunny"}, density=300.0, **lying))
+    advance(solver, 0.7)
+    start = solver.bodies.position.copy()
+    solver.begin_frame(0.7)
+    advance(solver, 0.3)
+    # As in a stack, a micrometre of overlap is left alone, and creeping is a matter of microns.
+    assert solver.diagnostics()["max_penetration"] < 1e-5
+    np.testing.assert_allclose(solver.bodies.position, start, atol=1e-5)

@@ -173,6 +173,23 @@ def test_the_cap_holds_and_what_had_no_room_is_counted(taichi_cpu):
     assert capped[1].generated + capped[1].not_generated == free[1].generated
 
 
+def test_two_fluids_of_a_tank_share_out_what_the_tank_makes(taichi_cpu):
+    """Each feels the other, so the halves are those of the whole, particle by particle."""
+    begin, end = jets()
+    half = len(begin.particle_id) // 2
+    made = [
+        solver(WhitewaterParameters()).advance_frame(
+            WhitewaterCloud.empty(), begin, end, frame=1, particle_radius=RADIUS, sources=sources
+        )
+        for sources in (None, begin.particle_id[:half], begin.particle_id[half:])
+    ]
+    (whole, report), (left, of_left), (right, of_right) = made
+    assert min(of_left.generated, of_right.generated) > 20
+    assert of_left.generated + of_right.generated == report.generated
+    both = np.concatenate([left.position, right.position])
+    np.testing.assert_array_equal(np.sort(both, axis=0), np.sort(whole.position, axis=0))
+
+
 def test_the_same_frame_gives_the_same_bits_and_another_seed_does_not(taichi_cpu):
     begin, end = jets()
 
