@@ -43,6 +43,8 @@ BYTES_PER_WALL_SAMPLE = 150
 """State, search and what building the walls takes for a moment."""
 COUNTED_PARTICLES = 200_000
 """Up to so many particles a fluid is filled as the simulation fills it; beyond, a coarser lattice is scaled up."""
+ROUND_OFF_IN_SPACINGS = 1.0e-6
+"""Sizes written in decimal may fall short of a whole number of spacings by this much."""
 ALL = 1.0 - 1e-6
 """Share of a box that counts as all of it: sizes and positions written in decimal do not add up exactly."""
 SPEED_OF_SOUND_IN_SPEEDS = 10.0
@@ -230,8 +232,14 @@ class _Lattice:
                 continue
             free &= obstacle.signed_distance(points.astype(np.float64)) >= (1.0 - ROUNDING) * step / 2
         left = int(np.count_nonzero(free))
-        scale = self.coarsening**3
+        # Whole layers fit into a box, so its fine lattice is not just coarsening³ times its coarse one.
+        scale = self._places(solid, self.spacing) / max(1.0, self._places(solid, step))
         return round(left * scale), round((len(points) - left) * scale)
+
+    def _places(self, solid: Solid, spacing: float) -> float:
+        """Places of a lattice in the bounds of the solid, as `fill_with_particles` lays it."""
+        extent = np.minimum(solid.bounds[1], self.box[1]) - np.maximum(solid.bounds[0], self.box[0])
+        return float(np.prod(np.floor(extent / spacing + ROUND_OFF_IN_SPACINGS)))
 
 
 def _check_block(path: KeyPath, solid: Solid, lattice: _Lattice, findings: Findings) -> int:
