@@ -23,6 +23,9 @@ class SPHFluid(MaterialFluid):
     with P = p/(rho/rho0)², Monaghan's viscosity (`sim.fluid.viscosity`) and the cohesion of Becker & Teschner 2007.
     """
 
+    _pressure_slope = 0.0
+    """dp/d(rho/rho0) at rest density [Pa], where pressure follows the density."""
+
     def __init__(self, *args: Any, **keywords: Any) -> None:
         """Take particles, walls and bodies, as `ParticleFluid` does."""
         super().__init__(*args, **keywords)
@@ -80,10 +83,11 @@ class SPHFluid(MaterialFluid):
             self.boundary.position, self.boundary.velocity, self.boundary.volume, self.boundary.moving_count > 0,
             phases.rest_density, self._explicit_viscosity, phases.surface_tension, len(phases) > 1,
             self.gravity, self.particle_volume, self._sigma, 1.0 / self.support_radius,
-            pressure_term is not None,
+            pressure_term is not None, self._pressure_slope,
             SOFTENING * self.support_radius**2, self._artificial_viscosity,
             parameters.wall_friction, self.spacing, parameters.wall_friction > 0.0,
             self._with_kappa, self._acceleration,
+            self._density if self._frequency_squared is None else self._frequency_squared,
         )  # fmt: skip
         self._add_surface_tension(self._acceleration)
 
@@ -120,10 +124,15 @@ def compute_acceleration(
     boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, with_moving: ti.template(),
     rest_density: Floats, dynamic_viscosity: Floats, surface_tension: Floats, several: ti.template(),
     gravity: ti.math.vec3, volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, with_pressure: ti.template(),
-    softening: ti.f32, artificial: ti.f32, wall_friction: ti.f32, spacing: ti.f32,
-    with_wall_friction: ti.template(), with_cohesion: ti.template(), acceleration: Vectors,
+    pressure_slope: ti.f32, softening: ti.f32, artificial: ti.f32, wall_friction: ti.f32, spacing: ti.f32,
+    with_wall_friction: ti.template(), with_cohesion: ti.template(), acceleration: Vectors, frequency_squared: Floats,
 ):  # fmt: skip
-    """All accelerations in one pass over the neighbours, or all but that by pressure; the terms stand at the solver."""
+    """All accelerations in one pass over the neighbours, or all but that by pressure; the terms stand at the solver.
+
+    With pressure also the square of the frequency at which a particle would swing against the pressures that its own
+    displacement makes, dp/d(rho/rho0) A_ii with A_ii as in `sim.fluid.pressure_kernels`: high where a particle is
+    squeezed, or close to boundary samples. `pressure_slope` is dp/d(rho/rho0) at rest density [Pa].
+    """
     gradient_factor = sigma * inverse_support
     ti.loop_config(block_dim=128)
     for i in range(count):
@@ -136,6 +145,8 @@ def compute_acceleration(
             own = phase[i]
         rho0, mu = rest_density[own], LAPLACIAN_FACTOR * dynamic_viscosity[own]
         fluid_sum = ti.math.vec3(0.0)
+        gradient_sum = ti.math.vec3(0.0)
+        square_sum = 0.0
         cohesion_sum = ti.math.vec3(0.0)
         first = start[i]
         for k in range(fluid_count[i]):
@@ -155,10 +166,16 @@ def compute_acceleration(
             scale = 2.0 * viscous / (rho_i + density[j])
             if ti.static(with_pressure):
                 scale -= pressure_i + pressure_term[j]
-            fluid_sum += scale * spline_slope(r * inverse_support) * inverse_r * x_ij
+            slope = spline_slope(r * inverse_support)
+            gradient = slope * inverse_r * x_ij
+            fluid_sum += scale * gradient
+            if ti.static(with_pressure):
+                gradient_sum += gradient
+                square_sum += slope * slope
             if ti.static(with_cohesion):
                 cohesion_sum += alike * cohesion_becker_teschner2007(r, inverse_support, spacing) * x_ij
         boundary_sum = ti.math.vec3(0.0)
+        boundary_gradient = ti.math.vec3(0.0)
         first += fluid_count[i] * stride
         for k in range(boundary_count[i]):
             b = neighbors[first + k * stride]
@@ -173,7 +190,13 @@ def compute_acceleration(
                     v_ib -= boundary_velocity[b]
                 viscous = viscous_factor(v_ib.dot(x_ib), r_squared, softening, mu, artificial * rho0)
                 scale += wall_friction * viscous / rho_i
-            boundary_sum += boundary_volume[b] * scale * spline_slope(r * inverse_support) * inverse_r * x_ib
+            gradient = boundary_volume[b] * spline_slope(r * inverse_support) * inverse_r * x_ib
+            boundary_sum += scale * gradient
+            boundary_gradient += gradient
+        if ti.static(with_pressure):
+            diagonal = (volume * gradient_sum + boundary_gradient).norm_sqr() + volume * volume * square_sum
+            stiffer = rho_i * rho_i * rho_i
+            frequency_squared[i] = pressure_slope / rho0 * stiffer * stiffer * gradient_factor**2 * diagonal
         a_i = gravity + gradient_factor / rho0 * (volume * fluid_sum + boundary_sum)
         if ti.static(with_cohesion):
             a_i -= surface_tension[own] * sigma * cohesion_sum

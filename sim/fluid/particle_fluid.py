@@ -89,6 +89,7 @@ class ParticleFluid(ABC):
         self.particle_volume = particle_volume(self.spacing, self.parameters.support_in_spacings)
         self.particles_removed = 0
         self._first_bad: str | None = None
+        self._frequency_squared: ti.Ndarray | None = None
         self._travelled = self._boundary_travelled = 0.0
         self._boundary_speed = 0.0
 
@@ -216,6 +217,7 @@ class ParticleFluid(ABC):
             "boundary_speed": np.array([self._boundary_speed], dtype=np.float64),
             "max_speed": np.array([self._motion.max_speed], dtype=np.float64),
             "max_acceleration": np.array([self._motion.max_acceleration], dtype=np.float64),
+            "max_frequency": np.array([self._motion.max_frequency], dtype=np.float64),
             "particles_removed": np.array([self.particles_removed], dtype=np.int64),
             "next_particle_id": np.array([self._next_particle_id], dtype=np.int64),
         }
@@ -238,7 +240,11 @@ class ParticleFluid(ABC):
         self._boundary_speed = float(arrays["boundary_speed"][0])
         self._travelled = float(arrays["travelled"][0])
         self._boundary_travelled = float(arrays["boundary_travelled"][0])
-        self._motion = MotionSummary(float(arrays["max_speed"][0]), float(arrays["max_acceleration"][0]))
+        self._motion = MotionSummary(
+            max_speed=float(arrays["max_speed"][0]),
+            max_acceleration=float(arrays["max_acceleration"][0]),
+            max_frequency=float(arrays["max_frequency"][0]),
+        )
         self.particles_removed = int(arrays["particles_removed"][0])
         self._next_particle_id = int(arrays["next_particle_id"][0])
         self._emission.restore(arrays)
@@ -320,7 +326,9 @@ class ParticleFluid(ABC):
     def _advance_particles(self, acceleration: ti.Ndarray, dt: float) -> None:
         particles = self._particles
         self._emission.drive(particles, acceleration)
-        self._motion = self._stepper.advance(particles.position, particles.velocity, acceleration, particles.count, dt)
+        self._motion = self._stepper.advance(
+            particles.position, particles.velocity, acceleration, particles.count, dt, self._frequency_squared
+        )
         emitted = self._emission.advance(particles, dt, self._next_particle_id)
         self._next_particle_id += emitted
         self._without_neighbors |= emitted > 0

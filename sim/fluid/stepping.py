@@ -10,7 +10,7 @@ from sim.fluid.box import Box
 from sim.launch import fast_launch
 from sim.reductions import Floats, LaneReduction, Results, is_finite, reduced
 
-MAXIMA, COUNTS = 3, 3
+MAXIMA, COUNTS = 4, 3
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class MotionSummary:
         max_speed: largest |v_i|, before a wall stops it [m/s].
         max_acceleration: largest |a_i| [m/s²].
         max_displacement: largest way that a particle went [m].
+        max_frequency: largest frequency at which a particle can swing against its own pressure [1/s].
         left: particles that passed an open face.
         touched: particles that were put back onto a wall.
         non_finite: particles with a position or velocity that is NaN or infinite.
@@ -29,6 +30,7 @@ class MotionSummary:
     max_speed: float
     max_acceleration: float
     max_displacement: float = 0.0
+    max_frequency: float = 0.0
     left: int = 0
     touched: int = 0
     non_finite: int = 0
@@ -42,7 +44,13 @@ class ParticleStepper:
         self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
 
     def advance(
-        self, position: ti.Ndarray, velocity: ti.Ndarray, acceleration: ti.Ndarray, count: int, dt: float
+        self,
+        position: ti.Ndarray,
+        velocity: ti.Ndarray,
+        acceleration: ti.Ndarray,
+        count: int,
+        dt: float,
+        frequency_squared: ti.Ndarray | None = None,
     ) -> MotionSummary:
         """v_i += dt a_i, x_i += dt v_i; then whoever passed a wall is put back onto it.
 
@@ -52,18 +60,22 @@ class ParticleStepper:
             acceleration: [m/s²], likewise.
             count: number of particles.
             dt: the step [s].
+            frequency_squared: square of the frequency at which each particle can swing [1/s²], at least (count,).
         """
         reduction = self._reduction
         lanes = reduction.lanes
         results = advance_particles(
-            position, velocity, acceleration, count, dt, *self._corners,
+            position, velocity, acceleration,
+            reduction.partial if frequency_squared is None else frequency_squared, frequency_squared is not None,
+            count, dt, *self._corners,
             lanes.items(count), lanes.lane_step(count), lanes.item_step(), *reduction.tree,
         )  # fmt: skip
-        speed, strength, displacement, left, touched, bad = reduction.unpack(results)
+        speed, strength, displacement, frequency, left, touched, bad = reduction.unpack(results)
         return MotionSummary(
             max_speed=float(np.sqrt(speed)),
             max_acceleration=float(np.sqrt(strength)),
             max_displacement=float(np.sqrt(displacement)),
+            max_frequency=float(np.sqrt(frequency)),
             left=int(left),
             touched=int(touched),
             non_finite=int(bad),
@@ -73,14 +85,15 @@ class ParticleStepper:
 @fast_launch
 @ti.kernel
 def advance_particles(
-    position: Vectors, velocity: Vectors, acceleration: Vectors, count: ti.i32, dt: ti.f32,
+    position: Vectors, velocity: Vectors, acceleration: Vectors,
+    frequency_squared: Floats, with_frequency: ti.template(), count: ti.i32, dt: ti.f32,
     wall_low: ti.math.vec3, wall_high: ti.math.vec3, keep_low: ti.math.vec3, keep_high: ti.math.vec3,
     items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
     partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
 ) -> Results:  # fmt: skip
     """Symplectic Euler, then the walls; returns these.
 
-    Largest |v|² [m²/s²], before a wall stops it, largest |a|² [m²/s⁴], and largest |x - x before|² [m²];
+    Largest |v|² [m²/s²], before a wall stops it, |a|² [m²/s⁴], |x - x before|² [m²] and squared frequency [1/s²];
     how many particles passed an open face, were put back onto a wall, and had a position or velocity that was
     not finite before the wall. Those that are not finite count neither as gone nor as put back.
     """
@@ -88,6 +101,7 @@ def advance_particles(
         max_speed_squared = 0.0
         max_acceleration_squared = 0.0
         max_displacement_squared = 0.0
+        max_frequency_squared = 0.0
         left = 0.0
         touched = 0.0
         bad = 0.0
@@ -116,12 +130,15 @@ def advance_particles(
                     if (x_i < keep_low).any() or (x_i > keep_high).any():
                         left += 1.0
                 max_displacement_squared = ti.max(max_displacement_squared, (x_i - x_before).norm_sqr())
+                if ti.static(with_frequency):
+                    max_frequency_squared = ti.max(max_frequency_squared, frequency_squared[i])
                 position[i] = x_i
                 velocity[i] = v_i
         partial[lane] = max_speed_squared
         partial[lanes + lane] = max_acceleration_squared
         partial[2 * lanes + lane] = max_displacement_squared
-        partial[3 * lanes + lane] = left
-        partial[4 * lanes + lane] = touched
-        partial[5 * lanes + lane] = bad
+        partial[3 * lanes + lane] = max_frequency_squared
+        partial[4 * lanes + lane] = left
+        partial[5 * lanes + lane] = touched
+        partial[6 * lanes + lane] = bad
     return reduced(partial, lanes, quantities, maxima, nodes)

@@ -8,6 +8,7 @@ import taichi as ti
 
 from sim.cells import Floats, Integers, Vectors
 from sim.fluid.forces import SPHFluid
+from sim.fluid.implicit_fluid import largest_eigenvalue
 from sim.fluid.kernels import distance, spline
 from sim.fluid.time_step import stable_time_step
 from sim.fluid.viscosity import LAPLACIAN_FACTOR
@@ -52,6 +53,8 @@ class WCSPHSolver(SPHFluid):
         self.sound_speed = self.parameters.sound_speed or SPEED_RATIO * self._expected_speed
         self._stiffness = float(self.phases.rest_densities.max()) * self.sound_speed**2 / GAMMA
         self._pressure_terms = ti.ndarray(ti.f32, self._particles.capacity)
+        self._frequency_squared = ti.ndarray(ti.f32, self._particles.capacity)
+        self._frequency_ratio = math.sqrt(largest_eigenvalue(self.parameters.support_in_spacings))
 
     def stable_dt(self) -> float:
         """Largest time step [s] for the current state, or the fixed one that the parameters name."""
@@ -66,6 +69,7 @@ class WCSPHSolver(SPHFluid):
             acceleration=self._motion.max_acceleration,
             viscosity=self._limiting_viscosity + artificial,
             cohesion_rate=self._cohesion_rate,
+            pressure_frequency=self._frequency_ratio * self._motion.max_frequency,
             cfl=self.parameters.cfl,
         )
 
@@ -76,6 +80,10 @@ class WCSPHSolver(SPHFluid):
         self._react_on_bodies(self._pressure_terms, dt)
         self._apply_implicit_viscosity(self._acceleration, dt)
         self._advance_particles(self._acceleration, dt)
+
+    @property
+    def _pressure_slope(self) -> float:
+        return self._stiffness * GAMMA
 
     @property
     def _pressure_term(self) -> ti.Ndarray:

@@ -327,6 +327,22 @@ def test_adaptive_time_step_shrinks_with_viscosity_and_speed_of_sound(dam_break)
     assert plain > dam_break(cfl=0.5).stable_dt()
 
 
+def test_a_particle_that_is_pressed_against_a_wall_shortens_the_step(taichi_cpu):
+    """Explicit pressure at a wall is stiffer than in the bulk: an isolated pair of layers squeezed onto the floor."""
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.2, 0.2, 0.4))
+    steps_taken = {}
+    for name, lowest in (("at rest", 0.01), ("squeezed", 0.006)):
+        particles = lattice((0.0, 0.0, 0.0), (0.2, 0.2, 0.06), 0.02)
+        particles[:, 2] += np.where(particles[:, 2] < 0.02, np.float32(lowest - 0.01), np.float32(0.0))
+        fluid = make_fluid(domain, particles, gravity=(0.0,) * 3, sound_speed=20.0, artificial_viscosity=0.0)
+        at_start = fluid.stable_dt()
+        assert at_start == pytest.approx(0.4 * 0.02 / 20.0)
+        fluid.substep(1.0e-6)
+        steps_taken[name] = fluid.stable_dt() / at_start
+    assert steps_taken["at rest"] > 0.95  # as the speed of sound allows, but for the little that moves
+    assert steps_taken["squeezed"] < 0.5
+
+
 def test_expected_speed_is_the_largest_of_start_fall_and_cohesion():
     domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 1.0, 1.0))
     positions, velocities = np.array([[0.5, 0.5, 0.8]]), np.array([[3.0, 0.0, 0.0]])
