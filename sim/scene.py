@@ -54,3 +54,14 @@ class SceneParameters(Parameters):
     device: Device = Field(
         default="auto", description="Where the simulation runs; auto: the fastest device that works."
     )
+
+    @model_validator(mode="after")
+    def _has_reactions(self) -> Self:
+        sticky = [fluid.name for fluid in self.fluid if fluid.adhesion > 0.0]
+        free = [body.name for body in self.rigid if body.kind == "dynamic"]
+        if sticky and free:
+            raise ValueError(
+                f'adhesion of "{sticky[0]}" has no reaction on bodies in this version, and would drive "{free[0]}" by '
+                'itself; set adhesion = 0, or make the bodies "static" or "kinematic"'
+            )
+        return self

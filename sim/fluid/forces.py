@@ -76,6 +76,7 @@ class SPHFluid(MaterialFluid):
     def _compute_acceleration(self, pressure_term: ti.Ndarray | None) -> None:
         """Fill `_acceleration` with gravity, viscosity, cohesion and, where its term P is given, pressure."""
         particles, parameters, phases = self._particles, self.parameters, self.phases
+        assert pressure_term is None or self._frequency_squared is not None
         compute_acceleration(
             particles.position, particles.velocity, particles.phase, self._density,
             self._density if pressure_term is None else pressure_term,
@@ -98,10 +99,11 @@ class SPHFluid(MaterialFluid):
         friction was counted before, in a call without pressure. There, bodies that answer within the step begin to
         fall, as the particles do by `_compute_acceleration`.
         """
-        if pressure_term is None and self.body_forces.response is not None:
-            self.body_forces.response.fall(dt)
         if pressure_term is not None or self.parameters.wall_friction > 0.0:
             self.body_forces.gather(*self._body_force_terms(pressure_term, with_friction=with_friction), dt=dt)
+        # After the gathering: the particles felt friction against bodies that had not begun to fall.
+        if pressure_term is None and self.body_forces.response is not None:
+            self.body_forces.response.fall(dt)
 
     def _body_force_terms(self, pressure_term: ti.Ndarray | None, *, with_friction: bool) -> tuple[Any, ...]:
         """What the forces on bodies by pressure, by friction or by both are made of (`gather_sample_forces`)."""
@@ -171,7 +173,10 @@ def compute_acceleration(
             fluid_sum += scale * gradient
             if ti.static(with_pressure):
                 gradient_sum += gradient
-                square_sum += slope * slope
+                lightness = 1.0
+                if ti.static(several):
+                    lightness = rho0 / rest_density[phase[j]]
+                square_sum += slope * slope * lightness
             if ti.static(with_cohesion):
                 cohesion_sum += alike * cohesion_becker_teschner2007(r, inverse_support, spacing) * x_ij
         boundary_sum = ti.math.vec3(0.0)

@@ -207,6 +207,7 @@ class ParticleFluid(ABC):
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The particles in the order of the neighbour list, and the positions that it was made from."""
+        self._update_neighbors()
         return {
             **self._particles.host_arrays(),
             **self.boundary.checkpoint(),

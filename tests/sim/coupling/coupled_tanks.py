@@ -68,13 +68,14 @@ class Tank:
         self.coupling.follow(dt)
         return dt
 
-    def run(self, duration: float) -> None:
-        """Coupled substeps for a time [s]."""
+    def run(self, duration: float) -> float:
+        """Coupled substeps for a time [s], or the little more that they took, which is returned."""
         time = 0.0
         while time < duration:
             time += self.step()
             assert self.fluid.first_bad_quantity() is None
             assert self.rigid.first_bad_quantity() is None
+        return time
 
     def settle(self, duration: float) -> None:
         """Let the fluid come to rest for a time [s] while the bodies are held."""
