@@ -76,6 +76,7 @@ _KNOWN = {
         Quantity("residual", "residual", "", "Residual"),
         Quantity("divergence", "largest divergence", "1/s", "Divergence"),
         Quantity("not_converged", "solves at their iteration limit", "", "Solves at their limit", counted=True),
+        Quantity("linear_solves", "solves made linear", "", "Solves made linear", counted=True),
         Quantity("particle_count", "particles", "", _COUNT, counted=True),
         Quantity("particles_removed", "particles removed", "", _COUNT, counted=True),
         Quantity("bodies_lost", "bodies out of sight", "", "Bodies out of sight", counted=True),

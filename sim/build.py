@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sim.coupling.fluid_rigid import FluidRigidCoupling
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
+from sim.fluid.nozzles import nozzle_collision, pipes
 from sim.fluid.opening import Opening, obstruction
 from sim.fluid.parameters import shared_conflicts
 from sim.rigid.static import StaticBody
@@ -22,6 +23,7 @@ from sim.world import World
 if TYPE_CHECKING:
     from sim.fluid.forces import SPHFluid
     from sim.rigid.solver import RigidSolver
+    from sim.shapes.solid import Solid
 
 
 def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
@@ -43,6 +45,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
 def _build_fluids(scene: SceneParameters, bodies: Sequence[StaticBody], rigid: RigidSolver | None) -> SPHFluid:
     """One solver for all fluids, as they share the tank; of moving bodies it has the samples."""
     from sim.coupling.body_samples import samples_of_moving_bodies
+    from sim.coupling.body_speed import expected_body_speed
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
     from sim.fluid.kernels import particle_volume
     from sim.fluid.solvers import SOLVERS
@@ -53,15 +56,11 @@ def _build_fluids(scene: SceneParameters, bodies: Sequence[StaticBody], rigid: R
     spacing, support = 2.0 * scene.fluid[0].particle_radius, scene.fluid[0].support_in_spacings
     volume = particle_volume(spacing, support)
     solids = [body.solid for body in bodies]
-    moving = [build_solid(body) for body in scene.rigid if body.kind != "static"]
-    pipes = [NO_POINTS]
-    for fluid in scene.fluid:
-        for number, emitter in enumerate(fluid.emitter):
-            opening = Opening.of(emitter, spacing, volume)
-            if reason := obstruction(opening, spacing, scene.domain, [*solids, *moving]):
-                raise ValueError(f'fluid "{fluid.name}" emitter[{number}]: {reason}')
-            pipes.append(opening.pipe(spacing))
-    filling = fill_fluids(scene.fluid, scene.domain, [*solids, *moving], np.concatenate(pipes))
+    movers = [body for body in scene.rigid if body.kind != "static"]
+    moving = [build_solid(body) for body in movers]
+    openings = _build_openings(scene, [*solids, *moving], spacing, volume)
+    around = pipes(openings, spacing)
+    filling = fill_fluids(scene.fluid, scene.domain, [*solids, *moving], np.concatenate([NO_POINTS, *around]))
     samples = [
         sink_samples(
             _reachable(body.surface_samples(spacing), scene.domain, support * spacing),
@@ -71,7 +70,7 @@ def _build_fluids(scene: SceneParameters, bodies: Sequence[StaticBody], rigid: R
         )
         for body in bodies
     ]
-    boundary = BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples, *pipes)
+    boundary = BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples, *around)
     return SOLVERS[scene.fluid[0].solver](
         scene.fluid,
         domain=scene.domain,
@@ -82,8 +81,25 @@ def _build_fluids(scene: SceneParameters, bodies: Sequence[StaticBody], rigid: R
         boundary=boundary,
         moving=None if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
         body_count=len(moving),
+        body_speed=0.0 if rigid is None else expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity),
         capacity=particle_capacity(scene.fluid, scene.domain, filling.count_of(len(scene.fluid)), volume),
     )
+
+
+def _build_openings(scene: SceneParameters, solids: list[Solid], spacing: float, volume: float) -> list[Opening]:
+    """The openings of all fluids, which must be free, and not in each other's way."""
+    openings: dict[str, Opening] = {}
+    for fluid in scene.fluid:
+        for number, emitter in enumerate(fluid.emitter):
+            name = f'fluid "{fluid.name}" emitter[{number}]'
+            opening = Opening.of(emitter, spacing, volume, fluid.support_in_spacings)
+            reason = obstruction(opening, spacing, scene.domain, solids)
+            for earlier_name, earlier in openings.items():
+                reason = reason or nozzle_collision(opening, earlier, earlier_name, spacing)
+            if reason:
+                raise ValueError(f"{name}: {reason}")
+            openings[name] = opening
+    return list(openings.values())
 
 
 def _reachable(samples: NDArray[np.float32], domain: DomainParameters, margin: float) -> NDArray[np.float32]:

@@ -48,6 +48,7 @@ class Tank:
             material: of the fluid, where it is not the default.
         """
         from sim.coupling.body_samples import samples_of_moving_bodies
+        from sim.coupling.body_speed import expected_body_speed
         from sim.coupling.fluid_rigid import FluidRigidCoupling
         from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
         from sim.fluid.parameters import FluidParameters
@@ -79,6 +80,7 @@ class Tank:
             boundary=BoundarySamples.of_bodies(domain_wall_samples(domain, spacing)),
             moving=samples_of_moving_bodies(self.rigid, spacing),
             body_count=len(bodies),
+            body_speed=expected_body_speed(bodies, self.rigid.solids, domain, gravity),
         )
         self.coupling = FluidRigidCoupling(self.fluid, self.rigid)
 

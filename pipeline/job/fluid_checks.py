@@ -31,10 +31,14 @@ def check_fluids(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) 
         findings.error(("fluid", number, key), message)
     _check_overlaps(job, solids, findings)
     obstacles = [solid for path, solid in solids.items() if path[0] == "rigid"]
+    openings: dict[KeyPath, Opening] = {}
     for index, fluid in enumerate(job.fluid):
         _check_speeds(job, index, findings)
         for number, opening in _openings(fluid, index, findings):
-            _check_emitter(job, ("fluid", index, "emitter", number), opening, obstacles, findings)
+            path = ("fluid", index, "emitter", number)
+            _check_emitter(job, path, opening, obstacles, findings)
+            _check_nozzle(path, opening, openings, 2.0 * fluid.particle_radius, findings)
+            openings[path] = opening
 
 
 def particle_room(job: Job, fluid: FluidParameters, block_volume: float) -> float:
@@ -68,7 +72,7 @@ def _openings(
     spacing = 2.0 * fluid.particle_radius
     for number, emitter in enumerate(fluid.emitter):
         try:
-            yield number, Opening.of(emitter, spacing, spacing**3)
+            yield number, Opening.of(emitter, spacing, spacing**3, fluid.support_in_spacings)
         except ValueError as error:
             if findings is not None:
                 findings.error(("fluid", index, "emitter", number, "shape"), str(error))
@@ -83,6 +87,18 @@ def _check_emitter(job: Job, path: KeyPath, opening: Opening, obstacles: Sequenc
     length = job.frame_count / job.fps
     if opening.start_s >= length:
         findings.warn((*path, "start_s"), f"starts at {opening.start_s:g} s, after the film's end at {length:g} s")
+
+
+def _check_nozzle(
+    path: KeyPath, opening: Opening, earlier: Mapping[KeyPath, Opening], spacing: float, findings: Findings
+) -> None:
+    """Refuse an emitter that is in the way of one before it; one reason will do."""
+    from sim.fluid.nozzles import nozzle_collision
+
+    for other_path, other in earlier.items():
+        if reason := nozzle_collision(opening, other, format_path(other_path), spacing):
+            findings.error(path, reason)
+            return
 
 
 def check_search_cells(domain: DomainParameters, fluid: FluidParameters, findings: Findings) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -80,7 +81,7 @@ class Boundary:
             [distance[moving.body == body].max(initial=0.0) for body in range(body_count)]
         )
         self.states = ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH)
-        self._reference_states = self.states.to_numpy()
+        self._host_states = self._reference_states = self.states.to_numpy()
         self._moving_cells = CellSort(grid, self.moving_count) if self.moving_count else None
         self._moving_ids = _device_array(np.arange(self.moving_count, dtype=np.int32))
         self._moving_position = ti.Vector.ndarray(3, ti.f32, max(self.moving_count, 1))
@@ -100,7 +101,7 @@ class Boundary:
         rotation: NDArray[np.float64],
         velocity: NDArray[np.float64],
         angular_velocity: NDArray[np.float64],
-    ) -> None:
+    ) -> float:
         """Put the moving samples where their bodies are, at the velocity of that point of the body.
 
         Args:
@@ -108,10 +109,20 @@ class Boundary:
             rotation: from body to world axes, (bodies, 3, 3).
             velocity: of the centres of mass [m/s], (bodies, 3).
             angular_velocity: [rad/s], (bodies, 3).
+
+        Returns:
+            How far any sample got at most [m].
         """
+        if not self.body_count:
+            return 0.0
         states = np.concatenate([position, rotation.reshape(-1, 9), velocity, angular_velocity], axis=1)
-        if self.body_count:
-            self._place(np.ascontiguousarray(states, dtype=np.float32).ravel())
+        before = self._host_states
+        self._place(np.ascontiguousarray(states, dtype=np.float32).ravel())
+        # In float64 of the float32 states, which a checkpoint holds: a run that continues finds the same.
+        moved = (self._host_states.astype(np.float64) - before).reshape(-1, STATE_WIDTH)
+        # Two rotations by an angle a apart differ by 2 sqrt(2) sin(a/2), and points at a distance of 1 by 2 sin(a/2).
+        turned = np.linalg.norm(moved[:, 3:12], axis=1) / math.sqrt(2.0)
+        return float((np.linalg.norm(moved[:, :3], axis=1) + turned * self.reach).max())
 
     def checkpoint(self) -> dict[str, NDArray[np.float32]]:
         """Where the bodies are, and where they were when the moving samples were sorted last."""
@@ -126,7 +137,8 @@ class Boundary:
         self._place(arrays["body_states"])
 
     def _place(self, states: NDArray[np.generic]) -> None:
-        self.states.from_numpy(np.ascontiguousarray(states))
+        self._host_states = np.ascontiguousarray(states)
+        self.states.from_numpy(self._host_states)
         place_samples(
             self.offset, self.body, self.moving_count, self.fixed_count, self.states, self.position, self.velocity
         )

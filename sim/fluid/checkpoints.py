@@ -21,6 +21,7 @@ CHECKPOINT_ARRAYS = {
     "max_speed": ("float64", "number"),
     "max_acceleration": ("float64", "number"),
     "max_frequency": ("float64", "number"),
+    "max_displacement": ("float64", "number"),
     "particles_removed": ("int64", "number"),
     "next_particle_id": ("int64", "number"),
 }

@@ -4,9 +4,9 @@ from typing import Any
 
 import taichi as ti
 
-from sim.fluid.implicit_fluid import ImplicitFluid, SolveRecord, momentum
+from sim.fluid.implicit_fluid import ImplicitFluid, SolveRecord
 from sim.fluid.kernels import lattice_offsets
-from sim.fluid.pressure_kernels import add_scaled, measure_divergence, predict_compression, relax_pressure
+from sim.fluid.pressure_kernels import add_scaled, measure_divergence
 from sim.solver import Diagnostics
 
 LEAST_ITERATIONS, LEAST_DIVERGENCE_ITERATIONS = 2, 1
@@ -91,12 +91,8 @@ class DFSPHSolver(ImplicitFluid):
         add_scaled(particles.velocity, self._pressure_acceleration, dt, particles.count)
 
     def _correct_density(self, dt: float) -> None:
-        particles, boundary = self._particles, self.boundary
-        predict_compression(
-            particles.position, particles.velocity, self._acceleration, self._density, particles.count, *self._list,
-            boundary.position, boundary.velocity, boundary.volume, boundary.moving_count > 0,
-            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt, self._correction(dt), self._compression,
-        )  # fmt: skip
+        particles = self._particles
+        self._predict_compression(dt)
         self._start_from(particles.carried["pressure"])
         particles.carried["pressure"] = self._solve(
             self._density_solves, particles.carried["pressure"], dt,
@@ -106,11 +102,4 @@ class DFSPHSolver(ImplicitFluid):
         add_scaled(self._acceleration, self._pressure_acceleration, 1.0, particles.count)
 
     def _relax(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
-        particles, boundary = self._particles, self.boundary
-        relax_pressure(
-            particles.position, self._pressure_acceleration, self._compression, self._inverse_diagonal,
-            particles.count, *self._list,
-            boundary.position, self._boundary_response, boundary.volume, boundary.moving_count > 0,
-            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt**2, self._relaxation,
-            momentum(iteration), pressure, self._relaxed_before, self._next_pressure, self._remaining,
-        )  # fmt: skip
+        self._relax_linearly(pressure, dt, iteration)

@@ -7,7 +7,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cells import CellGrid, Cells, Integers, Vectors, cell_of_point, row_of_cell
-from sim.fluid.opening import NOZZLE_LAYERS, Opening
+from sim.fluid.opening import Opening
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import ParticleSet
 from sim.launch import fast_launch
@@ -47,7 +47,11 @@ class Emission:
         self.emitted = self.blocked = self.capped = 0
         self._fluids, self._spacing, self._grid = tuple(fluids), spacing, grid
         self._phase = [number for number, fluid in enumerate(fluids) for _ in fluid.emitter]
-        self.openings = [Opening.of(emitter, spacing, particle_volume) for fluid in fluids for emitter in fluid.emitter]
+        self.openings = [
+            Opening.of(emitter, spacing, particle_volume, fluid.support_in_spacings)
+            for fluid in fluids
+            for emitter in fluid.emitter
+        ]
         self._places = [_device_points(opening.points) for opening in self.openings]
         self._layers = np.zeros(len(self.openings), dtype=np.int64)
         most = max((len(opening.points) for opening in self.openings), default=1)
@@ -66,15 +70,15 @@ class Emission:
 
     def drive(self, particles: ParticleSet, acceleration: ti.Ndarray) -> None:
         """Give all particles in a nozzle the velocity of its inflow, and no acceleration."""
-        for opening in self.openings:
-            depth = NOZZLE_LAYERS * opening.layer_distance
-            if opening.start_s <= self.time_s < opening.end_s + depth / opening.speed:
+        # Where emitters share a nozzle, the newest rules.
+        for opening in sorted(self.openings, key=lambda each: each.start_s):
+            if opening.start_s <= self.time_s < opening.drained_s:
                 drive_nozzle(
                     particles.position, particles.velocity, acceleration, particles.count,
                     opening.centre, opening.velocity, opening.axes[0], opening.axes[1],
                     opening.half_size[0] + EDGE_IN_SPACINGS * self._spacing,
                     opening.half_size[1] + EDGE_IN_SPACINGS * self._spacing, int(opening.is_round),
-                    depth * opening.speed,
+                    opening.nozzle_depth * opening.speed,
                 )  # fmt: skip
 
     def advance(self, particles: ParticleSet, dt: float, first_id: int) -> int:
@@ -93,11 +97,11 @@ class Emission:
         if not self.openings:
             return 0
         self.time_s += dt
-        before = self.emitted
+        before, sorted_count = self.emitted, particles.count
         for number, opening in enumerate(self.openings):
             for layer in range(self._layers[number], opening.layers_due(self.time_s)):
                 self._layers[number] = layer + 1
-                self._emit_layer(number, layer, particles, first_id + self.emitted - before)
+                self._emit_layer(number, layer, particles, sorted_count, first_id + self.emitted - before)
         return self.emitted - before
 
     def diagnostics(self) -> dict[str, float]:
@@ -135,7 +139,7 @@ class Emission:
             self.emitted = int(arrays["emission_count"][0])
             self._layers[:] = arrays["emission_layers"]
 
-    def _emit_layer(self, number: int, layer: int, particles: ParticleSet, first_id: int) -> None:
+    def _emit_layer(self, number: int, layer: int, particles: ParticleSet, sorted_count: int, first_id: int) -> None:
         opening, phase, places = self.openings[number], self._phase[number], self._places[number]
         count = len(opening.points)
         if count > self._room(phase, particles):
@@ -144,7 +148,7 @@ class Emission:
         moved = ti.math.vec3(*(opening.layer_at(layer, self.time_s)[0] - opening.points[0]))
         grid = self._grid
         find_free_places(
-            places, count, moved, particles.position, particles.cells.cell_start,
+            places, count, moved, particles.position, particles.cells.cell_start, sorted_count, particles.count,
             ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape),
             BLOCKED_IN_SPACINGS * min(self._spacing, opening.layer_distance), self._free,
         )  # fmt: skip
@@ -197,11 +201,13 @@ def drive_nozzle(
 @ti.kernel
 def find_free_places(
     places: Vectors, count: ti.i32, moved: ti.math.vec3, position: Vectors, cell_start: Integers,
+    sorted_count: ti.i32, particle_count: ti.i32,
     origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, clearance: ti.f32, free: Integers,
 ):  # fmt: skip
     """1 for each place without a particle nearer than the clearance, else 0.
 
-    Particles have moved by less than the skin since they were sorted; a cell is wider than both together.
+    Particles have moved by less than the skin since they were sorted; a cell is wider than both together. Those that
+    other layers brought in this step, from `sorted_count` on, are in no cell yet.
     """
     for k in range(count):
         x_k = places[k] + moved
@@ -212,6 +218,8 @@ def find_free_places(
                 row = row_of_cell(cell, dy, dz, shape)
                 for j in range(cell_start[row - 1], cell_start[row + 2]):
                     near += ti.cast((position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)
+        for j in range(sorted_count, particle_count):
+            near += ti.cast((position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)
         free[k] = ti.cast(near == 0, ti.i32)
 
 

@@ -28,20 +28,27 @@ def expected_speed(
     *,
     surface_tension: float,
     spacing: float,
+    body_speed: float = 0.0,
 ) -> float:
     """Largest speed to expect [m/s], never 0.
 
     That is the initial one with a fall from the highest particle to the bottom, the corner of the domain that lies
-    deepest along gravity; or what cohesion, `surface_tension` kappa [m³/s²], asks for at this `spacing` d [m].
+    deepest along gravity; what cohesion, `surface_tension` kappa [m³/s²], asks for at this `spacing` d [m]; or that of
+    the fastest body, `body_speed` [m/s], which fluid that it hits takes on.
     """
+    initial = float((np.asarray(velocities, dtype=np.float64) ** 2).sum(axis=1).max(initial=0.0))
+    fall = math.sqrt(initial + square_of_fall_speed(positions, domain, gravity))
+    cohesion = math.sqrt(COHESION_SPEED_FACTOR * surface_tension / spacing)
+    return max(fall, cohesion, body_speed, SLOWEST_EXPECTED_SPEED)
+
+
+def square_of_fall_speed(positions: NDArray[np.floating], domain: DomainParameters, gravity: Vector3) -> float:
+    """2 g H [m²/s²] of a fall from the highest of the positions [m], (n, 3), to the domain's deepest corner."""
     g = np.asarray(gravity, dtype=np.float64)
     strength = float(np.linalg.norm(g))
-    height = 0.0
-    if strength > 0.0 and len(positions):
-        corners = np.stack(np.meshgrid(*zip(domain.min, domain.max, strict=True)), axis=-1).reshape(-1, 3)
-        down = g / strength
-        height = float((corners @ down).max() - (np.asarray(positions, dtype=np.float64) @ down).min())
-    initial = float((np.asarray(velocities, dtype=np.float64) ** 2).sum(axis=1).max(initial=0.0))
-    fall = math.sqrt(initial + 2.0 * strength * max(height, 0.0))
-    cohesion = math.sqrt(COHESION_SPEED_FACTOR * surface_tension / spacing)
-    return max(fall, cohesion, SLOWEST_EXPECTED_SPEED)
+    if strength == 0.0 or not len(positions):
+        return 0.0
+    corners = np.stack(np.meshgrid(*zip(domain.min, domain.max, strict=True)), axis=-1).reshape(-1, 3)
+    down = g / strength
+    height = float((corners @ down).max() - (np.asarray(positions, dtype=np.float64) @ down).min())
+    return 2.0 * strength * max(height, 0.0)

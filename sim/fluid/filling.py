@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sim.fluid.opening import Opening
+from sim.fluid.opening import Opening, pipe_clearance
 from sim.shapes.placement import build_solid
 from sim.shapes.sampling import fill_with_particles
 
@@ -25,9 +25,6 @@ CLEARANCE_IN_SPACINGS = 0.5
 
 TAKEN_IN_SPACINGS = 0.9
 """A place is taken where a particle is nearer than this; particles as near as that push each other apart at once."""
-
-PIPE_CLEARANCE_IN_SPACINGS = 1.4
-"""Distance of the particles from the samples of a pipe; at 1.45 spacings they are at rest."""
 
 NO_POINTS = np.empty((0, 3))
 
@@ -87,7 +84,8 @@ def fill_fluids(
             points = fill_with_particles(build_solid(block), spacing, lower=domain.min, upper=domain.max)
             points = free_places(points, spacing, solids, np.concatenate(positions))
             if len(pipes) and len(points):
-                points = points[cKDTree(pipes).query(points)[0] > PIPE_CLEARANCE_IN_SPACINGS * spacing]
+                clearance = pipe_clearance(fluid.support_in_spacings) * spacing
+                points = points[cKDTree(pipes).query(points)[0] > clearance]
             if len(points) == 0:
                 raise ValueError(
                     f'fluid "{fluid.name}" block[{number}] has no particle: '
@@ -136,7 +134,8 @@ def particle_capacity(
     spacing = 2.0 * fluids[0].particle_radius
     total = 0.0
     for fluid, count in zip(fluids, filled.tolist(), strict=True):
-        most = count + sum(Opening.of(emitter, spacing, particle_volume).total_particles() for emitter in fluid.emitter)
+        openings = [Opening.of(each, spacing, particle_volume, fluid.support_in_spacings) for each in fluid.emitter]
+        most = count + sum(opening.total_particles() for opening in openings)
         total += max(count, min(most, math.inf if fluid.max_particles is None else fluid.max_particles))
     full = FULL_DOMAIN * math.prod(np.subtract(domain.max, domain.min)) / particle_volume
     return max(int(filled.sum()), int(min(total, full)))

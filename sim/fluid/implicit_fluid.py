@@ -15,6 +15,8 @@ from sim.fluid.pressure_kernels import (
     accelerate_by_pressure,
     copy_scalars,
     measure_density_and_diagonal,
+    predict_compression,
+    relax_pressure,
     sum_errors,
 )
 from sim.fluid.time_step import CFL_NUMBER, stable_time_step
@@ -63,12 +65,16 @@ class SolveRecord:
 
     def add(self, iterations: int, error: float, *, converged: bool) -> None:
         """Take one solve into account."""
-        self.solves += 1
-        self.iterations += iterations
+        self.merge(SolveRecord(1, iterations, error, int(not converged)))
+
+    def merge(self, other: "SolveRecord") -> None:
+        """Take all solves of another record into account."""
+        self.solves += other.solves
+        self.iterations += other.iterations
         # A NaN is larger than any number here, and stays.
-        if not (error <= self.worst_error or math.isnan(self.worst_error)):
-            self.worst_error = error
-        self.not_converged += not converged
+        if not (other.worst_error <= self.worst_error or math.isnan(self.worst_error)):
+            self.worst_error = other.worst_error
+        self.not_converged += other.not_converged
 
     @property
     def mean_iterations(self) -> float:
@@ -193,8 +199,9 @@ class ImplicitFluid(SPHFluid):
         return min(1.0, CORRECTED_PER_CROSSING * self._expected_speed * dt / self.spacing)
 
     def _solve(
-        self, record: SolveRecord, pressure: ti.Ndarray, dt: float, *, least: int, tolerance: float
-    ) -> ti.Ndarray:
+        self, record: SolveRecord, pressure: ti.Ndarray, dt: float, *,
+        least: int, tolerance: float, error_growth: float = math.inf,
+    ) -> ti.Ndarray:  # fmt: skip
         """Iterate until the error is below the tolerance, and count; `_pressure_acceleration` has the result.
 
         Args:
@@ -203,12 +210,14 @@ class ImplicitFluid(SPHFluid):
             dt: the step [s].
             least: iterations to make in any case.
             tolerance: mean compression that may be left [-].
+            error_growth: give up, not converged, where the error is more than so many times the first one, or ten
+                times the tolerance, whichever is larger [-].
 
         Returns:
             P, in this array or in another one.
         """
         limit = max(self.parameters.max_iterations, least)
-        iteration, next_look = 0, least
+        iteration, next_look, bound = 0, least, math.inf
         while True:
             self._accelerate_by_pressure(pressure)
             self._bodies_respond(pressure)
@@ -216,9 +225,11 @@ class ImplicitFluid(SPHFluid):
             iteration += 1
             if iteration >= min(next_look, limit):
                 error = self._mean_error(pressure, dt)
-                if error <= tolerance or iteration >= limit:
+                if error <= tolerance or iteration >= limit or not error <= bound:
                     record.add(iteration, error, converged=error <= tolerance)
                     return pressure
+                if math.isinf(bound):
+                    bound = error_growth * max(error, 10.0 * tolerance)
                 next_look += iterations_ahead(error, tolerance)
             pressure, self._next_pressure = self._next_pressure, pressure
 
@@ -229,6 +240,26 @@ class ImplicitFluid(SPHFluid):
     @abstractmethod
     def _relax(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
         """Fill `_remaining` with the compression that the accelerations leave, and `_next_pressure`."""
+
+    def _predict_compression(self, dt: float) -> None:
+        """Fill `_compression` with what a step of dt [s] without pressure leads to, linear in the velocities."""
+        particles, boundary = self._particles, self.boundary
+        predict_compression(
+            particles.position, particles.velocity, self._acceleration, self._density, particles.count, *self._list,
+            boundary.position, boundary.velocity, boundary.volume, boundary.moving_count > 0,
+            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt, self._correction(dt), self._compression,
+        )  # fmt: skip
+
+    def _relax_linearly(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
+        """`_relax` with s - dt² A P for the compression that is left, s from `_compression`."""
+        particles, boundary = self._particles, self.boundary
+        relax_pressure(
+            particles.position, self._pressure_acceleration, self._compression, self._inverse_diagonal,
+            particles.count, *self._list,
+            boundary.position, self._boundary_response, boundary.volume, boundary.moving_count > 0,
+            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt**2, self._relaxation,
+            momentum(iteration), pressure, self._relaxed_before, self._next_pressure, self._remaining,
+        )  # fmt: skip
 
     def _accelerate_by_pressure(self, pressure: ti.Ndarray) -> None:
         particles = self._particles

@@ -33,8 +33,8 @@ class MaterialFluid(ParticleFluid):
 
     speed_ratio = 1.0
 
-    def __init__(self, *args: Any, **keywords: Any) -> None:
-        """Take particles, walls and bodies, as `ParticleFluid` does."""
+    def __init__(self, *args: Any, body_speed: float = 0.0, **keywords: Any) -> None:
+        """Take particles, walls and bodies, as `ParticleFluid` does, and the largest speed of moving bodies [m/s]."""
         given = args[0] if args else keywords["parameters"]
         fluids = (given,) if isinstance(given, FluidParameters) else tuple(given)
         spacing = 2.0 * fluids[0].particle_radius
@@ -47,7 +47,7 @@ class MaterialFluid(ParticleFluid):
         if self._with_akinci2013:
             # The kappa with the same stress, as the speed to expect follows from that.
             kappa = STRESS_PER_COHESION / STRESS_PER_KAPPA * float(cohesion.max()) * support * spacing
-        self._expected_speed = _expected_speed(fluids, spacing, kappa, keywords)
+        self._expected_speed = _expected_speed(fluids, spacing, kappa, body_speed, keywords)
 
         self._stiffest = max(fluid.viscosity for fluid in fluids) * max(1.0, fluids[0].wall_friction)
         implicit = is_implicit(
@@ -169,10 +169,12 @@ class MaterialFluid(ParticleFluid):
 
 
 def _expected_speed(
-    fluids: tuple[FluidParameters, ...], spacing: float, kappa: float, keywords: dict[str, Any]
+    fluids: tuple[FluidParameters, ...], spacing: float, kappa: float, body_speed: float, keywords: dict[str, Any]
 ) -> float:
-    """Largest speed to expect [m/s] of the particles at the start, and of those that will flow in."""
-    openings = [Opening.of(emitter, spacing, spacing**3) for fluid in fluids for emitter in fluid.emitter]
+    """Largest speed to expect [m/s] of the particles at the start, of those that will flow in, and of bodies."""
+    openings = [
+        Opening.of(each, spacing, spacing**3, fluid.support_in_spacings) for fluid in fluids for each in fluid.emitter
+    ]
     points = [keywords["positions"], *(opening.points for opening in openings)]
     velocities = [
         keywords["velocities"],
@@ -185,4 +187,5 @@ def _expected_speed(
         keywords["gravity"],
         surface_tension=kappa,
         spacing=spacing,
+        body_speed=body_speed,
     )

@@ -21,18 +21,16 @@ if TYPE_CHECKING:
 NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35
 """How near particles of a layer, and layers, may be to each other: nearer, they would burst from the opening."""
 
-NOZZLE_LAYERS = 2
-"""Depth of the nozzle in layers: whoever is in it moves at the speed of the inflow, whatever pushes. Two layers are a
-support radius deep: a particle that leaves has a whole lattice behind it, and pressure cannot push the flow back."""
-
-PIPE_STANDOFF_IN_SPACINGS = 0.95
-"""How far outside the nozzle the samples of its pipe are: where those of a wall are that touches the fluid."""
+PIPE_PLAY_IN_SPACINGS = 0.05
+"""How much nearer to a pipe than at rest particles may start: the lattice of a block lies anywhere beside it."""
 
 LATTICES_TRIED = 41
 """Lattice constants between 0.9 and 1.1 spacings that are tried for a disc."""
 
 CELL_MISMATCH = 0.05
 """By how much the area of a disc and that of the lattice cells in it may differ."""
+
+PARTICLE_RADIUS_IN_SPACINGS = 0.5
 
 GRAVITY_FREE_AXIS = np.array([0.0, 0.0, 1.0])
 
@@ -50,6 +48,7 @@ class Opening:
         velocity: of the inflow [m/s], (3,).
         layer_distance: from one layer to the next [m]: the volume of a layer over the area of the opening, so that the
             flow is exactly speed times area.
+        support_in_spacings: support radius of the fluid's kernel.
         start_s: when the first layer leaves [s].
         end_s: no layer leaves from then on [s].
     """
@@ -61,12 +60,21 @@ class Opening:
     points: NDArray[np.float64]
     velocity: NDArray[np.float64]
     layer_distance: float
+    support_in_spacings: float
     start_s: float
     end_s: float
 
     @classmethod
-    def of(cls, emitter: EmitterParameters, spacing: float, particle_volume: float) -> Opening:
-        """The opening of an emitter, for particles of this spacing [m] and volume [m³].
+    def of(
+        cls, emitter: EmitterParameters, spacing: float, particle_volume: float, support_in_spacings: float
+    ) -> Opening:
+        """The opening of an emitter.
+
+        Args:
+            emitter: what flows in, and where.
+            spacing: of the particles [m].
+            particle_volume: of a particle [m³].
+            support_in_spacings: support radius of the fluid's kernel.
 
         Raises:
             ValueError: it is too narrow for particles of this spacing.
@@ -90,6 +98,7 @@ class Opening:
             points=points,
             velocity=emitter.speed * direction,
             layer_distance=layer.distance,
+            support_in_spacings=support_in_spacings,
             start_s=emitter.start_s,
             end_s=math.inf if emitter.end_s is None else emitter.end_s,
         )
@@ -99,18 +108,49 @@ class Opening:
         """Of the inflow [m/s]."""
         return float(np.linalg.norm(self.velocity))
 
+    @property
+    def direction(self) -> NDArray[np.float64]:
+        """Unit vector along the inflow, (3,)."""
+        return self.velocity / self.speed
+
+    @property
+    def nozzle_layers(self) -> int:
+        """Layers in the nozzle: whoever is in it moves at the speed of the inflow, whatever pushes.
+
+        They are a support radius deep: a particle that leaves has a whole lattice behind it, and pressure cannot push
+        the flow back.
+        """
+        return math.ceil(self.support_in_spacings)
+
+    @property
+    def nozzle_depth(self) -> float:
+        """Length of the nozzle along the inflow [m]."""
+        return self.nozzle_layers * self.layer_distance
+
+    @property
+    def drained_s(self) -> float:
+        """When the nozzle no longer holds anything [s]."""
+        return self.end_s + self.nozzle_depth / self.speed
+
+    def nozzle_places(self) -> NDArray[np.float64]:
+        """Where particles are in the full nozzle as its last layer leaves the opening [m], (m, 3)."""
+        moved = np.arange(self.nozzle_layers) * self.layer_distance
+        return (self.points[None] + moved[:, None, None] * self.direction).reshape(-1, 3)
+
     def pipe(self, spacing: float) -> NDArray[np.float64]:
         """Boundary samples of a short pipe around the nozzle [m], (m, 3).
 
         It keeps surrounding fluid from flowing into the gap that opens behind a layer before the next one fills it.
+        The samples are as far outside of the nozzle as those of a wall that touches the fluid.
 
         Args:
             spacing: of the particles [m].
         """
-        depths = np.arange(0.0, NOZZLE_LAYERS * self.layer_distance, spacing)
-        rim = _rim(tuple(half + PIPE_STANDOFF_IN_SPACINGS * spacing for half in self.half_size), self.is_round, spacing)
+        depths = np.arange(0.0, self.nozzle_depth, spacing)
+        outside = (_wall_standoff(self.support_in_spacings) - PARTICLE_RADIUS_IN_SPACINGS) * spacing
+        rim = _rim(tuple(half + outside for half in self.half_size), self.is_round, spacing)
         around = self.centre + rim @ np.stack(self.axes)
-        return (around[None] + depths[:, None, None] * (self.velocity / self.speed)).reshape(-1, 3)
+        return (around[None] + depths[:, None, None] * self.direction).reshape(-1, 3)
 
     def layers_due(self, time_s: float) -> int:
         """Layers that have left the opening by a time [s]."""
@@ -130,6 +170,11 @@ class Opening:
         return math.inf if math.isinf(self.end_s) else float(len(self.points) * self.layers_due(self.end_s))
 
 
+def pipe_clearance(support_in_spacings: float) -> float:
+    """Least distance of a fluid's particles from the samples of a pipe at the start [spacings]."""
+    return _wall_standoff(support_in_spacings) - PIPE_PLAY_IN_SPACINGS
+
+
 def obstruction(opening: Opening, spacing: float, domain: DomainParameters, solids: list[Solid]) -> str | None:
     """Why fluid cannot enter here, or None: particles of the opening outside the domain, or in a solid."""
     outside = ((opening.points < domain.min) | (opening.points > domain.max)).any(axis=1)
@@ -144,6 +189,13 @@ def obstruction(opening: Opening, spacing: float, domain: DomainParameters, soli
     if inside.any():
         return f"{np.count_nonzero(inside)} of the {len(inside)} places of its opening are in a solid body; move it out"
     return None
+
+
+def _wall_standoff(support_in_spacings: float) -> float:
+    """Distance from samples at which fluid is at rest [spacings]."""
+    from sim.fluid.kernels import wall_calibration  # loads Taichi, which most checks of a job do without
+
+    return wall_calibration(support_in_spacings).standoff_in_spacings
 
 
 @dataclass(frozen=True)

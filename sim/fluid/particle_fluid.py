@@ -175,12 +175,9 @@ class ParticleFluid(ABC):
             angular_velocity: [rad/s], (bodies, 3).
             elapsed_s: time since they were placed last [s]; 0 where they are put there anew.
         """
-        self.boundary.place(position, rotation, velocity, angular_velocity)
+        self._boundary_travelled += self.boundary.place(position, rotation, velocity, angular_velocity)
         speed = np.linalg.norm(velocity, axis=1) + np.linalg.norm(angular_velocity, axis=1) * self.boundary.reach
-        # The larger of the speeds at both ends of the way, and 5 % for what lies between.
-        fastest = float(speed.max(initial=0.0))
-        self._boundary_travelled += 1.05 * max(fastest, self._boundary_speed) * elapsed_s
-        self._boundary_speed = fastest
+        self._boundary_speed = float(speed.max(initial=0.0))
         self._without_neighbors |= elapsed_s == 0.0
 
     def snapshots(self) -> dict[str, Snapshot]:
@@ -219,6 +216,7 @@ class ParticleFluid(ABC):
             "max_speed": np.array([self._motion.max_speed], dtype=np.float64),
             "max_acceleration": np.array([self._motion.max_acceleration], dtype=np.float64),
             "max_frequency": np.array([self._motion.max_frequency], dtype=np.float64),
+            "max_displacement": np.array([self._motion.max_displacement], dtype=np.float64),
             "particles_removed": np.array([self.particles_removed], dtype=np.int64),
             "next_particle_id": np.array([self._next_particle_id], dtype=np.int64),
         }
@@ -245,6 +243,7 @@ class ParticleFluid(ABC):
             max_speed=float(arrays["max_speed"][0]),
             max_acceleration=float(arrays["max_acceleration"][0]),
             max_frequency=float(arrays["max_frequency"][0]),
+            max_displacement=float(arrays["max_displacement"][0]),
         )
         self.particles_removed = int(arrays["particles_removed"][0])
         self._next_particle_id = int(arrays["next_particle_id"][0])

@@ -1,18 +1,30 @@
 """Predictive-corrective incompressible SPH (Solenthaler & Pajarola 2009), boundaries of Akinci et al. 2012."""
 
+import math
 from typing import Any
 
 import taichi as ti
 
 from sim.cells import Floats, Integers, Vectors
-from sim.fluid.implicit_fluid import ImplicitFluid, momentum
+from sim.fluid.implicit_fluid import ImplicitFluid, SolveRecord, momentum
 from sim.fluid.kernels import spline
-from sim.fluid.pressure_kernels import add_scaled
+from sim.fluid.pressure_kernels import add_scaled, copy_scalars
 from sim.fluid.time_step import CFL_NUMBER
 from sim.launch import fast_launch
+from sim.solver import Diagnostics
 
 LEAST_ITERATIONS = 3
 """Iterations in any case (Solenthaler & Pajarola 2009, algorithm 2): fewer let the pressure fluctuate."""
+
+LARGEST_ERROR_GROWTH = 2.0
+"""A solve whose error grows beyond this multiple diverges: from there on it goes to 1, not down again."""
+
+LARGEST_WAY = 0.5
+"""Way [spacings] beyond which a predicted position means nothing: two particles may have passed each other unseen, or
+one has left the neighbours that it knows and finds no compression where it is. Steps are made for 0.2."""
+
+ASTRAY = 1.0e10
+"""Stands for the compression left of a particle that goes farther; no solve with one of them has a small mean error."""
 
 
 class PCISPHSolver(ImplicitFluid):
@@ -33,8 +45,15 @@ class PCISPHSolver(ImplicitFluid):
     (`_correction`), as it turns into speed. The error is the mean over all particles, not the largest: that one hangs
     on single particles that hit a corner, and their number does not shrink with the spacing.
 
-    Positions are predicted, so two particles may not come near each other unseen: steps are half as long as those of
-    divergence-free SPH, and the list of neighbours is renewed before the next step can go beyond its reach.
+    Where a body closes a gap of about one layer of particles, that does not converge: densities are those at x*, but
+    forces act along gradients at x, and a particle squeezed out of the gap is pushed farther the denser it gets. Such a
+    solve is given up (`LARGEST_ERROR_GROWTH`, `LARGEST_WAY`, or the iteration limit), and this step's pressure is that
+    of the linear problem of divergence-free SPH, s - dt² A P, from the same first guess: it always has a solution.
+
+    Positions are predicted, so two particles should not come near each other unseen: steps are half as long as those
+    of divergence-free SPH, and the list of neighbours is renewed where the next step could go beyond its reach. The
+    skin is 0.1 d for each of two particles and a step at most 0.2 d, so that of the fastest pairs, which approach each
+    other at more than half the speed that limits the step, some may be seen a step late.
     """
 
     carried = ("pressure",)
@@ -46,26 +65,55 @@ class PCISPHSolver(ImplicitFluid):
         """Take particles, walls and bodies, as `ParticleFluid` does."""
         super().__init__(*args, **keywords)
         self._predicted = ti.Vector.ndarray(3, ti.f32, self.capacity)
+        self._first_guess = ti.ndarray(ti.f32, self.capacity)
+        self._is_linear = False
+
+    def begin_frame(self, time_s: float) -> None:
+        """Restart the counters of the frame."""
+        super().begin_frame(time_s)
+        self._linear_solves = 0
+
+    def diagnostics(self) -> Diagnostics:
+        """As for every implicit fluid, with the number of steps whose density was corrected linearly."""
+        return {**super().diagnostics(), "linear_solves": float(self._linear_solves)}
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
-        particles = self._particles
         self._compute_density()
         self._compute_acceleration(None)
         self._react_on_bodies(None, dt)
         self._apply_implicit_viscosity(self._acceleration, dt)
-        self._start_from(particles.carried["pressure"])
-        particles.carried["pressure"] = self._solve(
-            self._density_solves, particles.carried["pressure"], dt,
-            least=LEAST_ITERATIONS, tolerance=self.parameters.density_tolerance,
-        )  # fmt: skip
-        self._react_on_bodies(particles.carried["pressure"], dt, with_friction=False)
-        add_scaled(self._acceleration, self._pressure_acceleration, 1.0, particles.count)
+        self._correct_density(dt)
         self._advance_particles(self._acceleration, dt)
 
     @property
     def _pressure_term(self) -> ti.Ndarray:
         return self._particles.carried["pressure"]
+
+    def _correct_density(self, dt: float) -> None:
+        """Find the pressure of a step of dt [s], if need be the linear one, and add its acceleration."""
+        particles, record = self._particles, SolveRecord()
+        copy_scalars(particles.carried["pressure"], particles.count, self._first_guess)
+        self._solve_density(record, dt, error_growth=LARGEST_ERROR_GROWTH)
+        if record.not_converged:
+            record = SolveRecord(iterations=record.iterations)
+            copy_scalars(self._first_guess, particles.count, particles.carried["pressure"])
+            self._predict_compression(dt)
+            self._is_linear = True
+            self._solve_density(record, dt)
+            self._is_linear = False
+            self._linear_solves += 1
+        self._density_solves.merge(record)
+        self._react_on_bodies(particles.carried["pressure"], dt, with_friction=False)
+        add_scaled(self._acceleration, self._pressure_acceleration, 1.0, particles.count)
+
+    def _solve_density(self, record: SolveRecord, dt: float, *, error_growth: float = math.inf) -> None:
+        carried = self._particles.carried
+        self._start_from(carried["pressure"])
+        carried["pressure"] = self._solve(
+            record, carried["pressure"], dt,
+            least=LEAST_ITERATIONS, tolerance=self.parameters.density_tolerance, error_growth=error_growth,
+        )  # fmt: skip
 
     def _update_neighbors(self) -> None:
         # The next step looks at positions as far ahead as this one went.
@@ -76,13 +124,17 @@ class PCISPHSolver(ImplicitFluid):
             super()._update_neighbors()
 
     def _relax(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
+        if self._is_linear:
+            self._relax_linearly(pressure, dt, iteration)
+            return
         particles, boundary, phases = self._particles, self.boundary, self.phases
         predict_positions(
             particles.position, particles.velocity, self._acceleration, self._pressure_acceleration, particles.count,
             dt, self._predicted,
         )  # fmt: skip
         correct_pressure(
-            self._predicted, particles.phase, self._density, self._inverse_diagonal, particles.count, *self._list,
+            particles.position, (LARGEST_WAY * self.spacing) ** 2, self._predicted, particles.phase, self._density,
+            self._inverse_diagonal, particles.count, *self._list,
             boundary.position, boundary.velocity, self._boundary_response, boundary.volume, boundary.moving_count > 0,
             phases.rest_density, len(phases) > 1, self.particle_volume, self._sigma, 1.0 / self.support_radius,
             self._filled_diagonal, dt, self._correction(dt), self._relaxation, momentum(iteration),
@@ -104,7 +156,8 @@ def predict_positions(
 @fast_launch
 @ti.kernel
 def correct_pressure(
-    predicted: Vectors, phase: Integers, density: Floats, inverse_diagonal: Floats, count: ti.i32,
+    position: Vectors, largest_way_squared: ti.f32, predicted: Vectors, phase: Integers, density: Floats,
+    inverse_diagonal: Floats, count: ti.i32,
     start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
     boundary_position: Vectors, boundary_velocity: Vectors, boundary_response: Vectors, boundary_volume: Floats,
     with_moving: ti.template(), rest_density: Floats, several: ti.template(),
@@ -114,7 +167,8 @@ def correct_pressure(
 ):  # fmt: skip
     """Relative density at the predicted positions, and the pressure corrected by what is above 1 of it.
 
-    Of a compression that is there already only the share `correction` counts.
+    Of a compression that is there already only the share `correction` counts. What remains of a particle that would go
+    farther than the largest way is `ASTRAY`.
     """
     ti.loop_config(block_dim=128)
     for i in range(count):
@@ -139,4 +193,5 @@ def correct_pressure(
         relaxed = ti.max(pressure[i] + delta * left, 0.0)
         next_pressure[i] = ti.max(relaxed + momentum * (relaxed - relaxed_before[i]), 0.0)
         relaxed_before[i] = relaxed
-        remaining[i] = left
+        is_astray = (x_i - position[i]).norm_sqr() > largest_way_squared
+        remaining[i] = ti.select(is_astray, ASTRAY, left)

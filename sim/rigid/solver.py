@@ -171,8 +171,10 @@ class RigidSolver:
         self._count(contacts, outcome.iterations, outcome.converged)
 
         # A body in free flight moves by the mean of its velocities, which is exact; one in contact by the new one,
-        # which is the velocity that the contacts allow.
-        flying = free & ~outcome.is_touched[:, None]
+        # which is the velocity that the contacts allow, and so does one that a fluid pushed: the fluid is to see the
+        # velocity by which the body moves, and a body that it carries has none.
+        flying = free & ~(outcome.is_touched | bodies.is_pushed)[:, None]
+        bodies.is_pushed[:] = False
         velocity = bodies.velocity - np.where(flying, 0.5 * dt * self._gravity, 0.0)
         bodies.position = bodies.position + dt * np.where(free, velocity + outcome.extra_velocity, 0.0)
         spin = bodies.angular_momentum()

@@ -37,6 +37,7 @@ class MovingBodies:
         velocity: of the centre of mass [m/s], (n, 3).
         angular_velocity: about world axes [rad/s], (n, 3).
         is_lost: (n,) bool: so far outside of the domain that it was stopped; no force moves it any more.
+        is_pushed: (n,) bool: got an impulse since the last step; the step that takes it in resets it.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class MovingBodies:
         self.mass = np.array([inertia.mass for inertia in inertias])
         self.is_dynamic = np.isfinite(self.mass)
         self.is_lost = np.zeros(n, dtype=bool)
+        self.is_pushed = np.zeros(n, dtype=bool)
         self._tensor = np.stack([inertia.tensor for inertia in inertias])
         self._inverse_tensor = np.zeros((n, 3, 3))
         self._inverse_tensor[self.is_dynamic] = np.linalg.inv(self._tensor[self.is_dynamic])
@@ -110,5 +112,6 @@ class MovingBodies:
             linear: [N s], (n, 3).
             angular: about the centres of mass [N m s], (n, 3).
         """
+        self.is_pushed = self.is_pushed | linear.any(axis=1)
         self.velocity = self.velocity + self.inverse_mass[:, None] * linear
         self.angular_velocity = self.angular_velocity + np.einsum("nij,nj->ni", self.inverse_inertia(), angular)

@@ -122,6 +122,21 @@ def test_an_emitter_in_a_solid_body_is_refused(tmp_path):
     assert any("places of its opening are in a solid body; move it out" in error for error in errors)
 
 
+def test_emitters_in_each_others_way_are_refused_at_load(tmp_path):
+    again = JET.split("[[fluid.emitter]]")[1]
+    same = "[[fluid.emitter]]" + again
+    errors, _, _ = checked(HEAD + JET + same, tmp_path)
+    assert [error.split("emitter[1]")[1] for error in errors] == [
+        ": is the same opening as fluid[0].emitter[0], at the same time; let one start when the other has ended"
+    ]
+    moved = same.replace("[0.0, 0.0, 0.9]", "[0.23, 0.0, 0.9]")
+    errors, _, _ = checked(HEAD + JET + moved, tmp_path)
+    assert len(errors) == 1
+    assert "so near that the pipe around one is in the way of the other" in errors[0]
+    errors, _, _ = checked(HEAD + JET + "end_s = 0.5\n" + same + "start_s = 0.5\n", tmp_path)
+    assert errors == []
+
+
 def test_memory_counts_what_emitters_may_add(tmp_path):
     # The domain of 1 m³ holds 15,625 particles of 4 cm, and an endless jet may fill it.
     endless, _, _ = checked(HEAD + JET, tmp_path, memory_bytes=8_000_000)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.coupling.body_samples import samples_of_moving_bodies
+from sim.coupling.body_speed import expected_body_speed
 from sim.coupling.fluid_rigid import FluidRigidCoupling
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.parameters import FluidParameters
@@ -55,6 +56,7 @@ class Tank:
             boundary=BoundarySamples.of_bodies(domain_wall_samples(domain, self.spacing)),
             moving=samples_of_moving_bodies(self.rigid, self.spacing),
             body_count=len(parameters),
+            body_speed=expected_body_speed(parameters, self.rigid.solids, domain, gravity),
         )
         self.coupling = FluidRigidCoupling(self.fluid, self.rigid)
         self.world = World([self.fluid, self.rigid], frames_per_second=frames_per_second, couplings=[self.coupling])

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.build import build_world
-from sim.fluid.filling import PIPE_CLEARANCE_IN_SPACINGS
-from sim.fluid.opening import Opening, obstruction
+from sim.fluid.nozzles import nozzle_collision, pipes
+from sim.fluid.opening import Opening, obstruction, pipe_clearance
 from sim.fluid.parameters import EmitterParameters
 from sim.scene import DomainParameters, SceneParameters
 from sim.shapes.parameters import Placement
@@ -34,13 +34,14 @@ FROM_BELOW = {
 }
 
 
-def opening_of(emitter: dict, spacing: float = SPACING) -> Opening:
-    return Opening.of(EmitterParameters.model_validate(emitter), spacing, spacing**3)
+def opening_of(emitter: dict, support: float = 2.0) -> Opening:
+    return Opening.of(EmitterParameters.model_validate(emitter), SPACING, SPACING**3, support)
 
 
 def jet(*emitters: dict, domain=OPEN_SPACE, gravity=(0.0, 0.0, 0.0), positions=NOTHING, **more):
-    pipes = [opening_of(emitter).pipe(SPACING) for emitter in emitters]
-    return make_fluid(domain, positions, gravity=gravity, bodies=pipes, emitter=emitters, capacity=4000, **more)
+    openings = [opening_of(emitter, more.get("support_in_spacings", 2.0)) for emitter in emitters]
+    around = pipes(openings, SPACING)
+    return make_fluid(domain, positions, gravity=gravity, bodies=around, emitter=emitters, capacity=4000, **more)
 
 
 def run(fluid, duration_s: float, steps: int | None = None) -> None:
@@ -66,18 +67,26 @@ def test_the_flow_is_speed_times_area(taichi_cpu, emitter, area):
     )
 
 
-@pytest.mark.parametrize("emitter", [DISC, SLOT])
-def test_particles_never_overlap_and_make_rest_density(taichi_cpu, emitter):
-    fluid = jet(emitter)
+@pytest.mark.parametrize(
+    ("emitter", "support", "excess"),
+    # Of a lattice that is stretched by up to 10 % one way and squeezed as much the other. In the corners of a nozzle
+    # as in the edges of a tank, where walls leave 2 %, 5 % and 7 % too much at these supports, there is more.
+    [(DISC, 2.0, 0.03), (SLOT, 2.0, 0.03), (DISC, 3.0, 0.03), (SLOT, 3.0, 0.05), (DISC, 4.0, 0.05), (SLOT, 4.0, 0.13)],
+)
+def test_particles_never_overlap_and_make_rest_density(taichi_cpu, emitter, support, excess):
+    fluid, opening = jet(emitter, support_in_spacings=support), opening_of(emitter, support)
     for _ in range(8):
         run(fluid, 0.02)
-        position = fluid.snapshots()["water"].arrays["position"]
-        distance, _ = cKDTree(position).query(position, k=2)
-        # Within a layer and between layers; a jet without gravity stays the lattice that it was emitted as.
-        assert distance[:, 1].min() > 0.819 * SPACING
-    inside = fluid.snapshots()["water"].arrays["density"].max()
-    # Of a lattice that is stretched by up to 10 % one way and squeezed as much the other.
-    assert inside == pytest.approx(1000.0, rel=0.03)
+        arrays = fluid.snapshots()["water"].arrays
+        distance, _ = cKDTree(arrays["position"]).query(arrays["position"], k=2)
+        # Within a layer and between layers; a jet without gravity stays the lattice that it was emitted as, but for
+        # the pairs that the spline makes of a jet in the air where it is wider than usual (Dehnen & Aly 2012).
+        depth = (arrays["position"] - opening.centre) @ opening.direction
+        is_lattice = depth < (math.inf if support == 2.0 else opening.nozzle_depth)
+        assert distance[is_lattice, 1].min() > 0.819 * SPACING
+    assert arrays["density"].max() == pytest.approx(1000.0, rel=excess)
+    # Too dense by 13 % it bursts sideways at 0.13 c_s, c_s = 10 v: 1.6 v in all. It is 4 v and more where it explodes.
+    assert np.linalg.norm(arrays["velocity"], axis=1).max() < 2.0 * emitter["speed"]
 
 
 def test_emission_does_not_depend_on_the_steps(taichi_cpu):
@@ -95,7 +104,7 @@ def test_inflow_holds_against_pressure(taichi_cpu):
     pool = lattice((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2), SPACING)
     distance, _ = cKDTree(opening_of(FROM_BELOW).pipe(SPACING)).query(pool)
     in_front = (np.abs(pool[:, :2]).max(axis=1) < 0.05) & (pool[:, 2] < 0.02)
-    pool = pool[(distance > PIPE_CLEARANCE_IN_SPACINGS * SPACING) & ~in_front]
+    pool = pool[(distance > pipe_clearance(2.0) * SPACING) & ~in_front]
     fluid = jet(FROM_BELOW, domain=BASIN, gravity=(0.0, 0.0, -9.81), positions=pool)
     run(fluid, 0.3)
     now = fluid.diagnostics()
@@ -182,3 +191,66 @@ def test_a_scene_may_have_nothing_but_an_emitter(taichi_cpu):
     for _ in range(3):
         report = world.advance_frame()
     assert report.diagnostics["jet"]["particles_emitted"] == report.diagnostics["jet"]["particle_count"] > 0
+
+
+SIDE = {**FROM_BELOW, "position": (0.0, 0.0, 0.2)}
+
+
+@pytest.mark.parametrize(
+    ("other", "reason"),
+    [
+        (SIDE, "is the same opening as fluid[0].emitter[0], at the same time; let one start when the other has ended"),
+        ({**SIDE, "position": (0.001, 0.0, 0.2)}, "its nozzle overlaps that of fluid[0].emitter[0], at the same time"),
+        ({**SIDE, "direction": (1, 0, 0)}, "its nozzle overlaps"),
+        ({**SIDE, "position": (0.0, 0.0, 0.22)}, "its nozzle overlaps"),
+        ({**SIDE, "position": (0.09, 0.0, 0.2)}, "the pipe around one is in the way of the other; move them apart by"),
+        # Pipes stay when their emitters have ended.
+        ({**SIDE, "position": (0.06, 0.0, 0.2), "start_s": 2.0}, "the pipe around one is in the way"),
+    ],
+)
+def test_emitters_in_each_others_way_are_refused(other, reason):
+    first = {**SIDE, "end_s": 1.0}
+    for one, two in ((first, other), (other, first)):
+        assert reason in nozzle_collision(opening_of(one), opening_of(two), "fluid[0].emitter[0]", SPACING)
+    scene = SceneParameters.model_validate(
+        {
+            "domain": {"min": (-0.3, -0.3, 0), "max": (0.3, 0.3, 0.6)},
+            "fluid": [{"name": "w", "emitter": [first, other]}],
+        }
+    )
+    with pytest.raises(ValueError, match=r'fluid "w" emitter\[1\]: (its nozzle|is the same opening)'):
+        build_world(scene, frames_per_second=60)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {**SIDE, "position": (0.12, 0.0, 0.2)},
+        {**SIDE, "direction": (0, 0, -1)},
+        {**SIDE, "position": (0.0, 0.0, 0.3)},
+        {**SIDE, "start_s": 1.0, "speed": 2.0},
+    ],
+    ids=["beside", "back to back", "in front", "one after the other"],
+)
+def test_emitters_that_are_not_in_each_others_way_pass(other):
+    assert nozzle_collision(opening_of(other), opening_of({**SIDE, "end_s": 1.0}), "the other", SPACING) is None
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_an_inflow_may_change_its_speed(taichi_cpu, order):
+    # The first emitter's last layer leaves 0.4 ms before the second's first: 0.01 d, within one step.
+    slow = {**SIDE, "end_s": 0.0804}
+    fast = {**SIDE, "start_s": 0.0804, "speed": 1.0}
+    fluid = jet(*(slow, fast)[::order])
+    assert len(pipes([opening_of(slow), opening_of(fast)], SPACING)) == 1
+    run(fluid, 0.084, steps=42)
+    position = fluid.snapshots()["water"].arrays["position"]
+    # Nothing is put nearer than 0.9 d. Later the faster jet runs into the slower one, which spreads.
+    assert cKDTree(position).query(position, k=2)[0][:, 1].min() > 0.899 * SPACING
+    run(fluid, 0.066, steps=33)
+    arrays = fluid.snapshots()["water"].arrays
+    # Whoever is in the nozzle, four particles wide and 2 d deep, has the speed of the newer emitter.
+    held = (arrays["position"][:, 2] > 0.2) & (arrays["position"][:, 2] < 0.24)
+    np.testing.assert_allclose(arrays["velocity"][held, 2], 1.0, rtol=1e-6)
+    # Layers of the first at 0, 40 and 80 ms; those of the second, 20 ms apart, but for the one that has no room.
+    assert fluid.diagnostics()["particles_emitted"] == (3 + 4 - 1) * 16

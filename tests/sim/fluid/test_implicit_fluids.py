@@ -130,7 +130,8 @@ def test_a_solve_that_hits_its_limit_is_counted(dam_break, solver):
     steps(fluid, 5)
     state = fluid.diagnostics()
     assert state["not_converged"] >= 5.0
-    assert state["iterations"] == 4.0
+    # What PCISPH cannot solve it solves linearly.
+    assert state["iterations"] == {"dfsph": 4.0, "pcisph": 8.0}[solver]
     fluid.begin_frame(0.0)
     assert fluid.diagnostics()["not_converged"] == 0.0
 

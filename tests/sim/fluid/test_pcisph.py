@@ -57,3 +57,21 @@ def test_neighbours_are_searched_before_a_step_can_go_beyond_their_list(taichi_c
         searches[solver] = fluid.diagnostics()["neighbor_searches"]
     # The skin is 4 mm, 2 mm for each of a pair, and a step goes 0.45 mm: five steps, and four if one looks one ahead.
     assert searches == {"wcsph": 4.0, "pcisph": 6.0}
+
+
+def test_neighbours_are_searched_in_the_same_steps_after_a_resume(taichi_cpu):
+    particles = lattice((-0.05,) * 3, (0.05,) * 3, 0.02)
+    velocities = np.zeros_like(particles)
+    velocities[:, 0] = 0.9
+    options = {"gravity": (0.0,) * 3, "solver": "pcisph", "dt": 2.5e-3}
+    whole, resumed = (make_fluid(OPEN_SPACE, particles, velocities, **options) for _ in range(2))
+    # A step goes 2.25 mm, more than the 2 mm that the skin allows each of a pair.
+    whole.substep(2.5e-3)
+    whole.diagnostics()
+    resumed.restore(whole.checkpoint())
+    searches = []
+    for fluid in (whole, resumed):
+        fluid.begin_frame(0.0)
+        fluid.substep(2.5e-3)
+        searches.append(fluid.diagnostics()["neighbor_searches"])
+    assert searches == [2.0, 2.0]

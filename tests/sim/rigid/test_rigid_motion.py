@@ -112,3 +112,17 @@ def test_impulses_do_not_move_kinematic_bodies():
     np.testing.assert_array_equal(solver.bodies.velocity, [[1.0, 0.0, 0.0]])
     assert not solver.bodies.inverse_mass.any()
     assert not solver.bodies.inverse_inertia().any()
+
+
+def test_a_body_whose_weight_impulses_carry_stays_until_they_end():
+    solver, dt = in_room(body("stone", ball(0.1), (0.0, 0.0, 1.0))), 1.7e-3
+    weight = solver.bodies.mass[0] * GRAVITY
+    for _ in range(100):
+        solver.bodies.apply_impulses(np.array([[0.0, 0.0, weight * dt]]), np.zeros((1, 3)))
+        solver.substep(dt)
+    # Rounding of a hundred additions; with steps of free fall it would rise by g dt²/2 in each, 1.4 mm.
+    np.testing.assert_allclose(solver.bodies.position[0], [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(solver.bodies.velocity[0], 0.0, atol=1e-12)
+    for _ in range(100):
+        solver.substep(dt)
+    np.testing.assert_allclose(solver.bodies.position[0, 2], 1.0 - 0.5 * GRAVITY * (100 * dt) ** 2, atol=1e-12)

@@ -1,0 +1,47 @@
+"""How fast bodies will become, as far as their start and their paths tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim.fluid.expected_speed import square_of_fall_speed
+from sim.parameters import Vector3
+from sim.rigid import rotation
+from sim.rigid.geometry import BodyGeometry
+from sim.rigid.keyframes import path_of
+from sim.rigid.parameters import RigidBodyParameters
+from sim.scene import DomainParameters
+
+
+def expected_body_speed(
+    parameters: Sequence[RigidBodyParameters],
+    geometries: Sequence[BodyGeometry],
+    domain: DomainParameters,
+    gravity: Vector3,
+) -> float:
+    """Largest speed [m/s] to expect of any surface point of bodies that move; 0 without bodies.
+
+    For a dynamic body that is the initial one with a fall of its centre of mass to the domain's deepest corner, and its
+    initial spin; for a kinematic one the largest on its path, wherever that leads. What collisions of bodies add is
+    not foreseen.
+
+    Args:
+        parameters: the dynamic and kinematic bodies.
+        geometries: of each of them.
+        domain: how deep they can fall.
+        gravity: [m/s²].
+    """
+    speeds = [0.0]
+    for body, geometry in zip(parameters, geometries, strict=True):
+        arm = geometry.centre_of_mass
+        if body.kind == "kinematic":
+            speeds.append(path_of(body).largest_speed(float(np.linalg.norm(arm)) + geometry.radius))
+            continue
+        centre = np.asarray(body.position) + rotation.rotated(rotation.from_degrees(body.rotation_deg), arm)
+        fall = square_of_fall_speed(centre[None], domain, gravity)
+        spin = math.hypot(*body.angular_velocity) * geometry.radius
+        speeds.append(math.sqrt(math.hypot(*body.velocity) ** 2 + fall) + spin)
+    return max(speeds)

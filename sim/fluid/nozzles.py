@@ -1,0 +1,89 @@
+"""The nozzles of a tank together: which of them are in each other's way, and the pipes around them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sim.fluid.opening import NEAREST_IN_SPACINGS, pipe_clearance
+
+if TYPE_CHECKING:
+    from sim.fluid.opening import Opening
+
+SAME_IN_SPACINGS = 1.0e-3
+"""Nozzles whose particles, and whose sides, differ by less are one."""
+
+
+def is_same_nozzle(one: Opening, other: Opening, spacing: float) -> bool:
+    """Whether two emitters have one opening and one pipe, as when an inflow changes its speed.
+
+    Args:
+        one: an opening.
+        other: another one.
+        spacing: of the particles [m].
+    """
+
+    def is_equal(own: object, others: object) -> bool:
+        return bool(np.allclose(own, others, rtol=0.0, atol=SAME_IN_SPACINGS * spacing))  # type: ignore[arg-type]
+
+    return (
+        one.is_round == other.is_round
+        and one.points.shape == other.points.shape
+        and is_equal(one.points, other.points)
+        and is_equal(one.half_size, other.half_size)
+        and is_equal(spacing * one.direction, spacing * other.direction)
+    )
+
+
+def nozzle_collision(one: Opening, other: Opening, name: str, spacing: float) -> str | None:
+    """Why two emitters cannot be in one tank, or None.
+
+    Particles of one nozzle must not be where those of the other are at the same time, and not at its pipe, which stays
+    when its emitter has ended. Both move as they are told, so nothing would push them apart.
+
+    Args:
+        one: an opening.
+        other: another one.
+        name: of the other, for the message.
+        spacing: of the particles [m].
+    """
+    if is_same_nozzle(one, other, spacing):
+        if one.start_s < other.end_s and other.start_s < one.end_s:
+            return f"is the same opening as {name}, at the same time; let one start when the other has ended"
+        return None
+    places, others_places = one.nozzle_places(), other.nozzle_places()
+    if one.start_s < other.drained_s and other.start_s < one.drained_s:
+        nearest = _least_distance(places, others_places)
+        if nearest < NEAREST_IN_SPACINGS * spacing:
+            return f"its nozzle overlaps that of {name}, at the same time; move one of them"
+    clearance = pipe_clearance(one.support_in_spacings) * spacing
+    nearest = min(_least_distance(places, other.pipe(spacing)), _least_distance(others_places, one.pipe(spacing)))
+    if nearest < clearance:
+        return (
+            f"its nozzle and that of {name} are so near that the pipe around one is in the way of the other; "
+            f"move them apart by {clearance - nearest:.2g} m at least"
+        )
+    return None
+
+
+def pipes(openings: Sequence[Opening], spacing: float) -> list[NDArray[np.float64]]:
+    """Boundary samples of the pipes of all openings [m], (m_k, 3) each; emitters with one nozzle share its pipe.
+
+    Args:
+        openings: of the tank.
+        spacing: of the particles [m].
+    """
+    return [
+        opening.pipe(spacing)
+        for number, opening in enumerate(openings)
+        if not any(is_same_nozzle(opening, earlier, spacing) for earlier in openings[:number])
+    ]
+
+
+def _least_distance(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """From a point of one set to a point of the other [m]."""
+    return float(cKDTree(one).query(other)[0].min())
