@@ -77,7 +77,7 @@ def test_the_film_is_cut_every_half_second():
         ({"render": {"shutter": 0.25}}, {"render", "volume"}),
         ({"fps": 30}, {"simulate", "volume", "render", "movie"}),
     ],
-    ids=str,
+    ids=lambda value: "+".join(sorted(value)) if isinstance(value, set) else str(value),
 )
 def test_a_change_concerns_only_the_stages_that_read_it(change, concerned):
     before, after = digests(job()), digests(job(**change))

@@ -78,7 +78,7 @@ def test_without_its_table_there_is_no_task_and_no_change_to_the_pictures():
         ({"fluid": [{**TANK["fluid"][0], "viscosity": 1e-3}]}, {"simulate"}),
         ({"frames": 80}, set()),
     ],
-    ids=str,
+    ids=lambda value: "+".join(sorted(value)) if isinstance(value, set) else str(value),
 )
 def test_a_change_concerns_only_the_stages_that_read_it(change, concerned):
     before, after = digests(job()), digests(job(**change))
