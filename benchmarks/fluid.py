@@ -67,7 +67,7 @@ def make_dam(solver: str, particles: int, support_in_spacings: float, **paramete
 
 def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[str, Any]:
     """One dam: steps per second, and what a step consists of."""
-    from sim.fluid.memory import estimate_bytes
+    from sim.fluid.memory import IMPLICIT_PRESSURE_BYTES, estimate_bytes
 
     tolerances = dict.fromkeys(("density_tolerance", "divergence_tolerance"), arguments.tolerance)
     fluid = make_dam(
@@ -91,7 +91,13 @@ def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[
     if bad := fluid.first_bad_quantity():
         raise RuntimeError(f"{solver} with {particles} particles diverged: {bad}")
     state, count = fluid.diagnostics(), fluid.particle_count
-    planned = estimate_bytes(count, fluid.boundary.count, fluid.cell_count, support_in_spacings=arguments.support)
+    planned = estimate_bytes(
+        count,
+        fluid.boundary.count,
+        fluid.cell_count,
+        support_in_spacings=arguments.support,
+        extra_bytes=0 if solver == "wcsph" else IMPLICIT_PRESSURE_BYTES,
+    )
     return {
         "solver": solver,
         "particles": count,

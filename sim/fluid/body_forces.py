@@ -10,7 +10,7 @@ from sim.cells import CellGrid, Cells, Floats, Integers, SortedPoints, Vectors, 
 from sim.fluid.body_response import BodyResponse, weigh_errors
 from sim.fluid.boundary import Boundary
 from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
-from sim.fluid.kernels import spline_slope
+from sim.fluid.kernels import TINY_DISTANCE, spline_slope
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, viscous_factor
 from sim.launch import fast_launch
 from sim.neighbors import ROUNDING_MARGIN
@@ -19,9 +19,6 @@ CHUNK = 64
 """Samples of a body that one node of the sum takes together."""
 
 GROWTH = 1.25
-
-TINY_DISTANCE = 1.0e-12
-"""Keeps x_ib/|x_ib| finite where a particle lies on a sample [m]; the fluid's own sums have the same."""
 
 
 class BodyForces:

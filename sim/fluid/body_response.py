@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sim.cells import Floats, Integers, Vectors
 from sim.fluid.boundary import Boundary
 from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
-from sim.fluid.kernels import spline, spline_slope
+from sim.fluid.kernels import TINY_DISTANCE, spline, spline_slope
 from sim.launch import fast_launch
 
 MOBILITY_WIDTH = 10
@@ -25,9 +25,6 @@ LARGEST_PUSH = 6.0
 """|sum_b V_b grad W_ib| of a particle that is pressed onto samples, over 1/d; it is 0.9 at rest beside them."""
 
 NO_BODY = 2**31 - 1
-
-TINY_DISTANCE = 1.0e-12
-"""Keeps x_ib/|x_ib| finite where a particle lies on a sample [m]; the fluid's own sums have the same."""
 
 
 class BodyResponse:

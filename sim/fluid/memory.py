@@ -9,15 +9,8 @@ EXPECTED_NEIGHBORS = 48
 """Places in the neighbour list per particle, with the skin, and on a GPU the padding of its slices, at the usual
 support radius; they grow with its cube."""
 
-
 IMPLICIT_PRESSURE_BYTES = 40
 """What DFSPH and PCISPH have more of a particle than WCSPH: pressures, their acceleration, diagonal and errors."""
-
-IMPLICIT_VISCOSITY_BYTES = 124
-"""Nine vectors of conjugate gradients, and the change that is kept from step to step with its place in the sort."""
-
-AKINCI2013_BYTES = 12
-"""The normals of the colour field."""
 
 
 def estimate_bytes(
@@ -35,7 +28,7 @@ def estimate_bytes(
         boundary_count: samples of walls and bodies.
         cell_count: cells of the search for neighbours, which cover the whole domain.
         support_in_spacings: support radius of the kernel.
-        extra_bytes: of a particle, for what the plain solver does not have: the constants above.
+        extra_bytes: of a particle, for what WCSPH does not have.
     """
     vector, number = 12, 4
     state = 2 * (2 * vector + 2 * number) + vector  # position, velocity, id and phase, sorted from and to; reference

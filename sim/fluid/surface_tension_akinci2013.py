@@ -3,7 +3,7 @@
 import taichi as ti
 
 from sim.cells import Floats, Integers, Vectors
-from sim.fluid.kernels import spline_slope
+from sim.fluid.kernels import TINY_DISTANCE, spline_slope
 
 COHESION_PER_TENSION = 100.0
 """Cohesion c [m/s²] over sigma/(rho0 h²) with which a drop oscillates as one of surface tension sigma does (Rayleigh).
@@ -23,9 +23,6 @@ most 0.135/h between two particles of a lattice, and six are as near as that."""
 AREA_SHARE = 1.0e-3
 """Coefficient of the area forces over that of cohesion, both as accelerations. The paper has one gamma for both: its
 cohesion is gamma rho0 V C, its area force gamma (n_i - n_j), and rho0 is 1000 in its units."""
-
-TINY_DISTANCE = 1.0e-12
-"""Keeps x_ij/|x_ij| finite where two particles coincide [m]; the fluid's own sums have the same."""
 
 
 class SurfaceTensionAkinci2013:

@@ -5,7 +5,7 @@ import math
 import taichi as ti
 
 from sim.cells import Floats, Integers, Vectors
-from sim.fluid.kernels import spline_slope
+from sim.fluid.kernels import TINY_DISTANCE, spline_slope
 from sim.fluid.time_step import CFL_NUMBER, VISCOUS_NUMBER
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING, pair_viscosity
 from sim.reductions import LaneReduction
@@ -19,9 +19,6 @@ MAX_ITERATIONS = 200
 
 CARRIED = ("viscous_change_x", "viscous_change_y", "viscous_change_z")
 """Velocity change of each particle in the step before [m/s], from which the next solve starts."""
-
-TINY_DISTANCE = 1.0e-12
-"""Keeps x_ij/|x_ij| finite where two particles coincide [m]; the fluid's own sums have the same."""
 
 SUMS = 4
 
