@@ -1,7 +1,8 @@
 """Triangle meshes: from PLY files into Blender, fast enough to do it for every frame.
 
-The PLY files are binary little endian: per vertex float32 `x y z`, optionally `nx ny nz` (unit normals) and
-`vx vy vz` (velocity [m/s]); per face `list uchar int vertex_indices` with three indices.
+The PLY files are binary little endian: per vertex float32 `x y z`, optionally `nx ny nz` (unit normals), `vx vy vz`
+(velocity [m/s]) and `s t` (coordinates on the surface at rest [m]); per face `list uchar int vertex_indices` with three
+indices.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ import bpy
 import numpy as np
 
 from blender_scripts.errors import RenderInputError
+
+REST_UV = "rest"
+"""UV map of coordinates on the surface at rest [m]: what hangs on it does not swim as the surface moves."""
 
 _MAX_HEADER_BYTES = 65536
 _FACE_RECORD = np.dtype([("corner_count", "u1"), ("vertex_indices", "<i4", (3,))])
@@ -30,12 +34,14 @@ class TriangleMesh:
         triangles: vertex indices, (m, 3), int32.
         normals: unit vectors, (n, 3), float32, or None.
         velocities: [m/s], (n, 3), float32, or None.
+        uv: coordinates on the surface at rest [m], (n, 2), float32, or None.
     """
 
     positions: np.ndarray
     triangles: np.ndarray
     normals: np.ndarray | None = None
     velocities: np.ndarray | None = None
+    uv: np.ndarray | None = None
 
 
 def read_ply(path: Path) -> TriangleMesh:
@@ -65,6 +71,7 @@ def read_ply(path: Path) -> TriangleMesh:
         triangles=np.ascontiguousarray(faces["vertex_indices"]),
         normals=_columns(vertices, ("nx", "ny", "nz")) if "nx" in vertices.dtype.names else None,
         velocities=_columns(vertices, ("vx", "vy", "vz")) if "vx" in vertices.dtype.names else None,
+        uv=_columns(vertices, ("s", "t")) if "s" in vertices.dtype.names else None,
     )
     _check(mesh, path)
     return mesh
@@ -75,7 +82,7 @@ def fill_mesh(mesh: Any, source: TriangleMesh) -> None:
 
     `foreach_set` copies whole arrays; a million triangles take 0.3 s where `from_pydata` needs 1.1 s. The attribute
     names are Blender's: Cycles blurs along a POINT attribute `velocity` [m/s], also when the topology changes from
-    frame to frame, and shades with a POINT attribute `custom_normal`.
+    frame to frame, and shades with a POINT attribute `custom_normal`. Coordinates at rest become the UV map `REST_UV`.
     """
     mesh.clear_geometry()
     vertex_count, triangle_count = len(source.positions), len(source.triangles)
@@ -88,6 +95,7 @@ def fill_mesh(mesh: Any, source: TriangleMesh) -> None:
         mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * triangle_count, 3, dtype=np.int32))
         _set_vector_attribute(mesh, "velocity", source.velocities)
         _set_vector_attribute(mesh, "custom_normal", source.normals)
+        _set_uv_map(mesh, source)
     mesh.update(calc_edges=True)
 
 
@@ -129,12 +137,12 @@ def _parse_header(content: bytes, path: Path) -> tuple[np.dtype, int, int, int]:
     return np.dtype(vertex_fields), counts["vertex"], counts["face"], end + len(marker)
 
 
-def _columns(vertices: np.ndarray, names: tuple[str, str, str]) -> np.ndarray:
+def _columns(vertices: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     return np.stack([vertices[name] for name in names], axis=1).astype(np.float32, copy=False)
 
 
 def _check(mesh: TriangleMesh, path: Path) -> None:
-    for quantity in ("positions", "normals", "velocities"):
+    for quantity in ("positions", "normals", "velocities", "uv"):
         values = getattr(mesh, quantity)
         if values is not None and not np.isfinite(values).all():
             bad = int((~np.isfinite(values).all(axis=1)).sum())
@@ -150,6 +158,15 @@ def _set_vector_attribute(mesh: Any, name: str, values: np.ndarray | None) -> No
     if values is not None:
         attribute = mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
         attribute.data.foreach_set("vector", values.ravel())
+
+
+def _set_uv_map(mesh: Any, source: TriangleMesh) -> None:
+    existing = mesh.uv_layers.get(REST_UV)
+    if existing is not None:
+        mesh.uv_layers.remove(existing)
+    if source.uv is not None:
+        layer = mesh.uv_layers.new(name=REST_UV, do_init=False)
+        layer.uv.foreach_set("vector", source.uv[source.triangles].ravel())
 
 
 def keep_sharp_edges(mesh: Any, angle_deg: float) -> None:

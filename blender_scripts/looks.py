@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import bpy
 
-from blender_scripts.compatibility import node_tree_of
-
-Color = tuple[float, float, float]
-Value = TypeVar("Value")
+from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
+from blender_scripts.weaves import build_cotton, build_denim, build_silk
 
 WATER_IOR = 1.333
 WATER_ABSORPTION_PER_M: Color = (0.30, 0.055, 0.009)
@@ -26,57 +23,12 @@ _SMOKE_OPTICAL_SIZE = 22.0
 """Optical depth of smoke of density 1 across the whole domain."""
 
 
-@dataclass(frozen=True)
-class LookContext:
-    """What a look may depend on.
-
-    Attributes:
-        domain_size: diagonal of the domain [m].
-        color: base colour or tint from the job, linear RGB, or None.
-        roughness: from the job [-], or None.
-        density: from the job, or None; see `render.parameters.MaterialParameters`.
-    """
-
-    domain_size: float
-    color: Color | None
-    roughness: float | None
-    density: float | None
-
-
-class NodeBuilder:
-    """A material's node tree, with the two steps that every look takes made short."""
-
-    def __init__(self, material: Any) -> None:
-        self.tree = node_tree_of(material)
-        self.output = self.tree.nodes.new("ShaderNodeOutputMaterial")
-
-    def node(self, kind: str, **inputs: float | Color) -> Any:
-        """A new node; inputs by socket name with underscores for blanks, colours as three numbers."""
-        node = self.tree.nodes.new(kind)
-        for name, value in inputs.items():
-            socket = node.inputs[name.replace("_", " ")]
-            socket.default_value = (*value, 1.0) if isinstance(value, tuple) and socket.type == "RGBA" else value
-        return node
-
-    def link(self, source: Any, target: Any) -> None:
-        """Connect an output socket to an input socket."""
-        self.tree.links.new(source, target)
-
-    def surface(self, shader: Any) -> None:
-        """Use a node's first output as the surface."""
-        self.link(shader.outputs[0], self.output.inputs["Surface"])
-
-    def volume(self, shader: Any) -> None:
-        """Use a node's first output as the inside."""
-        self.link(shader.outputs[0], self.output.inputs["Volume"])
-
-
 def new_material(name: str, parameters: dict[str, Any], *, domain_size: float) -> Any:
     """The material for a body.
 
     Args:
         name: of the body.
-        parameters: `look`, `color`, `roughness` and `density` of the specification.
+        parameters: `look`, `color`, `roughness`, `density` and `thread_spacing` of the specification.
         domain_size: diagonal of the domain [m].
 
     Returns:
@@ -84,7 +36,11 @@ def new_material(name: str, parameters: dict[str, Any], *, domain_size: float) -
     """
     color = parameters["color"]
     context = LookContext(
-        domain_size, None if color is None else tuple(color), parameters["roughness"], parameters["density"]
+        domain_size,
+        None if color is None else tuple(color),
+        parameters["roughness"],
+        parameters["density"],
+        parameters["thread_spacing"],
     )
     material = bpy.data.materials.new(name)
     LOOKS[parameters["look"]](NodeBuilder(material), context)
@@ -96,13 +52,13 @@ def _water(builder: NodeBuilder, context: LookContext) -> None:
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
         Base_Color=(1.0, 1.0, 1.0),
-        Roughness=_or(context.roughness, 0.0),
+        Roughness=or_default(context.roughness, 0.0),
         IOR=WATER_IOR,
         Transmission_Weight=1.0,
     )
     builder.surface(_with_clear_shadow(builder, shader, tint=(0.94, 0.975, 1.0)))
     # Given explicitly, the factor is on the real absorption; by default a small tank is as blue as a deep pool.
-    factor = _or(context.density, _WATER_ABSORPTION_BY_SIZE / context.domain_size)
+    factor = or_default(context.density, _WATER_ABSORPTION_BY_SIZE / context.domain_size)
     coefficients = WATER_ABSORPTION_PER_M if context.color is None else _absorption_of_tint(context.color)
     _homogeneous_absorption(builder, tuple(factor * value for value in coefficients))
 
@@ -110,20 +66,20 @@ def _water(builder: NodeBuilder, context: LookContext) -> None:
 def _glass(builder: NodeBuilder, context: LookContext) -> None:
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
-        Base_Color=_or(context.color, (0.97, 0.99, 0.98)),
-        Roughness=_or(context.roughness, 0.0),
+        Base_Color=or_default(context.color, (0.97, 0.99, 0.98)),
+        Roughness=or_default(context.roughness, 0.0),
         IOR=1.5,
         Transmission_Weight=1.0,
     )
-    builder.surface(_with_clear_shadow(builder, shader, tint=_or(context.color, (0.90, 0.93, 0.92))))
+    builder.surface(_with_clear_shadow(builder, shader, tint=or_default(context.color, (0.90, 0.93, 0.92))))
 
 
 def _smoke(builder: NodeBuilder, context: LookContext) -> None:
     """Light smoke that scatters forwards a little; extinction follows the `density` grid."""
     shader = builder.node(
         "ShaderNodeVolumePrincipled",
-        Color=_or(context.color, (0.86, 0.88, 0.90)),
-        Density=_or(context.density, _SMOKE_OPTICAL_SIZE / context.domain_size),
+        Color=or_default(context.color, (0.86, 0.88, 0.90)),
+        Density=or_default(context.density, _SMOKE_OPTICAL_SIZE / context.domain_size),
         Anisotropy=0.3,
     )
     builder.volume(shader)
@@ -133,8 +89,8 @@ def _rubber(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(
         builder.node(
             "ShaderNodeBsdfPrincipled",
-            Base_Color=_or(context.color, (0.95, 0.56, 0.02)),
-            Roughness=_or(context.roughness, 0.42),
+            Base_Color=or_default(context.color, (0.95, 0.56, 0.02)),
+            Roughness=or_default(context.roughness, 0.42),
             Specular_IOR_Level=0.45,
         )
     )
@@ -144,8 +100,8 @@ def _ceramic(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(
         builder.node(
             "ShaderNodeBsdfPrincipled",
-            Base_Color=_or(context.color, (0.82, 0.79, 0.74)),
-            Roughness=_or(context.roughness, 0.35),
+            Base_Color=or_default(context.color, (0.82, 0.79, 0.74)),
+            Roughness=or_default(context.roughness, 0.35),
             Coat_Weight=0.6,
             Coat_Roughness=0.06,
         )
@@ -156,8 +112,8 @@ def _plastic(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(
         builder.node(
             "ShaderNodeBsdfPrincipled",
-            Base_Color=_or(context.color, (0.62, 0.06, 0.05)),
-            Roughness=_or(context.roughness, 0.25),
+            Base_Color=or_default(context.color, (0.62, 0.06, 0.05)),
+            Roughness=or_default(context.roughness, 0.25),
             IOR=1.46,
         )
     )
@@ -167,8 +123,8 @@ def _metal(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(
         builder.node(
             "ShaderNodeBsdfPrincipled",
-            Base_Color=_or(context.color, (0.62, 0.61, 0.60)),
-            Roughness=_or(context.roughness, 0.28),
+            Base_Color=or_default(context.color, (0.62, 0.61, 0.60)),
+            Roughness=or_default(context.roughness, 0.28),
             Metallic=1.0,
         )
     )
@@ -176,7 +132,7 @@ def _metal(builder: NodeBuilder, context: LookContext) -> None:
 
 def _stone(builder: NodeBuilder, context: LookContext) -> None:
     """Grey rock: mottled colour and a rough surface from noise in the body's own coordinates, so it does not swim."""
-    base = _or(context.color, (0.32, 0.30, 0.28))
+    base = or_default(context.color, (0.32, 0.30, 0.28))
     coordinates = builder.node("ShaderNodeTexCoord")
     # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box.
     noise = builder.node("ShaderNodeTexNoise", Scale=7.0, Detail=6.0, Roughness=0.62)
@@ -188,7 +144,9 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
     builder.link(noise.outputs[0], ramp.inputs[0])
     bump = builder.node("ShaderNodeBump", Strength=0.35, Distance=0.006 * context.domain_size)
     builder.link(noise.outputs[0], bump.inputs["Height"])
-    shader = builder.node("ShaderNodeBsdfPrincipled", Roughness=_or(context.roughness, 0.8), Specular_IOR_Level=0.3)
+    shader = builder.node(
+        "ShaderNodeBsdfPrincipled", Roughness=or_default(context.roughness, 0.8), Specular_IOR_Level=0.3
+    )
     builder.link(ramp.outputs["Color"], shader.inputs["Base Color"])
     builder.link(bump.outputs["Normal"], shader.inputs["Normal"])
     builder.surface(shader)
@@ -196,19 +154,19 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
 
 def _spray(builder: NodeBuilder, context: LookContext) -> None:
     """Droplets in the air: too small to refract in a picture, so they are white and let some light straight through."""
-    white = _scattering(builder, _or(context.color, (0.96, 0.98, 1.0)))
-    glint = builder.node("ShaderNodeBsdfGlossy", Roughness=_or(context.roughness, 0.25))
+    white = _scattering(builder, or_default(context.color, (0.96, 0.98, 1.0)))
+    glint = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.25))
     fresnel = builder.node("ShaderNodeFresnel", IOR=WATER_IOR)
-    droplet = _mix(builder, fresnel.outputs[0], white, glint)
+    droplet = mix_shaders(builder, fresnel.outputs[0], white, glint)
     through = builder.node("ShaderNodeBsdfTransparent")
     share = builder.node("ShaderNodeValue")
     share.outputs[0].default_value = 0.45
-    builder.surface(_mix(builder, share.outputs[0], droplet, through))
+    builder.surface(mix_shaders(builder, share.outputs[0], droplet, through))
 
 
 def _foam(builder: NodeBuilder, context: LookContext) -> None:
     """Bubbles packed at the surface, which scatter light in all directions."""
-    builder.surface(_scattering(builder, _or(context.color, (0.93, 0.95, 0.96))))
+    builder.surface(_scattering(builder, or_default(context.color, (0.93, 0.95, 0.96))))
 
 
 def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
@@ -217,22 +175,22 @@ def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
     Points are hit on their front only, so what passes goes on straight instead of being refracted twice.
     """
     fresnel = builder.node("ShaderNodeFresnel", IOR=1.0 / WATER_IOR)
-    mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=_or(context.roughness, 0.0))
-    through = builder.node("ShaderNodeBsdfTransparent", Color=_or(context.color, (0.97, 0.985, 1.0)))
-    builder.surface(_mix(builder, fresnel.outputs[0], through, mirror))
+    mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.0))
+    through = builder.node("ShaderNodeBsdfTransparent", Color=or_default(context.color, (0.97, 0.985, 1.0)))
+    builder.surface(mix_shaders(builder, fresnel.outputs[0], through, mirror))
 
 
 def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
     """Thin glass: reflects as glass does, and lets everything else straight through, so that it costs no bounces."""
     fresnel = builder.node("ShaderNodeFresnel", IOR=1.35)
-    reflection = builder.node("ShaderNodeBsdfGlossy", Roughness=_or(context.roughness, 0.0))
-    through = builder.node("ShaderNodeBsdfTransparent", Color=_or(context.color, (0.975, 0.99, 0.985)))
+    reflection = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.0))
+    through = builder.node("ShaderNodeBsdfTransparent", Color=or_default(context.color, (0.975, 0.99, 0.985)))
     light_path = builder.node("ShaderNodeLightPath")
     seen = builder.node("ShaderNodeMath")
     seen.operation = "MULTIPLY"
     builder.link(fresnel.outputs[0], seen.inputs[0])
     builder.link(light_path.outputs["Is Camera Ray"], seen.inputs[1])
-    builder.surface(_mix(builder, seen.outputs[0], through, reflection))
+    builder.surface(mix_shaders(builder, seen.outputs[0], through, reflection))
 
 
 def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
@@ -240,8 +198,8 @@ def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(
         builder.node(
             "ShaderNodeBsdfPrincipled",
-            Base_Color=_or(context.color, (0.50, 0.72, 0.66)),
-            Roughness=_or(context.roughness, 0.15),
+            Base_Color=or_default(context.color, (0.50, 0.72, 0.66)),
+            Roughness=or_default(context.roughness, 0.15),
             Specular_IOR_Level=0.6,
         )
     )
@@ -256,6 +214,9 @@ LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
     "metal": _metal,
     "stone": _stone,
     "glass": _glass,
+    "cotton": build_cotton,
+    "silk": build_silk,
+    "denim": build_denim,
     "spray": _spray,
     "foam": _foam,
     "bubbles": _bubbles,
@@ -265,25 +226,13 @@ LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
 """How each look is built, by the name that a specification uses."""
 
 
-def _or(value: Value | None, default: Value) -> Value:
-    return default if value is None else value
-
-
-def _mix(builder: NodeBuilder, factor: Any, first: Any, second: Any) -> Any:
-    mix = builder.node("ShaderNodeMixShader")
-    builder.link(factor, mix.inputs[0])
-    builder.link(first.outputs[0], mix.inputs[1])
-    builder.link(second.outputs[0], mix.inputs[2])
-    return mix
-
-
 def _scattering(builder: NodeBuilder, color: Color) -> Any:
     """White that glows through: half of the light that meets a particle leaves it on the other side."""
     half = builder.node("ShaderNodeValue")
     half.outputs[0].default_value = 0.5
     back = builder.node("ShaderNodeBsdfDiffuse", Color=color)
     forth = builder.node("ShaderNodeBsdfTranslucent", Color=color)
-    return _mix(builder, half.outputs[0], back, forth)
+    return mix_shaders(builder, half.outputs[0], back, forth)
 
 
 def _with_clear_shadow(builder: NodeBuilder, shader: Any, *, tint: Color) -> Any:
@@ -301,7 +250,7 @@ def _with_clear_shadow(builder: NodeBuilder, shader: Any, *, tint: Color) -> Any
         builder.link(light_path.outputs[kind], maximum.inputs[1])
         asks_for_light = maximum.outputs[0]
     clear = builder.node("ShaderNodeBsdfTransparent", Color=tint)
-    return _mix(builder, asks_for_light, shader, clear)
+    return mix_shaders(builder, asks_for_light, shader, clear)
 
 
 def _homogeneous_absorption(builder: NodeBuilder, coefficients: Color) -> None:

@@ -107,7 +107,8 @@ def fill_points(mesh: Any, points: Points) -> None:
 
 
 def _count(lines: list[str]) -> int | None:
-    """The number of points, if these are the lines of the one header that is known."""
+    """The number of points, if these are the lines of the one header that is known; comments are passed over."""
+    lines = [line for line in lines if not line.startswith("comment ")]
     words = lines[2].split() if len(lines) > 2 else []
     if len(words) != 3 or not words[2].isdecimal():
         return None

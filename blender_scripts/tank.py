@@ -13,7 +13,7 @@ _WALL_THICKNESS = 0.008
 """In domain diagonals."""
 _GAP = 0.002
 """Between water and glass, in domain diagonals: coinciding surfaces would shade each other at random."""
-_OWN_MATERIAL = {"color": None, "roughness": None, "density": None}
+_OWN_MATERIAL = {"color": None, "roughness": None, "density": None, "thread_spacing": None}
 
 
 def add_tank(spec: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from pipeline.commands.running import rerun, resume, submit
 from pipeline.commands.showing import report, sheet
 from pipeline.errors import PipelineError
 
-TEMPLATES = ("dam-break", "drop", "smoke")
+TEMPLATES = ("dam-break", "drop", "smoke", "cloth")
 """As in `pipeline.job.starter`, which is too heavy to be imported for `--help`."""
 
 
@@ -88,6 +88,8 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, as_json: bo
         click.echo(f"  about {findings.particles:,} particles")
     if job.smoke:
         click.echo(f"  {findings.cells:,} smoke cells")
+    if job.cloth:
+        click.echo(f"  {findings.nodes:,} cloth nodes")
     click.echo(f"  {width} x {height} pixels, {job.render.quality} quality")
 
 

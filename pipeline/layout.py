@@ -98,6 +98,11 @@ class JobLayout:
         return ArtifactPath(f"whitewater/{body}/{frame:06d}.ply")
 
     @staticmethod
+    def cloth(body: str, frame: int) -> ArtifactPath:
+        """PLY mesh of a cloth at one frame."""
+        return ArtifactPath(f"cloths/{body}/{frame:06d}.ply")
+
+    @staticmethod
     def picture(frame: int) -> ArtifactPath:
         """Rendered frame."""
         return ArtifactPath(f"frames/{frame:06d}.png")

@@ -47,6 +47,8 @@ def quantity(name: str, *, of_kind: str | None = None) -> Quantity:
         of_kind: what the body is; the mass of smoke is an integral of its density, which has no unit.
     """
     found = _KNOWN.get(name)
+    if found is None and name.startswith(COUNT_OF_FLUID):
+        return Quantity(name, f"particles of {name.removeprefix(COUNT_OF_FLUID)}", "", _COUNT, counted=True)
     if found is None:
         label = name.replace("_", " ")
         return Quantity(name, label, "", label.capitalize())
@@ -54,6 +56,9 @@ def quantity(name: str, *, of_kind: str | None = None) -> Quantity:
         return Quantity(name, found.label, "m³", "Smoke")
     return found
 
+
+COUNT_OF_FLUID = "particle_count_"
+"""Begins the name of the number of particles of one fluid among several in a tank; its name follows."""
 
 MECHANICAL_ENERGY = "mechanical_energy"
 """Sum of `PARTS_OF_ENERGY`; not written by any solver."""
@@ -72,18 +77,28 @@ _KNOWN = {
         Quantity("viscosity_iterations", "viscosity iterations", "", _ITERATIONS),
         Quantity("density_error", "density error", SHARE, _ERROR),
         Quantity("divergence_error", "divergence error", SHARE, _ERROR),
+        Quantity("viscosity_error", "viscosity error", SHARE, "Error of the viscosity solve"),
         Quantity("max_compression", "largest compression", SHARE, _ERROR),
         Quantity("residual", "residual", "", "Residual"),
         Quantity("divergence", "largest divergence", "1/s", "Divergence"),
         Quantity("not_converged", "solves at their iteration limit", "", "Solves at their limit", counted=True),
+        Quantity("squeezed", "squeezed beyond 20 %", "", "Frames with squeezed particles", counted=True),
         Quantity("linear_solves", "solves made linear", "", "Solves made linear", counted=True),
         Quantity("particle_count", "particles", "", _COUNT, counted=True),
+        Quantity("whitewater_particles", "whitewater particles", "", "Whitewater particles", counted=True),
+        Quantity("whitewater_capped", "whitewater capped", "", "Particles not emitted", counted=True),
         Quantity("particles_removed", "particles removed", "", _COUNT, counted=True),
+        Quantity("node_count", "nodes", "", "Cloth nodes", counted=True),
+        Quantity("nodes_lost", "nodes out of sight", "", "Cloth nodes out of sight", counted=True),
         Quantity("bodies_lost", "bodies out of sight", "", "Bodies out of sight", counted=True),
         Quantity("particles_emitted", "particles emitted", "", _COUNT, counted=True),
         Quantity("emission_blocked", "emission blocked", "", "Particles not emitted", counted=True),
         Quantity("emission_capped", "emission capped", "", "Particles not emitted", counted=True),
         Quantity("contacts", "contacts", "", "Contacts", counted=True),
+        Quantity("repaired_crossings", "crossings repaired", "", "Cloth crossings repaired", counted=True),
+        Quantity("impact_zone_vertices", "nodes moved as one", "", "Cloth nodes moved as one", counted=True),
+        Quantity("pair_searches", "searches for pairs", "", "Searches for pairs per frame", counted=True),
+        Quantity("max_strain", "largest strain", SHARE, "Strain"),
         Quantity("wall_contacts", "wall contacts", "", "Contacts", counted=True),
         Quantity("max_penetration", "deepest penetration", "m", "Penetration"),
         Quantity("neighbor_searches", "neighbour searches", "", "Neighbour searches per frame", counted=True),
@@ -106,7 +121,12 @@ _KNOWN = {
 def in_order(names: Iterable[str]) -> list[str]:
     """Names as they are shown: those that are known first."""
     known = list(_KNOWN)
-    return sorted(names, key=lambda name: (known.index(name) if name in _KNOWN else len(known), name))
+
+    def place(name: str) -> tuple[int, str]:
+        of_all = "particle_count" if name.startswith(COUNT_OF_FLUID) else name
+        return known.index(of_all) if of_all in _KNOWN else len(known), name
+
+    return sorted(names, key=place)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +153,11 @@ class CountedEvent:
 WARNINGS = (
     CountedEvent("not_converged", "solve hit its iteration limit", "solves hit their iteration limit"),
     CountedEvent(
+        "squeezed",
+        "frame has particles squeezed by more than 20 %",
+        "frames have particles squeezed by more than 20 %",
+    ),
+    CountedEvent(
         "emission_blocked",
         "particle was not emitted, as its place was taken",
         "particles were not emitted, as their places were taken",
@@ -141,6 +166,17 @@ WARNINGS = (
         "emission_capped",
         "particle was not emitted, as there are max_particles",
         "particles were not emitted, as there are max_particles",
+    ),
+    CountedEvent(
+        "whitewater_capped",
+        "particle was not made, as there are max_particles",
+        "particles were not made, as there are max_particles",
+    ),
+    CountedEvent(
+        "nodes_lost",
+        "node of a cloth fell out of sight and was stopped",
+        "nodes of cloths fell out of sight and were stopped",
+        running_total=True,
     ),
     CountedEvent(
         "bodies_lost",

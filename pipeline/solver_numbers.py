@@ -1,10 +1,10 @@
-"""The solvers' numbers of a job, frame by frame, as its cache has them; and what in them is worth a warning."""
+"""The solvers' numbers of a job, frame by frame, as its files have them; and what in them is worth a warning."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pipeline.artifacts import Receipt, read_receipt
 from pipeline.cache import FrameNumbers, read_numbers
@@ -15,6 +15,8 @@ from pipeline.plan import frame_ranges
 from pipeline.quantities import WARNINGS, CountedEvent, in_order, quantity
 from pipeline.run_events import RunEvent
 from pipeline.task import ArtifactPath
+from pipeline.whitewater_numbers import WHITEWATER, parts_of, read_whitewater_numbers, whitewater_numbers
+from sim.solver import Diagnostics
 
 SIMULATE = "simulate"
 """The stage whose artifacts are frames of the cache."""
@@ -24,17 +26,19 @@ _TIED = "\N{NO-BREAK SPACE}"
 
 @dataclass(frozen=True, slots=True)
 class SimulationNumbers:
-    """What the solvers told of a simulation.
+    """What the solvers told of a simulation, and what its whitewater came to.
 
     Attributes:
         frames: of each committed frame that can be read, in order; maybe only what warnings need.
         last: all numbers of the last of them.
         unreadable: frames that were committed and cannot be read any more.
+        unreadable_whitewater: files of whitewater, likewise.
     """
 
     frames: tuple[FrameNumbers, ...] = ()
     last: FrameNumbers | None = None
     unreadable: tuple[int, ...] = ()
+    unreadable_whitewater: tuple[ArtifactPath, ...] = ()
 
     def warnings(self) -> list[Warned]:
         """What happened in these frames that should not, by solver."""
@@ -46,6 +50,9 @@ class SimulationNumbers:
         if self.unreadable:
             frames = frame_ranges(self.unreadable, range(min(self.unreadable), max(self.unreadable) + 1))
             lines.append(f"frames of the cache that cannot be read: {frames}; see: pipeline verify")
+        if self.unreadable_whitewater:
+            files = ", ".join(self.unreadable_whitewater)
+            lines.append(f"whitewater that cannot be read: {files}; see: pipeline verify")
         return lines
 
     def as_json(self) -> dict[str, object]:
@@ -57,6 +64,7 @@ class SimulationNumbers:
             "solvers": {} if last is None else {name: dict(of) for name, of in last.solvers.items()},
             "warnings": [each.as_json() for each in self.warnings()],
             "unreadable_frames": list(self.unreadable),
+            "unreadable_whitewater": list(self.unreadable_whitewater),
         }
 
 
@@ -102,15 +110,21 @@ def simulation_numbers(layout: JobLayout, *, history: bool = False) -> Simulatio
     """
     only = None if history else [event.name for event in WARNINGS]
     receipts = _frame_receipts(layout)
+    clouds = whitewater_numbers(layout, receipts)
+
+    def numbers(receipt: Receipt, only: list[str] | None) -> FrameNumbers:
+        of_cache = read_numbers(layout.path(receipt.artifact), only)
+        return replace(of_cache, solvers={**of_cache.solvers, **clouds.frames.get(of_cache.frame, {})})
+
     frames: list[FrameNumbers] = []
     unreadable: list[int] = []
     for frame, receipt in receipts.items():
         try:
-            frames.append(read_numbers(layout.path(receipt.artifact), only))
+            frames.append(numbers(receipt, only))
         except InvalidArtifactError:
             unreadable.append(frame)
-    last = read_numbers(layout.path(receipts[frames[-1].frame].artifact)) if frames else None
-    return SimulationNumbers(tuple(frames), last, tuple(unreadable))
+    last = numbers(receipts[frames[-1].frame], None) if frames else None
+    return SimulationNumbers(tuple(frames), last, tuple(unreadable), tuple(clouds.unreadable))
 
 
 def describe(numbers: FrameNumbers) -> list[str]:
@@ -134,7 +148,7 @@ def count_warnings(frames: Iterable[FrameNumbers]) -> list[Warned]:
     counts: dict[tuple[str, CountedEvent], dict[int, int]] = {}
     totals: dict[tuple[str, CountedEvent], int] = {}
     for each in frames:
-        for solver, event, count in _events_of(each):
+        for solver, event, count in _events_of(each.solvers):
             news = count - totals.get((solver, event), 0) if event.running_total else count
             totals[solver, event] = count
             if news > 0:
@@ -151,24 +165,32 @@ class SolverWatch:
         self._told: set[tuple[str, str]] = set()
 
     def notify(self, event: RunEvent) -> None:
-        """Look at every frame that the simulation commits."""
-        if not isinstance(event, Committed) or event.receipt.stage != SIMULATE:
+        """Look at every frame, and every file of whitewater, that is committed."""
+        if not isinstance(event, Committed) or event.receipt.stage not in (SIMULATE, WHITEWATER):
             return
         try:
-            numbers = read_numbers(self._layout.path(event.receipt.artifact))
+            frame, solvers = self._numbers_of(event.receipt)
         except InvalidArtifactError as error:
             self._say(str(error))
             return
-        for solver, kind, count in _events_of(numbers):
+        for solver, kind, count in _events_of(solvers):
             if (solver, kind.name) not in self._told:
                 self._told.add((solver, kind.name))
-                self._say(f"{Warned(solver, kind, count, (numbers.frame,))}; later ones are counted: pipeline status")
+                self._say(f"{Warned(solver, kind, count, (frame,))}; later ones are counted: pipeline status")
+
+    def _numbers_of(self, receipt: Receipt) -> tuple[int, Mapping[str, Diagnostics]]:
+        """The frame that was committed, and its numbers by what tells them."""
+        if receipt.stage == SIMULATE:
+            numbers = read_numbers(self._layout.path(receipt.artifact))
+            return numbers.frame, numbers.solvers
+        whitewater = parts_of(receipt.artifact)
+        return whitewater.frame, {whitewater.teller: read_whitewater_numbers(self._layout, receipt.artifact)}
 
 
-def _events_of(numbers: FrameNumbers) -> list[tuple[str, CountedEvent, int]]:
+def _events_of(solvers: Mapping[str, Diagnostics]) -> list[tuple[str, CountedEvent, int]]:
     return [
         (solver, event, int(of[event.name]))
-        for solver, of in numbers.solvers.items()
+        for solver, of in solvers.items()
         for event in WARNINGS
         if of.get(event.name, 0.0) > 0.0
     ]

@@ -1,7 +1,7 @@
 """Triangle meshes as binary PLY files, written and read with numpy alone.
 
-Layout (docs/formats.md): binary little endian; vertices `x y z [nx ny nz] [vx vy vz]`, all float32; faces as a list of
-one uchar (always 3) and int32 indices. A mesh without vertices is legal: a frame without fluid.
+Layout (docs/formats.md): binary little endian; vertices `x y z [nx ny nz] [vx vy vz] [s t]`, all float32; faces as a
+list of one uchar (always 3) and int32 indices. A mesh without vertices is legal: a frame without fluid.
 """
 
 from __future__ import annotations
@@ -20,7 +20,12 @@ Float32Array = NDArray[np.float32]
 Int32Array = NDArray[np.int32]
 
 _FACE = np.dtype([("count", "u1"), ("indices", "<i4", (3,))])
-_GROUPS = {"position": ("x", "y", "z"), "normal": ("nx", "ny", "nz"), "velocity": ("vx", "vy", "vz")}
+_GROUPS = {
+    "position": ("x", "y", "z"),
+    "normal": ("nx", "ny", "nz"),
+    "velocity": ("vx", "vy", "vz"),
+    "uv": ("s", "t"),
+}
 _LONGEST_HEADER = 4096
 _HEADER_END = b"end_header\n"
 
@@ -34,12 +39,14 @@ class SurfaceMesh:
         faces: (m, 3) int32 vertex indices.
         normals: (n, 3) float32 unit vectors that point out, or None.
         velocities: (n, 3) float32 [m/s], or None.
+        uv: (n, 2) float32 coordinates on the surface at rest [m], or None.
     """
 
     vertices: Float32Array
     faces: Int32Array
     normals: Float32Array | None = None
     velocities: Float32Array | None = None
+    uv: Float32Array | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,7 @@ def write_ply(
     *,
     normals: ArrayLike | None = None,
     velocities: ArrayLike | None = None,
+    uv: ArrayLike | None = None,
 ) -> None:
     """Write a triangle mesh; the same arrays give the same bytes.
 
@@ -86,13 +94,14 @@ def write_ply(
         faces: (m, 3) vertex indices, stored as int32.
         normals: (n, 3) unit vectors, or None.
         velocities: (n, 3) [m/s], or None.
+        uv: (n, 2) coordinates on the surface at rest [m], or None.
 
     Raises:
         ValueError: the shapes do not fit together.
     """
-    groups = {"position": vertices, "normal": normals, "velocity": velocities}
-    columns = {name: _as_rows(name, value) for name, value in groups.items() if value is not None}
-    triangles = _as_rows("faces", faces)
+    groups = {"position": vertices, "normal": normals, "velocity": velocities, "uv": uv}
+    columns = {name: _as_rows(name, value, len(_GROUPS[name])) for name, value in groups.items() if value is not None}
+    triangles = _as_rows("faces", faces, 3)
     counts = {name: len(column) for name, column in columns.items()}
     if len(set(counts.values())) > 1:
         raise ValueError(f"a mesh needs as many of each per vertex, got {counts}")
@@ -100,8 +109,8 @@ def write_ply(
     header = _Header(counts["position"], len(triangles), properties, size=0)
 
     rows = np.empty((header.vertex_count, len(properties)), "<f4")
-    for index, column in enumerate(columns.values()):
-        rows[:, 3 * index : 3 * index + 3] = column
+    for name, start in _group_starts(properties):
+        rows[:, start : start + len(_GROUPS[name])] = columns[name]
     records = np.empty(len(triangles), _FACE)
     records["count"] = 3
     records["indices"] = triangles
@@ -128,7 +137,7 @@ def read_ply(path: Path) -> SurfaceMesh:
     if (records["count"] != 3).any():
         raise InvalidFileError(path, "has a face that is not a triangle")
     columns = {
-        group: np.ascontiguousarray(rows[:, start : start + 3], np.float32)
+        group: np.ascontiguousarray(rows[:, start : start + len(_GROUPS[group])], np.float32)
         for group, start in _group_starts(header.properties)
     }
     return SurfaceMesh(
@@ -136,6 +145,7 @@ def read_ply(path: Path) -> SurfaceMesh:
         faces=np.ascontiguousarray(records["indices"], np.int32),
         normals=columns.get("normal"),
         velocities=columns.get("velocity"),
+        uv=columns.get("uv"),
     )
 
 
@@ -147,7 +157,7 @@ def validate_ply(path: Path) -> None:
         OSError: it cannot be read.
     """
     mesh = read_ply(path)
-    columns = {"position": mesh.vertices, "normal": mesh.normals, "velocity": mesh.velocities}
+    columns = {"position": mesh.vertices, "normal": mesh.normals, "velocity": mesh.velocities, "uv": mesh.uv}
     for name, column in columns.items():
         if column is not None and not np.isfinite(column).all():
             row = int(np.flatnonzero(~np.isfinite(column).all(axis=1))[0])
@@ -157,12 +167,12 @@ def validate_ply(path: Path) -> None:
         raise InvalidFileError(path, f"a face names vertex {bad}, but there are {len(mesh.vertices)}")
 
 
-def _as_rows(name: str, values: ArrayLike) -> NDArray[np.generic]:
+def _as_rows(name: str, values: ArrayLike, width: int) -> NDArray[np.generic]:
     rows = np.asarray(values)
     if rows.size == 0:
-        return rows.reshape(0, 3)
-    if rows.ndim != 2 or rows.shape[1] != 3:
-        raise ValueError(f"{name} must have the shape (n, 3), got {rows.shape}")
+        return rows.reshape(0, width)
+    if rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"{name} must have the shape (n, {width}), got {rows.shape}")
     return rows
 
 
@@ -189,6 +199,6 @@ def _parse_header(path: Path, content: bytes) -> _Header:
 def _group_starts(properties: tuple[str, ...]) -> Iterator[tuple[str, int]]:
     position = 0
     for group, names in _GROUPS.items():
-        if properties[position : position + 3] == names:
+        if properties[position : position + len(names)] == names:
             yield group, position
-            position += 3
+            position += len(names)

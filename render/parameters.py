@@ -69,7 +69,10 @@ class StageParameters(Parameters):
     tank: bool = Field(default=False, description="Show the domain's walls as a glass tank.")
 
 
-Look = Literal["water", "smoke", "rubber", "ceramic", "plastic", "metal", "stone", "glass", "spray", "foam", "bubbles"]
+Look = Literal[
+    "water", "smoke", "rubber", "ceramic", "plastic", "metal", "stone", "glass", "spray", "foam", "bubbles", "cotton",
+    "silk", "denim",
+]  # fmt: skip
 
 
 class MaterialParameters(Parameters):
@@ -81,6 +84,9 @@ class MaterialParameters(Parameters):
     density: Positive | None = Field(
         default=None,
         description="Smoke: extinction per metre at density 1 [1/m]. Water: factor on its absorption [-].",
+    )
+    thread_spacing: Positive | None = Field(
+        default=None, description="Woven cloth: distance of its threads [m]; the look's own if omitted."
     )
 
 

@@ -1,7 +1,8 @@
 """Whitewater as binary PLY files of points, written and read with numpy alone.
 
-Layout (docs/formats.md): binary little endian; one element `vertex` with float32 `x y z vx vy vz radius lifetime` and
-uchar `kind`. No particles is legal: a frame without whitewater.
+Layout (docs/formats.md): binary little endian; a comment with the number of particles that had no room; one element
+`vertex` with float32 `x y z vx vy vz radius lifetime` and uchar `kind`. No particles is legal: a frame without
+whitewater.
 """
 
 from __future__ import annotations
@@ -20,11 +21,17 @@ KINDS = ("spray", "foam", "bubbles")
 
 _ROW = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "vx", "vy", "vz", "radius", "lifetime")), ("kind", "u1")])
 _HEADER = (
-    "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
+    "ply\nformat binary_little_endian 1.0\ncomment not_made {not_made}\nelement vertex {count}\n"
     + "".join(f"property {'uchar' if _ROW[name].kind == 'u' else 'float'} {name}\n" for name in _ROW.names or ())
     + "end_header\n"
 )
-_PATTERN = re.compile(re.escape(_HEADER).replace(re.escape("{count}"), r"(0|[1-9]\d{0,9})").encode("ascii"))
+_PATTERN = re.compile(
+    re.escape(_HEADER)
+    .replace(re.escape("{count}"), r"(?P<count>0|[1-9]\d{0,9})")
+    .replace(re.escape("{not_made}"), r"(?P<not_made>0|[1-9]\d{0,18})")
+    .encode("ascii")
+)
+_LONGEST_HEADER = len(_HEADER) + 32
 
 
 @dataclass(frozen=True)
@@ -37,6 +44,7 @@ class PointCloud:
         radius: [m], (n,), float32.
         lifetime: what is left of it [s], (n,), float32.
         kind: index into `KINDS`, (n,), uint8.
+        not_made: particles that the frame should have got, and had no room for.
     """
 
     position: NDArray[np.float32]
@@ -44,6 +52,20 @@ class PointCloud:
     radius: NDArray[np.float32]
     lifetime: NDArray[np.float32]
     kind: NDArray[np.uint8]
+    not_made: int = 0
+
+
+@dataclass(frozen=True)
+class PointCounts:
+    """What the header of a cloud tells.
+
+    Attributes:
+        points: how many there are.
+        not_made: how many had no room.
+    """
+
+    points: int
+    not_made: int
 
 
 def write_point_cloud(path: Path, cloud: PointCloud) -> None:
@@ -62,7 +84,7 @@ def write_point_cloud(path: Path, cloud: PointCloud) -> None:
         rows[name], rows[f"v{name}"] = cloud.position[:, axis], cloud.velocity[:, axis]
     rows["radius"], rows["lifetime"], rows["kind"] = cloud.radius, cloud.lifetime, cloud.kind
     with path.open("wb") as file:
-        file.write(_HEADER.format(count=count).encode("ascii"))
+        file.write(_HEADER.format(count=count, not_made=cloud.not_made).encode("ascii"))
         file.write(rows.tobytes())
 
 
@@ -74,10 +96,8 @@ def read_point_cloud(path: Path) -> PointCloud:
         OSError: it cannot be read.
     """
     content = path.read_bytes()
-    header = _PATTERN.match(content)
-    if header is None:
-        raise InvalidFileError(path, "is not a point cloud of the expected layout (docs/formats.md)")
-    count = int(header[1])
+    header = _header(path, content)
+    count = int(header["count"])
     size = header.end() + count * _ROW.itemsize
     if len(content) != size:
         raise InvalidFileError(path, f"{len(content)} bytes, but its header promises {size}")
@@ -88,7 +108,20 @@ def read_point_cloud(path: Path) -> PointCloud:
         radius=rows["radius"].astype(np.float32),
         lifetime=rows["lifetime"].astype(np.float32),
         kind=rows["kind"].copy(),
+        not_made=int(header["not_made"]),
     )
+
+
+def read_point_counts(path: Path) -> PointCounts:
+    """Read the header of a cloud alone.
+
+    Raises:
+        InvalidFileError: it is not of this layout.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        header = _header(path, file.read(_LONGEST_HEADER))
+    return PointCounts(int(header["count"]), int(header["not_made"]))
 
 
 def validate_point_cloud(path: Path) -> None:
@@ -110,3 +143,10 @@ def validate_point_cloud(path: Path) -> None:
     if (cloud.kind >= len(KINDS)).any():
         row = int(np.flatnonzero(cloud.kind >= len(KINDS))[0])
         raise InvalidFileError(path, f"kind of point {row} is {cloud.kind[row]}, of 0 to {len(KINDS) - 1}")
+
+
+def _header(path: Path, content: bytes) -> re.Match[bytes]:
+    header = _PATTERN.match(content)
+    if header is None:
+        raise InvalidFileError(path, "is not a point cloud of the expected layout (docs/formats.md)")
+    return header

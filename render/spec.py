@@ -52,7 +52,10 @@ class MovingMeshObject(Parameters):
 
 
 class MeshSequenceObject(Parameters):
-    """A mesh that changes every frame: one PLY file a frame with `vx vy vz` [m/s] and `nx ny nz` per vertex."""
+    """A mesh that changes every frame: one PLY file a frame with `vx vy vz` [m/s] and `nx ny nz` per vertex.
+
+    Looks of woven cloth need `s t` too.
+    """
 
     type: Literal["mesh_sequence"] = "mesh_sequence"
     name: str

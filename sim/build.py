@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
 from sim.coupling.fluid_rigid import FluidRigidCoupling
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
 from sim.fluid.nozzles import nozzle_collision, pipes
@@ -17,10 +18,11 @@ from sim.rigid.static import StaticBody
 from sim.scene import DomainParameters, SceneParameters
 from sim.shapes.placement import build_solid
 from sim.smoke.parameters import SmokeParameters
-from sim.solver import Solver
+from sim.solver import Coupling, Solver
 from sim.world import World
 
 if TYPE_CHECKING:
+    from sim.cloth.solver import ClothSolver
     from sim.fluid.forces import SPHFluid
     from sim.rigid.solver import RigidSolver
     from sim.shapes.solid import Solid
@@ -37,8 +39,13 @@ def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
     rigid = _build_rigid(scene)
     fluids = [_build_fluids(scene, bodies, rigid)] if scene.fluid else []
     smokes = [_build_smoke(smoke, scene, bodies) for smoke in scene.smoke]
-    solvers: list[Solver] = [*fluids, *([] if rigid is None else [rigid]), *smokes]
-    couplings = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
+    cloths = [_build_cloths(scene, frames_per_second)] if scene.cloth else []
+    solvers: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
+    couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
+    for cloth in cloths:
+        contacts = contacts_of_cloths(cloth, scene.rigid, domain=scene.domain, rigid=rigid)
+        cloth.add_contacts(contacts)
+        couplings += [] if rigid is None else [ClothRigidCoupling(cloth, rigid, contacts)]
     return World(solvers, frames_per_second=frames_per_second, couplings=couplings, static_bodies=bodies)
 
 
@@ -124,6 +131,15 @@ def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
     solver = RigidSolver(moving, obstacles=obstacles, domain=scene.domain, gravity=scene.gravity)
     check_start(solver)
     return solver
+
+
+def _build_cloths(scene: SceneParameters, frames_per_second: float) -> ClothSolver:
+    """One solver for all cloths, as they collide with each other."""
+    from sim.cloth.solver import SOLVER_NAME, ClothSolver
+
+    if SOLVER_NAME in {body.name for body in (*scene.fluid, *scene.smoke)}:
+        raise ValueError(f'"{SOLVER_NAME}" is what all cloths are called together; name the fluid or smoke otherwise')
+    return ClothSolver(scene.cloth, domain=scene.domain, gravity=scene.gravity, frames_per_second=frames_per_second)
 
 
 def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:

@@ -1,6 +1,6 @@
 """Points sorted into the cells of a grid: a counting sort, the same whatever the number of threads.
 
-The cells are numbered along x first, so that the three cells of a row are one contiguous range of the sorted points.
+The cells are numbered along x first, so that the cells of a row are one contiguous range of the sorted points.
 """
 
 from dataclasses import dataclass
@@ -23,38 +23,49 @@ MAX_CELLS = 2**28
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Cubic cells that cover a box, with one more layer of cells around it.
+    """Cubic cells that cover a box, and a search radius around it.
 
     Attributes:
         origin: lower corner of the outermost cells [m].
-        cell_size: edge of a cell, at least the search radius [m].
+        cell_size: edge of a cell, at least the search radius over `reach` [m].
         shape: number of cells along x, y, z.
+        reach: cells to either side that a search looks into.
     """
 
     origin: tuple[float, float, float]
     cell_size: float
     shape: tuple[int, int, int]
+    reach: int = 1
 
     @classmethod
-    def covering(cls, low: NDArray[np.floating], high: NDArray[np.floating], cell_size: float) -> "CellGrid":
+    def covering(
+        cls, low: NDArray[np.floating], high: NDArray[np.floating], search_radius: float, *, reach: int = 1
+    ) -> "CellGrid":
         """The grid for a box from `low` to `high` [m].
+
+        Args:
+            low: lower corner.
+            high: upper corner.
+            search_radius: within which neighbours are wanted [m].
+            reach: cells that it spans.
 
         Raises:
             ValueError: the box holds more than `MAX_CELLS` cells, wherever the points are.
         """
+        cell_size = search_radius / reach
         size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
-        shape = np.maximum(np.ceil(size / cell_size), 1.0) + 2.0
+        shape = np.maximum(np.ceil(size / cell_size), 1.0) + 2.0 * reach
         if not shape.prod() <= MAX_CELLS:
             raise ValueError(
                 f"a box of {' x '.join(f'{edge:g}' for edge in size)} m has {shape.prod():.3g} neighbour cells of "
                 f"{cell_size:g} m, more than {MAX_CELLS}; give a smaller domain or a larger particle radius"
             )
-        origin = np.asarray(low, dtype=np.float64) - cell_size
-        return cls(tuple(origin.tolist()), cell_size, tuple(shape.astype(int).tolist()))
+        origin = np.asarray(low, dtype=np.float64) - search_radius
+        return cls(tuple(origin.tolist()), cell_size, tuple(shape.astype(int).tolist()), reach)
 
     @property
     def cell_count(self) -> int:
-        """Number of cells, the outer layer included."""
+        """Number of cells, the outer layers included."""
         nx, ny, nz = self.shape
         return nx * ny * nz
 
@@ -95,7 +106,7 @@ class CellSort:
         """
         grid = self.grid
         dropped = sort_points_by_cell(
-            positions, ids, count, grid.origin, 1.0 / grid.cell_size, grid.shape, keep_low, keep_high,
+            positions, ids, count, grid.origin, 1.0 / grid.cell_size, grid.shape, grid.reach, keep_low, keep_high,
             self._cell_of, self._cursor, self._scratch, self.cell_start, self.order,
         )  # fmt: skip
         return count - int(dropped)
@@ -115,10 +126,12 @@ class SortedPoints:
 
 
 @ti.func
-def cell_of_point(point: ti.math.vec3, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells) -> Cells:
-    """Cell of a point, moved inside the outer layer, so that all 27 cells around it exist; a NaN lands there too."""
+def cell_of_point(
+    point: ti.math.vec3, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, reach: ti.i32 = 1
+) -> Cells:
+    """Cell of a point, moved inside the outer layers, so that all cells around it exist; a NaN lands there too."""
     cell = ti.cast(ti.floor((point - origin) * inverse_cell_size), ti.i32)
-    return ti.max(ti.min(cell, shape - 2), 1)
+    return ti.max(ti.min(cell, shape - 1 - reach), reach)
 
 
 @ti.func
@@ -131,7 +144,7 @@ def row_of_cell(cell: Cells, dy: ti.i32, dz: ti.i32, shape: Cells) -> ti.i32:
 @ti.kernel
 def sort_points_by_cell(
     positions: Vectors, ids: Integers, count: ti.i32, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells,
-    keep_low: ti.math.vec3, keep_high: ti.math.vec3,
+    reach: ti.i32, keep_low: ti.math.vec3, keep_high: ti.math.vec3,
     cell_of: Integers, cursor: Integers, scratch: Integers, cell_start: Integers, order: Integers,
 ) -> ti.i32:  # fmt: skip
     """Count the points of each cell, sum the counts up, and put the points of a cell next to each other, by id.
@@ -145,7 +158,7 @@ def sort_points_by_cell(
     dropped = 0
     for i in range(count):
         x_i = positions[i]
-        cell = row_of_cell(cell_of_point(x_i, origin, inverse_cell_size, shape), 0, 0, shape)
+        cell = row_of_cell(cell_of_point(x_i, origin, inverse_cell_size, shape, reach), 0, 0, shape)
         if (x_i < keep_low).any() or (x_i > keep_high).any():
             cell = cell_count
             dropped += 1

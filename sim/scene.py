@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
+from sim.cloth.parameters import ClothParameters
 from sim.fluid.parameters import FluidParameters
 from sim.parameters import Parameters, Vector3
 from sim.rigid.parameters import RigidBodyParameters
@@ -32,12 +33,6 @@ class DomainParameters(Parameters):
         return self
 
 
-def _refuse_cloth(cloth: object) -> object:
-    if cloth:
-        raise ValueError("cloth is not simulated by this version; remove [[cloth]]")
-    return cloth
-
-
 class SceneParameters(Parameters):
     """Everything that decides how the bodies move."""
 
@@ -48,8 +43,8 @@ class SceneParameters(Parameters):
         default=(), description="Particle fluids; several share one tank, and the keys that say how it is computed."
     )
     smoke: tuple[SmokeParameters, ...] = Field(default=(), description="Smoke.")
-    cloth: Annotated[tuple[Any, ...], BeforeValidator(_refuse_cloth)] = Field(
-        default=(), description="Reserved: cloth is not simulated by this version.", max_length=0
+    cloth: tuple[ClothParameters, ...] = Field(
+        default=(), description="Cloths; they collide with each other, and share the keys that say how they step."
     )
     device: Device = Field(
         default="auto", description="Where the simulation runs; auto: the fastest device that works."

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-BodyKind = Literal["fluid", "rigid", "smoke"]
+BodyKind = Literal["fluid", "rigid", "smoke", "cloth"]
 Attribute = int | float | str | tuple[float, ...]
 
 
@@ -26,6 +26,8 @@ class Snapshot:
       `ambient_temperature` [K].
     - rigid: `position` (3,) [m], `orientation` (4,) unit quaternion w, x, y, z, `velocity` (3,) [m/s],
       `angular_velocity` (3,) [rad/s]; all float64. The mesh is the body's own, in its rest pose.
+    - cloth: `position` (n, 3) [m], `velocity` (n, 3) [m/s], and the same in every frame: `triangles` (k, 3) int32, and
+      `uv` (n, 2) coordinates on the sheet at rest [m]. Attribute: `thickness` [m].
     """
 
     kind: BodyKind

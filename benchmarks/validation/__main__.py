@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.validation.cases import CASES, compute, load_case
@@ -22,7 +23,7 @@ def main() -> int:
     """Run what the command line names; 1 where a number is not as it should be."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("case", nargs="*", metavar="CASE", help=f"{', '.join(CASES)}; all if omitted")
-    parser.add_argument("--solver", action="append", choices=[*FLUID_SOLVERS, "rigid"], help="all if omitted")
+    parser.add_argument("--solver", action="append", choices=[*FLUID_SOLVERS, "rigid", "cloth"], help="all if omitted")
     parser.add_argument("--quick", action="store_true", help="small; prints the numbers and keeps nothing")
     parser.add_argument("--redraw", action="store_true", help="computes nothing")
     parser.add_argument("--device", default="cpu")
@@ -37,13 +38,13 @@ def main() -> int:
                 keep_figure(name, arguments.output)
         _update_page(arguments.output)
         return 0
-    initialize(arguments.device)
+    device = initialize(arguments.device)
     failures = 0
     for name in names:
         for solver in load_case(name).solvers:
             if arguments.solver and solver not in arguments.solver:
                 continue
-            result = compute(name, solver, quick=arguments.quick)
+            result = replace(compute(name, solver, quick=arguments.quick), device=device)
             lines = [f"{name}, {solver}, {result.seconds:.1f} s", *(f"  {check}" for check in result.checks)]
             sys.stdout.write("\n".join(lines) + "\n")
             sys.stdout.flush()

@@ -20,9 +20,12 @@ CASES = {
     "elliptical-drop": "elliptical_drop",
     "viscosity": "viscosity",
     "free-momentum": "free_momentum",
+    "coupled-momentum": "coupled_momentum",
     "rigid-motion": "rigid_motion",
     "rigid-contacts": "rigid_contacts",
     "inertia": "inertia",
+    "cloth": "cloth",
+    "submerged-sphere": "submerged_sphere",
     "buoyancy": "buoyancy",
     "bunny-energy": "bunny_energy",
 }

@@ -54,6 +54,7 @@ class CaseResult:
         checks: the numbers.
         series: curves for the figure, by name.
         seconds: time that it took [s], on a machine that other work shares.
+        device: what Taichi ran on.
     """
 
     case: str
@@ -62,6 +63,7 @@ class CaseResult:
     checks: Sequence[Check]
     series: Mapping[str, Sequence[float]] = field(default_factory=dict)
     seconds: float = 0.0
+    device: str = "cpu"
 
     @property
     def failures(self) -> list[str]:

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from benchmarks.validation.checks import CaseResult
 
-COLOURS = {"wcsph": "#2a6fbb", "dfsph": "#d1652b", "pcisph": "#2f8f5b", "rigid": "#2a6fbb"}
-TITLES = {"wcsph": "WCSPH", "dfsph": "DFSPH", "pcisph": "PCISPH", "rigid": "rigid body"}
+COLOURS = {"wcsph": "#2a6fbb", "dfsph": "#d1652b", "pcisph": "#2f8f5b", "rigid": "#2a6fbb", "cloth": "#2a6fbb"}
+TITLES = {"wcsph": "WCSPH", "dfsph": "DFSPH", "pcisph": "PCISPH", "rigid": "rigid body", "cloth": "cloth"}
 MEAN_OF = 20
 """Samples of a running mean."""
 
@@ -178,12 +178,22 @@ def draw_viscosity(results: Sequence[CaseResult]) -> Figure:
 
 
 def draw_free_momentum(results: Sequence[CaseResult]) -> Figure:
-    """Drift over steps."""
-    figure, (linear, angular) = _panels(2)
-    for axes, name in ((linear, "linear"), (angular, "angular")):
+    """Drift over time."""
+    return _drifts(results, {"linear": "linear", "angular": "angular"})
+
+
+def draw_coupled_momentum(results: Sequence[CaseResult]) -> Figure:
+    """Drift over time, of the collision with the lightest box."""
+    lightest = min(results[0].settings["densities"])
+    return _drifts(results, {name: f"{name}_{lightest:g}" for name in ("linear", "angular")})
+
+
+def _drifts(results: Sequence[CaseResult], curves: dict[str, str]) -> Figure:
+    figure, panels = _panels(2)
+    for axes, (name, curve) in zip(panels, curves.items(), strict=True):
         for result in results:
             # A drift of exactly zero has no place on a logarithmic axis.
-            drifts = [max(drift, 1e-10) for drift in result.series[name]]
+            drifts = [max(drift, 1e-10) for drift in result.series[curve]]
             axes.semilogy(result.series["times"], drifts, **_style(result))
         axes.axhline(1e-5, color=THEORY, linewidth=1.0, linestyle="--", label="bound")
         axes.set_ylim(1e-10, 1e-2)
@@ -228,29 +238,46 @@ def draw_rigid_contacts(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
+def draw_submerged_sphere(results: Sequence[CaseResult]) -> Figure:
+    """Force on held spheres and added mass by size, speed of released ones."""
+    figure, (held, added, released) = _panels(3)
+    for number, result in enumerate(results):
+        series, style = result.series, {**_style(result), "markersize": 4, "linewidth": 1.0}
+        sizes = [size + 0.06 * (number - 1) for size in series["sizes"]]
+        held.errorbar(sizes, series["held"], series["held_error"], fmt="o-", **style)
+        added.errorbar(sizes, series["added_mass"], series["added_mass_error"], fmt="o-", **style)
+        times = [1e3 * time for time in series["times"]]
+        for density, dash in zip(result.settings["densities"], ("-", "--"), strict=True):
+            released.plot(times, series[f"released_{density:g}"], dash, color=COLOURS[result.solver])
+    for axes in (held, added):
+        axes.set_xticks(results[0].series["sizes"])
+    held.axhline(1.0, color=THEORY, linewidth=1.0)
+    held.set_ylim(0.9, 1.1)
+    _label(held, "radius / spacing", "force / rho g V", "held sphere; bars: standard error")
+    added.axhline(results[0].settings["added_mass"], color=THEORY, linewidth=1.0)
+    added.set_ylim(0.4, 0.7)
+    _label(added, "radius / spacing", "added / displaced mass", "sphere let go; black: theory")
+    released.plot([0.0, times[-1]], [0.0, 1e-3 * times[-1]], color=THEORY, linewidth=1.0, label="theory at first")
+    for density, dash in zip(results[0].settings["densities"], ("-", "--"), strict=True):
+        released.plot([], [], dash, color="#777777", label=f"{density:g} kg/m³")
+    _label(released, "time [ms]", "speed / first acceleration [s]", f"R = {series['sizes'][-1]} d")
+    return figure
+
+
 def draw_buoyancy(results: Sequence[CaseResult]) -> Figure:
-    """Force on held spheres by size, speed of released ones, way of a neutral one, draught of boxes."""
-    figure, (held, released, neutral, afloat) = _panels(4, width=3.0)
+    """Way of neutral bodies, draught of boxes."""
+    figure, (neutral, afloat) = _panels(2, width=4.2)
     dashes = ("-", "--", ":")
     for result in results:
-        series, style, colour = result.series, _style(result), COLOURS[result.solver]
-        held.plot(series["sizes"], series["held"], "o-", markersize=4, **style)
-        neutral.plot(series["neutral_times"], [1e3 * way for way in series["neutral_ways"]], **style)
-        for density, dash in zip(result.settings["released_densities"], dashes, strict=False):
-            times = [1e3 * time for time in series["released_times"]]
-            released.plot(times, series[f"released_{density:g}"], dash, color=colour)
+        series, colour = result.series, COLOURS[result.solver]
+        for name, dash in (("sphere", "-"), ("duck", "--")):
+            neutral.plot(series["neutral_times"], [1e3 * way for way in series[f"ways_{name}"]], dash, color=colour)
+        neutral.plot([], [], **_style(result))
         for density, dash in zip(result.settings["floating_densities"], dashes, strict=False):
             draughts = [1e3 * draught for draught in series[f"afloat_{density:g}"]]
             afloat.plot(series["afloat_times"], draughts, dash, color=colour, linewidth=1.0)
-    held.axhline(1.0, color=THEORY, linewidth=1.0)
-    held.set_ylim(0.85, 1.15)
-    _label(held, "radius / spacing", "force / rho g V", "held sphere")
-    released.plot([0.0, times[-1]], [0.0, 1e-3 * times[-1]], color=THEORY, linewidth=1.0, label="theory")
-    for density, dash in zip(results[0].settings["released_densities"], dashes, strict=False):
-        released.plot([], [], dash, color="#777777", label=f"{density:g} kg/m³")
-    _label(released, "time [ms]", "speed / acceleration of theory [s]", "released sphere")
-    neutral.axhline(1e3 * results[0].settings["spacing_m"], color=THEORY, linewidth=1.0, linestyle="--")
-    _label(neutral, "time [s]", "way [mm]; dashed: one spacing", "neutral sphere", legend=False)
+    neutral.axhline(1e3 * results[0].settings["spacing_m"], color=THEORY, linewidth=1.0, label="one spacing")
+    _label(neutral, "time [s]", "way [mm]", "neutral sphere (solid) and duck (dashed)")
     for density in results[0].settings["floating_densities"]:
         exact = 1e3 * density / 1000.0 * results[0].settings["box_m"][2]
         afloat.axhline(exact, color=THEORY, linewidth=1.0)
@@ -276,6 +303,28 @@ def draw_bunny_energy(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
+def draw_cloth(results: Sequence[CaseResult]) -> Figure:
+    """Stretch of a column by rows, refinement of a band's sag, energy of a swinging sheet."""
+    figure, (column, order, energy) = _panels(3)
+    series = results[0].series
+    for name, label, shade in (("xpbd", "XPBD, cotton", SHADES[0]), ("explicit", "explicit, 60 N/m", SHADES[1])):
+        relative = [100.0 * (ratio - 1.0) for ratio in series[f"ratio_{name}"]]
+        column.plot(series[f"rows_{name}"], relative, "o-", markersize=3, color=shade, label=label)
+    column.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
+    column.set_ylim(-1.5, 1.5)
+    _label(column, "row from above", "stretch / theory - 1  [%]", "hanging column; grey: 1 %")
+    spacings = [1.0 / count for count in series["cells"]]
+    order.loglog(spacings, series["errors"], "o-", markersize=4, color=SHADES[0], label="band between two bars")
+    _order_line(order, spacings, max(series["errors"]), 2)
+    order.set_xticks(spacings, [f"1/{count}" for count in series["cells"]], minor=False)
+    order.set_xticks([], minor=True)
+    _label(order, "spacing / span", "error of the sag [m]", "refinement")
+    energy.plot(series["times"], [100.0 * each for each in series["energies"]], color=SHADES[0], linewidth=0.8)
+    energy.set_ylim(-1.0, 1.0)
+    _label(energy, "time [s]", "energy - start / (m g L/2)  [%]", "undamped sheet, explicit", legend=False)
+    return figure
+
+
 DRAWINGS: dict[str, Callable[[Sequence[CaseResult]], Figure]] = {
     "kernel": draw_kernel,
     "hydrostatic": draw_hydrostatic,
@@ -283,8 +332,11 @@ DRAWINGS: dict[str, Callable[[Sequence[CaseResult]], Figure]] = {
     "elliptical-drop": draw_elliptical_drop,
     "viscosity": draw_viscosity,
     "free-momentum": draw_free_momentum,
+    "coupled-momentum": draw_coupled_momentum,
+    "submerged-sphere": draw_submerged_sphere,
     "buoyancy": draw_buoyancy,
     "bunny-energy": draw_bunny_energy,
     "rigid-motion": draw_rigid_motion,
     "rigid-contacts": draw_rigid_contacts,
+    "cloth": draw_cloth,
 }

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.validation.stepping import landing_steps
 from sim.scene import DomainParameters
 
 if TYPE_CHECKING:
@@ -75,12 +76,8 @@ def advance(fluid: SPHFluid, duration: float, *, cuts: int = 1) -> Iterator[floa
     """
     part = duration / cuts
     for cut in range(1, cuts + 1):
-        remaining = part
-        while remaining > 0.0:
-            left = max(1, int(np.ceil(remaining / fluid.stable_dt() * (1.0 - 1.0e-9))))
-            dt = remaining / left
+        for dt in landing_steps(part, fluid.stable_dt):
             fluid.substep(dt)
-            remaining = remaining - dt if left > 1 else 0.0
         quantity = fluid.first_bad_quantity()
         if quantity is not None:
             raise RuntimeError(f"{fluid.name} diverged by t = {cut * part:.4g} s: {quantity}")

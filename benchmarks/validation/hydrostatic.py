@@ -30,7 +30,7 @@ def stand(solver: str, layers: int) -> dict[str, Any]:
     spacing = HEIGHT / layers
     domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(SIDE, SIDE, 2.0 * HEIGHT))
     fluid = make_fluid(solver, domain, lattice((0.0,) * 3, (SIDE, SIDE, HEIGHT), spacing), spacing=spacing)
-    floor = domain_wall_samples(domain, spacing)[:, 2] < 0.0
+    floor = domain_wall_samples(domain, spacing).positions[:, 2] < 0.0
     before = fluid.diagnostics()
     weight = before["mass"] * GRAVITY
     surface = before["mass"] / (WATER * SIDE**2)
@@ -65,6 +65,7 @@ def stand(solver: str, layers: int) -> dict[str, Any]:
             sum(after[name] - before[name] for name in ("kinetic_energy", "potential_energy")) / (weight * HEIGHT)
         ),
         "wall_contacts": after["wall_contacts"],
+        "not_converged": after.get("not_converged", 0.0),
         "particles": fluid.particle_count,
     }
 
@@ -88,6 +89,7 @@ def run(solver: str, *, quick: bool = False) -> CaseResult:
         Check("energy gained over m g H", max(0.0, finest["energy_gain"]), 0.0, 1e-4,
               "float32 sums; it may lose any"),
         Check("particles put back by a wall", finest["wall_contacts"], 0.0, 0.0, "a count"),
+        Check("pressure solves that did not converge", finest["not_converged"], 0.0, 0.0, "a count"),
     ]  # fmt: skip
     series = {"layers": list(layers), "errors": [each["error"] for each in runs]}
     for count, each in zip(layers, runs, strict=True):

@@ -13,7 +13,9 @@ from benchmarks.validation.checks import CaseResult, Check
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "validation"
 PAGE = "README.md"
 
-TITLES = {"wcsph": "WCSPH", "dfsph": "DFSPH", "pcisph": "PCISPH", "rigid": "value"}
+TITLES = {"wcsph": "WCSPH", "dfsph": "DFSPH", "pcisph": "PCISPH", "rigid": "value", "cloth": "value"}
+
+DEVICES = {"cpu": "a CPU", "cuda": "a GPU"}
 
 _TABLE = re.compile(r"(?P<head><!-- numbers: (?P<case>[a-z-]+) -->\n).*?(?P<tail><!-- end -->)", re.DOTALL)
 
@@ -65,7 +67,7 @@ def with_tables(text: str, folder: Path = FOLDER) -> str:
 
 
 def table_of(results: Sequence[CaseResult]) -> str:
-    """The numbers of a case as a Markdown table, one column a solver; what fails is bold."""
+    """The numbers of a case as a Markdown table, one column a solver; what fails is bold; and what computed them."""
     if not results:
         return "not computed\n"
     names = list(dict.fromkeys(check.name for each in results for check in each.checks))
@@ -81,6 +83,8 @@ def table_of(results: Sequence[CaseResult]) -> str:
         unit = "" if first.unit == "-" else f" [{first.unit}]"
         row = [f"{name}{unit}", f"{first.expected:.5g}", f"{first.tolerance:.2g}", *cells, first.reason]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |")
+    devices = [DEVICES.get(each, each) for each in dict.fromkeys(each.device for each in results)]
+    lines += ["", f"Computed on {' and '.join(devices)}."]
     return "\n".join(lines) + "\n"
 
 

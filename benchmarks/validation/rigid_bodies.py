@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.validation.stepping import landing_steps
 from sim.rigid.parameters import RigidBodyParameters
 from sim.scene import DomainParameters
 
@@ -49,12 +50,8 @@ def advance(solver: RigidSolver, duration: float, *, cuts: int = 1, largest_dt: 
     """
     part = duration / cuts
     for cut in range(1, cuts + 1):
-        remaining = part
-        while remaining > 0.0:
-            left = max(1, math.ceil(remaining / min(solver.stable_dt(), largest_dt) * (1.0 - 1.0e-9)))
-            dt = remaining / left
+        for dt in landing_steps(part, lambda: min(solver.stable_dt(), largest_dt)):
             solver.substep(dt)
-            remaining = remaining - dt if left > 1 else 0.0
         quantity = solver.first_bad_quantity()
         if quantity is not None:
             raise RuntimeError(f"the bodies diverged by t = {cut * part:.4g} s: {quantity}")

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from benchmarks.validation.fluids import EARTH, lattice
+from benchmarks.validation.fluids import EARTH, lattice, state_of
+from benchmarks.validation.rigid_bodies import body
+from benchmarks.validation.stepping import landing_steps
 from sim.rigid.parameters import RigidBodyParameters
 from sim.scene import DomainParameters
+
+SPACING = 0.02
+"""Of the particles around bodies that are validated in water [m]."""
+
+SIDE_IN_RADII = 6.0
+"""Of the tank with a sphere in it, and the depth of its water."""
 
 
 class Tank:
@@ -84,6 +91,10 @@ class Tank:
         )
         self.coupling = FluidRigidCoupling(self.fluid, self.rigid)
 
+    def stable_dt(self) -> float:
+        """Largest step [s] that fluid and bodies both take now."""
+        return min(self.fluid.stable_dt(), self.rigid.stable_dt())
+
     def advance(self, duration: float, *, cuts: int) -> Iterator[float]:
         """Advance by a duration [s] and stop after each of so many equal parts; yields the time [s].
 
@@ -92,16 +103,22 @@ class Tank:
         """
         part = duration / cuts
         for cut in range(1, cuts + 1):
-            remaining = part
-            while remaining > 0.0:
-                stable_dt = min(self.fluid.stable_dt(), self.rigid.stable_dt())
-                left = max(1, math.ceil(remaining / stable_dt * (1.0 - 1.0e-9)))
-                self.step(remaining / left)
-                remaining = remaining - remaining / left if left > 1 else 0.0
-            quantity = self.fluid.first_bad_quantity() or self.rigid.first_bad_quantity()
-            if quantity is not None:
-                raise RuntimeError(f"the tank diverged by t = {cut * part:.4g} s: {quantity}")
+            for _ in self.steps(part):
+                pass
             yield cut * part
+
+    def steps(self, duration: float) -> Iterator[float]:
+        """Take steps that land on a duration [s]; yields the length of each after it was taken [s].
+
+        Raises:
+            RuntimeError: fluid or bodies are not finite or run away.
+        """
+        for dt in landing_steps(duration, self.stable_dt):
+            self.step(dt)
+            yield dt
+        quantity = self.fluid.first_bad_quantity() or self.rigid.first_bad_quantity()
+        if quantity is not None:
+            raise RuntimeError(f"the tank diverged: {quantity}")
 
     def step(self, dt: float) -> None:
         """One coupled substep of dt [s], in the order of `sim.world.World`."""
@@ -110,13 +127,28 @@ class Tank:
         self.rigid.substep(dt)
         self.coupling.follow(dt)
 
-    def settle(self, duration: float) -> None:
-        """Let the water come to rest for a time [s] while the bodies are held where they are."""
-        bodies = self.rigid.bodies
-        is_dynamic = bodies.is_dynamic.copy()
-        bodies.is_dynamic[:] = False
-        self.coupling.follow(0.0)
-        for _ in self.advance(duration, cuts=1):
-            pass
-        bodies.is_dynamic[:] = is_dynamic
-        self.coupling.follow(0.0)
+    def astray(self) -> int:
+        """Particles with their centre inside of a body by more than a tenth of a spacing, and those that left."""
+        position, _ = state_of(self.fluid)
+        inside = 0
+        for number, turned in enumerate(self.rigid.bodies.rotation()):
+            in_body = (position - self.rigid.bodies.position[number]) @ turned
+            distance = self.rigid.signed_distance_in_body_frame(number)(in_body)
+            inside += int((distance < -0.1 * self.fluid.spacing).sum())
+        return inside + self.fluid.particles_removed
+
+
+def submerged_sphere(solver: str, density: float | None, radius: float, **material: float) -> Tank:
+    """A sphere in the middle of a cube of water.
+
+    Args:
+        solver: of the fluid.
+        density: of the sphere [kg/m³]; without one it is held for good.
+        radius: of the sphere [m].
+        material: of the water, where it is not the default.
+    """
+    side = SIDE_IN_RADII * radius
+    kind = {"kind": "kinematic"} if density is None else {"density": density}
+    sphere = body("sphere", {"type": "sphere", "radius": radius}, position=(0.0, 0.0, side / 2.0), **kind)
+    domain = DomainParameters(min=(-side / 2.0, -side / 2.0, 0.0), max=(side / 2.0, side / 2.0, 1.4 * side))
+    return Tank(solver, [sphere], domain=domain, depth=side, spacing=SPACING, **material)

@@ -134,8 +134,9 @@ def run(solver: str, *, quick: bool = False) -> CaseResult:
         Check("the same with the implicit solve", implicit["rate"] / lattice_rate(IMPLICIT_RESOLUTION, 0.0), 1.0, 0.03,
               "backward Euler with steps of 1/160 of the decay time errs by 0.3 %; the rest is as above"),
         Check("order of the rate's error under refinement, wave along the axis",
-              fitted_order([1.0 / n for n in resolutions], errors), 2.0, 0.4,
-              "the operator is even in k; the error is taken against the rate of long waves"),
+              fitted_order([1.0 / n for n in resolutions], errors), 2.0, 0.5,
+              "the operator is even in k; free sides and pressure solves leave 0.3 % of the rate, half of the error on "
+              "the finest lattice: 0.3 to 0.5 in the order"),
     ]  # fmt: skip
     series: dict[str, Any] = {
         "resolutions": list(resolutions),

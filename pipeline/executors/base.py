@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from types import TracebackType
+from typing import Protocol, Self
 
 from pipeline.artifacts import Receipt
 from pipeline.layout import JobLayout
@@ -113,6 +115,22 @@ class Failed:
 
 
 TaskEvent = Started | Progress | Committed | Finished | Failed
+
+
+class ShutDownOnExit(ABC):
+    """Lets a `with` block shut an executor down at its end."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.shutdown()
+
+    @abstractmethod
+    def shutdown(self) -> None:
+        """End everything."""
 
 
 class Executor(Protocol):

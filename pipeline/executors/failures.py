@@ -31,10 +31,12 @@ def classify(error: BaseException) -> FailureKind:
 
 
 def describe(error: BaseException) -> str:
-    """One line for the user: our own errors are sentences already, others need their type's name."""
+    """One line for the user: our own errors are sentences already, others need their type's name; then their notes."""
     if isinstance(error, PipelineError) or _is_called(_DIVERGED, error):
-        return str(error)
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        sentence = str(error)
+    else:
+        sentence = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return "; ".join([sentence, *getattr(error, "__notes__", [])])
 
 
 def is_disk_full(error: BaseException) -> bool:

@@ -5,15 +5,13 @@ from __future__ import annotations
 import time
 from collections import deque
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
-from types import TracebackType
-from typing import Self
 
 from pipeline.executors.attempt import run_attempt
-from pipeline.executors.base import Assignment, Failed, TaskEvent
+from pipeline.executors.base import Assignment, Failed, ShutDownOnExit, TaskEvent
 from pipeline.task import FailureKind, TaskId
 
 
-class InlineExecutor:
+class InlineExecutor(ShutDownOnExit):
     """Runs one assignment per `wait`, in the calling process; what it prints goes into the attempt's log.
 
     Nothing interrupts a running task here, so `cancel` and timeouts act only on tasks that have not begun, and what a
@@ -23,14 +21,6 @@ class InlineExecutor:
     def __init__(self) -> None:
         self._queue: deque[Assignment] = deque()
         self._events: list[TaskEvent] = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.shutdown()
 
     def submit(self, assignment: Assignment) -> None:
         """Put the attempt into the queue."""

@@ -12,12 +12,10 @@ import selectors
 import time
 from dataclasses import dataclass
 from math import inf
-from types import TracebackType
-from typing import Self
 
 import psutil
 
-from pipeline.executors.base import Assignment, Failed, Finished, TaskEvent
+from pipeline.executors.base import Assignment, Failed, Finished, ShutDownOnExit, TaskEvent
 from pipeline.executors.channel import Channel
 from pipeline.executors.failures import is_disk_full
 from pipeline.executors.worker_process import WorkerProcess, log_tail
@@ -54,7 +52,7 @@ class WorkerLimits:
     stall_timeout_s: float = 900.0
 
 
-class ProcessExecutor:
+class ProcessExecutor(ShutDownOnExit):
     """Runs assignments in worker processes of this machine; see `Executor` for what it promises.
 
     Workers die with the thread that submits to this executor (that is how Linux's PR_SET_PDEATHSIG counts), so use it
@@ -68,14 +66,6 @@ class ProcessExecutor:
         self._workers: list[WorkerProcess] = []
         self._selector = selectors.DefaultSelector()
         self._events: list[TaskEvent] = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.shutdown()
 
     @property
     def worker_pids(self) -> list[int]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import JobFileError
 from pipeline.job.loading import LoadedJob, read_job
-from pipeline.job.looks import BODY, WHITEWATER, parts_of
+from pipeline.job.looks import BODY, WHITEWATER, WOVEN_LOOKS, parts_of
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
@@ -42,7 +42,7 @@ def check_job(job: Job, *, memory_bytes: int | None = None) -> Findings:
 
 def named_bodies(job: Job) -> Iterator[tuple[KeyPath, str, str]]:
     """Path, kind and name of every body."""
-    for kind in ("rigid", "fluid", "smoke"):
+    for kind in ("rigid", "fluid", "smoke", "cloth"):
         for index, body in enumerate(getattr(job, kind)):
             yield (kind, index), kind, body.name
 
@@ -58,13 +58,21 @@ def _shares_space(smoke: SmokeParameters, job: Job) -> bool:
 
 def _check_bodies(job: Job, findings: Findings) -> None:
     if not job.body_names:
-        findings.error((), "has no body; add [[fluid]], [[smoke]] or [[rigid]]")
-    elif not job.fluid and not job.smoke and all(body.kind == "static" for body in job.rigid):
-        findings.warn((), "has neither fluid nor smoke, so nothing will move")
+        findings.error((), "has no body; add [[fluid]], [[smoke]], [[cloth]] or [[rigid]]")
+    elif not (job.fluid or job.smoke or job.cloth) and all(body.kind == "static" for body in job.rigid):
+        findings.warn((), "has neither fluid nor smoke nor cloth, so nothing will move")
     if job.smoke and any(body.kind != "static" for body in job.rigid):
         findings.warn((), "smoke passes through bodies that move in this version; only static ones are in its way")
     if job.fluid and any(_shares_space(smoke, job) for smoke in job.smoke):
         findings.warn((), "fluid and smoke do not act on each other in this version")
+    for kind in ("fluid", "smoke"):
+        if job.cloth and getattr(job, kind):
+            findings.warn((), f"cloth and {kind} do not act on each other in this version")
+    for kind, solver in (("rigid", "moving bodies"), ("cloth", "cloths")):
+        moves = job.cloth if kind == "cloth" else [body for body in job.rigid if body.kind != "static"]
+        for path, of_kind, name in named_bodies(job):
+            if moves and of_kind in ("fluid", "smoke") and name == kind:
+                findings.error((*path, "name"), f'"{kind}" is what all {solver} are called together; take another')
     # Names become file names, and some file systems do not tell upper from lower case.
     taken: dict[str, KeyPath] = {}
     for path, _, name in named_bodies(job):
@@ -95,6 +103,12 @@ def _check_materials(job: Job, findings: Findings) -> None:
             findings.error((*path, "look"), f'smoke can only look like "smoke", got "{material.look}"')
         elif kinds[name] != "smoke" and material.look == "smoke":
             findings.error((*path, "look"), f'"smoke" is a look for [[smoke]]; "{name}" is in [[{kinds[name]}]]')
+        elif kinds[name] != "cloth" and material.look in WOVEN_LOOKS:
+            findings.error(
+                (*path, "look"), f'"{material.look}" is a look for [[cloth]]; "{name}" is in [[{kinds[name]}]]'
+            )
+        if material.thread_spacing is not None and material.look not in WOVEN_LOOKS:
+            findings.warn((*path, "thread_spacing"), f'has no effect on the look "{material.look}"')
         if material.density is not None and material.look not in ("smoke", "water"):
             findings.warn((*path, "density"), f'has no effect on the look "{material.look}"')
 

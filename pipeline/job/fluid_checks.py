@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.job.jet_checks import check_jets
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path
 from sim.fluid.parameters import shared_conflicts
@@ -39,6 +40,8 @@ def check_fluids(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) 
             _check_emitter(job, path, opening, obstacles, findings)
             _check_nozzle(path, opening, openings, 2.0 * fluid.particle_radius, findings)
             openings[path] = opening
+    if openings:
+        check_jets(job, solids, openings, 2.0 * job.fluid[0].particle_radius, findings)
 
 
 def particle_room(job: Job, fluid: FluidParameters, block_volume: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from render.parameters import MaterialParameters
+from sim.cloth.materials import Material
 
 BODY = "body"
 """The part of a shape that carries the body's own name."""
@@ -29,6 +30,17 @@ PAINTED_LOOKS = ("rubber", "plastic", "ceramic")
 
 WHITEWATER = {part: MaterialParameters(look=part) for part in ("spray", "foam", "bubbles")}
 """Materials of the parts of a fluid that has whitewater; each is a look of its own."""
+
+CLOTHS: dict[Material, MaterialParameters] = {
+    "cotton": MaterialParameters(look="cotton"),
+    "silk": MaterialParameters(look="silk"),
+    "denim": MaterialParameters(look="denim"),
+    "rubber": MaterialParameters(look="rubber", color=(0.03, 0.03, 0.035)),
+}
+"""Materials of cloths, by what they are made of."""
+
+WOVEN_LOOKS = ("cotton", "silk", "denim")
+"""Their threads run along coordinates on the sheet at rest, which only cloths have."""
 
 FLUID = MaterialParameters(look="water")
 SMOKE = MaterialParameters(look="smoke")

@@ -20,7 +20,8 @@ LARGEST_NUMBER = 1.0e9
 def check_magnitudes(job: Job, findings: Findings) -> bool:
     """Whether every number of the scene is of a size that can be computed with; notes those that are not."""
     ok = True
-    for path, value in _numbers(job.model_dump(include={"domain", "gravity", "rigid", "fluid", "smoke", "whitewater"})):
+    scene = job.model_dump(include={"domain", "gravity", "rigid", "fluid", "smoke", "cloth", "whitewater"})
+    for path, value in _numbers(scene):
         node = schema.node_at(path)
         unit = node.unit if node is not None else ""
         is_size = unit == "m" and node is not None and node.is_positive

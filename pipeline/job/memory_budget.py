@@ -54,7 +54,9 @@ class _NvmlMemory(ctypes.Structure):
 def free_gpu_bytes() -> int | None:
     """Free memory of the first Nvidia GPU that this process may use [bytes]; None where no driver tells.
 
-    Asks the management library that comes with the driver (NVML); unlike CUDA itself it takes no memory of the GPU.
+    Asks the management library that comes with the driver (NVML); unlike CUDA itself it takes no memory of the GPU. It
+    counts GPUs by their slots, CUDA the fastest first: where they differ, name one by its UUID in CUDA_VISIBLE_DEVICES.
+    Of a GPU in slices (MIG), too, only a UUID tells which; by number it is the whole.
     """
     try:
         library = ctypes.CDLL("libnvidia-ml.so.1")

@@ -7,7 +7,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from pipeline.job.looks import BODY, FLUID, NATURAL_MATERIALS, PAINTED_LOOKS, SMOKE, SOLID, WHITEWATER
+from pipeline.job.looks import BODY, CLOTHS, FLUID, NATURAL_MATERIALS, PAINTED_LOOKS, SMOKE, SOLID, WHITEWATER
 from render.parameters import (
     CameraParameters,
     LightParameters,
@@ -18,6 +18,7 @@ from render.parameters import (
     SurfaceParameters,
     VolumeParameters,
 )
+from sim.cloth.parameters import ClothParameters
 from sim.fluid.parameters import FluidParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.scene import SceneParameters
@@ -82,12 +83,16 @@ class Job(SceneParameters):
             return own
         if any(fluid.name == body for fluid in self.fluid):
             return FLUID
+        for cloth in self.cloth:
+            if cloth.name == body:
+                return CLOTHS[cloth.material]
         return SMOKE if any(smoke.name == body for smoke in self.smoke) else SOLID
 
-    def _bodies(self) -> Iterator[RigidBodyParameters | FluidParameters | SmokeParameters]:
+    def _bodies(self) -> Iterator[RigidBodyParameters | FluidParameters | SmokeParameters | ClothParameters]:
         yield from self.rigid
         yield from self.fluid
         yield from self.smoke
+        yield from self.cloth
 
     @model_validator(mode="after")
     def _frames_or_duration(self) -> Self:

@@ -10,7 +10,7 @@ from sim.shapes.parameters import MeshShape, Placement
 
 
 def placements(job: Job) -> Iterator[tuple[KeyPath, Placement]]:
-    """Every shape that stands in the scene, with the path of its table."""
+    """Every solid that stands in the scene, with the path of its table."""
     for index, body in enumerate(job.rigid):
         yield ("rigid", index), body
     for index, fluid in enumerate(job.fluid):
@@ -26,3 +26,6 @@ def mesh_shapes(job: Job) -> Iterator[tuple[KeyPath, MeshShape]]:
     for place, placement in placements(job):
         if isinstance(placement.shape, MeshShape):
             yield (*place, "shape"), placement.shape
+    for index, cloth in enumerate(job.cloth):
+        if isinstance(cloth.shape, MeshShape):
+            yield ("cloth", index, "shape"), cloth.shape

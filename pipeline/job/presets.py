@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pipeline.job.models import Job
 from pipeline.job.overrides import Override
+from sim.cloth.parameters import RectangleSheet
 
 PREVIEW = "--preview"
 COARSENING = 2.0
-"""Particle radii and cells grow by this factor: an eighth of the particles and cells, and larger steps."""
+"""Particle radii, cells and the cells of cloths grow by this factor: an eighth of the particles and cells, a quarter of
+the nodes, and larger steps."""
 
 
 def preview_overrides(job: Job) -> list[Override]:
@@ -26,7 +28,19 @@ def preview_overrides(job: Job) -> list[Override]:
             changes.append((("fluid", index, "dt"), fluid.dt * COARSENING))
     for index, smoke in enumerate(job.smoke):
         changes.append((("smoke", index, "cell_size"), smoke.cell_size * COARSENING))
+    for index, cloth in enumerate(job.cloth):
+        # Nodes that pins name by their numbers would be others in a coarser sheet.
+        if isinstance(cloth.shape, RectangleSheet) and all(pin.index is None for pin in cloth.pin):
+            changes.append(_coarser(("cloth", index, "shape"), cloth.shape))
     return [Override(path, value, PREVIEW) for path, value in changes]
+
+
+def _coarser(path: tuple[str | int, ...], sheet: RectangleSheet) -> tuple[tuple[str | int, ...], object]:
+    """The key that divides a sheet, and its value for half as many cells along each side."""
+    if sheet.counts is None:
+        assert sheet.resolution is not None
+        return (*path, "resolution"), sheet.resolution * COARSENING
+    return (*path, "counts"), [max(2, round((count - 1) / COARSENING) + 1) for count in sheet.counts]
 
 
 def _half(pixels: int) -> int:

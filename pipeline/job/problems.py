@@ -30,12 +30,14 @@ class Findings:
         warnings: what is worth a look, in any order.
         particles: of all fluids, about.
         cells: of all smoke grids.
+        nodes: of all cloths.
     """
 
     errors: list[Problem] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)
     particles: int = 0
     cells: int = 0
+    nodes: int = 0
 
     def error(self, path: KeyPath, message: str) -> None:
         """Note what forbids the job."""

@@ -18,6 +18,15 @@ from pipeline.job.problems import quoted_list
 BEGIN = "<!-- reference: begin; written by `python -m pipeline.job.reference docs/job-file.md` -->"
 END = "<!-- reference: end -->"
 
+_KEYS_OF_TYPED = {
+    "Shape": "shape",
+    "Opening": "[[fluid.emitter]] shape",
+    "Sheet": "[[cloth]] shape",
+    "Region": "[[cloth.pin]] region",
+}
+"""The key that tables of several types stand under, by the end of their models' names."""
+FEW_TYPES = 3
+
 _SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 
 
@@ -41,10 +50,11 @@ def _tables() -> Iterator[tuple[str, str, schema.Node]]:
     yield "Top of the file", "", schema.job_schema()
     for key, property_ in schema.job_schema()["properties"].items():
         yield from _nested_tables(key, property_)
-    for name, definition in definitions.items():
-        if name.endswith("Shape"):
-            type_ = definition["properties"]["type"]["const"]
-            yield f'shape = {{ type = "{type_}", ... }}', definition["description"], definition
+    for suffix, key in _KEYS_OF_TYPED.items():
+        for name, definition in definitions.items():
+            if name.endswith(suffix):
+                type_ = definition["properties"]["type"]["const"]
+                yield f'{key} = {{ type = "{type_}", ... }}', definition["description"], definition
 
 
 def _nested_tables(path: str, property_: schema.Node) -> Iterator[tuple[str, str, schema.Node]]:
@@ -77,7 +87,7 @@ def _definition(node: schema.Node) -> schema.Node:
 
 def _section(heading: str, about: str, node: schema.Node) -> Iterator[str]:
     rows = list(_rows(node))
-    yield f"### `{heading}`" if heading.startswith(("[", "shape")) else f"### {heading}"
+    yield f"### `{heading}`" if heading.startswith("[") or "=" in heading else f"### {heading}"
     yield ""
     if about:
         yield from (" ".join(about.split()), "")
@@ -108,7 +118,8 @@ def _kind(node: schema.Node) -> str:
         options = [option for option in node["anyOf"] if option.get("type") != "null"]
         return " or ".join(_kind(option) for option in options)
     if "oneOf" in node:
-        return "a shape, see below"
+        types = sorted(node["discriminator"]["mapping"])
+        return f"{quoted_list(types)}, see below" if len(types) <= FEW_TYPES else "a shape, see below"
     if "enum" in node:
         return quoted_list(node["enum"])
     if "const" in node:

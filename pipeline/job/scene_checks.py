@@ -5,29 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.job.amounts import count, gigabytes, rounded_up
+from pipeline.job.boxes import Box, domain_box, overlap, span, touch
+from pipeline.job.cloth_checks import check_cloths
 from pipeline.job.fluid_checks import check_fluids, check_search_cells, emitted_particles, particle_room
 from pipeline.job.memory_budget import MemoryBudget, memory_budget
+from pipeline.job.mesh_checks import mesh_exists
 from pipeline.job.models import Job
 from pipeline.job.placements import placements
 from pipeline.job.positions import KeyPath
-from pipeline.job.problems import Findings, suggestion
+from pipeline.job.problems import Findings
 from pipeline.job.rigid_checks import check_rigid_start
+from pipeline.job.step_checks import check_time_steps
 from sim.fluid.parameters import FluidParameters
 from sim.scene import DomainParameters
-from sim.shapes.parameters import MeshShape, Placement
 from sim.smoke.parameters import SmokeParameters
 
 if TYPE_CHECKING:
     from sim.shapes import Solid
-
-Box = NDArray[np.float64]
-"""Lower and upper corner [m], (2, 3)."""
 
 BYTES_PER_PARTICLE = 1024
 """Upper bound of what the fluid solvers take, neighbour search and snapshots included."""
@@ -47,8 +46,6 @@ ROUND_OFF_IN_SPACINGS = 1.0e-6
 """Sizes written in decimal may fall short of a whole number of spacings by this much."""
 ALL = 1.0 - 1e-6
 """Share of a box that counts as all of it: sizes and positions written in decimal do not add up exactly."""
-SPEED_OF_SOUND_IN_SPEEDS = 10.0
-"""The numerical speed of sound over the largest expected speed, for less than 1 % compression."""
 
 
 def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -> None:
@@ -58,8 +55,10 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
     check_rigid_start(job, solids, findings)
     _check_camera(job, solids, findings)
     check_fluids(job, solids, findings)
+    check_time_steps(job, solids, findings)
     budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
     findings.particles = sum(_check_fluid(job, index, solids, budget, findings) for index in range(len(job.fluid)))
+    findings.nodes = check_cloths(job, solids, budget, findings)
     findings.cells = sum(_check_smoke(job, index, solids, budget, findings) for index in range(len(job.smoke)))
 
 
@@ -72,7 +71,7 @@ def _build_solids(job: Job, findings: Findings) -> Mapping[KeyPath, Solid]:
 
     solids = {}
     for path, placement in placements(job):
-        if not _mesh_exists(placement, (*path, "shape", "file"), findings):
+        if not mesh_exists(placement.shape, path, findings):
             continue
         try:
             solid = build_solid(placement)
@@ -85,54 +84,19 @@ def _build_solids(job: Job, findings: Findings) -> Mapping[KeyPath, Solid]:
     return solids
 
 
-def _mesh_exists(placement: Placement, path: KeyPath, findings: Findings) -> bool:
-    if not isinstance(placement.shape, MeshShape):
-        return True
-    file = Path(placement.shape.file)
-    if file.is_file():
-        return True
-    if file.is_dir():
-        findings.error(path, f"{file} is a folder, not a mesh")
-    elif not file.parent.is_dir():
-        findings.error(path, f"no such file: {file}; there is no folder {file.parent}")
-    else:
-        neighbours = [each.name for each in file.parent.iterdir()]
-        findings.error(path, f"no such file: {file}{suggestion(file.name, neighbours)}")
-    return False
-
-
 # --- places --------------------------------------------------------------------------------------------------------
-
-
-def _domain_box(domain: DomainParameters) -> Box:
-    return np.array([domain.min, domain.max])
 
 
 def _smoke_box(smoke: SmokeParameters, domain: DomainParameters) -> Box:
     return np.array([smoke.min or domain.min, smoke.max or domain.max])
 
 
-def _overlap(a: Box, b: Box) -> float:
-    """Share of box `a` that lies in box `b` [-]."""
-    sides = np.minimum(a[1], b[1]) - np.maximum(a[0], b[0])
-    return float(np.prod(np.clip(sides, 0.0, None)) / np.prod(a[1] - a[0]))
-
-
-def _touch(a: Box, b: Box, *, margin: float) -> bool:
-    """Whether two boxes come closer than a margin [m]; far cheaper than signed distances of a mesh."""
-    return bool(np.all((a[0] - margin <= b[1]) & (b[0] - margin <= a[1])))
-
-
-def _span(box: Box) -> str:
-    return " ".join(f"{axis} {low:.4g}..{high:.4g}" for axis, low, high in zip("xyz", *box, strict=True)) + " m"
-
-
 def _check_rigid_bodies(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    domain = _domain_box(job.domain)
+    domain = domain_box(job.domain)
     regions = [domain, *(_smoke_box(smoke, job.domain) for smoke in job.smoke)]
     for path, solid in solids.items():
-        if path[0] == "rigid" and not any(_overlap(solid.bounds, region) for region in regions):
-            findings.error(path, f"is wholly outside the domain: it spans {_span(solid.bounds)}, not {_span(domain)}")
+        if path[0] == "rigid" and not any(overlap(solid.bounds, region) for region in regions):
+            findings.error(path, f"is wholly outside the domain: it spans {span(solid.bounds)}, not {span(domain)}")
 
 
 def _check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
@@ -140,7 +104,7 @@ def _check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings)
         return
     eye = np.array([job.camera.position])
     for path, solid in solids.items():
-        if path[0] == "smoke" or not _touch(solid.bounds, np.repeat(eye, 2, axis=0), margin=0.0):
+        if path[0] == "smoke" or not touch(solid.bounds, np.repeat(eye, 2, axis=0), margin=0.0):
             continue
         if solid.signed_distance(eye)[0] < 0.0:
             name = getattr(job, str(path[0]))[path[1]].name
@@ -166,14 +130,13 @@ def _check_fluid(
         remedy = ", or give emitters an end_s, or the fluid max_particles" if fluid.emitter else ""
         findings.error(
             ("fluid", index, "particle_radius"),
-            f"{_count(expected)} particles need {_gigabytes(expected * each)}, {budget.owner} has "
-            f"{_gigabytes(budget.bytes)}; at most {_count(possible)} fit: "
-            f"use {_rounded_up(radius):g} m or more{remedy}",
+            f"{count(expected)} particles need {gigabytes(expected * each)}, {budget.owner} has "
+            f"{gigabytes(budget.bytes)}; at most {count(possible)} fit: "
+            f"use {rounded_up(radius):g} m or more{remedy}",
         )
         return int(expected)
     _check_domain_size(job.domain, fluid, budget, findings)
-    _check_time_step(job, index, findings)
-    lattice = _Lattice(_domain_box(job.domain), obstacles, spacing, max(1.0, (expected / COUNTED_PARTICLES) ** (1 / 3)))
+    lattice = _Lattice(domain_box(job.domain), obstacles, spacing, max(1.0, (expected / COUNTED_PARTICLES) ** (1 / 3)))
     start = sum(_check_block(path, solid, lattice, findings) for path, solid in blocks.items())
     most = math.inf if fluid.max_particles is None else max(start, fluid.max_particles)
     return int(min(start + emitted_particles(job, fluid), most))
@@ -188,15 +151,15 @@ def _check_domain_size(
     domain: DomainParameters, fluid: FluidParameters, budget: MemoryBudget, findings: Findings
 ) -> None:
     """The whole domain is covered by cells for the neighbour search, and its walls by samples, fluid or not."""
-    box = _domain_box(domain)
+    box = domain_box(domain)
     x, y, z = (box[1] - box[0]) / (2.0 * fluid.particle_radius)
     need = x * y * z / 8.0 * BYTES_PER_SEARCH_CELL + 2.0 * (x * y + y * z + z * x) * BYTES_PER_WALL_SAMPLE
     if need > budget.bytes:
-        radius = _rounded_up(fluid.particle_radius * math.sqrt(need / budget.bytes))
+        radius = rounded_up(fluid.particle_radius * math.sqrt(need / budget.bytes))
         findings.error(
             ("domain",),
             f"is so large that walls and search cells for particles of {fluid.particle_radius:g} m need "
-            f"{_gigabytes(need)}, {budget.owner} has {_gigabytes(budget.bytes)}; "
+            f"{gigabytes(need)}, {budget.owner} has {gigabytes(budget.bytes)}; "
             f"make it smaller, or particle_radius {radius:g} m",
         )
     else:
@@ -228,7 +191,7 @@ class _Lattice:
         points = fill_with_particles(solid, step, lower=self.box[0], upper=self.box[1])
         free = np.ones(len(points), dtype=bool)
         for obstacle in self.obstacles:
-            if not _touch(obstacle.bounds, solid.bounds, margin=step):
+            if not touch(obstacle.bounds, solid.bounds, margin=step):
                 continue
             free &= obstacle.signed_distance(points.astype(np.float64)) >= (1.0 - ROUNDING) * step / 2
         left = int(np.count_nonzero(free))
@@ -244,9 +207,9 @@ class _Lattice:
 
 def _check_block(path: KeyPath, solid: Solid, lattice: _Lattice, findings: Findings) -> int:
     """Particles in a block, about."""
-    inside = _overlap(solid.bounds, lattice.box)
+    inside = overlap(solid.bounds, lattice.box)
     if inside == 0.0:
-        spans = f"it spans {_span(solid.bounds)}, not {_span(lattice.box)}"
+        spans = f"it spans {span(solid.bounds)}, not {span(lattice.box)}"
         findings.error(path, f"is wholly outside the domain: {spans}")
         return 0
     if inside < ALL:
@@ -255,8 +218,8 @@ def _check_block(path: KeyPath, solid: Solid, lattice: _Lattice, findings: Findi
     if kept_out and not left:
         findings.error(path, "lies wholly inside solid bodies, so it holds no particle; move it")
     elif kept_out:
-        filled = _count(left + kept_out)
-        findings.warn(path, f"overlaps a solid body: {_count(kept_out)} of its {filled} particles are left out")
+        filled = count(left + kept_out)
+        findings.warn(path, f"overlaps a solid body: {count(kept_out)} of its {filled} particles are left out")
     elif not left and lattice.coarsening == 1.0:
         thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
         findings.error(
@@ -265,29 +228,6 @@ def _check_block(path: KeyPath, solid: Solid, lattice: _Lattice, findings: Findi
             "enlarge it or use a smaller particle_radius",
         )
     return left
-
-
-def _check_time_step(job: Job, index: int, findings: Findings) -> None:
-    """Warn of a fixed step beyond the CFL bound at the speed that a fall through the domain gives."""
-    fluid = job.fluid[index]
-    if fluid.dt == "adaptive":
-        return
-    stable = _expected_stable_dt(job, fluid)
-    if fluid.dt > stable:
-        findings.warn(
-            ("fluid", index, "dt"),
-            f'{fluid.dt:g} s is above the stable step of about {stable:.2g} s and may blow up; use "adaptive"',
-        )
-
-
-def _expected_stable_dt(job: Job, fluid: FluidParameters) -> float:
-    """CFL bound [s]: cfl 0.4 d / (c_s + v), with v from the initial speed and a fall through the domain."""
-    diagonal = math.dist(job.domain.min, job.domain.max)
-    fall = 2.0 * math.hypot(*job.gravity) * diagonal
-    speeds = [math.hypot(*block.velocity) for block in fluid.block] + [emitter.speed for emitter in fluid.emitter]
-    speed = math.sqrt(fall + max(speeds, default=0.0) ** 2)
-    sound = fluid.sound_speed or SPEED_OF_SOUND_IN_SPEEDS * speed
-    return fluid.cfl * 0.4 * 2.0 * fluid.particle_radius / (sound + speed) if sound + speed > 0.0 else math.inf
 
 
 # --- smoke ---------------------------------------------------------------------------------------------------------
@@ -302,7 +242,7 @@ def _check_smoke(
     extent = box[1] - box[0]
     if np.any(extent <= 0.0):
         corner = "max" if smoke.max is not None else "min"
-        findings.error(("smoke", index, corner), f"max must be above min on every axis, got {_span(box)}")
+        findings.error(("smoke", index, corner), f"max must be above min on every axis, got {span(box)}")
         return 0
     if np.any(extent < 4.0 * smoke.cell_size):
         findings.error(
@@ -316,9 +256,9 @@ def _check_smoke(
         size = smoke.cell_size * (cells / possible) ** (1.0 / 3.0)
         findings.error(
             ("smoke", index, "cell_size"),
-            f"{_count(cells)} cells need {_gigabytes(cells * BYTES_PER_CELL)}, "
-            f"{budget.owner} has {_gigabytes(budget.bytes)}; "
-            f"at most {_count(possible)} fit: use {_rounded_up(size):g} m or more",
+            f"{count(cells)} cells need {gigabytes(cells * BYTES_PER_CELL)}, "
+            f"{budget.owner} has {gigabytes(budget.bytes)}; "
+            f"at most {count(possible)} fit: use {rounded_up(size):g} m or more",
         )
     for path, solid in solids.items():
         if path[:3] == ("smoke", index, "source"):
@@ -327,30 +267,10 @@ def _check_smoke(
 
 
 def _check_source(path: KeyPath, solid: Solid, grid: Box, cell_size: float, findings: Findings) -> None:
-    inside = _overlap(solid.bounds, grid)
+    inside = overlap(solid.bounds, grid)
     if inside == 0.0:
-        findings.error(path, f"is wholly outside the smoke's grid: it spans {_span(solid.bounds)}, not {_span(grid)}")
+        findings.error(path, f"is wholly outside the smoke's grid: it spans {span(solid.bounds)}, not {span(grid)}")
     elif inside < ALL:
         findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the smoke's grid and emit nothing")
     if np.min(solid.bounds[1] - solid.bounds[0]) < cell_size:
         findings.warn(path, f"is thinner than a cell of {cell_size:g} m and may emit nothing; enlarge it")
-
-
-# --- numbers in words ----------------------------------------------------------------------------------------------
-
-
-def _count(number: float) -> str:
-    for limit, unit in ((1e9, "billion"), (1e6, "million")):
-        if number >= limit:
-            return f"{number / limit:.3g} {unit}"
-    return f"{number:.0f}"
-
-
-def _gigabytes(size_bytes: float) -> str:
-    return f"{size_bytes / 1e9:.3g} GB"
-
-
-def _rounded_up(value: float) -> float:
-    """To two significant digits, upwards, so that the number is short and still fits."""
-    step = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return float(f"{math.ceil(value / step) * step:.2g}")

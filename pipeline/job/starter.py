@@ -118,10 +118,40 @@ look = "smoke"
 look = "ceramic"
 """
 
+_CLOTH = """
+[domain]
+min = [-0.6, -0.6, 0.0]
+max = [0.6, 0.6, 1.0]
+open_faces = ["x-", "x+", "y-", "y+", "z+"]     # a floor, and no walls
+
+[[rigid]]
+name = "ball"
+shape = { type = "sphere", radius = 0.2 }
+position = [0.0, 0.0, 0.3]
+friction = 0.4
+
+[[cloth]]                       # falls onto the ball and drapes over it
+name = "sheet"
+material = "cotton"             # or silk, denim, rubber
+shape = { type = "rectangle", size = [0.9, 0.9], resolution = 0.01 }    # half of it: four times the nodes, finer folds
+position = [0.0, 0.0, 0.6]
+rotation_deg = [0.0, 0.0, 20.0]
+thickness = 1.0e-3
+
+# [[cloth.pin]]                 # holds a corner, until it is let go
+# corner = "x-y-"
+# release_s = 0.5
+
+[material.sheet]
+look = "cotton"
+color = [0.09, 0.20, 0.36]
+"""
+
 _SCENES: Mapping[str, tuple[str, str]] = {
     "dam-break": ("2.0", _DAM_BREAK),
     "drop": ("1.5", _DROP),
     "smoke": ("3.0", _SMOKE),
+    "cloth": ("2.0", _CLOTH),
 }
 TEMPLATES = tuple(_SCENES)
 

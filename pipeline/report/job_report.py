@@ -13,9 +13,10 @@ from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.manifest_reader import ManifestReader, StageTiming
+from pipeline.quantities import COUNT_OF_FLUID
 from pipeline.report.panels import JobNumbers
 from pipeline.solver_numbers import Warned, simulation_numbers
-from pipeline.task import TaskState
+from pipeline.task import ArtifactPath, TaskState
 
 SHEET_PICTURES, SHEET_COLUMNS = 12, 4
 SHEET_WIDTH = 1200
@@ -36,6 +37,7 @@ class JobReport:
         numbers: what the solvers told.
         warnings: what they warned of.
         unreadable: frames of the cache that cannot be read.
+        unreadable_whitewater: files of whitewater that cannot.
         sheet: its pictures side by side, as the bytes of a WebP picture; None before there are any.
     """
 
@@ -48,6 +50,7 @@ class JobReport:
     numbers: JobNumbers
     warnings: tuple[Warned, ...]
     unreadable: tuple[int, ...]
+    unreadable_whitewater: tuple[ArtifactPath, ...]
     sheet: bytes | None
 
     @property
@@ -63,12 +66,22 @@ class JobReport:
             "pictures": f"{width} × {height}, {job.render.quality} quality",
         }
         for fluid in job.fluid:
-            count = frames[-1].solvers.get(fluid.name, {}).get("particle_count") if frames else None
+            count = self._particle_count(fluid.name)
             particles = f"{count:,.0f} particles of" if count is not None else "particles of"
             facts[fluid.name] = f"{fluid.solver.upper()}, {particles} radius {fluid.particle_radius:g} m"
         for smoke in job.smoke:
             facts[smoke.name] = f"smoke, cells of {smoke.cell_size:g} m"
+        for cloth in job.cloth:
+            facts[cloth.name] = f"cloth of {cloth.material}, {cloth.mass_per_area:g} kg/m²"
         return facts
+
+    def _particle_count(self, fluid: str) -> float | None:
+        """Particles of a fluid in the last frame: of its own solver, or its part of those that share one."""
+        solvers = self.numbers.frames[-1].solvers if self.numbers.frames else {}
+        shared = next(
+            (of[f"{COUNT_OF_FLUID}{fluid}"] for of in solvers.values() if f"{COUNT_OF_FLUID}{fluid}" in of), None
+        )
+        return solvers.get(fluid, {}).get("particle_count", shared)
 
     def as_json(self) -> dict[str, object]:
         """All numbers for machines."""
@@ -81,6 +94,7 @@ class JobReport:
             "stages": [timing._asdict() for timing in self.timings],
             "warnings": [each.as_json() for each in self.warnings],
             "unreadable_frames": list(self.unreadable),
+            "unreadable_whitewater": list(self.unreadable_whitewater),
             "frame": [frame.frame for frame in frames],
             "time_s": [frame.time_s for frame in frames],
             "solvers": {
@@ -116,6 +130,7 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         numbers=JobNumbers(title, simulation.frames),
         warnings=tuple(simulation.warnings()),
         unreadable=simulation.unreadable,
+        unreadable_whitewater=simulation.unreadable_whitewater,
         sheet=_sheet(layout, picture_width=job.render.resolution[0]),
     )
 

@@ -61,6 +61,8 @@ def _warnings(report: JobReport) -> str:
     if report.unreadable:
         frames = frame_ranges(report.unreadable, range(report.unreadable[-1] + 1))
         sentences.append(f"frames of the cache that cannot be read: {frames}")
+    if report.unreadable_whitewater:
+        sentences.append(f"whitewater that cannot be read: {', '.join(report.unreadable_whitewater)}")
     items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
     return f'<ul class="warnings">{items}</ul>' if items else '<p class="quiet">No warnings.</p>'
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pipeline.stages.base import Stage
 from pipeline.stages.bodies import BodiesStage
+from pipeline.stages.cloth import ClothStage
 from pipeline.stages.movie import MovieStage
 from pipeline.stages.render import RenderStage
 from pipeline.stages.simulate import SimulateStage
@@ -15,6 +16,7 @@ STAGES: tuple[Stage, ...] = (
     BodiesStage(),
     SimulateStage(),
     SurfaceStage(),
+    ClothStage(),
     VolumeStage(),
     WhitewaterStage(),
     RenderStage(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from math import inf, prod
@@ -11,13 +12,17 @@ from typing import TypeVar
 from blake3 import blake3
 
 from pipeline.errors import MissingInputError
+from sim.cloth.parameters import ClothParameters, RectangleSheet
 from sim.scene import SceneParameters
 from sim.shapes.parameters import MeshShape, Placement
 
 ABSENT = "absent"
 """Version of a package that is not installed."""
 
-P = TypeVar("P", bound=Placement)
+P = TypeVar("P", Placement, ClothParameters)
+
+BYTES_PER_VERTEX = 12
+"""Least that a vertex takes in a mesh file: three float32; its triangles come on top."""
 
 
 @cache
@@ -51,6 +56,7 @@ def bodies_by_content(scene: SceneParameters) -> dict[str, object]:
         "rigid": [by_content(body) for body in scene.rigid],
         "fluid": [fluid.model_copy(update={"block": tuple(map(by_content, fluid.block))}) for fluid in scene.fluid],
         "smoke": [smoke.model_copy(update={"source": tuple(map(by_content, smoke.source))}) for smoke in scene.smoke],
+        "cloth": [by_content(cloth) for cloth in scene.cloth],
     }
 
 
@@ -65,16 +71,40 @@ def most_particles(scene: SceneParameters) -> float:
     return sum(min(volume / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf) for fluid in scene.fluid)
 
 
+def most_cloth_nodes(scene: SceneParameters) -> int:
+    """Upper bound of the number of nodes of all cloths; of meshes by the size of the file, which is not read.
+
+    Raises:
+        MissingInputError: a mesh file cannot be read.
+    """
+    return sum(
+        prod(cloth.shape.node_counts)
+        if isinstance(cloth.shape, RectangleSheet)
+        else _status(cloth.shape.file).st_size // BYTES_PER_VERTEX
+        for cloth in scene.cloth
+    )
+
+
 def _content_name(file: str) -> str:
     """Hash and suffix, for the suffix decides how the file is read."""
-    path = Path(file)
+    status = _status(file)
+    return _hash(file, status.st_size, status.st_mtime_ns) + Path(file).suffix.lower()
+
+
+def _status(file: str) -> os.stat_result:
     try:
-        status = path.stat()
-        return _hash(file, status.st_size, status.st_mtime_ns) + path.suffix.lower()
+        return Path(file).stat()
     except OSError as error:
-        raise MissingInputError(f"cannot read the mesh {file}: {error.strerror}; the job needs it") from error
+        raise _missing(file, error) from error
+
+
+def _missing(file: str, error: OSError) -> MissingInputError:
+    return MissingInputError(f"cannot read the mesh {file}: {error.strerror}; the job needs it")
 
 
 @cache
 def _hash(file: str, _size: int, _mtime_ns: int) -> str:
-    return blake3(Path(file).read_bytes()).hexdigest()
+    try:
+        return blake3(Path(file).read_bytes()).hexdigest()
+    except OSError as error:
+        raise _missing(file, error) from error

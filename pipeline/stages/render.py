@@ -126,6 +126,12 @@ def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
         for fluid in job.fluid
     ]
     objects += [
+        MeshSequenceObject(
+            name=cloth.name, file=f"cloths/{cloth.name}/{{frame}}.ply", material=job.material_of(cloth.name)
+        )
+        for cloth in job.cloth
+    ]
+    objects += [
         PointSequenceObject(
             name=f"{fluid}.{kind}",
             file=f"whitewater/{fluid}/{{frame}}.ply",
@@ -189,9 +195,10 @@ def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]
     surfaces = [layout.surface(fluid.name, frame) for fluid in job.fluid]
     volumes = [layout.volume(smoke.name, frame) for smoke in job.smoke]
     points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+    cloths = [layout.cloth(cloth.name, frame) for cloth in job.cloth]
     # The cache changes with every change of the simulation, so it is an input only where something of it is drawn.
-    cached = [layout.frame_cache(frame)] if moving_bodies(job) or not surfaces + volumes else []
-    return surfaces + volumes + points + cached
+    cached = [layout.frame_cache(frame)] if moving_bodies(job) or not surfaces + cloths + volumes else []
+    return surfaces + cloths + volumes + points + cached
 
 
 def _write_poses(context: TaskContext, frame: int) -> None:

@@ -6,7 +6,8 @@ Frames and checkpoints are written while the next frame is computed; see docs/de
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from math import ceil
 
@@ -20,7 +21,13 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import bodies_by_content, domain_volume, most_particles, tool_version
+from pipeline.stages.inputs import (
+    bodies_by_content,
+    domain_volume,
+    most_cloth_nodes,
+    most_particles,
+    tool_version,
+)
 from pipeline.stages.ordered_writer import WAITING, OrderedWriter
 from pipeline.task import Resources, Task, TaskId
 from sim.scene import SceneParameters
@@ -32,15 +39,17 @@ CHECKPOINT_INTERVAL_S = 30.0
 
 CHECKPOINTS_KEPT = 2
 
-SNAPSHOTS_AT_ONCE = 4 + WAITING
-"""The one that is written, what is read back of it, the ones that wait for that, the newest before it finds a place in
-the queue, and what goes into its making."""
+SNAPSHOTS_AT_ONCE = 5 + WAITING
+"""The one that is written, its file in memory and a copy of that, or what is read back of it, the ones that wait for
+that, the newest before it finds a place in the queue, and what goes into its making."""
 WORKER_BYTES = 800_000_000
 """Interpreter, compiler and the driver's share of the host's memory; an estimate, on the safe side."""
 BYTES_PER_PARTICLE = 80
 """A checkpoint's position, velocity, number and reference position, and sorting; a frame takes 32."""
 BYTES_PER_CELL = 24
 """Five float32 in a frame, five with ghosts in a checkpoint."""
+BYTES_PER_CLOTH_NODE = 60
+"""Position, velocity, coordinates and two triangles in a frame; a checkpoint takes 36."""
 
 
 class SimulateStage:
@@ -51,7 +60,7 @@ class SimulateStage:
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""
-        scene = {name: getattr(job, name) for name in SceneParameters.model_fields if name != "cloth"}
+        scene = {name: getattr(job, name) for name in SceneParameters.model_fields}
         return [
             Task(
                 id=TaskId("simulate"),
@@ -129,7 +138,10 @@ class _Simulation:
             self._hand_in_checkpoint(writer)
 
     def _commit(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
-        with self._context.committing(self._context.task.outputs[report.frame], validate_frame) as path:
+        with (
+            _saying(f"while frame {report.frame} was written"),
+            self._context.committing(self._context.task.outputs[report.frame], validate_frame) as path,
+        ):
             write_frame(path, bodies, report, device=self._device)
 
     def _require_device_of_committed_frames(self, missing: Collection[int]) -> None:
@@ -181,14 +193,25 @@ class _Simulation:
         """
         path = self._folder / f"{frame:06d}.h5"
         part = self._folder / f".{path.name}.part.{self._context.attempt}"
-        write_checkpoint(part, Checkpoint(frame, self._context.fingerprint, self._device, arrays))
-        read_checkpoint(part)
-        sync(part)
+        with _saying(f"while the checkpoint of frame {frame} was written"):
+            write_checkpoint(part, Checkpoint(frame, self._context.fingerprint, self._device, arrays))
+            read_checkpoint(part)
+            sync(part)
         part.replace(path)
         sync(self._folder)
         so_far = sorted(each for each in self._folder.glob("[0-9]*.h5") if each.name <= path.name)
         for old in so_far[:-CHECKPOINTS_KEPT]:
             old.unlink()
+
+
+@contextmanager
+def _saying(note: str) -> Iterator[None]:
+    """Give errors a note: by the time that the computing thread raises them it is some frames ahead."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(note)
+        raise
 
 
 def _resources(job: Job) -> Resources:
@@ -206,7 +229,8 @@ def _resources(job: Job) -> Resources:
 def _snapshot_bytes(job: Job) -> int:
     """Upper bound of what a snapshot or a checkpoint takes: no fluid holds more than fills the domain."""
     cells = sum(domain_volume(job) / smoke.cell_size**3 for smoke in job.smoke)
-    return ceil(most_particles(job) * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL)
+    nodes = most_cloth_nodes(job)
+    return ceil(most_particles(job) * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL + nodes * BYTES_PER_CLOTH_NODE)
 
 
 def _describe(report: FrameReport) -> str:

@@ -7,8 +7,9 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
+from pipeline.stages.body_frames import tasks_of_bodies
 from pipeline.stages.inputs import tool_version
-from pipeline.task import Resources, Task, TaskId
+from pipeline.task import Resources, Task
 
 MEMORY_BYTES = 500_000_000
 """What meshing half a million particles was measured to take (425 MB at 512,000, 76 MB at 16,000). How many there are
@@ -29,20 +30,9 @@ class SurfaceStage:
             tools={"pysplashsurf": tool_version("pysplashsurf")},
             surface=job.surface,
         )
-        return [
-            Task(
-                id=TaskId(f"surface/{fluid.name}/{frame:06d}"),
-                stage=self.name,
-                inputs=(layout.frame_cache(frame),),
-                outputs=(layout.surface(fluid.name, frame),),
-                parameters=parameters,
-                subject=fluid.name,
-                frame=frame,
-                resources=Resources(memory_bytes=MEMORY_BYTES),
-            )
-            for fluid in job.fluid
-            for frame in range(job.frame_count)
-        ]
+        resources = Resources(memory_bytes=MEMORY_BYTES)
+        fluids = [(fluid.name, resources) for fluid in job.fluid]
+        return tasks_of_bodies(self.name, job, layout, bodies=fluids, output=layout.surface, parameters=parameters)
 
     def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
         """None: its packages are always there."""

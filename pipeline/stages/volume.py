@@ -9,8 +9,9 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
+from pipeline.stages.body_frames import tasks_of_bodies
 from pipeline.stages.inputs import ABSENT, tool_version
-from pipeline.task import Resources, Task, TaskId
+from pipeline.task import Resources, Task
 from sim.scene import DomainParameters
 from sim.smoke.parameters import SmokeParameters
 
@@ -36,20 +37,11 @@ class VolumeStage:
             fps=job.fps,
             shutter=job.render.shutter,
         )
-        return [
-            Task(
-                id=TaskId(f"volume/{smoke.name}/{frame:06d}"),
-                stage=self.name,
-                inputs=(layout.frame_cache(frame),),
-                outputs=(layout.volume(smoke.name, frame),),
-                parameters=parameters,
-                subject=smoke.name,
-                frame=frame,
-                resources=Resources(memory_bytes=WORKER_BYTES + BYTES_PER_CELL * _cells(smoke, job.domain)),
-            )
+        smokes = [
+            (smoke.name, Resources(memory_bytes=WORKER_BYTES + BYTES_PER_CELL * _cells(smoke, job.domain)))
             for smoke in job.smoke
-            for frame in range(job.frame_count)
         ]
+        return tasks_of_bodies(self.name, job, layout, bodies=smokes, output=layout.volume, parameters=parameters)
 
     def obstacles(self, job: Job) -> list[str]:
         """No OpenVDB."""

@@ -41,7 +41,7 @@ class WhitewaterStage:
     """
 
     name = "whitewater"
-    version = 2
+    version = 3
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame of each fluid that has whitewater."""
@@ -70,12 +70,12 @@ class WhitewaterStage:
         """Make one frame of one fluid's whitewater."""
         from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
 
-        cloud, not_generated = _next_cloud(context)
+        cloud, not_made = _next_cloud(context)
         with context.committing(context.task.outputs[0], validate_point_cloud) as path:
             write_point_cloud(
-                path, PointCloud(cloud.position, cloud.velocity, cloud.radius, cloud.lifetime, cloud.kind)
+                path, PointCloud(cloud.position, cloud.velocity, cloud.radius, cloud.lifetime, cloud.kind, not_made)
             )
-        lacking = f", {not_generated} more had no room below max_particles" if not_generated else ""
+        lacking = f", {not_made} more had no room below max_particles" if not_made else ""
         context.progress(1, 1, f"{len(cloud)} particles{lacking}")
 
     def _parameters(self, job: Job, fluid: str) -> ParameterSet:

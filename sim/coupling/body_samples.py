@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
+from scipy.stats import qmc
 
 from sim.fluid.boundary_akinci2012 import BoundarySamples, sink_samples
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate
@@ -17,14 +20,22 @@ if TYPE_CHECKING:
 
 SignedDistance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-MOST_PROBES = 400
-"""Points at which a body's field is compared with the fluid that it displaces: their mean is within 1 %."""
+MOST_PROBES = 3000
+"""Points at which a body's field is compared with the fluid that it displaces, at most: a cube of 22 spacings has so
+many samples."""
 
-CELLS_PER_SPACING = 4
-"""Fineness of the sum over the inside of a body."""
+QUADRATURE_BITS = 8
+"""Binary digits of the number of points in a cube around each; half of them are within the support."""
+
+PROBES_AT_A_TIME = 1000
+"""The distances of some hundred points around each are asked for together: 6 MiB of points."""
 
 OUTWARD_ROUNDS = 4
 """Steps by which points of the surface are moved out to where particles touch it."""
+
+LEAST_FACTOR = 0.25
+"""With a quarter a particle amid the samples of a sheet still has 6/4 of the rest density from them alone, so that none
+gets through."""
 
 
 def samples_of_moving_bodies(
@@ -37,63 +48,77 @@ def samples_of_moving_bodies(
         spacing: particle spacing of the fluid [m].
         support_in_spacings: support radius of its kernel.
     """
-    samples, factors = [], []
+    samples = []
     for index in range(len(rigid.bodies)):
         surface, signed_distance = rigid.body_samples(index, spacing), rigid.signed_distance_in_body_frame(index)
         sunk = sink_samples(surface, signed_distance, spacing, support_in_spacings)
-        samples.append(sunk)
-        factor = completing_factor(sunk, surface, signed_distance, spacing, support_in_spacings)
-        factors.append(np.full(len(sunk), factor))
-    bare = BoundarySamples.of_bodies(*samples)
-    return BoundarySamples(bare.positions, bare.body, np.concatenate([*factors, np.empty(0)]))
+        factors = completing_factors(sunk, surface, signed_distance, spacing, support_in_spacings)
+        samples.append(sunk.scaled(factors))
+    return BoundarySamples.of_bodies(*samples)
 
 
-def completing_factor(
-    samples: NDArray[np.floating],
+def completing_factors(
+    samples: BoundarySamples,
     surface: NDArray[np.floating],
     signed_distance: SignedDistance,
     spacing: float,
     support_in_spacings: float = SUPPORT_IN_SPACINGS,
-) -> float:
-    """Factor on the volumes of a body's samples that completes the density of the fluid that touches the body.
+) -> NDArray[np.float64]:
+    """Factors on the volumes of a body's samples that complete the density of the fluid that touches the body, (m,).
 
     A particle that touches the body, half a spacing off, lacks the density that fluid in place of the body would give,
-    the integral of W over the inside; the samples are to give as much in the mean over the surface. Flat walls do, by
-    their calibration. The samples of a curved body lie on a smaller surface than the one they stand for, and give too
-    little: a sphere of three spacings radius a fifth. Fluid would come nearer, and the body displace too little of it.
-    Where a body is thinner than its samples should be deep, they give too much; but weaker samples all over would let
-    fluid come too near elsewhere, so that the factor is 1 then.
+    the integral of W over the inside; the samples are to give as much all over the surface. Flat walls do, by their
+    calibration. The samples of a curved body lie on a smaller surface than the one they stand for, and give too little:
+    a sphere of three spacings radius a fifth. Fluid would come nearer, and the body displace too little of it. Where a
+    body is thinner than its samples should be deep, they give too much, and the body would displace too much.
+
+    A sample's factor is the mean of what lacks at the points of the surface that it reaches, over the mean of what they
+    get, both weighted by its part in them. Nearby samples have similar factors then, which exact completeness at every
+    point would not give: which of them gives how much is an ill-posed question.
 
     Args:
-        samples: sunk into the body [m], (m, 3).
+        samples: sunk into the body.
         surface: points spread evenly over its surface [m], (k, 3).
         signed_distance: of points (n, 3) to the surface [m], (n,); negative inside.
         spacing: particle spacing of the fluid [m].
         support_in_spacings: support radius of its kernel.
     """
     support = support_in_spacings * spacing
-    random = np.random.default_rng(0)
-    chosen = random.permutation(len(surface))[:MOST_PROBES]
+    chosen = np.random.default_rng(0).permutation(len(surface))[:MOST_PROBES]
     probes = _moved_out(np.asarray(surface, dtype=np.float64)[chosen], signed_distance, 0.5 * spacing)
+    lacking = _flat_share(spacing, support_in_spacings) * _share_inside(probes, signed_distance, support)
 
-    cell = spacing / CELLS_PER_SPACING
-    axis = np.arange(-CELLS_PER_SPACING * support_in_spacings, CELLS_PER_SPACING * support_in_spacings + 1) * cell
-    offsets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    offsets = offsets[np.linalg.norm(offsets, axis=1) < support]
+    points = samples.positions.astype(np.float64)
+    pairs = cKDTree(probes).sparse_distance_matrix(cKDTree(points), support, output_type="coo_matrix")
+    volumes = samples.volumes(spacing, support_in_spacings)
+    weights = csr_matrix(
+        (volumes[pairs.col] * evaluate(pairs.data, support), (pairs.row, pairs.col)), shape=pairs.shape
+    )
+    given = np.asarray(weights.sum(axis=1)).ravel()
+    given_by_reached = weights.T @ given
+    reached = given_by_reached > 0.0
+    if not reached.any():
+        return np.ones(len(points))
+    factors = (weights.T @ lacking)[reached] / given_by_reached[reached]
+    # Means that weigh strong points more are too low; over the whole surface nothing is to lack.
+    factors *= lacking.sum() / (weights[:, np.flatnonzero(reached)] @ factors).sum()
+    factors = np.maximum(factors, LEAST_FACTOR)
+    # A large body has too few probes for all its samples: the others do as those nearby.
+    return factors[cKDTree(points[reached]).query(points)[1]]
+
+
+def _share_inside(probes: NDArray[np.float64], signed_distance: SignedDistance, support: float) -> NDArray[np.float64]:
+    """Integral of W over the inside of a body around each probe [-], (n,)."""
+    # Points of low discrepancy: of a lattice whole layers would change sides where a face is parallel to it.
+    cube = 2.0 * qmc.Sobol(3, seed=1).random_base2(QUADRATURE_BITS) - 1.0
+    offsets = support * cube[np.linalg.norm(cube, axis=1) < 1.0]
     weights = evaluate(np.linalg.norm(offsets, axis=1), support)
     weights /= weights.sum()
-    missing = given = 0.0
-    tree = cKDTree(samples)
-    volumes = BoundarySamples.of_bodies(samples).volumes(spacing, support_in_spacings)
-    for probe in probes:
-        shifted = probe + offsets + cell * (random.random(3) - 0.5)
-        missing += float(weights[signed_distance(shifted) < 0.0].sum())
-        near = tree.query_ball_point(probe, support)
-        distance = np.linalg.norm(np.asarray(samples, dtype=np.float64)[near] - probe, axis=1)
-        given += float(volumes[near] @ evaluate(distance, support))
-    if given == 0.0:
-        return 1.0
-    return max(1.0, missing / given * _flat_share(spacing, support_in_spacings))
+    shares = [np.empty(0)]
+    for batch in np.array_split(probes, math.ceil(len(probes) / PROBES_AT_A_TIME)):
+        inside = signed_distance((batch[:, None] + offsets).reshape(-1, 3)) < 0.0
+        shares.append(inside.reshape(len(batch), -1) @ weights)
+    return np.concatenate(shares)
 
 
 def _flat_share(spacing: float, support_in_spacings: float) -> float:

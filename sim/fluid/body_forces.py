@@ -13,7 +13,7 @@ from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
 from sim.fluid.kernels import TINY_DISTANCE, spline_slope
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, viscous_factor
 from sim.launch import fast_launch
-from sim.neighbors import ROUNDING_MARGIN
+from sim.neighbor_kernels import ROUNDING_MARGIN
 
 CHUNK = 64
 """Samples of a body that one node of the sum takes together."""
@@ -78,7 +78,7 @@ class BodyForces:
             return
         search = (
             boundary.position, boundary.fixed_count, boundary.moving_count, *points.coordinates, points.cell_start,
-            ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape), self._search_radius**2,
+            ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape), grid.reach, self._search_radius**2,
             self._near_count,
         )  # fmt: skip
         count_particles_near_samples(*search)
@@ -89,22 +89,28 @@ class BodyForces:
             self._near = ti.ndarray(ti.i32, int(starts[-1] * GROWTH))
         list_particles_near_samples(*search, self._near_start, self._near)
 
-    def gather(self, *terms: Any, dt: float) -> None:
+    def let_bodies_respond(self, gravity: tuple[float, float, float], spacing: float) -> None:
+        """From now on the bodies' samples, if there are any, answer to forces within the step.
+
+        Args:
+            gravity: [m/s²].
+            spacing: of the particles [m].
+        """
+        if self._boundary.moving_count > 0 and self.response is None:
+            self.response = BodyResponse(self._boundary, gravity, spacing)
+
+    def gather(self, *terms: Any, dt: float, sample_velocity: ti.Ndarray | None = None) -> None:
         """Add the impulses of a step, from forces that the fluid has just felt.
 
         Args:
             terms: what `gather_sample_forces` takes of the fluid, from `position` on.
             dt: the step [s].
+            sample_velocity: of the boundary samples, as the fluid felt them [m/s]; their present ones if omitted.
         """
-        boundary = self._boundary
-        if boundary.moving_count == 0:
+        if self._boundary.moving_count == 0:
             return
-        gather_sample_forces(
-            boundary.position, boundary.velocity, boundary.volume, boundary.fixed_count, boundary.moving_count,
-            *self.near, *terms, self._force,
-        )  # fmt: skip
-        self._sum_over_bodies()
-        self._impulse += dt * self._wrench.to_numpy().astype(np.float64).reshape(-1, WRENCH_WIDTH)
+        self._gather(self._boundary.velocity if sample_velocity is None else sample_velocity, terms)
+        self._impulse += dt * self._host_wrenches()
         if self.response is not None:
             self.response.push_samples(self._wrench, dt)
 
@@ -115,13 +121,18 @@ class BodyForces:
             terms: as for `gather`.
         """
         assert self.response is not None
-        boundary = self._boundary
-        gather_sample_forces(
-            boundary.position, boundary.velocity, boundary.volume, boundary.fixed_count, boundary.moving_count,
-            *self.near, *terms, self._force,
-        )  # fmt: skip
-        self._sum_over_bodies()
+        self._gather(self._boundary.velocity, terms)
         return self.response.accelerate_samples(self._wrench)
+
+    def measure(self, sample_velocity: ti.Ndarray, *terms: Any) -> NDArray[np.float64]:
+        """Forces [N] and torques [N m] on each body that are only tried, (bodies, 6).
+
+        Args:
+            sample_velocity: of the boundary samples [m/s].
+            terms: as for `gather`.
+        """
+        self._gather(sample_velocity, terms)
+        return self._host_wrenches()
 
     def worst_mean_near_bodies(self, remaining: ti.Ndarray, pressure: ti.Ndarray, *terms: Any) -> float:
         """Mean error of a pressure solve among the particles near a body, weighted by its kernel; the largest of all.
@@ -137,7 +148,7 @@ class BodyForces:
             remaining, pressure, *terms, self._force,
         )  # fmt: skip
         self._sum_over_bodies()
-        error, weight = self._wrench.to_numpy().reshape(-1, WRENCH_WIDTH)[:, :2].T
+        error, weight = self._host_wrenches()[:, :2].T
         return float(np.divide(error, weight, out=np.zeros_like(error), where=weight > 0.0).max(initial=0.0))
 
     def take_impulses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -147,6 +158,17 @@ class BodyForces:
         """
         taken, self._impulse = self._impulse, np.zeros_like(self._impulse)
         return taken[:, :3], taken[:, 3:]
+
+    def _gather(self, sample_velocity: ti.Ndarray, terms: tuple[Any, ...]) -> None:
+        boundary = self._boundary
+        gather_sample_forces(
+            boundary.position, sample_velocity, boundary.volume, boundary.fixed_count, boundary.moving_count,
+            *self.near, *terms, self._force,
+        )  # fmt: skip
+        self._sum_over_bodies()
+
+    def _host_wrenches(self) -> NDArray[np.float64]:
+        return self._wrench.to_numpy().astype(np.float64).reshape(-1, WRENCH_WIDTH)
 
     def _sum_over_bodies(self) -> None:
         boundary = self._boundary
@@ -166,18 +188,18 @@ def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
 @ti.kernel
 def count_particles_near_samples(
     sample_position: Vectors, first: ti.i32, sample_count: ti.i32, x: Floats, y: Floats, z: Floats,
-    cell_start: Integers, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, radius_squared: ti.f32,
-    near_count: Integers,
+    cell_start: Integers, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, reach: ti.i32,
+    radius_squared: ti.f32, near_count: Integers,
 ):  # fmt: skip
     """How many particles may be within the radius of each sample; a distance may be rounded differently later."""
     for b in range(sample_count):
         x_b = sample_position[first + b]
-        cell = cell_of_point(x_b, origin, inverse_cell_size, shape)
+        cell = cell_of_point(x_b, origin, inverse_cell_size, shape, reach)
         found = 0
-        for dz in range(-1, 2):
-            for dy in range(-1, 2):
+        for dz in range(-reach, reach + 1):
+            for dy in range(-reach, reach + 1):
                 row = row_of_cell(cell, dy, dz, shape)
-                for i in range(cell_start[row - 1], cell_start[row + 2]):
+                for i in range(cell_start[row - reach], cell_start[row + reach + 1]):
                     if is_near(x_b, x[i], y[i], z[i], radius_squared * (1.0 + ROUNDING_MARGIN)):
                         found += 1
         near_count[b] = found
@@ -186,18 +208,18 @@ def count_particles_near_samples(
 @ti.kernel
 def list_particles_near_samples(
     sample_position: Vectors, first: ti.i32, sample_count: ti.i32, x: Floats, y: Floats, z: Floats,
-    cell_start: Integers, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, radius_squared: ti.f32,
-    near_count: Integers, near_start: Integers, near: Integers,
+    cell_start: Integers, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, reach: ti.i32,
+    radius_squared: ti.f32, near_count: Integers, near_start: Integers, near: Integers,
 ):  # fmt: skip
     """Write the particles near each moving sample, in their order; there is room for as many as were counted."""
     for b in range(sample_count):
         x_b = sample_position[first + b]
-        cell = cell_of_point(x_b, origin, inverse_cell_size, shape)
+        cell = cell_of_point(x_b, origin, inverse_cell_size, shape, reach)
         place = near_start[b]
-        for dz in range(-1, 2):
-            for dy in range(-1, 2):
+        for dz in range(-reach, reach + 1):
+            for dy in range(-reach, reach + 1):
                 row = row_of_cell(cell, dy, dz, shape)
-                for i in range(cell_start[row - 1], cell_start[row + 2]):
+                for i in range(cell_start[row - reach], cell_start[row + reach + 1]):
                     if is_near(x_b, x[i], y[i], z[i], radius_squared):
                         near[place] = i
                         place += 1

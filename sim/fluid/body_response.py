@@ -10,6 +10,7 @@ from sim.cells import Floats, Integers, Vectors
 from sim.fluid.boundary import Boundary
 from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
 from sim.fluid.kernels import TINY_DISTANCE, spline, spline_slope
+from sim.fluid.pressure_kernels import error_left
 from sim.launch import fast_launch
 
 MOBILITY_WIDTH = 10
@@ -41,6 +42,8 @@ class BodyResponse:
 
     Attributes:
         is_needed: whether any body is free to answer.
+        inverse_masses: M^-1 of each body, mass [1/kg] and inertia tensor in world axes [1/(kg m²)], (bodies, 6, 6), on
+            the host; 0 for bodies on given paths.
         no_acceleration: of all boundary samples where none is [m/s²].
     """
 
@@ -63,6 +66,7 @@ class BodyResponse:
         self._acceleration = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
         self._acceleration.fill(0.0)
         self.is_needed = False
+        self.inverse_masses: NDArray[np.float64] = np.zeros((boundary.body_count, WRENCH_WIDTH, WRENCH_WIDTH))
         self.no_acceleration = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
         self.no_acceleration.fill(0.0)
 
@@ -75,6 +79,8 @@ class BodyResponse:
         """
         rows = np.concatenate([inverse_mass[:, None], inverse_inertia.reshape(-1, 9)], axis=1)
         self.is_needed = bool((inverse_mass > 0.0).any())
+        self.inverse_masses[:, :3, :3] = inverse_mass[:, None, None] * np.eye(3)
+        self.inverse_masses[:, 3:, 3:] = inverse_inertia
         if not len(rows):
             return
         self._mobility.from_numpy(np.ascontiguousarray(rows, dtype=np.float32).ravel())
@@ -274,6 +280,6 @@ def weigh_errors(
             i = near[k]
             if inverse_diagonal[i] > 0.0:
                 weight = spline((position[i] - sample_position[first + b]).norm() * inverse_support)
-                least = -pressure[i] * dt_squared / inverse_diagonal[i]
-                total += weight * ti.math.vec3(ti.abs(ti.max(remaining[i], least)), 1.0, 0.0)
+                error = error_left(remaining[i], pressure[i], inverse_diagonal[i], dt_squared)
+                total += weight * ti.math.vec3(error, 1.0, 0.0)
         weighed[b] = sample_volume[first + b] * total

@@ -1,5 +1,6 @@
 """Inflow: layers of particles that leave their openings at an exact rate."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -65,8 +66,14 @@ class Emission:
 
     @property
     def speed(self) -> float:
-        """Largest speed of what flows in now or will [m/s]."""
-        return max((opening.speed for opening in self.openings if self.time_s < opening.end_s), default=0.0)
+        """Largest speed of what flows in now [m/s]."""
+        flowing = [opening.speed for opening in self.openings if opening.start_s <= self.time_s < opening.end_s]
+        return max(flowing, default=0.0)
+
+    def longest_step(self, way: float) -> float:
+        """Longest step [s] in which no layer of an emitter that begins goes farther than a way [m] from its opening."""
+        waiting = [opening for opening in self.openings if self.time_s < opening.start_s]
+        return min((opening.start_s - self.time_s + way / opening.speed for opening in waiting), default=math.inf)
 
     def drive(self, particles: ParticleSet, acceleration: ti.Ndarray) -> None:
         """Give all particles in a nozzle the velocity of its inflow, and no acceleration."""

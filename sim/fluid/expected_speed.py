@@ -11,12 +11,12 @@ from sim.scene import DomainParameters
 SLOWEST_EXPECTED_SPEED = 0.1
 """Where neither gravity nor an initial velocity says what to expect [m/s]."""
 
-COHESION_SPEED_FACTOR = 1.5
-"""Square of the speed to expect from cohesion over kappa/d.
+COHESION_SPEED_FACTOR = 10.0
+"""Square of the speed to expect from cohesion over the stress with which that pulls a filled lattice together, per
+density.
 
-Cohesion pulls a filled lattice together with the stress rho kappa sigma/6 sum_j |x_ij|² w_ij = 0.15 rho kappa/d, which
-at rest compresses it by 0.1 % at this factor. The collapse of a cube to a drop compresses it more: 1.7 % for 5³
-particles, 1.1 % for 8³ and 0.9 % for 12³, whatever kappa; half of the factor doubles that.
+At rest the stress compresses the lattice by 0.1 % at this factor. The collapse of a cube to a drop compresses it more:
+1.7 % for 5³ particles, 1.1 % for 8³ and 0.9 % for 12³, whatever kappa; half of the factor doubles that.
 """
 
 
@@ -26,19 +26,18 @@ def expected_speed(
     domain: DomainParameters,
     gravity: Vector3,
     *,
-    surface_tension: float,
-    spacing: float,
+    cohesion_stress: float = 0.0,
     body_speed: float = 0.0,
 ) -> float:
     """Largest speed to expect [m/s], never 0.
 
     That is the initial one with a fall from the highest particle to the bottom, the corner of the domain that lies
-    deepest along gravity; what cohesion, `surface_tension` kappa [m³/s²], asks for at this `spacing` d [m]; or that of
-    the fastest body, `body_speed` [m/s], which fluid that it hits takes on.
+    deepest along gravity; what cohesion asks for, whose stress over the density is `cohesion_stress` [m²/s²]; or that
+    of the fastest body, `body_speed` [m/s], which fluid that it hits takes on.
     """
     initial = float((np.asarray(velocities, dtype=np.float64) ** 2).sum(axis=1).max(initial=0.0))
     fall = math.sqrt(initial + square_of_fall_speed(positions, domain, gravity))
-    cohesion = math.sqrt(COHESION_SPEED_FACTOR * surface_tension / spacing)
+    cohesion = math.sqrt(COHESION_SPEED_FACTOR * cohesion_stress)
     return max(fall, cohesion, body_speed, SLOWEST_EXPECTED_SPEED)
 
 

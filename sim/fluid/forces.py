@@ -43,7 +43,7 @@ class SPHFluid(MaterialFluid):
         gather_boundary_forces(
             boundary.position, boundary.volume, boundary.fixed_count,
             self._particles.cells.cell_start, ti.math.vec3(*self._grid.origin), 1.0 / self._grid.cell_size,
-            Cells(*self._grid.shape),
+            Cells(*self._grid.shape), self._grid.reach,
             self._particles.position, self._pressure_term,
             self.particle_volume * self._sigma / self.support_radius, 1.0 / self.support_radius,
             forces,
@@ -96,13 +96,13 @@ class SPHFluid(MaterialFluid):
         """Count what the particles feel from moving bodies as impulses on these, for a step of dt [s].
 
         Call it with the positions and velocities that the particles felt it at. `with_friction` is False where
-        friction was counted before, in a call without pressure. There, bodies that answer within the step begin to
+        friction was counted before, in the first call of the step. There, bodies that answer within the step begin to
         fall, as the particles do by `_compute_acceleration`.
         """
         if pressure_term is not None or self.parameters.wall_friction > 0.0:
             self.body_forces.gather(*self._body_force_terms(pressure_term, with_friction=with_friction), dt=dt)
         # After the gathering: the particles felt friction against bodies that had not begun to fall.
-        if pressure_term is None and self.body_forces.response is not None:
+        if with_friction and self.body_forces.response is not None:
             self.body_forces.response.fall(dt)
 
     def _body_force_terms(self, pressure_term: ti.Ndarray | None, *, with_friction: bool) -> tuple[Any, ...]:
@@ -212,18 +212,18 @@ def compute_acceleration(
 def gather_boundary_forces(
     boundary_position: Vectors, boundary_volume: Floats, boundary_count: ti.i32,
     cell_start: Integers, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells,
-    position: Vectors, pressure_term: Floats,
+    reach: ti.i32, position: Vectors, pressure_term: Floats,
     volume_gradient_factor: ti.f32, inverse_support: ti.f32, force: Vectors,
 ):  # fmt: skip
     """Reaction to the pressure acceleration that each sample causes, summed in the order of the sorted particles."""
     for b in range(boundary_count):
         x_b = boundary_position[b]
-        cell = cell_of_point(x_b, origin, inverse_cell_size, shape)
+        cell = cell_of_point(x_b, origin, inverse_cell_size, shape, reach)
         total = ti.math.vec3(0.0)
-        for dz in range(-1, 2):
-            for dy in range(-1, 2):
+        for dz in range(-reach, reach + 1):
+            for dy in range(-reach, reach + 1):
                 row = row_of_cell(cell, dy, dz, shape)
-                for i in range(cell_start[row - 1], cell_start[row + 2]):
+                for i in range(cell_start[row - reach], cell_start[row + reach + 1]):
                     x_ib = position[i] - x_b
                     inverse_r = inverse_distance(x_ib.norm_sqr())
                     r = x_ib.norm_sqr() * inverse_r

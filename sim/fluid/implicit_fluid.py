@@ -2,13 +2,11 @@
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import taichi as ti
 
-from sim.fluid.body_response import BodyResponse
 from sim.fluid.forces import SPHFluid
 from sim.fluid.kernels import evaluate_slope, lattice_offsets
 from sim.fluid.pressure_kernels import (
@@ -19,6 +17,7 @@ from sim.fluid.pressure_kernels import (
     relax_pressure,
     sum_errors,
 )
+from sim.fluid.solve_record import SolveRecord
 from sim.fluid.time_step import CFL_NUMBER, stable_time_step
 from sim.fluid.viscosity import LAPLACIAN_FACTOR
 from sim.reductions import LaneReduction
@@ -42,44 +41,12 @@ Computed for 360 particles in a box: 0.98 on the lattice, 1.12 after random shif
 LEAST_DIAGONAL = 1.0e-6
 """Share of a filled neighbourhood's A_ii below which a particle can have no pressure: it has no neighbour."""
 
+LARGEST_ERROR = 1.0e20
+"""Means of errors beyond it contain one of a particle that is `NOT_FINITE`."""
+
 CARE_NEAR_BODIES = 10.0
 """How much smaller the error is kept near moving bodies: a mean compression of 1e-4 that is left around a body in a
 step of 2 ms is an error of its acceleration of 0.5 m/s², which for a light one does not change sign for many steps."""
-
-
-@dataclass
-class SolveRecord:
-    """What the pressure solves of one kind took in a frame.
-
-    Attributes:
-        solves: how many there were.
-        iterations: of all of them.
-        worst_error: largest error with which one ended [-].
-        not_converged: how many ended at their iteration limit.
-    """
-
-    solves: int = 0
-    iterations: int = 0
-    worst_error: float = 0.0
-    not_converged: int = 0
-
-    def add(self, iterations: int, error: float, *, converged: bool) -> None:
-        """Take one solve into account."""
-        self.merge(SolveRecord(1, iterations, error, int(not converged)))
-
-    def merge(self, other: "SolveRecord") -> None:
-        """Take all solves of another record into account."""
-        self.solves += other.solves
-        self.iterations += other.iterations
-        # A NaN is larger than any number here, and stays.
-        if not (other.worst_error <= self.worst_error or math.isnan(self.worst_error)):
-            self.worst_error = other.worst_error
-        self.not_converged += other.not_converged
-
-    @property
-    def mean_iterations(self) -> float:
-        """Iterations per solve."""
-        return self.iterations / max(self.solves, 1)
 
 
 class ImplicitFluid(SPHFluid):
@@ -114,8 +81,7 @@ class ImplicitFluid(SPHFluid):
         self._relaxed_before = ti.ndarray(ti.f32, capacity)
         self._relaxation = 1.0 / (DISORDER * largest_eigenvalue(self.parameters.support_in_spacings))
         self._boundary_response = ti.Vector.ndarray(3, ti.f32, 1)
-        if self.boundary.moving_count > 0:
-            self.body_forces.response = BodyResponse(self.boundary, self.gravity, self.spacing)
+        self.body_forces.let_bodies_respond(self.gravity, self.spacing)
         self._filled_diagonal = filled_diagonal(self.spacing, self.parameters.support_in_spacings)
         self._reduction = LaneReduction(maxima=0, sums=1)
 
@@ -147,7 +113,7 @@ class ImplicitFluid(SPHFluid):
             cfl=self.parameters.cfl * self.cfl_number / CFL_NUMBER,
         )
         at_rest = self.gravity_number * math.sqrt(self.spacing / gravity) if gravity > 0.0 else math.inf
-        return min(limit, at_rest)
+        return min(limit, at_rest, self._emission.longest_step(way))
 
     def diagnostics(self) -> Diagnostics:
         """As for every particle fluid, with the iterations and errors of the pressure solves of this frame."""
@@ -156,22 +122,19 @@ class ImplicitFluid(SPHFluid):
             **common,
             "iterations": record.mean_iterations,
             "density_error": record.worst_error,
-            "not_converged": common.get("not_converged", 0.0) + record.not_converged,
         }
+
+    @property
+    def _solves(self) -> dict[str, SolveRecord]:
+        return {**super()._solves, "density": self._density_solves}
+
+    @property
+    def _runaway(self) -> tuple[float, str, float]:
+        return RUNAWAY_RATIO, "the largest expected speed", self._expected_speed
 
     @property
     def _signal_speed(self) -> float:
         return self._expected_speed
-
-    def _bad_motion(self) -> str | None:
-        if self._motion.non_finite:
-            return f"{self._motion.non_finite} particles with a position or velocity that is not finite"
-        if self._motion.max_speed > RUNAWAY_RATIO * self._expected_speed:
-            return (
-                f"speed {self._motion.max_speed:.4g} m/s, beyond {RUNAWAY_RATIO:g} times "
-                f"the largest expected speed {self._expected_speed:.4g} m/s"
-            )
-        return None
 
     def _compute_density(self) -> None:
         self._update_neighbors()
@@ -224,7 +187,7 @@ class ImplicitFluid(SPHFluid):
             self._relax(pressure, dt, iteration)
             iteration += 1
             if iteration >= min(next_look, limit):
-                error = self._mean_error(pressure, dt)
+                error = self._mean_error(self._remaining, pressure, dt)
                 if error <= tolerance or iteration >= limit or not error <= bound:
                     record.add(iteration, error, converged=error <= tolerance)
                     return pressure
@@ -242,12 +205,16 @@ class ImplicitFluid(SPHFluid):
         """Fill `_remaining` with the compression that the accelerations leave, and `_next_pressure`."""
 
     def _predict_compression(self, dt: float) -> None:
-        """Fill `_compression` with what a step of dt [s] without pressure leads to, linear in the velocities."""
+        """Fill `_compression` with what a step of dt [s] without pressure leads to, linear in the velocities.
+
+        The velocities that it leads to stand in `_pressure_acceleration` until the solve needs that.
+        """
         particles, boundary = self._particles, self.boundary
         predict_compression(
             particles.position, particles.velocity, self._acceleration, self._density, particles.count, *self._list,
             boundary.position, boundary.velocity, boundary.volume, boundary.moving_count > 0,
-            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt, self._correction(dt), self._compression,
+            self.particle_volume, self._sigma, 1.0 / self.support_radius, dt, self._correction(dt),
+            self._pressure_acceleration, self._compression,
         )  # fmt: skip
 
     def _relax_linearly(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
@@ -278,23 +245,32 @@ class ImplicitFluid(SPHFluid):
         if response.is_needed:
             self._boundary_response = self.body_forces.respond(*self._body_force_terms(pressure, with_friction=False))
 
-    def _mean_error(self, pressure: ti.Ndarray, dt: float) -> float:
-        """Mean error over all particles, or ten times that among those near a moving body, whichever is larger."""
+    def _mean_error(self, remaining: ti.Ndarray, pressure: ti.Ndarray, dt: float) -> float:
+        """Mean error over all particles, or ten times that among those near a moving body, whichever is larger.
+
+        Infinite where that of any particle is not finite.
+
+        Args:
+            remaining: compression that is left of each particle [-].
+            pressure: with which it is left [Pa].
+            dt: the step [s]; 0 for what is left where no pressure has acted yet.
+        """
         reduction, lanes, count = self._reduction, self._reduction.lanes, self._particles.count
-        sum_errors(
-            self._remaining, pressure, self._inverse_diagonal, dt**2, count,
-            lanes.count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), reduction.partial,
+        results = sum_errors(
+            remaining, pressure, self._inverse_diagonal, dt**2, count,
+            lanes.items(count), lanes.lane_step(count), lanes.item_step(), *reduction.tree,
         )  # fmt: skip
-        everywhere = float(reduction.result()[0]) / max(count, 1)
+        everywhere = float(reduction.unpack(results)[0]) / max(count, 1)
         response = self.body_forces.response
         if response is None or not response.is_needed:
-            return everywhere
+            return everywhere if everywhere < LARGEST_ERROR else math.inf
         # A light body answers to the few particles around it, whose error the mean over all of them would hide.
         near_bodies = self.body_forces.worst_mean_near_bodies(
-            self._remaining, pressure, self._particles.position, self._inverse_diagonal, dt**2,
+            remaining, pressure, self._particles.position, self._inverse_diagonal, dt**2,
             1.0 / self.support_radius,
         )  # fmt: skip
-        return max(everywhere, CARE_NEAR_BODIES * near_bodies)
+        error = max(everywhere, CARE_NEAR_BODIES * near_bodies)
+        return error if error < LARGEST_ERROR else math.inf
 
 
 def iterations_ahead(error: float, tolerance: float) -> int:

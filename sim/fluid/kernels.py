@@ -15,6 +15,7 @@ from functools import cache
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from sim.reductions import runs_on_gpu
 
@@ -23,6 +24,9 @@ TINY_DISTANCE = 1.0e-12
 
 SUPPORT_IN_SPACINGS = 2.0
 """Usual support radius over lattice spacing: 4r over 2r."""
+
+NEAR_LAYER_IN_SPACINGS = 0.3, 1.2
+"""Between these distances from the fluid is the first of two layers of samples, at every support up to 4."""
 
 
 @ti.func
@@ -97,15 +101,17 @@ def particle_volume(spacing: float, support_in_spacings: float = SUPPORT_IN_SPAC
 
 @dataclass(frozen=True)
 class WallCalibration:
-    """What makes one layer of boundary samples act like more fluid.
+    """What makes a layer of boundary samples act like more fluid, alone or with other layers.
 
     Attributes:
         standoff_in_spacings: distance from the samples at which a lattice of fluid is at rest.
         volume_factor: gamma, on the volume 1 / sum_k W_bk of a sample.
+        volume_in_particles: volume of a sample of a square layer of the lattice's spacing over that of a particle.
     """
 
     standoff_in_spacings: float
     volume_factor: float
+    volume_in_particles: float
 
 
 @cache
@@ -120,22 +126,67 @@ def wall_calibration(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> WallCa
     right and half of the push; fluid then sinks into the wall.
 
     Only one layer is missing at the usual support of 2 spacings. A wider one reaches past the first layer of particles,
-    whose density and push stay right; of the second's density the samples then leave out up to 7 % (at 4 spacings).
+    whose density and push stay right; of the second's density one layer of samples leaves out up to 7 % (at 4
+    spacings). `wall_layers` has those that complete it.
     """
     low, high = 1.0, 1.0 + 0.95 * (support_in_spacings - 1.0)
-    missing = [
-        _layer_field(distance, support_in_spacings, shifts=1) for distance in np.arange(1.0, support_in_spacings)
-    ]
-    fluid_field, fluid_slope = np.sum(missing, axis=0)
+    fluid_field, fluid_slope = _missing_field(1, support_in_spacings)
     target = 2.0 * fluid_slope / fluid_field
     for _ in range(60):
         middle = 0.5 * (low + high)
         field, slope = _layer_field(middle, support_in_spacings)
         low, high = (low, middle) if slope / field < target else (middle, high)
     field, _ = _layer_field(low, support_in_spacings)
+    return _calibration(low, fluid_field / field, support_in_spacings)
+
+
+@cache
+def wall_layers(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> tuple[WallCalibration, ...]:
+    """The layers of samples of a wall, from the fluid inwards: one at the usual support, two at a wider one.
+
+    The second layer lies half a spacing short of the support from the first layer of particles, which it pushes. The
+    volumes of both follow from the two conditions of `wall_calibration`. The distance of the first layer, about a
+    spacing, where the lattice would go on, is that with which the second layer of particles has its density as well.
+    """
+    if support_in_spacings == SUPPORT_IN_SPACINGS:
+        return (wall_calibration(),)
+    far = support_in_spacings - 0.5
+
+    def volumes(near: float) -> NDArray[np.float64]:
+        fields = np.array([_layer_field(distance, support_in_spacings) for distance in (near, far)])
+        field, slope = _missing_field(1, support_in_spacings)
+        return np.linalg.solve(fields.T, [field, 2.0 * slope])
+
+    def excess_of_second_layer(near: float) -> float:
+        fields = [_layer_field(distance + 1.0, support_in_spacings)[0] for distance in (near, far)]
+        return float(volumes(near) @ fields) - _missing_field(2, support_in_spacings)[0]
+
+    near = float(brentq(excess_of_second_layer, *NEAR_LAYER_IN_SPACINGS, xtol=1.0e-9))
+    return tuple(
+        _calibration(distance, volume, support_in_spacings)
+        for distance, volume in zip((near, far), volumes(near), strict=True)
+    )
+
+
+def layer_field(distance_in_spacings: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Sum of W over a square layer of spacing 1 at a distance, averaged over its sideways shift."""
+    return _layer_field(distance_in_spacings, support_in_spacings)[0]
+
+
+def _calibration(standoff: float, volume_in_particles: float, support_in_spacings: float) -> WallCalibration:
     samples_sum, _ = _layer_field(0.0, support_in_spacings, shifts=1)
-    factor = fluid_field / field * samples_sum * particle_volume(1.0, support_in_spacings)
-    return WallCalibration(standoff_in_spacings=low, volume_factor=float(factor))
+    factor = volume_in_particles * samples_sum * particle_volume(1.0, support_in_spacings)
+    return WallCalibration(standoff, float(factor), float(volume_in_particles))
+
+
+def _missing_field(layer: int, support_in_spacings: float) -> tuple[float, float]:
+    """Sum of W over the layers that a wall takes from a layer of fluid, 1 for the one next to it, and its slope."""
+    missing = [
+        _layer_field(distance, support_in_spacings, shifts=1)
+        for distance in np.arange(float(layer), support_in_spacings)
+    ]
+    field, slope = np.sum([(0.0, 0.0), *missing], axis=0)
+    return float(field), float(slope)
 
 
 def _lattice_axis(half_width: float) -> NDArray[np.float64]:

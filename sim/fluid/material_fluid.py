@@ -1,27 +1,34 @@
 """What the materials of particle fluids need beside the pass over all neighbours: stiff viscosity, surface tension."""
 
+import math
+from abc import abstractmethod
 from typing import Any
 
 import numpy as np
 import taichi as ti
 
+from sim.fluid.body_friction import BodyFriction
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.opening import Opening
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particle_fluid import ParticleFluid
 from sim.fluid.phases import device_table
+from sim.fluid.solve_record import SolveRecord
+from sim.fluid.surface_tension import cohesion_rate, cohesion_stress
 from sim.fluid.surface_tension_akinci2013 import (
     COHESION_PER_TENSION,
     RATE_PER_COHESION,
-    STRESS_PER_COHESION,
     SurfaceTensionAkinci2013,
+    cohesion_stress_akinci2013,
 )
 from sim.fluid.viscosity import SOFTENING
 from sim.fluid.viscosity_implicit import CARRIED, ImplicitViscosity, is_implicit
 from sim.solver import Diagnostics
 
-STRESS_PER_KAPPA = 0.15
-"""Stress of Becker & Teschner's cohesion in a filled lattice over rho kappa/d [-]."""
+SQUEEZED = 0.2
+"""Relative compression of a particle from which on a frame is counted as squeezed. The mean error of a pressure solve,
+which decides whether it converged, says nothing about single particles. Corners of a filled box start at 0.06, and
+gaps that close reach just under 0.2; a dam that hits a wall squeezes single particles by up to 0.5, for moments."""
 
 
 class MaterialFluid(ParticleFluid):
@@ -43,11 +50,10 @@ class MaterialFluid(ParticleFluid):
         )
         support = fluids[0].support_in_spacings * spacing
         cohesion = np.array([COHESION_PER_TENSION * f.surface_tension / (f.rest_density * support**2) for f in fluids])
-        kappa = max(fluid.surface_tension for fluid in fluids)
+        stress = cohesion_stress(fluids[0].support_in_spacings) * max(f.surface_tension for f in fluids) / spacing
         if self._with_akinci2013:
-            # The kappa with the same stress, as the speed to expect follows from that.
-            kappa = STRESS_PER_COHESION / STRESS_PER_KAPPA * float(cohesion.max()) * support * spacing
-        self._expected_speed = _expected_speed(fluids, spacing, kappa, body_speed, keywords)
+            stress = cohesion_stress_akinci2013(fluids[0].support_in_spacings) * float(cohesion.max()) * support
+        self._expected_speed = _expected_speed(fluids, spacing, stress, body_speed, keywords)
 
         self._stiffest = max(fluid.viscosity for fluid in fluids) * max(1.0, fluids[0].wall_friction)
         implicit = is_implicit(
@@ -65,7 +71,9 @@ class MaterialFluid(ParticleFluid):
 
         self._explicit_viscosity = self.phases.dynamic_viscosity
         if implicit:
-            self._implicit_viscosity = ImplicitViscosity(self.capacity)
+            self.body_forces.let_bodies_respond(self.gravity, self.spacing)
+            bodies = BodyFriction(self.boundary, self.body_forces.response)
+            self._implicit_viscosity = ImplicitViscosity(self.capacity, bodies)
             self._explicit_viscosity = device_table(np.zeros(len(fluids)))
         if self._with_akinci2013:
             self._akinci2013 = SurfaceTensionAkinci2013(self.capacity)
@@ -79,16 +87,41 @@ class MaterialFluid(ParticleFluid):
             self._implicit_viscosity.begin_frame()
 
     def diagnostics(self) -> Diagnostics:
-        """As for every particle fluid, with the iterations of implicit viscosity, the mean of this frame's solves."""
-        common = super().diagnostics()
-        solves = self._implicit_viscosity
-        if solves is None:
-            return common
-        return {
-            **common,
-            "viscosity_iterations": solves.iterations / max(solves.solves, 1),
-            "not_converged": float(solves.not_converged),
-        }
+        """As for every particle fluid, with the iterations and errors of implicit viscosity in this frame.
+
+        `squeezed` is 1 where a particle is compressed by more than `SQUEEZED` at its end, else 0.
+        """
+        numbers = dict(super().diagnostics())
+        numbers["squeezed"] = float(numbers["max_compression"] > SQUEEZED)
+        if self._solves:
+            numbers["not_converged"] = float(sum(record.not_converged for record in self._solves.values()))
+        if self._implicit_viscosity is not None:
+            record = self._implicit_viscosity.record
+            numbers |= {"viscosity_iterations": record.mean_iterations, "viscosity_error": record.worst_error}
+        return numbers
+
+    @property
+    def _solves(self) -> dict[str, SolveRecord]:
+        """The solves of this frame, by what they are for."""
+        return {} if self._implicit_viscosity is None else {"viscosity": self._implicit_viscosity.record}
+
+    @property
+    @abstractmethod
+    def _runaway(self) -> tuple[float, str, float]:
+        """Multiple of a speed beyond which speeds are numerical, what that speed is, and its value [m/s]."""
+
+    def _bad_motion(self) -> str | None:
+        if self._motion.non_finite:
+            return f"{self._motion.non_finite} particles with a position or velocity that is not finite"
+        if not math.isfinite(self._boundary_speed):
+            return f"speed of a moving body {self._boundary_speed} m/s"
+        for kind, record in self._solves.items():
+            if not math.isfinite(record.worst_error):
+                return f"error of a {kind} solve that is not finite"
+        ratio, name, speed = self._runaway
+        if self._motion.max_speed > ratio * speed:
+            return f"speed {self._motion.max_speed:.4g} m/s, beyond {ratio:g} times {name} {speed:.4g} m/s"
+        return None
 
     @property
     def _limiting_viscosity(self) -> float:
@@ -105,7 +138,8 @@ class MaterialFluid(ParticleFluid):
         """Square of the frequency of a particle on the spring that its neighbours' cohesion is [1/s²]."""
         if self._with_akinci2013:
             return RATE_PER_COHESION * self._largest_cohesion / self.support_radius
-        return max(fluid.surface_tension for fluid in self.phases.parameters) * self._sigma
+        kappa = max(fluid.surface_tension for fluid in self.phases.parameters)
+        return cohesion_rate(self.parameters.support_in_spacings) * kappa / self.spacing**3
 
     def _add_surface_tension(self, acceleration: ti.Ndarray) -> None:
         """Add the surface tension of Akinci et al. 2013 where the fluid has it."""
@@ -141,7 +175,17 @@ class MaterialFluid(ParticleFluid):
         if solver is None:
             return
         particles, boundary, phases = self._particles, self.boundary, self.phases
-        gradient_factor = self._sigma / self.support_radius
+        wall_friction = self.parameters.wall_friction
+
+        def friction_terms(velocity: ti.Ndarray) -> tuple[Any, ...]:
+            """What friction on bodies is made of (`gather_sample_forces`), at these velocities of the particles."""
+            return (
+                particles.position, velocity, particles.phase, self._density, self._density,
+                phases.rest_density, phases.dynamic_viscosity,
+                self.particle_volume * self._sigma / self.support_radius, 1.0 / self.support_radius,
+                SOFTENING * self.support_radius**2, 0.0, wall_friction, False, True,
+            )  # fmt: skip
+
         solver.add_acceleration(
             position=particles.position,
             velocity=particles.velocity,
@@ -151,25 +195,24 @@ class MaterialFluid(ParticleFluid):
             neighbor_list=self._list,
             boundary=(boundary.position, boundary.velocity, boundary.volume),
             materials=(phases.rest_density, phases.dynamic_viscosity),
-            gradient_factor=gradient_factor,
+            friction=lambda fluid, samples: self.body_forces.measure(samples, *friction_terms(fluid)),
+            gradient_factor=self._sigma / self.support_radius,
             volume=self.particle_volume,
             support_radius=self.support_radius,
-            wall_friction=self.parameters.wall_friction,
+            wall_friction=wall_friction,
+            rest_density=float(phases.rest_densities.max()),
             carried=particles.carried,
             acceleration=acceleration,
             dt=dt,
         )
-        if boundary.moving_count and self.parameters.wall_friction > 0.0:
+        if wall_friction > 0.0:
             self.body_forces.gather(
-                particles.position, solver.velocity, particles.phase, self._density, self._density,
-                phases.rest_density, phases.dynamic_viscosity,
-                self.particle_volume * gradient_factor, 1.0 / self.support_radius,
-                SOFTENING * self.support_radius**2, 0.0, self.parameters.wall_friction, False, True, dt=dt,
-            )  # fmt: skip
+                *friction_terms(solver.velocity), dt=dt, sample_velocity=solver.bodies.found_velocity()
+            )
 
 
 def _expected_speed(
-    fluids: tuple[FluidParameters, ...], spacing: float, kappa: float, body_speed: float, keywords: dict[str, Any]
+    fluids: tuple[FluidParameters, ...], spacing: float, stress: float, body_speed: float, keywords: dict[str, Any]
 ) -> float:
     """Largest speed to expect [m/s] of the particles at the start, of those that will flow in, and of bodies."""
     openings = [
@@ -185,7 +228,6 @@ def _expected_speed(
         np.concatenate(velocities),
         keywords["domain"],
         keywords["gravity"],
-        surface_tension=kappa,
-        spacing=spacing,
+        cohesion_stress=stress,
         body_speed=body_speed,
     )

@@ -73,7 +73,7 @@ class FluidParameters(Parameters):
     support_in_spacings: Annotated[float, Field(ge=2.0, le=4.0)] = Field(
         default=2.0,
         description="Support radius h of the kernel over the lattice spacing 2r [-]: 2 gives 32 neighbours, 4 gives "
-        "250 and smoother fields, at eight times the cost; walls are matched best at 2.",
+        "250 and smoother fields, at eight times the cost; from 3 on particles at rest gather in clumps.",
     )
     rest_density: Positive = Field(default=1000.0, description="Rest density [kg/m³].")
     viscosity: NonNegative = Field(default=1.0e-6, description="Kinematic viscosity nu [m²/s]; water 1e-6.")

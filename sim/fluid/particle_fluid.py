@@ -21,6 +21,7 @@ from sim.fluid.kernels import normalization, particle_volume
 from sim.fluid.particles import ParticleSet
 from sim.fluid.phases import Phases
 from sim.fluid.stepping import MotionSummary, ParticleStepper
+from sim.neighbors import cells_per_radius
 from sim.snapshots import Snapshot
 
 if TYPE_CHECKING:
@@ -97,7 +98,10 @@ class ParticleFluid(ABC):
         self._openings = box.openings
         self._stepper = ParticleStepper(box)
         self._search_radius = (1.0 + self.parameters.skin) * self.support_radius
-        self._grid = CellGrid.covering(np.array(domain.min), np.array(domain.max), self._search_radius)
+        self._grid = CellGrid.covering(
+            np.array(domain.min), np.array(domain.max), self._search_radius,
+            reach=cells_per_radius(self.parameters.support_in_spacings),
+        )  # fmt: skip
         self.boundary = Boundary(
             boundary,
             BoundarySamples.of_bodies() if moving is None else moving,
@@ -276,6 +280,7 @@ class ParticleFluid(ABC):
             "max_speed": self._peak_speed,
             "max_compression": float(self._host(self._density).max(initial=0.0)) - 1.0,
             "particle_count": float(self.particle_count),
+            **self._counts_of_fluids(),
             "particles_removed": float(self.particles_removed),
             **self._emission.diagnostics(),
             "wall_contacts": float(self._wall_contacts),
@@ -318,6 +323,13 @@ class ParticleFluid(ABC):
     def _sigma(self) -> float:
         """Factor of the kernel, 8/(pi h³) [1/m³]."""
         return normalization(self.support_radius)
+
+    def _counts_of_fluids(self) -> dict[str, float]:
+        """Particles of each fluid, where there are several."""
+        if len(self.phases.names) == 1:
+            return {}
+        counts = np.bincount(self._host(self._particles.phase), minlength=len(self.phases.names))
+        return {f"particle_count_{name}": float(of) for name, of in zip(self.phases.names, counts, strict=True)}
 
     def _masses(self) -> NDArray[np.float64]:
         """Mass of each particle, in their order [kg], (n,)."""

@@ -6,9 +6,10 @@ from typing import Any
 import taichi as ti
 
 from sim.cells import Floats, Integers, Vectors
-from sim.fluid.implicit_fluid import ImplicitFluid, SolveRecord, momentum
-from sim.fluid.kernels import spline
-from sim.fluid.pressure_kernels import add_scaled, copy_scalars
+from sim.fluid.implicit_fluid import ImplicitFluid, momentum
+from sim.fluid.kernels import distance, spline
+from sim.fluid.pressure_kernels import add_scaled, copy_scalars, not_negative
+from sim.fluid.solve_record import SolveRecord
 from sim.fluid.time_step import CFL_NUMBER
 from sim.launch import fast_launch
 from sim.solver import Diagnostics
@@ -50,10 +51,11 @@ class PCISPHSolver(ImplicitFluid):
     solve is given up (`LARGEST_ERROR_GROWTH`, `LARGEST_WAY`, or the iteration limit), and this step's pressure is that
     of the linear problem of divergence-free SPH, s - dt² A P, from the same first guess: it always has a solution.
 
-    Positions are predicted, so two particles should not come near each other unseen: steps are half as long as those
-    of divergence-free SPH, and the list of neighbours is renewed where the next step could go beyond its reach. The
-    skin is 0.1 d for each of two particles and a step at most 0.2 d, so that of the fastest pairs, which approach each
-    other at more than half the speed that limits the step, some may be seen a step late.
+    Positions are predicted, so the list of neighbours is renewed where a step as long as the last could use up what is
+    left of its skin, and steps are half as long as those of divergence-free SPH. That is no guarantee: the skin is
+    0.2 d between two particles at the usual support, and a step may bring them 0.4 d closer. A pair that the list does
+    not have, farther than 2.2 d apart, may so be predicted at 1.8 d, where each adds 6e-4 to the density of the other;
+    that much is seen a step late. From a support of 4 spacings on the skin is 0.4 d, and nothing is.
     """
 
     carried = ("pressure",)
@@ -179,7 +181,7 @@ def correct_pressure(
         fluid_sum = 1.0  # w(0): the particle itself
         first = start[i]
         for k in range(fluid_count[i]):
-            fluid_sum += spline((x_i - predicted[neighbors[first + k * stride]]).norm() * inverse_support)
+            fluid_sum += spline(distance((x_i - predicted[neighbors[first + k * stride]]).norm_sqr()) * inverse_support)
         boundary_sum = 0.0
         first += fluid_count[i] * stride
         for k in range(boundary_count[i]):
@@ -187,11 +189,11 @@ def correct_pressure(
             x_b = boundary_position[b]
             if ti.static(with_moving):
                 x_b += dt * (boundary_velocity[b] + dt * boundary_response[b])
-            boundary_sum += boundary_volume[b] * spline((x_i - x_b).norm() * inverse_support)
+            boundary_sum += boundary_volume[b] * spline(distance((x_i - x_b).norm_sqr()) * inverse_support)
         left = sigma * (volume * fluid_sum + boundary_sum) - 1.0 - (1.0 - correction) * ti.max(density[i] - 1.0, 0.0)
         delta = relaxation / (dt * dt) * ti.min(inverse_diagonal[i], rest_density[own] / filled_diagonal)
-        relaxed = ti.max(pressure[i] + delta * left, 0.0)
-        next_pressure[i] = ti.max(relaxed + momentum * (relaxed - relaxed_before[i]), 0.0)
+        relaxed = not_negative(pressure[i] + delta * left)
+        next_pressure[i] = not_negative(relaxed + momentum * (relaxed - relaxed_before[i]))
         relaxed_before[i] = relaxed
         is_astray = (x_i - position[i]).norm_sqr() > largest_way_squared
         remaining[i] = ti.select(is_astray, ASTRAY, left)

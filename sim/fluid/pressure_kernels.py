@@ -13,6 +13,10 @@ import taichi as ti
 from sim.cells import Floats, Integers, Vectors
 from sim.fluid.kernels import distance, inverse_distance, spline, spline_slope
 from sim.launch import fast_launch
+from sim.reductions import Results, is_finite, reduced
+
+NOT_FINITE = 1.0e30
+"""Stands for an error that is infinite or not a number, which the larger of two numbers would hide."""
 
 NOT_SOLVED = -1.0e6
 """Relative compression of a particle that takes no part in a solve: so much room that its pressure stays 0."""
@@ -23,6 +27,46 @@ def slope_over_distance(r_squared: ti.f32, inverse_support: ti.f32) -> ti.f32:
     """Factor on (sigma/h) x_ij of grad W_ij; times x_ij it is 0 where two particles coincide."""
     inverse = inverse_distance(r_squared)
     return spline_slope(r_squared * inverse * inverse_support) * inverse
+
+
+@ti.func
+def density_rate(
+    i: ti.i32, position: Vectors, velocity: Vectors,
+    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
+    boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, with_moving: ti.template(),
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32,
+) -> ti.f32:  # fmt: skip
+    """(D v)_i; `boundary_velocity` counts where there are moving samples only."""
+    x_i, v_i = position[i], velocity[i]
+    fluid_sum = 0.0
+    first = start[i]
+    for k in range(fluid_count[i]):
+        j = neighbors[first + k * stride]
+        x_ij = x_i - position[j]
+        fluid_sum += (v_i - velocity[j]).dot(x_ij) * slope_over_distance(x_ij.norm_sqr(), inverse_support)
+    boundary_sum = 0.0
+    first += fluid_count[i] * stride
+    for k in range(boundary_count[i]):
+        b = neighbors[first + k * stride]
+        x_ib = x_i - boundary_position[b]
+        v_ib = v_i
+        if ti.static(with_moving):
+            v_ib -= boundary_velocity[b]
+        boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(x_ib.norm_sqr(), inverse_support)
+    return sigma * inverse_support * (volume * fluid_sum + boundary_sum)
+
+
+@ti.func
+def not_negative(pressure: ti.f32) -> ti.f32:
+    """The pressure, or 0 where it is negative; one that is not a number stays, where a maximum would make it 0."""
+    return ti.select(is_finite(pressure), ti.max(pressure, 0.0), pressure)
+
+
+@ti.func
+def error_left(remaining: ti.f32, pressure: ti.f32, inverse_diagonal: ti.f32, dt_squared: ti.f32) -> ti.f32:
+    """|compression left|; where that is negative, no more of it than taking P_i away would change."""
+    error = ti.abs(ti.max(remaining, -pressure * dt_squared / inverse_diagonal))
+    return ti.select(is_finite(remaining) & is_finite(pressure), error, NOT_FINITE)
 
 
 @fast_launch
@@ -85,83 +129,49 @@ def predict_compression(
     position: Vectors, velocity: Vectors, acceleration: Vectors, density: Floats, count: ti.i32,
     start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
     boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, with_moving: ti.template(),
-    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt: ti.f32, correction: ti.f32, compression: Floats,
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt: ti.f32, correction: ti.f32,
+    predicted: Vectors, compression: Floats,
 ):  # fmt: skip
     """Relative compression s_i = dt (D v*)_i + (rho_i - 1) that a step without pressure leads to; v* = v + dt a.
 
-    Where rho_i > 1 already, only the share `correction` of that counts.
+    Where rho_i > 1 already, only the share `correction` of that counts. `predicted` becomes v*: to gather the velocity
+    and the acceleration of every neighbour would take a third longer.
     """
-    gradient_factor = sigma * inverse_support
+    for i in range(count):
+        predicted[i] = velocity[i] + dt * acceleration[i]
     ti.loop_config(block_dim=128)
     for i in range(count):
-        x_i = position[i]
-        v_i = velocity[i] + dt * acceleration[i]
-        fluid_sum = 0.0
-        first = start[i]
-        for k in range(fluid_count[i]):
-            j = neighbors[first + k * stride]
-            x_ij = x_i - position[j]
-            v_ij = v_i - velocity[j] - dt * acceleration[j]
-            fluid_sum += v_ij.dot(x_ij) * slope_over_distance(x_ij.norm_sqr(), inverse_support)
-        boundary_sum = 0.0
-        first += fluid_count[i] * stride
-        for k in range(boundary_count[i]):
-            b = neighbors[first + k * stride]
-            x_ib = x_i - boundary_position[b]
-            v_ib = v_i
-            if ti.static(with_moving):
-                v_ib -= boundary_velocity[b]
-            boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(x_ib.norm_sqr(), inverse_support)
+        rate = density_rate(
+            i, position, predicted, start, fluid_count, boundary_count, neighbors, stride,
+            boundary_position, boundary_velocity, boundary_volume, with_moving, volume, sigma, inverse_support,
+        )  # fmt: skip
         excess = density[i] - 1.0
-        compression[i] = (
-            dt * gradient_factor * (volume * fluid_sum + boundary_sum)
-            + ti.min(excess, 0.0)
-            + correction * ti.max(excess, 0.0)
-        )
+        compression[i] = dt * rate + ti.min(excess, 0.0) + correction * ti.max(excess, 0.0)
 
 
 @fast_launch
 @ti.kernel
 def measure_divergence(
-    position: Vectors, velocity: Vectors, inverse_diagonal: Floats, count: ti.i32,
+    position: Vectors, velocity: Vectors, density: Floats, inverse_diagonal: Floats, count: ti.i32,
     start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
     boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, with_moving: ti.template(),
-    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt: ti.f32, least_neighbors: ti.f32, relaxation: ti.f32,
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt: ti.f32, least_density: ti.f32, relaxation: ti.f32,
     compression: Floats, pressure: Floats, relaxed_before: Floats,
 ):  # fmt: skip
     """Relative compression s_i = dt (D v)_i, and the first relaxation of it from P = 0.
 
-    With fewer neighbours than the least a particle is `NOT_SOLVED`.
+    Below the least density a particle is `NOT_SOLVED`.
     """
-    support_squared = 1.0 / (inverse_support * inverse_support)
-    gradient_factor = sigma * inverse_support
     ti.loop_config(block_dim=128)
     for i in range(count):
-        x_i, v_i = position[i], velocity[i]
-        near = 0.0
-        fluid_sum = 0.0
-        first = start[i]
-        for k in range(fluid_count[i]):
-            j = neighbors[first + k * stride]
-            x_ij = x_i - position[j]
-            r_squared = x_ij.norm_sqr()
-            fluid_sum += (v_i - velocity[j]).dot(x_ij) * slope_over_distance(r_squared, inverse_support)
-            near += ti.cast(r_squared < support_squared, ti.f32)
-        boundary_sum = 0.0
-        first += fluid_count[i] * stride
-        for k in range(boundary_count[i]):
-            b = neighbors[first + k * stride]
-            x_ib = x_i - boundary_position[b]
-            r_squared = x_ib.norm_sqr()
-            v_ib = v_i
-            if ti.static(with_moving):
-                v_ib -= boundary_velocity[b]
-            boundary_sum += boundary_volume[b] * v_ib.dot(x_ib) * slope_over_distance(r_squared, inverse_support)
-            near += ti.cast(r_squared < support_squared, ti.f32)
-        s_i = dt * gradient_factor * (volume * fluid_sum + boundary_sum)
-        if near < least_neighbors:
+        rate = density_rate(
+            i, position, velocity, start, fluid_count, boundary_count, neighbors, stride,
+            boundary_position, boundary_velocity, boundary_volume, with_moving, volume, sigma, inverse_support,
+        )  # fmt: skip
+        s_i = dt * rate
+        if density[i] < least_density:
             s_i = NOT_SOLVED
-        p_i = relaxation / (dt * dt) * inverse_diagonal[i] * ti.max(s_i, 0.0)
+        p_i = not_negative(relaxation / (dt * dt) * inverse_diagonal[i] * s_i)
         compression[i] = s_i
         pressure[i] = p_i
         relaxed_before[i] = p_i
@@ -219,29 +229,15 @@ def relax_pressure(
         boundary_response: acceleration of the moving samples by it.
         relaxed_before: from the iteration before; exchanged for the new one.
     """
-    gradient_factor = sigma * inverse_support
     ti.loop_config(block_dim=128)
     for i in range(count):
-        x_i, a_i = position[i], acceleration[i]
-        fluid_sum = 0.0
-        first = start[i]
-        for k in range(fluid_count[i]):
-            j = neighbors[first + k * stride]
-            x_ij = x_i - position[j]
-            a_ij = a_i - acceleration[j]
-            fluid_sum += a_ij.dot(x_ij) * slope_over_distance(x_ij.norm_sqr(), inverse_support)
-        boundary_sum = 0.0
-        first += fluid_count[i] * stride
-        for k in range(boundary_count[i]):
-            b = neighbors[first + k * stride]
-            x_ib = x_i - boundary_position[b]
-            a_ib = a_i
-            if ti.static(with_moving):
-                a_ib -= boundary_response[b]
-            boundary_sum += boundary_volume[b] * a_ib.dot(x_ib) * slope_over_distance(x_ib.norm_sqr(), inverse_support)
-        left = compression[i] + dt_squared * gradient_factor * (volume * fluid_sum + boundary_sum)
-        relaxed = ti.max(pressure[i] + relaxation / dt_squared * inverse_diagonal[i] * left, 0.0)
-        next_pressure[i] = ti.max(relaxed + momentum * (relaxed - relaxed_before[i]), 0.0)
+        rate = density_rate(
+            i, position, acceleration, start, fluid_count, boundary_count, neighbors, stride,
+            boundary_position, boundary_response, boundary_volume, with_moving, volume, sigma, inverse_support,
+        )  # fmt: skip
+        left = compression[i] + dt_squared * rate
+        relaxed = not_negative(pressure[i] + relaxation / dt_squared * inverse_diagonal[i] * left)
+        next_pressure[i] = not_negative(relaxed + momentum * (relaxed - relaxed_before[i]))
         relaxed_before[i] = relaxed
         remaining[i] = left
 
@@ -266,13 +262,15 @@ def add_scaled(vector: Vectors, other: Vectors, factor: ti.f32, count: ti.i32):
 @ti.kernel
 def sum_errors(
     remaining: Floats, pressure: Floats, inverse_diagonal: Floats, dt_squared: ti.f32, count: ti.i32,
-    lanes: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
-):  # fmt: skip
-    """Sums by lanes of |compression left|; where that is negative, no more of it than taking P_i away would change."""
+    items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
+    partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
+) -> Results:  # fmt: skip
+    """Sum of the errors of all particles that can have a pressure."""
     for lane in range(lanes):
         total = 0.0
         for k in range(items):
             i = lane * lane_step + k * item_step
             if i < count and inverse_diagonal[i] > 0.0:
-                total += ti.abs(ti.max(remaining[i], -pressure[i] * dt_squared / inverse_diagonal[i]))
+                total += error_left(remaining[i], pressure[i], inverse_diagonal[i], dt_squared)
         partial[lane] = total
+    return reduced(partial, lanes, quantities, maxima, nodes)

@@ -1,9 +1,11 @@
 """Surface tension after Akinci, Akinci & Teschner 2013, "Versatile Surface Tension and Adhesion for SPH Fluids"."""
 
+import numpy as np
 import taichi as ti
 
 from sim.cells import Floats, Integers, Vectors
-from sim.fluid.kernels import TINY_DISTANCE, spline_slope
+from sim.fluid.kernels import inverse_distance, lattice_offsets, particle_volume, spline_slope
+from sim.launch import fast_launch
 
 COHESION_PER_TENSION = 100.0
 """Cohesion c [m/s²] over sigma/(rho0 h²) with which a drop oscillates as one of surface tension sigma does (Rayleigh).
@@ -13,12 +15,10 @@ sigma = pi/8 rho0 c int C(r) r⁴ dr (Fowler 1937), which asks for 335; area for
 surface make it stronger.
 """
 
-STRESS_PER_COHESION = 0.028
-"""Stress with which cohesion pulls a filled lattice together over rho0 c h: sum_j V C(|x_ij|) |x_ij| / (6 h) [-]."""
-
 RATE_PER_COHESION = 1.0
-"""Square of the frequency of a particle on the springs of its neighbours' cohesion over c/h [-]: the slope of V C is at
-most 0.135/h between two particles of a lattice, and six are as near as that."""
+"""Square of the frequency of a particle on the springs of its neighbours' cohesion over c/h [-]: at the usual support
+the slope of V C is at most 0.135/h between two particles of a lattice, and six are as near as that. At wider ones the
+sum of all slopes is at most 1.44/h, and no displacement is along more than a third of it."""
 
 AREA_SHARE = 1.0e-3
 """Coefficient of the area forces over that of cohesion, both as accelerations. The paper has one gamma for both: its
@@ -92,12 +92,24 @@ def cohesion_akinci2013(q: ti.f32) -> ti.f32:
     return 32.0 / ti.math.pi * ti.select(q > 0.5, bump, 2.0 * bump - 1.0 / 64.0)
 
 
+def cohesion_stress_akinci2013(support_in_spacings: float) -> float:
+    """Stress with which cohesion pulls a filled lattice together, over rho0 c h: sum_j V C(|x_ij|) |x_ij| / (6 h) [-].
+
+    0.028 at the usual support, 0.024 to 0.025 at wider ones.
+    """
+    q = np.linalg.norm(lattice_offsets(support_in_spacings), axis=1) / support_in_spacings
+    bump = (1.0 - q) ** 3 * q**3
+    cohesion = 32.0 / np.pi * np.where(q > 0.5, bump, 2.0 * bump - 1.0 / 64.0) / support_in_spacings**3
+    return particle_volume(1.0, support_in_spacings) * float((cohesion * q).sum()) / 6.0
+
+
 @ti.func
 def adhesion_akinci2013(q: ti.f32) -> ti.f32:
     """A(q h) h³, eq. 7: 0.007 (-4 q² + 6 q - 2)^(1/4) for 1/2 < q < 1."""
     return 0.007 * ti.sqrt(ti.sqrt(ti.max(-4.0 * q * q + 6.0 * q - 2.0, 0.0)))
 
 
+@fast_launch
 @ti.kernel
 def compute_normals(
     position: Vectors, phase: Integers, density: Floats, count: ti.i32,
@@ -114,11 +126,13 @@ def compute_normals(
             j = neighbors[first + k * stride]
             if phase[j] == phase[i]:
                 x_ij = x_i - position[j]
-                r = x_ij.norm()
-                total += spline_slope(r * inverse_support) / ((r + TINY_DISTANCE) * density[j]) * x_ij
+                r_squared = x_ij.norm_sqr()
+                inverse_r = inverse_distance(r_squared)
+                total += spline_slope(r_squared * inverse_r * inverse_support) * inverse_r / density[j] * x_ij
         normal[i] = sigma_volume * total
 
 
+@fast_launch
 @ti.kernel
 def add_surface_tension(
     position: Vectors, phase: Integers, density: Floats, count: ti.i32,
@@ -137,16 +151,18 @@ def add_surface_tension(
         for k in range(fluid_count[i]):
             j = neighbors[first + k * stride]
             x_ij = x_i - position[j]
-            r = x_ij.norm()
-            if phase[j] == own and r < support_radius:
-                pull = volume * per_volume * cohesion_akinci2013(r * inverse_support) / (r + TINY_DISTANCE)
+            r_squared = x_ij.norm_sqr()
+            if phase[j] == own and r_squared < support_radius * support_radius:
+                inverse_r = inverse_distance(r_squared)
+                pull = volume * per_volume * cohesion_akinci2013(r_squared * inverse_r * inverse_support) * inverse_r
                 total += 2.0 / (density[i] + density[j]) * (pull * x_ij + AREA_SHARE * (n_i - normal[j]))
         if ti.static(with_adhesion):
             first += fluid_count[i] * stride
             for k in range(boundary_count[i]):
                 b = neighbors[first + k * stride]
                 x_ib = x_i - boundary_position[b]
-                r = x_ib.norm()
-                pull = boundary_volume[b] * per_volume * adhesion_akinci2013(r * inverse_support)
-                total += adhesion[own] * pull / (r + TINY_DISTANCE) * x_ib
+                r_squared = x_ib.norm_sqr()
+                inverse_r = inverse_distance(r_squared)
+                pull = boundary_volume[b] * per_volume * adhesion_akinci2013(r_squared * inverse_r * inverse_support)
+                total += adhesion[own] * pull * inverse_r * x_ib
         acceleration[i] -= cohesion[own] * total

@@ -37,7 +37,7 @@ def stable_time_step(
         signal_speed: speed of sound plus largest speed; the largest speed alone where pressure is implicit [m/s].
         acceleration: largest acceleration [m/s²].
         viscosity: kinematic viscosity, the artificial one included [m²/s].
-        cohesion_rate: kappa sigma [1/s²]; 0 without surface tension.
+        cohesion_rate: square of the frequency of a particle on the springs of its neighbours' cohesion [1/s²].
         cfl: the user's factor on the limit by signals [-].
         pressure_frequency: highest frequency of particles against each other's pressure [1/s], where it is explicit.
     """

@@ -1,13 +1,24 @@
 """Stiff viscosity: the viscous change of all velocities at once, from a linear system (Weiler et al. 2018)."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
-from sim.fluid.kernels import TINY_DISTANCE, spline_slope
+from sim.fluid.body_friction import BodyFriction, Friction
+from sim.fluid.solve_record import SolveRecord
 from sim.fluid.time_step import CFL_NUMBER, VISCOUS_NUMBER
-from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING, pair_viscosity
+from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING
+from sim.fluid.viscosity_kernels import (
+    advance_solve,
+    finish_solve,
+    multiply,
+    predict_velocity,
+    start_solve,
+    sum_norms,
+    sum_products,
+)
 from sim.reductions import LaneReduction
 
 TOLERANCE = 1.0e-3
@@ -20,7 +31,13 @@ MAX_ITERATIONS = 200
 CARRIED = ("viscous_change_x", "viscous_change_y", "viscous_change_z")
 """Velocity change of each particle in the step before [m/s], from which the next solve starts."""
 
-SUMS = 4
+STAGNATION = 0.5
+"""A restart whose residual is more than this share of that of the restart before has met the limits of float32."""
+
+LEAST_SQUARE = 1.0e-24
+"""Velocity changes whose squares add up to less are nothing, and no reason to iterate [m²/s²]."""
+
+SUMS = 3
 
 
 def is_implicit(solver: str, *, viscosity: float, spacing: float, speed: float, dt: float | str, cfl: float) -> bool:
@@ -45,34 +62,41 @@ class ImplicitViscosity:
 
     With the pair forces of the explicit viscosity (`sim.fluid.viscosity`), taken at the new velocities:
 
-        rho0_i dv_i + dt sum_j k_ij x_ij x_ij^T (dv_i - dv_j) + dt sum_b k_ib x_ib x_ib^T dv_i
+        rho0_i dv_i + dt sum_j k_ij x_ij x_ij^T (dv_i - dv_j) + dt sum_b k_ib x_ib x_ib^T (dv_i - dv_b)
             = -dt sum_j k_ij (v_ij . x_ij) x_ij - dt sum_b k_ib (v_ib . x_ib) x_ib,
         k_ij = 2 (d+2) mu_ij V 2/(rho_i + rho_j) |grad W_ij| / (|x_ij| (|x_ij|² + 0.01 h²)) = k_ji
 
-    The matrix is symmetric and positive definite for every time step: conjugate gradients with the 3 x 3 blocks of its
-    diagonal as preconditioner (Weiler et al. 2018, section 3.2), in the form with one reduction an iteration
-    (Chronopoulos & Gear 1989). In the end the residual over rho0 is added to the change, which is the pair sum with
-    the velocities found: linear and angular momentum are conserved to rounding, wherever the iteration stopped.
+    and with dv_b = 0 for walls and driven bodies, that of the body for free ones, whose velocities are unknowns too
+    (`sim.fluid.body_friction`). The matrix is symmetric and positive definite for every time step: conjugate gradients
+    with the 3 x 3 blocks of its diagonal as preconditioner (Weiler et al. 2018, section 3.2), in the form with one
+    reduction an iteration (Chronopoulos & Gear 1989). That form carries the residual along, which drifts from the true
+    one; so the true one is computed where the carried one says that it is done, and if need be the iteration starts
+    again from there. In the end the residual over rho0 is added to the change, which is the pair sum with the
+    velocities found: linear and angular momentum are conserved to rounding, wherever the iteration stopped.
 
     Attributes:
-        iterations: of all solves of this frame.
-        solves: in this frame.
-        not_converged: solves of this frame that hit `MAX_ITERATIONS`.
+        velocity: of the particles with the change found, those that the pair sums were taken at [m/s].
+        bodies: likewise the share of the free bodies.
+        record: of the solves of this frame; its error is the true residual in the unit of `TOLERANCE`.
     """
 
-    def __init__(self, capacity: int) -> None:
-        self.iterations = self.solves = self.not_converged = 0
+    def __init__(self, capacity: int, bodies: BodyFriction) -> None:
+        """Prepare for so many particles, and for bodies."""
+        self.record = SolveRecord()
+        self.bodies = bodies
         self._reduction = LaneReduction(maxima=0, sums=SUMS)
         vectors = [ti.Vector.ndarray(3, ti.f32, max(capacity, 1)) for _ in range(7)]
         self.velocity, self._change, self._residual, self._preconditioned, self._product = vectors[:5]
         self._direction, self._direction_product = vectors[5:]
+        # The right-hand side has been read when the first direction is written.
+        self._given = self._direction_product
         # Two vectors hold the six numbers of a symmetric block: its diagonal, then xy, xz and yz.
         self._inverse_diagonal = ti.Vector.ndarray(3, ti.f32, max(capacity, 1))
         self._inverse_mixed = ti.Vector.ndarray(3, ti.f32, max(capacity, 1))
 
     def begin_frame(self) -> None:
         """Restart the counters of the frame."""
-        self.iterations = self.solves = self.not_converged = 0
+        self.record = SolveRecord()
 
     def add_acceleration(
         self,
@@ -85,10 +109,12 @@ class ImplicitViscosity:
         neighbor_list: tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray, ti.Ndarray, int],
         boundary: tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray],
         materials: tuple[ti.Ndarray, ti.Ndarray],
+        friction: Friction,
         gradient_factor: float,
         volume: float,
         support_radius: float,
         wall_friction: float,
+        rest_density: float,
         carried: dict[str, ti.Ndarray],
         acceleration: ti.Ndarray,
         dt: float,
@@ -104,247 +130,107 @@ class ImplicitViscosity:
             neighbor_list: start, fluid_count, boundary_count, indices, stride.
             boundary: position [m], velocity [m/s] and volume [m³] of the boundary samples.
             materials: rest density [kg/m³] and dynamic viscosity [Pa s] of each fluid.
+            friction: of the particles on the bodies.
             gradient_factor: sigma/h of the kernel [1/m⁴].
             volume: of a particle [m³].
             support_radius: h [m].
             wall_friction: viscosity against boundaries over that of the fluid [-].
+            rest_density: of the densest fluid [kg/m³].
             carried: the particles' scalars with the names of `CARRIED`.
             acceleration: by all other forces [m/s²]; that by viscosity is added.
             dt: the step [s].
         """
         changes = tuple(carried[name] for name in CARRIED)
+        bodies = self.bodies
+        bodies.forget()
         if count == 0:
             return
-        rest_density, _ = materials
+        self._with_bodies = bodies.are_free and wall_friction > 0.0
+        self._count, self._materials = count, (phase, materials[0])
         operator = (
             position, phase, density, count, *neighbor_list, boundary[0], boundary[2], *materials,
             dt * LAPLACIAN_FACTOR * gradient_factor, volume, 1.0 / support_radius,
             SOFTENING * support_radius**2, wall_friction,
         )  # fmt: skip
         predict_velocity(velocity, acceleration, count, dt, *changes, self.velocity, self._change)
-        start_solve(
-            *operator, boundary[1], self.velocity, self._change, self._inverse_diagonal, self._inverse_mixed,
-            self._residual, self._preconditioned, self._direction,
-        )  # fmt: skip
-        self._iterate(operator, phase, rest_density, count)
-        finish_solve(
-            phase, rest_density, self._residual, self._change, count, dt, *changes, acceleration, self.velocity
-        )
-        self.solves += 1
+        if self._with_bodies:
+            self._product.fill(0.0)
+            bodies.prepare(friction, self.velocity, self._product, volume=volume, rest_density=rest_density, dt=dt)
+            bodies.guess(self._change)
+        self._solve(operator, boundary[1])
+        finish_solve(*self._materials, self._residual, self._change, count, dt, *changes, acceleration, self.velocity)
 
-    def _iterate(self, operator: tuple[object, ...], phase: ti.Ndarray, rest_density: ti.Ndarray, count: int) -> None:
-        lanes = self._reduction.lanes
+    def _solve(self, operator: tuple[Any, ...], boundary_velocity: ti.Ndarray) -> None:
+        """Find the change, and its true residual."""
+        left, given, asked = self._start(operator, boundary_velocity)
+        if not left <= given:
+            # Without the guess there is less to do: viscosity has nothing to change any more, or something new.
+            self._change.fill(0.0)
+            self.bodies.forget()
+            left, _, asked = self._start(operator, boundary_velocity)
+        asked = max(asked, LEAST_SQUARE / TOLERANCE**2)
+        iterations, wanted, before = 0, TOLERANCE**2 * asked, math.inf
+        while left > wanted and left <= STAGNATION**2 * before and iterations < MAX_ITERATIONS:
+            iterations += self._iterate(operator, wanted, MAX_ITERATIONS - iterations)
+            before = left
+            left, _, _ = self._start(operator, boundary_velocity)
+        self.record.add(iterations, math.sqrt(left / asked), converged=left <= wanted)
+
+    def _start(self, operator: tuple[Any, ...], boundary_velocity: ti.Ndarray) -> tuple[float, float, float]:
+        """Find the true residual of the change so far; squares of it, of the right-hand side and of what that asks for.
+
+        Squares are sums over the particles [m²/s²]: |r/rho0|², |b/rho0|² and |D⁻¹ b|².
+        """
+        bodies = self.bodies
+        if self._with_bodies:
+            bodies.restart(self._change)
+        start_solve(
+            *operator, boundary_velocity, self.velocity, self._change, bodies.changes,
+            self._inverse_diagonal, self._inverse_mixed, self._residual, self._preconditioned, self._given,
+        )  # fmt: skip
+        sum_norms(
+            *self._materials, self._residual, self._given, self._inverse_diagonal, self._inverse_mixed, *self._lanes,
+        )  # fmt: skip
+        return self._with_share_of(bodies.norms)
+
+    def _iterate(self, operator: tuple[Any, ...], wanted: float, most: int) -> int:
+        """Conjugate gradients until the residual they carry along is as small as wanted; returns the iterations."""
+        bodies = self.bodies
         alpha = gamma_before = 0.0
-        wanted = math.inf
-        for iteration in range(MAX_ITERATIONS + 1):
-            multiply(*operator, self._preconditioned, self._product)
-            sum_products(
-                phase, rest_density, self._residual, self._preconditioned, self._product, self._direction, count,
-                lanes.count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._reduction.partial,
-            )  # fmt: skip
-            gamma, delta, residual, scale = (float(value) for value in self._reduction.result())
-            if iteration == 0:
-                wanted = TOLERANCE**2 * scale
-            if residual <= wanted:
-                return
+        for iteration in range(most):
+            if self._with_bodies:
+                bodies.spread_preconditioned()
+            multiply(*operator, self._preconditioned, bodies.changes, self._product)
+            if self._with_bodies:
+                bodies.multiply(self._preconditioned)
+            sum_products(*self._materials, self._residual, self._preconditioned, self._product, *self._lanes)
+            gamma, delta, left = self._with_share_of(bodies.products)
             beta = gamma / gamma_before if iteration else 0.0
             curvature = delta - beta * gamma / alpha if iteration else delta
             # Of a positive matrix both are positive; rounding, or velocities that are not finite, end the iteration.
-            if iteration == MAX_ITERATIONS or not (curvature > 0.0 and gamma > 0.0):
-                break
+            if left <= wanted or not (curvature > 0.0 and gamma > 0.0):
+                return iteration
             alpha, gamma_before = gamma / curvature, gamma
             advance_solve(
-                count, alpha, beta, self._inverse_diagonal, self._inverse_mixed, self._product,
+                self._count, alpha, beta, self._inverse_diagonal, self._inverse_mixed, self._product,
                 self._direction, self._direction_product, self._change, self._residual, self._preconditioned,
             )  # fmt: skip
-            self.iterations += 1
-        self.not_converged += 1
+            if self._with_bodies:
+                bodies.advance(alpha, beta)
+        return most
 
-
-@ti.func
-def friction_coefficient(
-    r_squared: ti.f32, inverse_support: ti.f32, softening: ti.f32, mean_density: ti.f32, mu: ti.f32
-) -> ti.f32:  # fmt: skip
-    """mu |w'|/(rho |x| (|x|² + 0.01 h²)): k without its constant factors."""
-    r = ti.sqrt(r_squared)
-    slope = -spline_slope(r * inverse_support)
-    return mu * slope / (mean_density * (r + TINY_DISTANCE) * (r_squared + softening))
-
-
-@ti.func
-def solve_block(diagonal: ti.math.vec3, mixed: ti.math.vec3, b: ti.math.vec3) -> ti.math.vec3:
-    """Product of a symmetric block, given by its diagonal and its xy, xz and yz, with a vector."""
-    return ti.math.vec3(
-        diagonal[0] * b[0] + mixed[0] * b[1] + mixed[1] * b[2],
-        mixed[0] * b[0] + diagonal[1] * b[1] + mixed[2] * b[2],
-        mixed[1] * b[0] + mixed[2] * b[1] + diagonal[2] * b[2],
-    )
-
-
-@ti.kernel
-def predict_velocity(
-    velocity: Vectors, acceleration: Vectors, count: ti.i32, dt: ti.f32,
-    change_x: Floats, change_y: Floats, change_z: Floats, predicted: Vectors, change: Vectors,
-):  # fmt: skip
-    """Velocities without viscosity, and the first guess of what it changes: as much as in the step before."""
-    for i in range(count):
-        predicted[i] = velocity[i] + dt * acceleration[i]
-        change[i] = ti.math.vec3(change_x[i], change_y[i], change_z[i])
-
-
-@ti.kernel
-def start_solve(
-    position: Vectors, phase: Integers, density: Floats, count: ti.i32,
-    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
-    boundary_position: Vectors, boundary_volume: Floats, rest_density: Floats, dynamic_viscosity: Floats,
-    factor: ti.f32, volume: ti.f32, inverse_support: ti.f32, softening: ti.f32, wall_friction: ti.f32,
-    boundary_velocity: Vectors, velocity: Vectors, change: Vectors, inverse_diagonal: Vectors, inverse_mixed: Vectors,
-    residual: Vectors, preconditioned: Vectors, asked: Vectors,
-):  # fmt: skip
-    """Blocks of the diagonal, inverted; residual of the first guess; `asked`: the right-hand side over the blocks."""
-    ti.loop_config(block_dim=128)
-    for i in range(count):
-        x_i, v_i, dv_i, own = position[i], velocity[i], change[i], phase[i]
-        rho0, mu = rest_density[own], dynamic_viscosity[own]
-        right = ti.math.vec3(0.0)
-        left = rho0 * dv_i
-        diagonal = ti.math.vec3(rho0)
-        mixed = ti.math.vec3(0.0)
-        first = start[i]
-        for k in range(fluid_count[i]):
-            j = neighbors[first + k * stride]
-            x_ij = x_i - position[j]
-            mu_ij = pair_viscosity(mu, dynamic_viscosity[phase[j]])
-            mean_density = 0.5 * (density[i] + density[j])
-            k_ij = factor * volume * friction_coefficient(
-                x_ij.norm_sqr(), inverse_support, softening, mean_density, mu_ij
-            )  # fmt: skip
-            right -= k_ij * (v_i - velocity[j]).dot(x_ij) * x_ij
-            left += k_ij * (dv_i - change[j]).dot(x_ij) * x_ij
-            diagonal += k_ij * x_ij * x_ij
-            mixed += k_ij * ti.math.vec3(x_ij[0] * x_ij[1], x_ij[0] * x_ij[2], x_ij[1] * x_ij[2])
-        first += fluid_count[i] * stride
-        if wall_friction > 0.0:
-            for k in range(boundary_count[i]):
-                b = neighbors[first + k * stride]
-                x_ib = x_i - boundary_position[b]
-                k_ib = factor * boundary_volume[b] * friction_coefficient(
-                    x_ib.norm_sqr(), inverse_support, softening, density[i], wall_friction * mu
-                )  # fmt: skip
-                right -= k_ib * (v_i - boundary_velocity[b]).dot(x_ib) * x_ib
-                left += k_ib * dv_i.dot(x_ib) * x_ib
-                diagonal += k_ib * x_ib * x_ib
-                mixed += k_ib * ti.math.vec3(x_ib[0] * x_ib[1], x_ib[0] * x_ib[2], x_ib[1] * x_ib[2])
-        # The inverse by cofactors; its determinant is at least rho0³.
-        cofactors = ti.math.vec3(
-            diagonal[1] * diagonal[2] - mixed[2] * mixed[2],
-            diagonal[0] * diagonal[2] - mixed[1] * mixed[1],
-            diagonal[0] * diagonal[1] - mixed[0] * mixed[0],
-        )
-        mixed_cofactors = ti.math.vec3(
-            mixed[1] * mixed[2] - mixed[0] * diagonal[2],
-            mixed[0] * mixed[2] - mixed[1] * diagonal[1],
-            mixed[0] * mixed[1] - mixed[2] * diagonal[0],
-        )
-        determinant = (
-            diagonal[0] * cofactors[0] + mixed[0] * mixed_cofactors[0] + mixed[1] * mixed_cofactors[1]
+    @property
+    def _lanes(self) -> tuple[Any, ...]:
+        """How many particles there are, and how a kernel shares them out, for the end of its arguments."""
+        count, lanes = self._count, self._reduction.lanes
+        return (
+            count, lanes.count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._reduction.partial,
         )  # fmt: skip
-        inverse_diagonal[i] = cofactors / determinant
-        inverse_mixed[i] = mixed_cofactors / determinant
-        residual[i] = right - left
-        preconditioned[i] = solve_block(inverse_diagonal[i], inverse_mixed[i], right - left)
-        asked[i] = solve_block(inverse_diagonal[i], inverse_mixed[i], right)
 
-
-@ti.kernel
-def multiply(
-    position: Vectors, phase: Integers, density: Floats, count: ti.i32,
-    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
-    boundary_position: Vectors, boundary_volume: Floats, rest_density: Floats, dynamic_viscosity: Floats,
-    factor: ti.f32, volume: ti.f32, inverse_support: ti.f32, softening: ti.f32, wall_friction: ti.f32,
-    vector: Vectors, product: Vectors,
-):  # fmt: skip
-    """The matrix times a vector."""
-    ti.loop_config(block_dim=128)
-    for i in range(count):
-        x_i, dv_i, own = position[i], vector[i], phase[i]
-        rho0, mu = rest_density[own], dynamic_viscosity[own]
-        fluid_sum = ti.math.vec3(0.0)
-        first = start[i]
-        for k in range(fluid_count[i]):
-            j = neighbors[first + k * stride]
-            x_ij = x_i - position[j]
-            mu_ij = pair_viscosity(mu, dynamic_viscosity[phase[j]])
-            mean_density = 0.5 * (density[i] + density[j])
-            k_ij = friction_coefficient(x_ij.norm_sqr(), inverse_support, softening, mean_density, mu_ij)
-            fluid_sum += k_ij * (dv_i - vector[j]).dot(x_ij) * x_ij
-        boundary_sum = ti.math.vec3(0.0)
-        first += fluid_count[i] * stride
-        if wall_friction > 0.0:
-            for k in range(boundary_count[i]):
-                b = neighbors[first + k * stride]
-                x_ib = x_i - boundary_position[b]
-                k_ib = boundary_volume[b] * friction_coefficient(
-                    x_ib.norm_sqr(), inverse_support, softening, density[i], wall_friction * mu
-                )  # fmt: skip
-                boundary_sum += k_ib * dv_i.dot(x_ib) * x_ib
-        product[i] = rho0 * dv_i + factor * (volume * fluid_sum + boundary_sum)
-
-
-@ti.kernel
-def sum_products(
-    phase: Integers, rest_density: Floats, residual: Vectors, preconditioned: Vectors, product: Vectors,
-    asked: Vectors, count: ti.i32,
-    lanes: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
-):  # fmt: skip
-    """r . u, u . A u, |r/rho0|² and |asked|²; r over the mean rest density of its own fluid keeps all of one size."""
-    for lane in range(lanes):
-        gamma = 0.0
-        delta = 0.0
-        norm = 0.0
-        scale = 0.0
-        for k in range(items):
-            i = lane * lane_step + k * item_step
-            if i < count:
-                gamma += residual[i].dot(preconditioned[i])
-                delta += product[i].dot(preconditioned[i])
-                norm += (residual[i] / rest_density[phase[i]]).norm_sqr()
-                scale += asked[i].norm_sqr()
-        partial[lane] = gamma
-        partial[lanes + lane] = delta
-        partial[2 * lanes + lane] = norm
-        partial[3 * lanes + lane] = scale
-
-
-@ti.kernel
-def advance_solve(
-    count: ti.i32, alpha: ti.f32, beta: ti.f32, inverse_diagonal: Vectors, inverse_mixed: Vectors, product: Vectors,
-    direction: Vectors, direction_product: Vectors, change: Vectors, residual: Vectors, preconditioned: Vectors,
-):  # fmt: skip
-    """p = u + beta p, A p = A u + beta A p, x += alpha p, r -= alpha A p, u = M⁻¹ r."""
-    for i in range(count):
-        p_i = preconditioned[i]
-        product_i = product[i]
-        # In the first iteration the arrays hold something else, which might not be finite.
-        if beta != 0.0:
-            p_i += beta * direction[i]
-            product_i += beta * direction_product[i]
-        direction[i] = p_i
-        direction_product[i] = product_i
-        change[i] += alpha * p_i
-        r_i = residual[i] - alpha * product_i
-        residual[i] = r_i
-        preconditioned[i] = solve_block(inverse_diagonal[i], inverse_mixed[i], r_i)
-
-
-@ti.kernel
-def finish_solve(
-    phase: Integers, rest_density: Floats, residual: Vectors, change: Vectors, count: ti.i32, dt: ti.f32,
-    change_x: Floats, change_y: Floats, change_z: Floats, acceleration: Vectors, velocity: Vectors,
-):  # fmt: skip
-    """The change as the pair sum of the velocities found; kept for the next step, and as an acceleration."""
-    for i in range(count):
-        dv_i = change[i] + residual[i] / rest_density[phase[i]]
-        change_x[i], change_y[i], change_z[i] = dv_i[0], dv_i[1], dv_i[2]
-        acceleration[i] += dv_i / dt
-        velocity[i] += dv_i
+    def _with_share_of(self, bodies_share: Callable[[], tuple[float, float, float]]) -> tuple[float, float, float]:
+        """The sums over all particles, and the bodies' share in them."""
+        first, second, third = (float(value) for value in self._reduction.result())
+        if self._with_bodies:
+            shares = bodies_share()
+            return first + shares[0], second + shares[1], third + shares[2]
+        return first, second, third

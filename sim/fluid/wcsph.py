@@ -10,7 +10,7 @@ from sim.cells import Floats, Integers, Vectors
 from sim.fluid.forces import SPHFluid
 from sim.fluid.implicit_fluid import largest_eigenvalue
 from sim.fluid.kernels import distance, spline
-from sim.fluid.time_step import stable_time_step
+from sim.fluid.time_step import CFL_NUMBER, stable_time_step
 from sim.fluid.viscosity import LAPLACIAN_FACTOR
 from sim.launch import fast_launch
 from sim.solver import Diagnostics
@@ -63,7 +63,7 @@ class WCSPHSolver(SPHFluid):
         artificial = self._artificial_viscosity / LAPLACIAN_FACTOR * max(1.0, self.parameters.wall_friction)
         # The pressure of the densest fluid pushes particles of the lightest one.
         sound_speed = self.sound_speed * math.sqrt(self.phases.density_contrast)
-        return stable_time_step(
+        limit = stable_time_step(
             spacing=self.spacing,
             signal_speed=sound_speed + max(self._motion.max_speed, self._boundary_speed),
             acceleration=self._motion.max_acceleration,
@@ -72,6 +72,7 @@ class WCSPHSolver(SPHFluid):
             pressure_frequency=self._frequency_ratio * self._motion.max_frequency,
             cfl=self.parameters.cfl,
         )
+        return min(limit, self._emission.longest_step(self.parameters.cfl * CFL_NUMBER * self.spacing))
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
@@ -93,16 +94,9 @@ class WCSPHSolver(SPHFluid):
     def _signal_speed(self) -> float:
         return self.sound_speed
 
-    def _bad_motion(self) -> str | None:
-        if self._motion.non_finite:
-            return f"{self._motion.non_finite} particles with a position or velocity that is not finite"
-        limit = RUNAWAY_RATIO * self.sound_speed
-        if self._motion.max_speed > limit:
-            return (
-                f"speed {self._motion.max_speed:.4g} m/s, beyond {RUNAWAY_RATIO:g} times "
-                f"the speed of sound {self.sound_speed:.4g} m/s"
-            )
-        return None
+    @property
+    def _runaway(self) -> tuple[float, str, float]:
+        return RUNAWAY_RATIO, "the speed of sound", self.sound_speed
 
     def diagnostics(self) -> Diagnostics:
         """As for every particle fluid, with the elastic energy of the compression, V sum_i int p/r² dr [J]."""

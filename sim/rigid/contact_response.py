@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, solve_positions, solve_velocities
+from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, solve_positions
 from sim.rigid.contacts import Contacts, Indices, Key, key_set
+from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 from sim.solver import Arrays
 
 Array = NDArray[np.float64]
-
-SLOWEST_BOUNCE = 0.02
-"""Bodies that approach more slowly do not bounce [m/s]; nor those that gravity gave that speed within two steps."""
 
 SEPARATION_TIME_S = 0.02
 """Overlaps decay within about this time: the longest that nobody sees, and no more than a fifth a step."""
@@ -58,6 +56,7 @@ class Outcome:
         extra_velocity: added to the velocity in this step's change of poses only [m/s], (n, 3).
         extra_angular_velocity: [rad/s], (n, 3).
         is_touched: bodies that got an impulse, (n,) bool.
+        is_held: bodies that got one from what cannot move, (n,) bool.
         iterations: sweeps of the solver.
         converged: whether it converged.
     """
@@ -65,6 +64,7 @@ class Outcome:
     extra_velocity: Array
     extra_angular_velocity: Array
     is_touched: NDArray[np.bool_]
+    is_held: NDArray[np.bool_]
     iterations: int
     converged: bool
 
@@ -94,19 +94,23 @@ class ContactResponse:
         n = len(bodies)
         if not len(contacts):
             self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), dt)
-            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=bool), 0, True)
+            return Outcome(
+                np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), 0, True
+            )
         system = ContactSystem.build(contacts, bodies.position, bodies.inverse_mass, bodies.inverse_inertia())
         free = system.velocities(bodies.velocity, bodies.angular_velocity)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
-        bounce = self._find_bounces(contacts, bodies, free[:, 0], restitution, dt)
-        least = np.where(bounce.happens, bounce.velocity, -np.maximum(contacts.gap, 0.0) / dt)
+        bounces = Bounces.find(
+            contacts, bodies, approach=free[:, 0], restitution=restitution, gravity=self._gravity, dt=dt
+        )
         tolerance = RELATIVE_TOLERANCE * float(np.abs(free).max()) + WEIGHT_TOLERANCE * dt * float(
             np.linalg.norm(self._gravity)
         )
-        solution = solve_velocities(
+        solution = solve_impacts(
             system,
             free,
-            least_normal=least,
+            bounces=bounces,
+            least_normal=-np.maximum(contacts.gap, 0.0) / dt,
             friction=friction,
             start=self._starting_impulses(contacts, system, dt),
             tolerance=tolerance,
@@ -114,15 +118,18 @@ class ContactResponse:
         change = system.body_velocities(solution.impulses)
         bodies.velocity, bodies.angular_velocity = bodies.velocity + change[0], bodies.angular_velocity + change[1]
         in_world = np.einsum("kc,kci->ki", solution.impulses, system.axes)
-        self._keep(contacts.keys, np.where(bounce.happens[:, None], 0.0, in_world), dt)
+        self._keep(contacts.keys, np.where(bounces.happens[:, None], 0.0, in_world), dt)
 
         normal_velocity = system.velocities(bodies.velocity, bodies.angular_velocity)[:, 0]
-        extra, iterations, converged = self._separate(contacts, system, bounce, normal_velocity, dt)
-        touched = np.zeros(n + 1, dtype=bool)
+        extra, iterations, converged = self._separate(contacts, system, bounces, normal_velocity, dt)
+        touched, held = np.zeros(n + 1, dtype=bool), np.zeros(n + 1, dtype=bool)
         pushed = solution.impulses[:, 0] > 0.0
-        for body in (contacts.first, contacts.second):
+        for body, other in ((contacts.first, contacts.second), (contacts.second, contacts.first)):
             touched[np.minimum(body[pushed], n)] = True
-        return Outcome(*extra, touched[:n], solution.iterations + iterations, solution.converged and converged)
+            held[np.minimum(body[pushed & ~bodies.are_free(other)], n)] = True
+        return Outcome(
+            *extra, touched[:n], held[:n], solution.iterations + iterations, solution.converged and converged
+        )
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The impulses that the next step starts from."""
@@ -155,61 +162,21 @@ class ContactResponse:
         impulses: Array = np.einsum("kci,ki->kc", system.axes, in_world)
         return impulses
 
-    def _find_bounces(
-        self, contacts: Contacts, bodies: MovingBodies, approach: Array, restitution: Array, dt: float
-    ) -> _Bounces:
-        """Contacts that close within the step fast enough to bounce, and what their bounce leads to.
-
-        Against what cannot move the instant of the impact counts: gravity acts before and after it, and the gap is
-        passed down and up at different speeds. Without that a ball would come back to e² h0 only to first order in
-        dt. Between free bodies gravity cancels, and an impulse at the start of the step keeps all momenta exactly.
-        """
-        free = np.append(bodies.is_free, False)
-        n = len(bodies)
-        first_free, second_free = free[np.minimum(contacts.first, n)], free[np.minimum(contacts.second, n)]
-        one_sided = first_free != second_free
-        pull = contacts.normal @ self._gravity
-        acceleration = np.where(first_free, pull, 0.0) - np.where(second_free, pull, 0.0)
-        gap = np.maximum(contacts.gap, 0.0)
-        before = approach - dt * acceleration
-        under_root = before**2 - 2.0 * acceleration * gap
-        falls = -before + np.sqrt(np.maximum(under_root, 0.0))
-        hits = (under_root >= 0.0) & (falls > 0.0)
-        time_s = np.where(hits, 2.0 * gap / np.where(hits, falls, 1.0), np.inf)
-        hits &= time_s <= dt
-        time_s = np.where(hits, time_s, 0.0)
-        impact = before + acceleration * time_s
-        slowest = max(SLOWEST_BOUNCE, 2.0 * dt * float(np.linalg.norm(self._gravity)))
-        happens = hits & (restitution > 0.0) & (impact < -slowest)
-        rest = dt - time_s
-        velocity = -restitution * impact + acceleration * rest
-        displacement = -gap - restitution * impact * rest + 0.5 * acceleration * rest**2
-        return _Bounces(happens, velocity, displacement, happens & one_sided & (contacts.gap > 0.0))
-
     def _separate(
-        self, contacts: Contacts, system: ContactSystem, bounce: _Bounces, normal_velocity: Array, dt: float
+        self, contacts: Contacts, system: ContactSystem, bounces: Bounces, normal_velocity: Array, dt: float
     ) -> tuple[tuple[Array, Array], int, bool]:
         """Velocities that only move poses: overlaps shrink, and bounces end where they would have come to."""
         overlap = -contacts.gap - SLOP
         n = system.jacobian.shape[2]
-        if not np.any(bounce.is_placed) and not np.any(overlap > 0.0):
+        if not np.any(bounces.is_placed) and not np.any(overlap > 0.0):
             return (np.zeros((n, 3)), np.zeros((n, 3))), 0, True
         rate = min(LARGEST_SEPARATION, -math.expm1(-dt / SEPARATION_TIME_S)) / dt
         # Contacts that do not overlap may close by what the velocities leave of their gaps.
         wanted = np.where(overlap > 0.0, rate * overlap, -np.maximum(contacts.gap, 0.0) / dt - normal_velocity)
         wanted = np.where(overlap > 0.0, wanted, np.minimum(wanted, 0.0))
-        wanted = np.where(bounce.is_placed, bounce.displacement / dt - normal_velocity, wanted)
+        wanted = np.where(
+            bounces.is_placed, bounces.displacement(normal_velocity, contacts.gap) / dt - normal_velocity, wanted
+        )
         tolerance = WEIGHT_TOLERANCE * float(np.abs(wanted).max())
-        solution = solve_positions(system, wanted, two_sided=bounce.is_placed, tolerance=tolerance)
+        solution = solve_positions(system, wanted, two_sided=bounces.is_placed, tolerance=tolerance)
         return system.body_velocities(solution.impulses), solution.iterations, solution.converged
-
-
-@dataclass(frozen=True, eq=False)
-class _Bounces:
-    """Of every contact, (k,) each: whether it bounces, its normal velocity [m/s] and displacement [m] at the end of
-    the step, and whether it is brought there."""
-
-    happens: NDArray[np.bool_]
-    velocity: Array
-    displacement: Array
-    is_placed: NDArray[np.bool_]

@@ -66,6 +66,11 @@ class ContactSystem:
         velocities: Array = np.einsum("kcni,ni->kc", self.jacobian, both)
         return velocities
 
+    def velocity_changes(self, impulses: Array) -> Array:
+        """Changes of the velocities at the contacts, (k, 3), by impulses (k, 3) along the axes."""
+        changes: Array = np.einsum("ij,j->i", self.matrix, impulses.reshape(-1))
+        return changes.reshape(-1, 3)
+
     def body_velocities(self, impulses: Array) -> tuple[Array, Array]:
         """Changes of velocity and angular velocity, (n, 3) each, by impulses (k, 3) along the axes."""
         both = np.einsum("kc,kcni->ni", impulses, self.response)
@@ -203,5 +208,6 @@ def _admissible(impulses: Array, friction: Array) -> Array:
     """Impulses with the normal one not negative and the tangential ones within friction."""
     normal = np.maximum(impulses[:, 0], 0.0)
     size = np.sqrt(np.square(impulses[:, 1:]).sum(axis=1))
-    share = np.minimum(1.0, friction * normal / np.maximum(size, np.finfo(np.float64).tiny))
+    limit = friction * normal
+    share = np.divide(limit, size, out=np.ones_like(size), where=size > limit)
     return np.concatenate([normal[:, None], share[:, None] * impulses[:, 1:]], axis=1)

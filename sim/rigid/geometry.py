@@ -34,7 +34,7 @@ class BodyGeometry:
     """
 
     def __init__(self, parameters: RigidBodyParameters) -> None:
-        """Build the shape; where it stands and its name have no part in it.
+        """Build the shape; where it stands and its name have no part in it, its density only if there is ballast.
 
         Raises:
             ShapeError: it cannot be built, or is too thin to have an inside.
@@ -42,13 +42,18 @@ class BodyGeometry:
         placed = build_solid(parameters)
         self.solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
         self._of_unit_density = _mass_properties(self.solid)
-        self.centre_of_mass = self._of_unit_density.centre_of_mass
+        self._ballast = parameters.ballast
+        # Without ballast the centre is that of the shape, and bodies without mass have one too.
+        self.centre_of_mass = self.mass_properties(parameters.density or 1.0).centre_of_mass
         self.warnings = self.solid.warnings
 
     def mass_properties(self, density: float) -> MassProperties:
-        """Mass [kg], centre of mass [m] and inertia about it [kg m²], in the frame of `solid`."""
+        """Mass [kg], centre of mass [m] and inertia about it [kg m²], ballast included, in the frame of `solid`."""
         unit = self._of_unit_density
-        return MassProperties(density * unit.mass, unit.centre_of_mass, density * unit.inertia)
+        properties = MassProperties(density * unit.mass, unit.centre_of_mass, density * unit.inertia)
+        for ballast in self._ballast:
+            properties = properties.with_point_mass(ballast.mass, ballast.position)
+        return properties
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:

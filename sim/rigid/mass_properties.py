@@ -1,11 +1,11 @@
-"""Mass, centre of mass and inertia of a body of even density."""
+"""Mass, centre of mass and inertia of a body of even density, and of one with point masses in it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sim.shapes.moments import HasSignedDistance, VolumeMoments, integrate_moments
 from sim.shapes.solid import TriangleMesh
@@ -24,6 +24,14 @@ class MassProperties:
     mass: float
     centre_of_mass: NDArray[np.float64]
     inertia: NDArray[np.float64]
+
+    def with_point_mass(self, mass: float, position: ArrayLike) -> MassProperties:
+        """The same body with a point mass [kg] fixed at a position [m], (3,): the parallel axis theorem."""
+        total = self.mass + mass
+        offset = np.asarray(position, dtype=np.float64) - self.centre_of_mass
+        reduced = self.mass * mass / total
+        inertia = self.inertia + reduced * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+        return MassProperties(total, self.centre_of_mass + mass / total * offset, inertia)
 
     def principal_axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Principal moments [kg m²], ascending, (3,), and a right-handed rotation with the axes as columns, (3, 3)."""

@@ -23,6 +23,13 @@ class RigidKeyframeParameters(Parameters):
     )
 
 
+class BallastParameters(Parameters):
+    """A small heavy piece fixed in a dynamic body, such as the weight that keeps a toy duck upright."""
+
+    mass: Positive = Field(description="Mass [kg], on top of that of the density.")
+    position: Vector3 = Field(description="Where it sits, from the shape's centre, before the body is turned [m].")
+
+
 class RigidBodyParameters(Placement):
     """A rigid body: fixed, moved along a path, or moved by forces and contacts."""
 
@@ -32,7 +39,16 @@ class RigidBodyParameters(Placement):
         description="static: never moves; kinematic: follows its keyframes, or its constant velocities, whatever it "
         "hits; dynamic: moved by gravity, contacts and fluid.",
     )
-    density: Positive | None = Field(default=None, description="Mass per volume [kg/m³]; dynamic bodies need one.")
+    density: Positive | None = Field(
+        default=None,
+        description="Mass per volume [kg/m³]; dynamic bodies need one. Within some 10 % of a fluid's, a body that "
+        "starts deep below its surface rises or sinks slowly.",
+    )
+    ballast: tuple[BallastParameters, ...] = Field(
+        default=(),
+        description="Point masses fixed in a dynamic body: they shift its centre of mass and add to its inertia, and "
+        "displace nothing.",
+    )
     velocity: Vector3 = Field(
         default=(0.0, 0.0, 0.0),
         description="Velocity [m/s]: at the start, of the centre of mass (dynamic), or always (kinematic).",
@@ -46,7 +62,8 @@ class RigidBodyParameters(Placement):
     )
     restitution: Fraction = Field(
         default=0.0,
-        description="Speed after an impact over the speed before [-]; a pair of bodies has the larger of its two.",
+        description="Speed after an impact over the speed before [-]; a pair of bodies has the larger of its two. "
+        "Where a rough body hits with an edge it may be less: no impact adds energy.",
     )
     keyframe: tuple[RigidKeyframeParameters, ...] = Field(
         default=(), description="Path of a kinematic body; it rests before the first and after the last keyframe."
@@ -84,6 +101,8 @@ class RigidBodyParameters(Placement):
                 f"density has no meaning for a {self.kind} body, got {self.density:g} kg/m³; "
                 'remove it or use kind = "dynamic"'
             )
+        if self.kind != "dynamic" and self.ballast:
+            raise ValueError(f'a {self.kind} body has no mass for ballast to add to; remove it or use kind = "dynamic"')
         if self.kind != "kinematic" and self.keyframe:
             raise ValueError(f'a {self.kind} body has no keyframes; remove them or use kind = "kinematic"')
         for key in ("velocity", "angular_velocity"):

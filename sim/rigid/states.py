@@ -76,6 +76,11 @@ class MovingBodies:
         free: NDArray[np.bool_] = self.is_dynamic & ~self.is_lost
         return free
 
+    def are_free(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether forces move the bodies of these numbers, (k,); those from n on are static, or the domain."""
+        free: NDArray[np.bool_] = np.append(self.is_free, False)[np.minimum(numbers, len(self))]
+        return free
+
     @property
     def inverse_mass(self) -> Array:
         """[1/kg], (n,); 0 for kinematic and lost bodies."""

@@ -25,8 +25,17 @@ def load_mesh_solid(shape: MeshShape) -> MeshSolid:
     Raises:
         ShapeError: the file is missing or unreadable, or its mesh is no solid; see `solid_from_triangles`.
     """
-    path = Path(shape.file)
-    vertices, faces = read_triangles(path)
+    vertices, faces = read_upright_triangles(shape)
+    return solid_from_triangles(vertices, faces, label=Path(shape.file).name)
+
+
+def read_upright_triangles(shape: MeshShape) -> tuple[Points, NDArray[np.int64]]:
+    """Vertices [m], (n, 3), and faces (m, 3) of a mesh: upright, its bounding box centred, scaled to `size`.
+
+    Raises:
+        ShapeError: the file is missing, of an unknown kind, or unreadable.
+    """
+    vertices, faces = read_triangles(Path(shape.file))
     if shape.up == "y":
         vertices = vertices @ _Y_UP_TO_Z_UP.T
     used = vertices[np.unique(faces)] if len(faces) else vertices
@@ -35,7 +44,7 @@ def load_mesh_solid(shape: MeshShape) -> MeshSolid:
         extent = float((upper - lower).max())
         scale = shape.size / extent if shape.size is not None and extent > 0.0 else 1.0
         vertices = scale * (vertices - 0.5 * (lower + upper))
-    return solid_from_triangles(vertices, faces, label=path.name)
+    return vertices, faces
 
 
 def read_triangles(path: Path) -> tuple[Points, NDArray[np.int64]]:

@@ -57,6 +57,13 @@ velocity = [0.0, 0.0, -3.0]
 
 [whitewater.water]
 
+[[cloth]]                      # thrown into a corner: it meets the floor and two walls within these few frames
+name = "sheet"
+shape = {{ type = "rectangle", size = [0.2, 0.2], counts = [7, 7] }}
+position = [0.18, -0.18, 0.08]
+rotation_deg = [20.0, 30.0, 10.0]
+velocity = [2.0, -2.0, -1.0]
+
 [[smoke]]
 name = "plume"
 min = [-0.3, -0.3, 0.0]

@@ -10,9 +10,9 @@ import pytest
 from films import FRAMES, STAGE_NAMES, Finished, Studio, stage_of
 from PIL import Image
 
-FILES = 1 + 5 * FRAMES + 2
-"""The ball's mesh; cache, surface, whitewater, volume and picture of each frame; segment and film."""
-TASKS = 1 + 1 + 4 * FRAMES + 2  # the same, with one task for all of the cache
+FILES = 1 + 6 * FRAMES + 2
+"""The ball's mesh; cache, surface, cloth, whitewater, volume and picture of each frame; segment and film."""
+TASKS = 1 + 1 + 5 * FRAMES + 2  # the same, with one task for all of the cache
 
 
 def test_submit_makes_every_file_and_a_film_of_the_right_size_and_length(first_submit: tuple[Studio, Finished]) -> None:
@@ -53,6 +53,7 @@ def test_a_finished_job_can_be_looked_at_from_all_sides(finished: Studio) -> Non
     assert status["failures"] == []
     assert status["simulation"]["frame"] == FRAMES - 1
     assert status["simulation"]["solvers"]["water"]["particle_count"] > 0
+    assert status["simulation"]["solvers"]["cloth"]["node_count"] == 49
     assert "<figcaption>Energy [J]</figcaption>" in finished.layout.report.read_text()  # left there by submit
     assert finished.run("status", "tiny").assert_code(0).out.startswith("renders/tiny: done\n")
     plan = json.loads(finished.run("plan", "tiny.toml", "--json").assert_code(0).out)

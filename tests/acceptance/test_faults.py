@@ -19,6 +19,7 @@ from films import PATIENCE_S, PROJECT, Finished, Studio
 
 ONE_OF_EACH_KIND = (
     "cache/000002.h5",
+    "cloths/sheet/000005.ply",
     "frames/000003.png",
     "meshes/ball.ply",
     "movie.mp4",
@@ -28,6 +29,7 @@ ONE_OF_EACH_KIND = (
 )
 THEIR_TASKS = {
     "bodies/ball",
+    "cloth/sheet/000005",
     "movie/film",
     "movie/segment-0000",
     "render/000003",

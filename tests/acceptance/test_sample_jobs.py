@@ -12,10 +12,14 @@ import pytest
 JOBS = sorted((Path(__file__).parents[2] / "jobs").glob("*.toml"))
 
 TINY = {
+    "ball_into_cloth": {"cloth.sheet.shape.counts": [9, 9]},
+    "cloth_over_bunny": {"cloth.veil.shape.counts": [11, 11]},
+    "cloth_over_sphere": {"cloth.sheet.shape.counts": [11, 11]},
     "dam_break": {"fluid.water.particle_radius": 0.025},
     "drop_on_bunny_dfsph": {"fluid.water.particle_radius": 0.05},
     "drop_on_bunny_wcsph": {"fluid.water.particle_radius": 0.05, "fluid.water.dt": 1.0e-3},
     "duck_in_pool_pcisph": {"fluid.water.particle_radius": 0.05},
+    "flag_in_wind": {"cloth.flag.shape.counts": [13, 9]},
     "floating_bodies": {"fluid.water.particle_radius": 0.025},
     "honey": {"fluid.honey.particle_radius": 0.0014},
     "quickstart": {"fluid.water.particle_radius": 0.02, "smoke.plume.cell_size": 0.06},

@@ -12,6 +12,7 @@ from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.parameter_set import ParameterSet
 from pipeline.task import Task, TaskId
+from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
 from sim.snapshots import Snapshot
 from sim.world import FrameReport
 
@@ -50,4 +51,28 @@ def commit(layout: JobLayout, frame: int, *, fingerprint: str = "f", **water: fl
         layout, task.outputs[0], task=task, attempt=1, fingerprint=fingerprint, validate=validate_frame
     ) as new:
         write_frame(new.path, {"water": snapshot}, report, device="cpu")
+    return new.receipt
+
+
+def commit_whitewater(layout: JobLayout, frame: int, cached: Receipt, *, points: int = 3, not_made: int = 0) -> Receipt:
+    """The fluid's whitewater of a frame, as it is committed; `cached` is the receipt of that frame of the cache."""
+    vectors, numbers = np.zeros((points, 3), np.float32), np.ones(points, np.float32)
+    task = Task(
+        TaskId(f"whitewater/water/{frame:06d}"),
+        "whitewater",
+        (cached.artifact,),
+        (layout.whitewater("water", frame),),
+        ParameterSet.of(stage="whitewater", version=1, tools={}),
+    )
+    with committing(
+        layout,
+        task.outputs[0],
+        task=task,
+        attempt=1,
+        fingerprint=f"w{frame}",
+        validate=validate_point_cloud,
+        inputs={cached.artifact: cached.hash},
+    ) as new:
+        cloud = PointCloud(vectors, vectors, numbers, numbers, np.zeros(points, np.uint8), not_made)
+        write_point_cloud(new.path, cloud)
     return new.receipt

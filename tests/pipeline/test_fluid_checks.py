@@ -137,6 +137,98 @@ def test_emitters_in_each_others_way_are_refused_at_load(tmp_path):
     assert errors == []
 
 
+def emitter(position: str, direction: str, *, speed: float = 2.0, more: str = "") -> str:
+    return f"""
+[[fluid.emitter]]
+shape = {{ type = "disc", radius = 0.1 }}
+position = {position}
+direction = {direction}
+speed = {speed}
+{more}
+"""
+
+
+JETS = JET.partition("[[fluid.emitter]]")[0]
+ACROSS = emitter("[-0.45, 0.0, 0.5]", "[1, 0, 0]", speed=5.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "arrival"),
+    [
+        # Straight ahead at 5 m/s to the edge of the other nozzle, 0.8 m away, and from above by a fall of half a metre.
+        (emitter("[0.45, 0.0, 0.5]", "[-1, 0, 0]", speed=5.0, more="start_s = 0.2") + ACROSS, "0.15"),
+        (emitter("[0.1, 0.0, 0.25]", "[0, 0, -1]") + emitter("[0.1, 0.0, 0.9]", "[0, 0, -1]"), "0.2"),
+        # On a parabola over 0.6 m, which is 9 cm lower there than a straight line.
+        (emitter("[0.3, 0.0, 0.22]", "[0, 0, -1]") + emitter("[-0.4, 0.0, 0.55]", "[1, 0, 0]", speed=3.0), "0.2"),
+    ],
+    ids=["head-on", "from above", "on a parabola"],
+)
+def test_a_jet_that_runs_into_another_nozzle_is_warned_of(text, arrival, tmp_path):
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
+    assert errors == []
+    hits = [warning for warning in warnings if "its jet runs into the nozzle of fluid[0].emitter[0]" in warning]
+    assert len(hits) == 1
+    seconds = float(hits[0].partition("emitter[0] ")[2].partition(" s ")[0])
+    assert seconds == pytest.approx(float(arrival), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        emitter("[-0.2, 0.0, 0.9]", "[0, 0, -1]") + emitter("[0.2, 0.0, 0.9]", "[0, 0, -1]"),
+        # It would meet the other one without the pool between, or without the post.
+        emitter("[0.1, 0.0, 0.1]", "[0, 0, 1]") + emitter("[0.1, 0.0, 0.9]", "[0, 0, -1]") + WATER.replace(
+            "0.1]", "0.35]").replace('name = "water"', 'name = "pool"'),
+        emitter("[0.45, 0.0, 0.5]", "[-1, 0, 0]") + emitter("[-0.45, 0.0, 0.5]", "[1, 0, 0]")
+        + '[[rigid]]\nname = "post"\nshape = { type = "box", size = [0.1, 0.4, 0.9] }\nposition = [0, 0, 0.5]\n',
+        # It falls below the other one before it is there.
+        emitter("[0.4, 0.0, 0.6]", "[-1, 0, 0]", more="start_s = 0.9")
+        + emitter("[-0.4, 0.0, 0.6]", "[1, 0, 0]", speed=1.0),
+    ],
+    ids=["side by side", "pool between", "post between", "too slow"],
+)  # fmt: skip
+def test_jets_that_meet_something_else_first_pass_without_a_word(text, tmp_path):
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
+    assert errors == []
+    assert not [warning for warning in warnings if "its jet" in warning or "before its opening" in warning]
+
+
+PLATE = '[[rigid]]\nname = "plate"\nshape = {{ type = "box", size = [0.5, 0.5, 0.02] }}\nposition = [0, 0, {height}]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "room"),
+    [
+        (emitter("[0.0, 0.0, 0.1]", "[0, 0, -1]"), "0.1"),  # the floor
+        (emitter("[0.0, 0.0, 0.9]", "[0, 0, -1]") + PLATE.format(height=0.78), "0.11"),
+        (emitter("[0.44, 0.0, 0.5]", "[1, 0, 0]"), "0.06"),
+    ],
+    ids=["floor", "plate", "side wall"],
+)
+def test_an_opening_right_before_a_wall_is_warned_of(text, room, tmp_path):
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
+    assert errors == []
+    (warning,) = (each for each in warnings if "before its opening" in each)
+    assert float(warning.partition("body is ")[2].partition(" m ")[0]) == pytest.approx(float(room), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        emitter("[0.0, 0.0, 0.16]", "[0, 0, -1]"),  # a nozzle of 8 cm, and a quarter of its width
+        emitter("[0.0, 0.0, 0.9]", "[0, 0, -1]") + PLATE.format(height=0.7),
+        # A thin post takes less than half of the jet.
+        emitter("[0.0, 0.0, 0.9]", "[0, 0, -1]") + PLATE.format(height=0.75).replace("0.5, 0.5", "0.05, 0.5"),
+        emitter("[0.44, 0.0, 0.5]", "[1, 0, 0]") + '[domain]\nopen_faces = ["x+"]\n',
+    ],
+    ids=["high enough", "plate below", "thin", "open"],
+)
+def test_an_opening_with_room_before_it_passes_without_a_word(text, tmp_path):
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
+    assert errors == []
+    assert not [warning for warning in warnings if "before its opening" in warning]
+
+
 def test_memory_counts_what_emitters_may_add(tmp_path):
     # The domain of 1 m³ holds 15,625 particles of 4 cm, and an endless jet may fill it.
     endless, _, _ = checked(HEAD + JET, tmp_path, memory_bytes=8_000_000)

@@ -51,7 +51,7 @@ def test_starter_passes_every_check_without_a_warning(template, preview, tmp_pat
     path.write_text(starter("film", template, file="film.toml"))
     loaded, findings = load_checked_job(path, preview=preview)
     assert loaded.warnings == ()
-    assert findings.particles + findings.cells > 100
+    assert findings.particles + findings.cells + findings.nodes > 100
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_starter_passes_every_check_without_a_warning(template, preview, tmp_pat
             HEAD + WATER.replace("radius = 0.02", "radius = 1e-30"),
             "dam.toml:6 fluid[0].particle_radius: must be at least 1e-06 m, got 1e-30; units are SI",
         ),
-        (HEAD, "dam.toml: has no body; add [[fluid]], [[smoke]] or [[rigid]]"),
+        (HEAD, "dam.toml: has no body; add [[fluid]], [[smoke]], [[cloth]] or [[rigid]]"),
         (
             HEAD + BALL + WATER.replace('"water"', '"Ball"'),
             'dam.toml:10 fluid[0].name: "Ball" is taken by rigid[0]; names are unique in a job',
@@ -150,7 +150,7 @@ def test_job_that_cannot_be_meant_is_refused_with_this_line(text, expected, tmp_
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (HEAD + BALL, "dam.toml: has neither fluid nor smoke, so nothing will move"),
+        (HEAD + BALL, "dam.toml: has neither fluid nor smoke nor cloth, so nothing will move"),
         (
             HEAD + BALL + 'kind = "kinematic"\n' + PLUME,
             "dam.toml: smoke passes through bodies that move in this version; only static ones are in its way",

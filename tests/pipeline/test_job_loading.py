@@ -126,8 +126,19 @@ BAD = {
         ["dam.toml:2 rigid[0]: density is missing; a dynamic body needs one, such as 600 kg/m³ for wood"],
     ),
     "cloth": (
-        'name = "dam"\n[[cloth]]\nname = "flag"',
-        ["dam.toml:2 cloth: cloth is not simulated by this version; remove [[cloth]]"],
+        'name = "dam"\n[[cloth]]\nname = "flag"\nmaterial = "wool"\nshape = {type = "rectangle", size = [1.0, 1.0]}',
+        [
+            'dam.toml:4 cloth[0].material: expected "cotton", "silk", "denim" or "rubber", got the text "wool"',
+            "dam.toml:5 cloth[0].shape: give counts or resolution, one of them",
+        ],
+    ),
+    "pin of a cloth": (
+        'name = "dam"\n[[cloth]]\nname = "flag"\nshape = {type = "rectangle", size = [1.0, 1.0], counts = [3, 3]}\n'
+        '[[cloth.pin]]\ncorner = "x-"',
+        [
+            'dam.toml:6 cloth[0].pin[0].corner: expected "x-y-", "x+y-", "x-y+" or "x+y+", '
+            'got the text "x-"; did you mean "x-y-"?'
+        ],
     ),
     "film without end": (
         'name = "dam"\nduration = 1e300',

@@ -97,7 +97,7 @@ def test_later_override_wins(tmp_path):
         (
             "rigid.ball=3",
             "--set rigid.ball=3: rigid[0] is a table; set its keys: shape, position, rotation_deg, scale, name, kind, "
-            "density, velocity, angular_velocity, friction, restitution, keyframe, interpolation",
+            "density, ballast, velocity, angular_velocity, friction, restitution, keyframe, interpolation",
         ),
         ("rigid.ball.shape.radius=-1", "--set rigid[0].shape.radius: must be > 0 m, got -1"),
         ("fps=fast", '--set fps: expected a whole number, got the text "fast"'),

@@ -63,11 +63,13 @@ def test_unit_of_a_key_is_found_through_lists_tables_and_alternatives():
     assert node_at(("gravity", 3)) is None
 
 
-def test_example_in_the_documentation_is_a_valid_job(tmp_path):
+def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
     document = (ROOT / "docs" / "job-file.md").read_text(encoding="utf-8")
-    [example] = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+    example, cloth = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
     (tmp_path / "drop.toml").write_text(example)
     assert load_job(tmp_path / "drop.toml").frame_count == 90
+    (tmp_path / "flag.toml").write_text(f'name = "flag"\n{cloth}')
+    assert len(load_job(tmp_path / "flag.toml").cloth[0].pin) == 2
 
 
 def test_reference_in_the_documentation_is_current():

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from pipeline.job import memory_budget as module
@@ -9,6 +15,7 @@ from pipeline.job.checks import check_job
 from pipeline.job.memory_budget import SHARE, free_gpu_bytes, memory_budget
 from pipeline.job.models import Job
 
+PROJECT = Path(__file__).resolve().parents[2]
 WATER = {"name": "water", "block": [{"shape": {"type": "box", "size": (0.4, 0.4, 0.4)}, "position": (0.0, 0.0, 0.5)}]}
 
 
@@ -60,6 +67,103 @@ def test_the_driver_is_asked_and_may_be_missing(monkeypatch):
     assert free is None or 0 < SHARE * free < 1e13
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert free_gpu_bytes() is None
+
+
+DRIVER = """
+#include <string.h>
+typedef struct { unsigned long long total, free, used; } memory_t;   /* nvmlMemory_t of nvml.h */
+static int users = 0;
+static int devices[3] = {0, 1, 2};
+int nvmlInit_v2(void) { users++; return 0; }
+int nvmlShutdown(void) { users--; return 0; }
+int nvmlDeviceGetHandleByIndex_v2(unsigned int index, void **device) {
+    if (index > 2) return 2;
+    *device = &devices[index];
+    return 0;
+}
+int nvmlDeviceGetHandleByUUID(const char *uuid, void **device) {
+    if (strcmp(uuid, "GPU-7") != 0) return 6;
+    *device = &devices[1];
+    return 0;
+}
+int nvmlDeviceGetMemoryInfo(void *device, memory_t *memory) {
+    static const unsigned long long free_bytes[2] = {149250000000ULL, 4000000ULL};
+    int index = *(int *)device;
+    if (users != 1 || index > 1) return 3;                           /* the third device answers nothing */
+    memory->total = 150000000000ULL;
+    memory->free = free_bytes[index];
+    memory->used = memory->total - memory->free;
+    return 0;
+}
+"""
+"""Of the functions of Nvidia's management library those that are asked, for three GPUs, with their real signatures."""
+
+
+@pytest.fixture(scope="module")
+def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a library that answers as a driver would."""
+    folder = tmp_path_factory.mktemp("driver")
+    (folder / "nvml.c").write_text(DRIVER)
+    command = ["cc", "-shared", "-fPIC", "-o", folder / "libnvidia-ml.so.1", folder / "nvml.c"]
+    subprocess.run(command, check=True)
+    return folder
+
+
+def with_driver(driver: Path, code: str, **environment: str) -> str:
+    """Run code in a process that finds this driver; what it prints."""
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "LD_LIBRARY_PATH": str(driver), "PYTHONPATH": str(PROJECT), **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return ended.stdout.strip()
+
+
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("visible", "free"),
+    [
+        (None, "149250000000"),
+        ("0,1", "149250000000"),
+        ("1,0", "4000000"),
+        ("GPU-7", "4000000"),
+        ("GPU-8", "None"),
+        ("2", "None"),
+        ("9", "None"),
+    ],
+)
+def test_the_driver_tells_the_free_memory_of_the_first_visible_gpu(driver, visible, free):
+    asked = "from pipeline.job.memory_budget import free_gpu_bytes as f; print(f(), f())"
+    environment = {} if visible is None else {"CUDA_VISIBLE_DEVICES": visible}
+    # Twice: every question has to end what it began.
+    assert with_driver(driver, asked, **environment) == f"{free} {free}"
+
+
+@needs_compiler
+def test_a_job_too_large_for_a_large_gpu_is_refused_with_the_count_that_fits(driver):
+    check = """
+import sim.runtime
+from pipeline.job.checks import check_job
+from pipeline.job.models import Job
+sim.runtime.available_devices = lambda: {"cpu": "ok", "cuda": "ok"}
+def errors(size):
+    box = {"shape": {"type": "box", "size": (size,) * 3}, "position": (0.0, 0.0, size / 2.0)}
+    domain = {"min": (-size, -size, 0.0), "max": (size, size, 2.0 * size)}
+    water = {"name": "water", "particle_radius": 0.005, "block": [box]}
+    job = {"name": "a", "frames": 2, "device": "cuda", "domain": domain, "fluid": [water]}
+    return [problem.message for problem in check_job(Job.model_validate(job, strict=False)).errors]
+print(errors(6.0))
+print(errors(6.1))
+"""
+    fits, refused = with_driver(driver, check).splitlines()
+    # 90 % of 149.25 GB are 134.3 GB, and 223.9 million particles of 600 bytes: a cube of 607 an edge.
+    assert fits == "[]"
+    assert "227 million particles need 136 GB, the GPU has 134 GB; at most 224 million fit: use 0.0051 m" in refused
 
 
 def test_a_fluid_of_emitters_alone_has_a_time_step_to_check():

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import threading
 
 import pytest
 
 from pipeline.executors.failures import is_disk_full
-from pipeline.stages.ordered_writer import WAITING, OrderedWriter
+from pipeline.stages.ordered_writer import WAITING, OrderedWriter, WriterLostError
 
 PATIENCE_S = 60.0
 """Only a hang gets here."""
@@ -91,6 +92,30 @@ def test_a_full_disk_is_still_a_full_disk_in_the_computing_thread_and_nothing_is
 def test_the_error_of_the_last_write_is_raised_on_leaving():
     with pytest.raises(OSError, match="No space left"), OrderedWriter() as writer:
         writer.submit(full_disk)
+
+
+def end_writing_thread() -> None:
+    """Raise SystemExit in it, where it waits for the next write."""
+    (thread,) = (each for each in threading.enumerate() if each.name == "writer")
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit))
+
+
+def test_a_thread_that_ended_is_an_error_for_the_computing_one_and_no_endless_wait():
+    done: list[int] = []
+    with pytest.raises(WriterLostError, match="has ended unexpectedly"), OrderedWriter() as writer:
+        writer.submit(lambda: done.append(0))
+        end_writing_thread()
+        for number in range(1, WAITING + 5):
+            writer.submit(lambda number=number: done.append(number))
+    assert done in ([], [0])  # whether it was already at the first one
+
+
+def test_a_thread_that_ended_is_found_on_leaving_where_nothing_came_after():
+    done: list[int] = []
+    with pytest.raises(WriterLostError), OrderedWriter() as writer:
+        end_writing_thread()
+        writer.submit(lambda: done.append(0))
+    assert done == []
 
 
 def test_what_was_computed_before_a_divergence_is_written():

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from numbered_frames import commit, submitted
+from numbered_frames import commit, commit_whitewater, submitted
 from PIL import Image
 
 from pipeline.artifacts import committing
@@ -296,6 +296,30 @@ def test_the_numbers_are_in_the_page_for_machines(layout):
         "bytes": 0,
     }
     assert job["warnings"][0]["frames"] == [2]
+
+
+def test_the_facts_have_the_particles_of_each_fluid_of_a_tank(layout):
+    water = "[[fluid]]" + layout.job_file.read_text().partition("[[fluid]]")[2]
+    with layout.job_file.open("a") as file:
+        file.write(water.replace("water", "oil"))
+    commit(layout, 3, particle_count=1300.0)
+    write_report([layout], layout.report)
+    assert "<dt>water</dt><dd>WCSPH, 1,300 particles of radius" in layout.report.read_text()
+    commit(layout, 4, particle_count_water=1000.0, particle_count_oil=300.0)
+    write_report([layout], layout.report)
+    text = layout.report.read_text()
+    assert "<dt>water</dt><dd>WCSPH, 1,000 particles of radius" in text
+    assert "<dt>oil</dt><dd>WCSPH, 300 particles of radius" in text
+
+
+def test_the_report_warns_of_whitewater_that_had_no_room_or_is_damaged(layout):
+    commit_whitewater(layout, 3, commit(layout, 3), not_made=11)
+    damaged = commit_whitewater(layout, 4, commit(layout, 4))
+    layout.path(damaged.artifact).write_bytes(b"gone")
+    write_report([layout], layout.report)
+    text = layout.report.read_text()
+    assert "whitewater of water: 11 particles were not made, as there are max_particles, frame 3" in text
+    assert "whitewater that cannot be read: whitewater/water/000004.ply" in text
 
 
 def test_a_name_is_text_and_no_markup(tmp_path):

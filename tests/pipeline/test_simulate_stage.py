@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import signal
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import killed_simulation
 import pytest
+from simulation_on_a_full_disk import FRAMES as FRAMES_OF_FULL_DISK
 
 from pipeline.artifacts import is_committed, sweep_parts
 from pipeline.cache import read_frame, write_frame
@@ -35,10 +37,38 @@ position = [0.0, 0.0, 0.3]
 """
 
 
-def simulate(layout: JobLayout, *, frames: int, attempt: int = 1) -> TaskEvent:
+DRAPE = """
+name = "drop"
+frames = {frames}
+
+[[rigid]]
+name = "ball"
+kind = "dynamic"
+density = 500.0
+shape = {{ type = "sphere", radius = 0.08 }}
+position = [0.0, 0.0, 0.3]
+velocity = [0.0, 0.0, 1.0]
+
+[[cloth]]
+name = "sheet"                # meets the ball in its first frames, let go at one corner and led away at another
+shape = {{ type = "rectangle", size = [0.5, 0.5], counts = [11, 11] }}
+position = [0.0, 0.0, 0.4]
+velocity = [0.0, 0.0, -1.0]
+wind = [3.0, 0.0, 0.0]
+[[cloth.pin]]
+corner = "x-y-"
+release_s = 0.04
+[[cloth.pin]]
+corner = "x+y+"
+keyframe = [{{ time_s = 0.0 }}, {{ time_s = 0.1, offset = [0.05, 0.0, 0.1] }}]
+"""
+"""Cloth, a body and contacts, coupled both ways."""
+
+
+def simulate(layout: JobLayout, *, frames: int, attempt: int = 1, job: str = JOB) -> TaskEvent:
     """Run the task of a job of so many frames until it ends; returns how it ended."""
     layout.root.mkdir(exist_ok=True)
-    layout.job_file.write_text(JOB.format(frames=frames))
+    layout.job_file.write_text(job.format(frames=frames))
     return killed_simulation.simulate(layout, attempt=attempt)
 
 
@@ -74,13 +104,22 @@ def frames_of(layout: JobLayout, count: int) -> list[bytes]:
     return [layout.path(layout.frame_cache(frame)).read_bytes() for frame in range(count)]
 
 
-@pytest.mark.parametrize("write", ["write_frame", "write_checkpoint"])
-def test_killed_in_the_middle_of_a_write_it_continues_to_the_same_frames(layout: JobLayout, write: str) -> None:
+@pytest.mark.parametrize(
+    ("write", "job"),
+    [
+        pytest.param("write_frame", JOB, id="frame"),
+        pytest.param("write_checkpoint", JOB, id="checkpoint"),
+        pytest.param("write_checkpoint", DRAPE, id="checkpoint of cloth", marks=pytest.mark.slow),
+    ],
+)
+def test_killed_in_the_middle_of_a_write_it_continues_to_the_same_frames(
+    layout: JobLayout, write: str, job: str
+) -> None:
     """Frames are written while later ones are computed: what is killed has computed more than it has written."""
     undisturbed = JobLayout(layout.root.with_name("undisturbed"))
-    assert isinstance(simulate(undisturbed, frames=6), Finished)
+    assert isinstance(simulate(undisturbed, frames=6, job=job), Finished)
     layout.root.mkdir()
-    layout.job_file.write_text(JOB.format(frames=6))
+    layout.job_file.write_text(job.format(frames=6))
     script = Path(killed_simulation.__file__)
     killed = subprocess.run(
         [sys.executable, script, layout.root, write, "3"],
@@ -94,9 +133,52 @@ def test_killed_in_the_middle_of_a_write_it_continues_to_the_same_frames(layout:
     # A checkpoint ahead of the frames would have to be thrown away, and the work before it be done again.
     assert sorted(path.name for path in layout.checkpoints.glob("[0-9]*.h5")) == ["000001.h5", "000002.h5"]
     sweep_parts(layout)
-    assert isinstance(simulate(layout, frames=6, attempt=2), Finished)
+    assert isinstance(simulate(layout, frames=6, attempt=2, job=job), Finished)
     assert "starting at frame 2" in layout.log(killed_simulation.TASK, 2).read_text()
     assert frames_of(layout, 6) == frames_of(undisturbed, 6)
+
+
+SMALL_DISK = """
+mount -t tmpfs -o size=400k tmpfs "$0" && head -c 250000 /dev/zero > "$0/ballast" &&
+exec "$1" "$2" "$0/drop" "$0/ballast"
+"""
+"""Of a few pages, in a name space of its own, which needs no rights."""
+
+
+def has_own_mounts() -> bool:
+    """Whether this machine lets anybody mount something in a name space of his own."""
+    return (
+        shutil.which("unshare") is not None
+        and not subprocess.run(
+            ["unshare", "--user", "--map-root-user", "--mount", "mount", "-t", "tmpfs", "tmpfs", "/mnt"],
+            capture_output=True,
+            check=False,
+        ).returncode
+    )
+
+
+@pytest.mark.skipif(not has_own_mounts(), reason="this machine forbids user name spaces, or lacks unshare")
+def test_a_disk_that_fills_up_stops_the_simulation_at_its_frame_and_costs_nothing(tmp_path: Path) -> None:
+    """On a real full disk: HDF5 once left files open there, and ended the process with a segmentation fault."""
+    script = Path(killed_simulation.__file__).with_name("simulation_on_a_full_disk.py")
+    ended = subprocess.run(
+        ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", SMALL_DISK, tmp_path, sys.executable, script],
+        env={**os.environ, "PYTHONPATH": str(PROJECT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    told = json.loads(ended.stdout.splitlines()[-1])
+    frames = len(told["committed"])
+    assert told["committed"] == list(range(frames))
+    assert 1 <= frames < FRAMES_OF_FULL_DISK
+    assert told["kind"] == FailureKind.DISK_FULL.value
+    assert told["message"] == f"OSError: [Errno 28] No space left on device; while frame {frames} was written"
+    assert told["parts"] == told["checkpoints"] == []
+    assert told["second"] == "Finished"
+    assert told["committed_then"] == list(range(FRAMES_OF_FULL_DISK))
 
 
 def test_a_disk_that_is_full_for_a_frame_is_told_as_such(layout: JobLayout, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,5 +192,6 @@ def test_a_disk_that_is_full_for_a_frame_is_told_as_such(layout: JobLayout, monk
         ended = simulate(layout, frames=6)
     assert isinstance(ended, Failed)
     assert ended.kind is FailureKind.DISK_FULL
+    assert ended.message.endswith("; while frame 2 was written")
     assert not list(layout.checkpoints.glob("*.h5"))  # it would be ahead of the frames
     assert isinstance(simulate(layout, frames=6, attempt=2), Finished)

@@ -6,7 +6,7 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from numbered_frames import commit, submitted
+from numbered_frames import commit, commit_whitewater, submitted
 
 from pipeline.cache import read_numbers
 from pipeline.cli import main
@@ -116,6 +116,47 @@ def test_a_run_tells_a_warning_once_when_it_first_happens(layout):
         receipt = commit(layout, frame, not_converged=float(count))
         watch.notify(Committed(TaskId("simulate"), 1, receipt))
     assert said == ["water: 3 solves hit their iteration limit, frame 1; later ones are counted: pipeline status"]
+
+
+def test_whitewater_that_had_no_room_is_counted_with_its_frames(layout):
+    for frame, not_made in enumerate([0, 0, 30, 12, 0]):
+        commit_whitewater(layout, frame, commit(layout, frame), points=10 * frame, not_made=not_made)
+    text = status(layout)
+    assert "warning: whitewater of water: 42 particles were not made, as there are max_particles, frames 2-3\n" in text
+    assert "whitewater of water, frame 4" in text
+    assert "whitewater particles 40" in text
+
+
+def test_whitewater_of_an_earlier_version_of_the_simulation_does_not_count(layout):
+    commit_whitewater(layout, 0, commit(layout, 0, kinetic_energy=1.0), not_made=5)
+    commit(layout, 0, kinetic_energy=2.0)
+    assert simulation_numbers(layout).warnings() == []
+
+
+def test_whitewater_that_cannot_be_read_is_said(layout):
+    receipt = commit_whitewater(layout, 0, commit(layout, 0))
+    layout.path(receipt.artifact).write_bytes(b"gone")
+    text = status(layout)
+    assert "water, frame 0" in text
+    assert "whitewater that cannot be read: whitewater/water/000000.ply; see: pipeline verify" in text
+
+
+def test_a_run_tells_when_whitewater_first_has_no_room(layout):
+    said: list[str] = []
+    watch = SolverWatch(layout, said.append)
+    for frame, not_made in enumerate([0, 7, 9]):
+        receipt = commit_whitewater(layout, frame, commit(layout, frame), not_made=not_made)
+        watch.notify(Committed(receipt.task, 1, receipt))
+    assert said == [
+        "whitewater of water: 7 particles were not made, as there are max_particles, frame 1; "
+        "later ones are counted: pipeline status"
+    ]
+
+
+def test_particles_of_each_fluid_of_a_tank_are_told_by_its_name(layout):
+    commit(layout, 0, particle_count=1300.0, particle_count_oil=300.0, particle_count_water=1000.0, contacts=1.0)
+    text = status(layout).replace("\n    ", " ")
+    assert "particles 1,300, particles of oil 300, particles of water 1,000, contacts 1" in text
 
 
 def test_the_mass_of_smoke_is_no_kilogram():

@@ -44,7 +44,16 @@ def digests(of: Job) -> dict[str, str]:
 def test_every_frame_gets_its_surface_volume_and_picture():
     tasks = plan_job(job(), LAYOUT, STAGES)
     count = {stage.name: sum(task.stage == stage.name for task in tasks) for stage in STAGES}
-    assert count == {"bodies": 1, "simulate": 1, "surface": 40, "volume": 40, "whitewater": 0, "render": 40, "movie": 3}
+    assert count == {
+        "bodies": 1,
+        "simulate": 1,
+        "surface": 40,
+        "cloth": 0,
+        "volume": 40,
+        "whitewater": 0,
+        "render": 40,
+        "movie": 3,
+    }
 
 
 def test_a_picture_waits_for_its_own_frame_only():

@@ -247,6 +247,18 @@ def test_a_fluid_feels_the_other_fluids_of_its_tank(tmp_path):
     assert len(read_point_cloud(layout.path(layout.whitewater("water", 4))).position) > 20
 
 
+def test_what_has_no_room_below_the_cap_is_told_by_the_file(tmp_path):
+    layout = JobLayout(tmp_path / "tank")
+    write_cache(layout)
+    layout.job_file.write_text(JOB_FILE + "max_particles = 50\n")
+    printed = run_in_a_process(layout, "0,1,2,3,4,5")
+    assert printed.count("Finished") == 6, printed
+    clouds = [read_point_cloud(layout.path(layout.whitewater("water", frame))) for frame in range(6)]
+    assert clouds[0].not_made == 0
+    assert len(clouds[-1].position) == 50
+    assert clouds[-1].not_made > 0
+
+
 def test_frames_that_are_gone_are_made_again_with_the_same_bits(tank, tmp_path):
     """As after a crash: another process continues from the last frame that is left."""
     copy = JobLayout(Path(shutil.copytree(tank.root, tmp_path / "tank")))

@@ -30,17 +30,19 @@ def file(tmp_path: Path, tetrahedron) -> Path:
 
 @pytest.mark.parametrize("with_normals", [False, True])
 @pytest.mark.parametrize("with_velocities", [False, True])
-def test_a_mesh_reads_back_as_written(tmp_path, tetrahedron, with_normals, with_velocities):
+@pytest.mark.parametrize("with_uv", [False, True])
+def test_a_mesh_reads_back_as_written(tmp_path, tetrahedron, with_normals, with_velocities, with_uv):
     vertices, faces = tetrahedron
     normals = vertices + 3 if with_normals else None
     velocities = vertices + 5 if with_velocities else None
+    uv = vertices[:, :2] + 7 if with_uv else None
     path = tmp_path / "mesh.ply"
-    write_ply(path, vertices, faces, normals=normals, velocities=velocities)
+    write_ply(path, vertices, faces, normals=normals, velocities=velocities, uv=uv)
     validate_ply(path)
     mesh = read_ply(path)
     np.testing.assert_array_equal(mesh.vertices, vertices)
     np.testing.assert_array_equal(mesh.faces, faces)
-    for written, read in ((normals, mesh.normals), (velocities, mesh.velocities)):
+    for written, read in ((normals, mesh.normals), (velocities, mesh.velocities), (uv, mesh.uv)):
         if written is None:
             assert read is None
         else:
@@ -99,14 +101,14 @@ def test_a_header_without_positions_is_refused(file):
         validate_ply(file)
 
 
-@pytest.mark.parametrize("column", ["vertices", "normals", "velocities"])
+@pytest.mark.parametrize("column", ["vertices", "normals", "velocities", "uv"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_numbers_that_are_not_finite_are_refused_by_name(tmp_path, tetrahedron, column, value):
     vertices, faces = tetrahedron
-    columns = {name: vertices.copy() for name in ("vertices", "normals", "velocities")}
+    columns = {name: vertices.copy() for name in ("vertices", "normals", "velocities")} | {"uv": vertices[:, :2].copy()}
     columns[column][2, 1] = value
     path = tmp_path / "mesh.ply"
-    write_ply(path, columns["vertices"], faces, normals=columns["normals"], velocities=columns["velocities"])
+    write_ply(path, faces=faces, **columns)
     with pytest.raises(InvalidFileError, match=r"of vertex 2 is not finite"):
         validate_ply(path)
 

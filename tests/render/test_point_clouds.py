@@ -10,7 +10,15 @@ import pytest
 import trimesh
 
 from render.errors import InvalidFileError
-from render.point_clouds import KINDS, PointCloud, read_point_cloud, validate_point_cloud, write_point_cloud
+from render.point_clouds import (
+    KINDS,
+    PointCloud,
+    PointCounts,
+    read_point_cloud,
+    read_point_counts,
+    validate_point_cloud,
+    write_point_cloud,
+)
 
 FIELDS = ("position", "velocity", "radius", "lifetime", "kind")
 
@@ -40,6 +48,16 @@ def test_a_cloud_reads_back_as_written(tmp_path, count):
     validate_point_cloud(path)
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(read_point_cloud(path), name), getattr(cloud, name))
+
+
+def test_what_had_no_room_is_told_by_the_header_alone(tmp_path):
+    path = tmp_path / "points.ply"
+    write_point_cloud(path, replace(some_points(), not_made=1_234_567))
+    assert read_point_counts(path) == PointCounts(points=50, not_made=1_234_567)
+    assert read_point_cloud(path).not_made == 1_234_567
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(InvalidFileError, match="not a point cloud"):
+        read_point_counts(path)
 
 
 def test_other_software_reads_the_file(file):
@@ -90,7 +108,13 @@ def test_a_file_of_another_size_is_refused(file, change):
 
 
 @pytest.mark.parametrize(
-    ("old", "new"), [(b"little", b"big"), (b"float radius", b"double radius"), (b"vertex 50", b"vertex 050")]
+    ("old", "new"),
+    [
+        (b"little", b"big"),
+        (b"float radius", b"double radius"),
+        (b"vertex 50", b"vertex 050"),
+        (b"not_made 0", b"not_made -1"),
+    ],
 )
 def test_another_layout_is_refused(file, old, new):
     content = file.read_bytes()

@@ -42,10 +42,10 @@ def test_a_box_of_as_many_cells_as_fit_is_taken():
 
 
 def find_neighbors(
-    points: np.ndarray, boundary: np.ndarray, moving: np.ndarray | None = None, *, stride: int = 1
+    points: np.ndarray, boundary: np.ndarray, moving: np.ndarray | None = None, *, stride: int = 1, reach: int = 1
 ) -> tuple[list[set[int]], list[set[int]], np.ndarray, np.ndarray]:
     """Neighbours by the device: of fluid, of boundary, with both point sets as sorted; moving samples come last."""
-    grid = CellGrid.covering(np.zeros(3), np.ones(3), RADIUS)
+    grid = CellGrid.covering(np.zeros(3), np.ones(3), RADIUS, reach=reach)
     clouds, orders, ordered = [], [], []
     for cloud in (points, boundary, moving):
         if cloud is None:
@@ -72,14 +72,15 @@ def find_neighbors(
     return fluid, solid, ordered[0], samples
 
 
+@pytest.mark.parametrize("reach", [1, 2])
 @pytest.mark.parametrize("stride", [1, 32])
 @pytest.mark.parametrize("moving_count", [0, 300])
-def test_neighbors_equal_those_of_a_search_tree(taichi_cpu, stride, moving_count):
+def test_neighbors_equal_those_of_a_search_tree(taichi_cpu, stride, moving_count, reach):
     rng = np.random.default_rng(3)
     points = rng.uniform(0.0, 1.0, (2000, 3)).astype(np.float32)
     boundary = rng.uniform(-0.1, 1.1, (800, 3)).astype(np.float32)
     moving = rng.uniform(0.3, 0.6, (moving_count, 3)).astype(np.float32) if moving_count else None
-    fluid, solid, points, boundary = find_neighbors(points, boundary, moving, stride=stride)
+    fluid, solid, points, boundary = find_neighbors(points, boundary, moving, stride=stride, reach=reach)
     tree, boundary_tree = cKDTree(points), cKDTree(boundary)
     # Pairs whose distance is the radius to float32 rounding may fall on either side; this seed has none.
     assert fluid == [set(near) - {i} for i, near in enumerate(tree.query_ball_point(points, RADIUS))]

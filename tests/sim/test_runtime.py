@@ -133,6 +133,22 @@ def test_stale_lock_of_the_kernel_cache_is_removed_and_a_live_one_kept(tmp_path)
     assert live.exists()
 
 
+def test_processes_that_fill_a_new_kernel_cache_at_the_same_time_do_no_harm(tmp_path):
+    """As the processes of a test run do; what they leave serves the next one."""
+    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)}
+
+    def start() -> subprocess.Popen[bytes]:
+        # It compiles a kernel, and checks what that computes.
+        return subprocess.Popen([sys.executable, "-m", "sim.runtime", "--probe", "cpu"], env=environment)
+
+    assert [process.wait(120) for process in [start() for _ in range(3)]] == [0, 0, 0]
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("**/*.tic")}
+    assert kept
+    assert not list(tmp_path.glob("**/*.lock"))
+    assert start().wait(120) == 0
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("**/*.tic")} == kept
+
+
 def test_device_error_survives_pickling():
     import pickle
 

@@ -53,8 +53,8 @@ class Tank:
             gravity=gravity,
             positions=points,
             velocities=np.broadcast_to(np.float32(water_velocity), points.shape).copy(),
-            boundary=BoundarySamples.of_bodies(domain_wall_samples(domain, self.spacing)),
-            moving=samples_of_moving_bodies(self.rigid, self.spacing),
+            boundary=BoundarySamples.of_bodies(domain_wall_samples(domain, self.spacing, fluid.support_in_spacings)),
+            moving=samples_of_moving_bodies(self.rigid, self.spacing, fluid.support_in_spacings),
             body_count=len(parameters),
             body_speed=expected_body_speed(parameters, self.rigid.solids, domain, gravity),
         )

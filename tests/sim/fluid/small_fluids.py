@@ -33,7 +33,7 @@ def make_fluid(
     material = FluidParameters.model_validate(
         {"name": "water", "block": [{"shape": {"type": "box", "size": (1, 1, 1)}}], **parameters}
     )
-    walls = domain_wall_samples(domain, 2.0 * material.particle_radius)
+    walls = domain_wall_samples(domain, 2.0 * material.particle_radius, material.support_in_spacings)
     return SOLVERS[material.solver](
         material,
         domain=domain,

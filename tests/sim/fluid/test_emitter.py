@@ -142,6 +142,35 @@ def test_emission_ends(taichi_cpu):
     assert fluid.diagnostics()["particles_emitted"] == opening.total_particles()
 
 
+@pytest.mark.parametrize(("solver", "share"), [("wcsph", 0.4), ("dfsph", 0.4), ("pcisph", 0.2)])
+def test_an_emitter_shortens_steps_only_while_it_emits(taichi_cpu, solver, share):
+    fast = {**DISC, "speed": 6.0, "start_s": 0.05, "end_s": 0.055}
+    # What it has emitted leaves the small domain, 0.25 m away, by 0.1 s; the drop in the middle stays.
+    domain = DomainParameters(min=(-0.15, -0.15, 0.15), max=(0.15, 0.15, 0.45), open_faces=EVERY_FACE)
+    drop = lattice((0.1, 0.1, 0.2), (0.14, 0.14, 0.24), SPACING)
+    fluid = jet(fast, domain=domain, positions=drop, solver=solver, sound_speed=60.0 if solver == "wcsph" else None)
+    before = fluid.stable_dt()
+    signal = 60.0 if solver == "wcsph" else 0.0
+    emitted, time = 0.0, 0.0
+    while time < 0.15:
+        dt = min(fluid.stable_dt(), 0.02)
+        fluid.substep(dt)
+        time += dt
+        arrays = fluid.snapshots()["water"].arrays
+        if not emitted and len(arrays["position"]) > len(drop):
+            emitted = time
+            assert time >= 0.05
+            # Half a layer in front of the opening, of at most 1.35 spacings, and no farther than a step may carry it.
+            ways = 0.4 - arrays["position"][len(drop) :, 2]
+            assert ways.max() < (0.675 + share) * SPACING
+            assert fluid.stable_dt() <= share * SPACING / (signal + 6.0) * 1.0001
+    assert emitted
+    assert fluid.particle_count == len(drop)
+    # Until 0.05 s, and when all is over, nothing moves; a step before the start may go on past it, but not far.
+    assert before == pytest.approx(fluid.stable_dt() if solver == "wcsph" else 0.05 + share * SPACING / 6.0)
+    assert fluid.stable_dt() > 0.9 * share * SPACING / (signal + 0.5)
+
+
 def test_a_jet_continues_from_a_checkpoint_bit_for_bit(taichi_cpu):
     emitters = ({**DISC, "end_s": 0.1}, SLOT)
     straight, other = jet(*emitters, gravity=(0.0, 0.0, -9.81)), jet(*emitters, gravity=(0.0, 0.0, -9.81))

@@ -10,7 +10,8 @@ import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.build import build_world
-from sim.fluid.implicit_fluid import SolveRecord, filled_diagonal, iterations_ahead, largest_eigenvalue
+from sim.fluid.implicit_fluid import filled_diagonal, iterations_ahead, largest_eigenvalue
+from sim.fluid.solve_record import SolveRecord
 from sim.scene import DomainParameters, SceneParameters
 
 OPEN_SPACE = DomainParameters(min=(-1.0, -1.0, -1.0), max=(1.0, 1.0, 1.0), open_faces=EVERY_FACE)
@@ -137,6 +138,21 @@ def test_a_solve_that_hits_its_limit_is_counted(dam_break, solver):
 
 
 @BOTH
+def test_a_frame_with_a_squeezed_particle_is_counted_though_every_solve_converges(taichi_cpu, solver):
+    particles = lattice((-0.12,) * 3, (0.12,) * 3, 0.02)
+    between = np.float32([[0.0, 0.0, 0.0]])  # amid eight others, 0.87 d from each
+    counted = []
+    for points in (particles, np.concatenate([particles, between])):
+        fluid = make_fluid(OPEN_SPACE, points, gravity=(0.0,) * 3, solver=solver, dt=1.0e-5)
+        fluid.begin_frame(0.0)
+        steps(fluid, 1)
+        state = fluid.diagnostics()
+        assert state["not_converged"] == 0.0
+        counted.append(state["squeezed"])
+    assert counted == [0.0, 1.0]
+
+
+@BOTH
 def test_energy_does_not_rise_in_a_tank_at_rest_whatever_the_step(taichi_cpu, solver):
     domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.12, 0.12, 0.3))
     for dt in (5.0e-4, 2.0e-3):
@@ -176,6 +192,33 @@ def test_runaway_speed_is_reported(dam_break, solver):
     fluid.restore(arrays)
     fluid.substep(1.0e-6)
     assert "largest expected speed" in fluid.first_bad_quantity()
+
+
+@BOTH
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_pressure_that_is_not_finite_is_told_and_not_taken_for_none(dam_break, solver, value):
+    fluid = dam_break(solver=solver)
+    steps(fluid, 5)
+    arrays = {name: array.copy() for name, array in fluid.checkpoint().items()}
+    arrays["pressure"][7] = value
+    fluid.restore(arrays)
+    fluid.begin_frame(0.0)
+    steps(fluid, 1)
+    assert "not finite" in fluid.first_bad_quantity()
+
+
+@BOTH
+def test_an_error_that_is_not_finite_is_no_small_one(dam_break, solver):
+    fluid = dam_break(solver=solver)
+    fluid._compute_density()
+    fluid._remaining.fill(0.0)
+    pressure = fluid._particles.carried["pressure"]
+    assert fluid._mean_error(fluid._remaining, pressure, 1.0e-3) == 0.0
+    remaining = np.zeros(fluid.capacity, dtype=np.float32)
+    for value in (np.nan, -np.inf, np.inf):
+        remaining[7] = value
+        fluid._remaining.from_numpy(remaining)
+        assert fluid._mean_error(fluid._remaining, pressure, 1.0e-3) == np.inf
 
 
 @BOTH

@@ -13,6 +13,7 @@ from sim.fluid.kernels import (
     spline,
     spline_slope,
     wall_calibration,
+    wall_layers,
 )
 
 
@@ -124,6 +125,37 @@ def test_wall_calibration_of_a_wide_support_completes_the_first_layer(support):
         fine_axis, standoff + 1.0
     )
     assert 0.0 < left_out < 0.07
+
+
+def test_a_wall_has_one_layer_at_the_usual_support():
+    assert wall_layers() == (wall_calibration(),)
+
+
+@pytest.mark.parametrize("support", [2.05, 2.25, 2.5, 2.75, 3.0, 3.25, 3.5, 3.75, 4.0])
+def test_two_layers_complete_both_layers_of_particles_and_push_the_first(support):
+    axis, fine_axis = np.arange(-6.0, 6.0), np.arange(-6.0, 6.0, 0.0625)
+    volume, step = particle_volume(1.0, support), 1e-4
+
+    def field(coordinates, height):
+        in_plane = np.hypot(coordinates[:, None], coordinates[None, :])
+        return evaluate(np.hypot(in_plane, height), support).sum()
+
+    def missing(height):
+        return volume * sum(field(axis, distance + height) for distance in np.arange(1.0, support + 1.0))
+
+    def given(height):
+        return sum(
+            layer.volume_in_particles * volume * 0.0625**2 * field(fine_axis, layer.standoff_in_spacings + height)
+            for layer in wall_layers(support)
+        )
+
+    assert all(layer.volume_in_particles > 0.0 for layer in wall_layers(support))
+    # Averages over eighths and sixteenths of a spacing, as for the usual support.
+    assert given(0.0) == pytest.approx(missing(0.0), rel=1e-3)
+    assert given(1.0) == pytest.approx(missing(1.0), abs=3e-4)
+    slope = (given(step) - given(-step)) / (2.0 * step)
+    missing_slope = (missing(step) - missing(-step)) / (2.0 * step)
+    assert slope == pytest.approx(2.0 * missing_slope, rel=2e-3)
 
 
 @ti.kernel

@@ -1,6 +1,7 @@
 """The predicted densities of predictive-corrective SPH."""
 
 import numpy as np
+import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.scene import DomainParameters
@@ -75,3 +76,23 @@ def test_neighbours_are_searched_in_the_same_steps_after_a_resume(taichi_cpu):
         fluid.substep(2.5e-3)
         searches.append(fluid.diagnostics()["neighbor_searches"])
     assert searches == [2.0, 2.0]
+
+
+def test_what_a_pair_adds_that_is_predicted_nearer_than_the_list_reaches_is_small(taichi_cpu):
+    # Two rows head on at the speed that the step allows; they start a hair beyond the list, 2.2 d apart.
+    left = lattice((-0.05, -0.05, -0.01), (0.05, 0.05, 0.01), 0.02)
+    apart = np.float32((0.0, 0.0, 0.0441))
+    particles = np.concatenate([left, left + apart])
+    velocities = np.zeros_like(particles)
+    velocities[:, 2] = np.where(particles[:, 2] > 0.02, np.float32(-1.0), np.float32(1.0))
+    fluid = make_fluid(OPEN_SPACE, particles, velocities, gravity=(0.0,) * 3, solver="pcisph", artificial_viscosity=0.0)
+    dt = fluid.stable_dt()
+    assert dt == pytest.approx(0.2 * 0.02 / 1.0)
+    fluid._compute_density()
+    alone = fluid._host(fluid._density).max()
+    fluid.substep(dt)
+    nearest = 0.0441 - 2.0 * dt
+    state = fluid.diagnostics()
+    assert np.ptp(np.unique(fluid.snapshots()["water"].arrays["position"][:, 2].round(4))) == pytest.approx(nearest)
+    # 6e-4 by the one straight ahead, and nothing by its neighbours, farther than 2 d by then.
+    assert state["max_compression"] + 1.0 - alone < 6.5e-4

@@ -92,6 +92,22 @@ def test_the_first_fluid_keeps_a_place_that_two_want(taichi_cpu):
     assert len(lattice((-0.06, -0.06, 0.0), (0.06, 0.06, 0.1), 0.02)) == 180
 
 
+def test_each_fluid_of_a_tank_is_counted(taichi_cpu):
+    def diagnostics(*heights: float):
+        fluids, bottom = [], 0.0
+        for name, height in zip("ab", heights, strict=False):
+            box = {"shape": {"type": "box", "size": (0.12, 0.12, height)}, "position": (0, 0, bottom + height / 2)}
+            fluids.append({"name": name, "block": [box]})
+            bottom += height
+        scene = SceneParameters.model_validate({"domain": TANK, "fluid": fluids})
+        (of_tank,) = build_world(scene, frames_per_second=60).diagnostics().values()
+        return of_tank
+
+    of_two = diagnostics(0.04, 0.1)
+    assert (of_two["particle_count"], of_two["particle_count_a"], of_two["particle_count_b"]) == (252.0, 72.0, 180.0)
+    assert "particle_count_a" not in diagnostics(0.04)
+
+
 def test_momentum_of_mixing_fluids_is_conserved(taichi_cpu):
     free = {"domain": {"min": (-1, -1, -1), "max": (1, 1, 1), "open_faces": ("x-", "x+", "y-", "y+", "z-", "z+")}}
     cube = {"type": "box", "size": (0.1, 0.1, 0.1)}

@@ -9,6 +9,8 @@ from scipy.spatial import ConvexHull
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.fluid.parameters import FluidParameters
+from sim.fluid.surface_tension import cohesion_rate, cohesion_stress
+from sim.fluid.surface_tension_akinci2013 import cohesion_stress_akinci2013
 from sim.scene import DomainParameters
 
 SPACING = 1.0e-3
@@ -130,3 +132,19 @@ def test_adhesion_without_its_model_is_refused():
         FluidParameters.model_validate(
             {"name": "water", "adhesion": 1.0, "block": [{"shape": {"type": "sphere", "radius": 1}}]}
         )
+
+
+def test_stress_and_frequency_of_cohesion_are_sums_over_the_lattice():
+    # At the usual support 6, 12 and 8 neighbours at q = r/2: W = 2 (1-q)³/pi, C = 32/pi (1-q)³ q³/8.
+    shells = [(6, 1.0), (12, math.sqrt(2.0)), (8, math.sqrt(3.0))]
+    weights = [(count, r, 2.0 * (1.0 - r / 2.0) ** 3 / math.pi) for count, r in shells]
+    assert cohesion_stress(2.0) == pytest.approx(sum(count * r**2 * w for count, r, w in weights) / 6.0)
+    assert cohesion_rate(2.0) == pytest.approx(sum(count * w for count, _, w in weights))
+    pulls = [(count, r / 2.0, 4.0 / math.pi * (1.0 - r / 2.0) ** 3 * (r / 2.0) ** 3) for count, r in shells]
+    # V is d³ to 0.003 %.
+    assert cohesion_stress_akinci2013(2.0) == pytest.approx(sum(n * q * c for n, q, c in pulls) / 6.0, rel=1e-4)
+    # The more neighbours, the more of them pull at a particle as its surroundings do not move: all but its own share.
+    assert [cohesion_rate(support) for support in (2.0, 4.0)] == pytest.approx([0.682, 0.960], abs=0.001)
+    # In the limit of wide supports a sum is an integral: int r² W dV d/6 grows with the square of the support.
+    assert cohesion_stress(8.0) / cohesion_stress(4.0) == pytest.approx(4.0, rel=0.01)
+    assert cohesion_stress_akinci2013(8.0) == pytest.approx(cohesion_stress_akinci2013(4.0), rel=0.02)

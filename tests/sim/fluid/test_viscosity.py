@@ -57,7 +57,33 @@ def test_a_long_implicit_step_is_that_of_backward_euler(taichi_cpu, stiffness):
     fluid.substep(dt)
     # v' = v/(1 + nu k² dt); the discrete nu k² is right to 10 %, and the iteration to its tolerance.
     assert amplitude(fluid, mode) / before == pytest.approx(1.0 / (1.0 + stiffness), rel=0.1, abs=3.0 * TOLERANCE)
-    assert fluid.diagnostics()["not_converged"] == 0.0
+    state = fluid.diagnostics()
+    # At nu dt = 400 d² the rounding of the changes alone, 6e-8 of each times that, is a residual beyond the tolerance;
+    # the residual that conjugate gradients carry along knows nothing of it.
+    assert (state["viscosity_error"] <= TOLERANCE) == (stiffness == 1.0)
+    assert state["viscosity_error"] < 0.01
+    assert state["not_converged"] == float(stiffness != 1.0)
+
+
+def test_a_first_guess_that_is_worse_than_none_is_forgotten(taichi_cpu):
+    particles = lattice((-0.1,) * 3, (0.1,) * 3, SPACING)
+    velocities = np.random.default_rng(5).normal(0.0, 0.3, particles.shape).astype(np.float32)
+    fluid = make_fluid(
+        OPEN_SPACE, particles, velocities, gravity=(0.0, 0.0, 0.0), viscosity=1.0, viscosity_solver="implicit",
+        artificial_viscosity=0.0,
+    )  # fmt: skip
+    fluid.substep(1.0e-3)
+    stopped = dict(fluid.checkpoint())
+    stopped["velocity"] = np.broadcast_to(np.float32((1.0, 2.0, 3.0)), velocities.shape).copy()
+    # WCSPH pushes particles apart where they are compressed; where they have started nobody is.
+    stopped["position"] = stopped["reference_position"] = particles[stopped["particle_id"]]
+    fluid.restore(stopped)
+    fluid.begin_frame(0.0)
+    fluid.substep(1.0e-3)
+    state = fluid.diagnostics()
+    # The right-hand side is 0: there is nothing to reach a thousandth of by taking the guess back bit by bit.
+    assert (state["viscosity_iterations"], state["viscosity_error"], state["not_converged"]) == (0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(fluid.snapshots()["water"].arrays["velocity"], stopped["velocity"])
 
 
 def test_implicit_viscosity_conserves_momentum_and_takes_energy(taichi_cpu):

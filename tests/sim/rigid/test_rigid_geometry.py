@@ -19,6 +19,22 @@ def test_ball_has_the_inertia_of_a_ball_in_spite_of_its_facets():
     np.testing.assert_allclose(properties.inertia, 0.4 * mass * 0.2**2 * np.eye(3), rtol=1e-6, atol=1e-9)
 
 
+def test_ballast_adds_to_mass_and_inertia_as_a_point_mass():
+    ballast = ({"mass": 3.0, "position": (0.0, 0.0, -0.2)}, {"mass": 1.0, "position": (0.1, 0.0, 0.0)})
+    plain = BodyGeometry(body("b", ball(0.2))).mass_properties(500.0)
+    geometry = BodyGeometry(body("b", ball(0.2), ballast=ballast))
+    loaded = geometry.mass_properties(500.0)
+    mass = plain.mass + 4.0
+    centre = np.array([0.1, 0.0, -0.6]) / mass
+    assert loaded.mass == pytest.approx(mass, rel=1e-12)
+    np.testing.assert_allclose(geometry.centre_of_mass, centre, atol=1e-12)
+    # About the shape's centre everything adds; Steiner's term takes it to the centre of mass.
+    points = np.array([3.0 * 0.2**2 + 0.0, 3.0 * 0.2**2 + 1.0 * 0.1**2, 1.0 * 0.1**2])
+    about_origin = plain.inertia + np.diag(points)
+    steiner = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    np.testing.assert_allclose(loaded.inertia, about_origin - steiner, rtol=1e-9, atol=1e-12)
+
+
 def test_cone_has_its_centre_of_mass_at_a_quarter_of_its_height():
     properties = BodyGeometry(body("c", {"type": "cone", "radius": 0.1, "height": 0.4}, scale=2.0)).mass_properties(
         300.0

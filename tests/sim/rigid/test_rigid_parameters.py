@@ -37,6 +37,10 @@ SENSELESS = {
         {"kind": "kinematic", "keyframe": KEYFRAMES, "position": (3, 0, 0)},
         "position differs from that of the first keyframe",
     ),
+    "ballast without mass": (
+        {"kind": "kinematic", "ballast": ({"mass": 1, "position": (0, 0, 0)},)},
+        'a kinematic body has no mass for ballast to add to; .* use kind = "dynamic"',
+    ),
     "keyframes out of order": (
         {"kind": "kinematic", "keyframe": (KEYFRAMES[1], KEYFRAMES[0])},
         r"keyframe\[1\].time_s must be after 1 s, .* got 0.5 s",

@@ -1,0 +1,197 @@
+"""Cloth that hangs, swings and falls: stretch, sag under refinement, period, energy, terminal speed."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.validation.checks import CaseResult, Check, fitted_order
+from sim.cloth.parameters import ClothParameters
+from sim.scene import DomainParameters
+
+if TYPE_CHECKING:
+    from sim.cloth.solver import ClothSolver
+
+SOLVERS = ("cloth",)
+
+GRAVITY = 9.81
+THREADS_ALONE: dict[str, Any] = {"shear_stiffness": 0.0, "bend_stiffness": 0.0, "air_density": 0.0}
+SOFT: dict[str, Any] = {"mass_per_area": 0.2, "stretch_stiffness": 100.0}
+"""Mass per area [kg/m²] and stretch stiffness [N/m] of what explicit springs compute."""
+
+COLUMN_ROWS, COLUMN_MASS, COLUMN_WIDTH = 21, 0.15, 0.05
+"""Rows, mass per area [kg/m²] and width [m] of the hanging column, 1 m long."""
+
+COTTON = 4000.0
+"""Stretch stiffness of cotton [N/m]."""
+
+SPAN, BAND_WIDTH = 0.5, 0.1
+"""Length between the bars and width of the band [m]."""
+
+SHEET, SHEET_NODES, DURATION = 0.2, 6, 10.0
+"""Side [m] and nodes along it of the swinging sheet, and how long it swings [s]."""
+
+
+def run(solver: str, *, quick: bool = False) -> CaseResult:
+    """Column, band, pendulum, swinging and falling sheet."""
+    columns = {name: _column(name, stiffness) for name, stiffness in (("xpbd", COTTON), ("explicit", 60.0))}
+    cells = (4, 8) if quick else (4, 8, 16)
+    exact_sag = _catenary_sag()
+    errors = [abs(_band_sag(count) - exact_sag) for count in cells]
+    energy = _swinging_sheet(0.5 if quick else DURATION)
+    periods = {name: _pendulum(name) for name in ("xpbd", "explicit")}
+    checks = [
+        *[
+            Check(f"largest error of a row's stretch, {name}", float(np.abs(column["ratio"] - 1.0).max()), 0.0, 0.01,
+                  "required; threads up to 64 springs long are solved exactly, float32 tells 1e-4 of the stretch of "
+                  "cotton")
+            for name, column in columns.items()
+        ],
+        Check("order of the sag of a band in the spacing", fitted_order([1.0 / count for count in cells], errors), 2.0,
+              0.2, "lumped masses and chords for the arc are of second order"),
+        Check("error of the sag at 8 cells over the sag", errors[1] / exact_sag, 0.0, 0.01, "1/(2 n²) of a parabola"),
+        *[
+            Check(f"period of a pendulum over theory, {name}", period, 1.0, 5e-4,
+                  "chords of 7 ms of its path, and its spring sways")
+            for name, period in periods.items()
+        ],
+        Check("largest deviation of the energy of a swinging sheet", energy["deviation"], 0.0, 0.01,
+              "required over 10 s; without damping, of m g L/2, explicit at its own step"),
+        Check("terminal speed of a falling sheet over theory", _terminal_speed(), 1.0, 1e-3,
+              "implicit drag is exact there; the sheet sways by 1e-4"),
+    ]  # fmt: skip
+    series = {
+        "cells": list(cells),
+        "errors": errors,
+        "times": energy["times"],
+        "energies": energy["energies"],
+        "kinetic": energy["kinetic"],
+    }
+    for name, column in columns.items():
+        series |= {f"rows_{name}": list(range(1, COLUMN_ROWS)), f"ratio_{name}": column["ratio"]}
+        series |= {f"stretch_{name}": column["stretch"], f"theory_{name}": column["theory"]}
+    settings = {"column_rows": COLUMN_ROWS, "cotton_n_per_m": COTTON, "soft": SOFT, "duration_s": DURATION,
+                "xpbd_substeps_per_frame": 20}  # fmt: skip
+    return CaseResult("cloth", solver, settings, checks, series)
+
+
+def _solver(**keys: Any) -> ClothSolver:
+    from sim.cloth.solver import ClothSolver
+
+    cloth = ClothParameters.model_validate({"name": "cloth", **keys})
+    return ClothSolver([cloth], domain=DomainParameters(), gravity=(0.0, 0.0, -GRAVITY), frames_per_second=60.0)
+
+
+def _rectangle(size: tuple[float, float], counts: tuple[int, int]) -> dict[str, Any]:
+    return {"type": "rectangle", "size": size, "counts": counts}
+
+
+def _settle(solver: ClothSolver, spans: tuple[float, ...]) -> None:
+    """Dynamic relaxation: let it move for each span of time [s], and stop it."""
+    for span in spans:
+        for _ in range(round(span / solver.stable_dt())):
+            solver.substep(solver.stable_dt())
+        solver.state.velocity.fill(0.0)
+
+
+def _column(integrator: str, stiffness: float) -> dict[str, NDArray[np.float64]]:
+    """Stretch of each row of a strip of two threads under the weight below it, from the upper row on."""
+    spacing = 1.0 / (COLUMN_ROWS - 1)
+    solver = _solver(
+        shape=_rectangle((COLUMN_WIDTH, 1.0), (2, COLUMN_ROWS)), rotation_deg=(90, 0, 0), pin=[{"edge": "y+"}],
+        mass_per_area=COLUMN_MASS, stretch_stiffness=stiffness, damping=2e-3, integrator=integrator, **THREADS_ALONE,
+    )  # fmt: skip
+    # A quarter of its period is sqrt(m / E): 6 ms and 50 ms; 16 ms are twenty steps of XPBD.
+    _settle(solver, (0.016,) * 40 if integrator == "xpbd" else (0.05, 0.033) * 8)
+    heights = solver.state.positions()[:, 2].reshape(COLUMN_ROWS, 2)[::-1].mean(axis=1)
+    weight = COLUMN_MASS * COLUMN_WIDTH * GRAVITY * (np.arange(COLUMN_ROWS - 1, 0, -1) - 0.5) * spacing
+    stretch, theory = -np.diff(heights) - spacing, weight * spacing / (stiffness * COLUMN_WIDTH)
+    return {"stretch": stretch, "theory": theory, "ratio": stretch / theory}
+
+
+def _catenary_sag() -> float:
+    """Sag [m] of an elastic band between two bars as far apart as it is long (Irvine 1981, "Cable structures", 1.3).
+
+    x(s) = H s / E + H/w asinh(w s / H),  z(s) = w s² / (2 E) + H/w ((1 + (w s / H)²)^(1/2) - 1), from its middle.
+    """
+    from scipy.optimize import brentq
+
+    half, weight = 0.5 * SPAN, SOFT["mass_per_area"] * GRAVITY * BAND_WIDTH
+    stiffness = SOFT["stretch_stiffness"] * BAND_WIDTH
+
+    def miss(h: float) -> float:
+        return h * half / stiffness + h / weight * math.asinh(weight * half / h) - half
+
+    h = float(brentq(miss, 1e-6 * weight * SPAN, stiffness))
+    return weight * half**2 / (2 * stiffness) + h / weight * (math.hypot(1.0, weight * half / h) - 1.0)
+
+
+def _band_sag(cells: int) -> float:
+    solver = _solver(
+        shape=_rectangle((SPAN, BAND_WIDTH), (cells + 1, 2)), pin=[{"edge": "x-"}, {"edge": "x+"}], damping=2e-3,
+        integrator="explicit", **SOFT, **THREADS_ALONE,
+    )  # fmt: skip
+    _settle(solver, (0.05, 0.033) * 14)  # a quarter of its swing, and another that stops what the first does not
+    return -float(solver.state.positions()[:, 2].min())
+
+
+def _pendulum(integrator: str) -> float:
+    """Period of two nodes on a short strip over 2 pi (L/g)^(1/2) (1 + a²/16), its length stretched by its weight."""
+    stiffness, length, angle = 200.0, 0.25, math.radians(5.0)
+    solver = _solver(
+        shape=_rectangle((0.1, length), (2, 2)), rotation_deg=(85, 0, 0), pin=[{"edge": "y+"}], mass_per_area=0.2,
+        stretch_stiffness=stiffness, integrator=integrator, bend_damping=0.0, **THREADS_ALONE,
+    )  # fmt: skip
+    dt, times = solver.stable_dt(), []
+    start = solver.state.positions()
+    anchor, side = start[2, 1], start[0, 1] - start[2, 1]
+    for step in range(round(2.6 / dt)):
+        solver.substep(dt)
+        if step % 8 == 7:
+            before, side = side, float(solver.state.positions()[0, 1] - anchor)
+            if side * before < 0.0:
+                times.append(dt * (step + 1 - 8 * side / (side - before)))
+    stretched = length * (1.0 + 0.5 * 0.2 * length * GRAVITY / stiffness)
+    exact = 2.0 * math.pi * math.sqrt(stretched / GRAVITY) * (1.0 + angle**2 / 16.0)
+    return 2.0 * float(np.diff(times).mean()) / exact
+
+
+def _swinging_sheet(duration: float) -> dict[str, Any]:
+    """Energy of an undamped sheet that falls from flat, held at two corners, over m g L / 2."""
+    solver = _solver(
+        shape=_rectangle((SHEET, SHEET), (SHEET_NODES, SHEET_NODES)), pin=[{"corner": "x-y-"}, {"corner": "x+y-"}],
+        shear_stiffness=20.0, bend_stiffness=1e-5, bend_damping=0.0, air_density=0.0, integrator="explicit", **SOFT,
+    )  # fmt: skip
+    dt, times, energies, kinetic = solver.stable_dt(), [], [], []
+    mass = solver.state.mass.to_numpy().astype(np.float64)
+    scale = mass.sum() * GRAVITY * 0.5 * SHEET
+    steps = round(duration / dt)
+    for step in range(steps):
+        solver.substep(dt)
+        if step % max(1, steps // 500) == 0:
+            # Velocities are those of half a step ago (leapfrog); so are these positions.
+            velocity = solver.state.velocity.to_numpy().astype(np.float64)
+            positions = solver.state.positions() - 0.5 * dt * velocity
+            moving = 0.5 * float(mass @ (velocity**2).sum(axis=1))
+            elastic = sum(springs.energy(positions) for springs in solver._springs)
+            times.append((step + 1) * dt)
+            kinetic.append(moving / scale)
+            energies.append((moving + elastic + GRAVITY * float(mass @ positions[:, 2])) / scale)
+    return {
+        "times": times,
+        "energies": energies,
+        "kinetic": kinetic,
+        "deviation": float(np.abs(energies).max()),
+    }
+
+
+def _terminal_speed() -> float:
+    """Speed of a sheet that has fallen flat for twenty times v/g, over (2 m g / rho C)^(1/2)."""
+    solver = _solver(shape=_rectangle((0.2, 0.2), (4, 4)), mass_per_area=0.05, air_density=1.2, drag=1.3, skin_drag=0.0)
+    for _ in range(round(1.5 / solver.stable_dt())):
+        solver.substep(solver.stable_dt())
+    speed = -float(solver.state.velocity.to_numpy()[:, 2].mean())
+    return speed / math.sqrt(2.0 * 0.05 * GRAVITY / (1.2 * 1.3))

@@ -1,0 +1,96 @@
+"""What looks are built with: a material's node tree, and what a look may depend on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from blender_scripts.compatibility import node_tree_of
+
+Color = tuple[float, float, float]
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class LookContext:
+    """What a look may depend on.
+
+    Attributes:
+        domain_size: diagonal of the domain [m].
+        color: base colour or tint from the job, linear RGB, or None.
+        roughness: from the job [-], or None.
+        density: from the job, or None; see `render.parameters.MaterialParameters`.
+        thread_spacing: of woven cloth, from the job [m], or None.
+    """
+
+    domain_size: float
+    color: Color | None
+    roughness: float | None
+    density: float | None
+    thread_spacing: float | None
+
+
+class NodeBuilder:
+    """A material's node tree, with the steps that looks take made short."""
+
+    def __init__(self, material: Any) -> None:
+        self.tree = node_tree_of(material)
+        self.output = self.tree.nodes.new("ShaderNodeOutputMaterial")
+
+    def node(self, kind: str, **inputs: float | Color) -> Any:
+        """A new node; inputs by socket name with underscores for blanks, colours as three numbers."""
+        node = self.tree.nodes.new(kind)
+        for name, value in inputs.items():
+            socket = node.inputs[name.replace("_", " ")]
+            socket.default_value = (*value, 1.0) if isinstance(value, tuple) and socket.type == "RGBA" else value
+        return node
+
+    def link(self, source: Any, target: Any) -> None:
+        """Connect an output socket to an input socket."""
+        self.tree.links.new(source, target)
+
+    def math(self, operation: str, *operands: Any) -> Any:
+        """The output socket of a calculation; operands are numbers and output sockets."""
+        node = self.tree.nodes.new("ShaderNodeMath")
+        node.operation = operation
+        for operand, socket in zip(operands, node.inputs, strict=False):
+            if isinstance(operand, int | float):
+                socket.default_value = operand
+            else:
+                self.link(operand, socket)
+        return node.outputs[0]
+
+    def mix_colors(self, factor: Any, first: Any, second: Any) -> Any:
+        """The output socket of the first colour where the factor is 0, the second where it is 1."""
+        node = self.tree.nodes.new("ShaderNodeMix")
+        node.data_type = "RGBA"
+        # The node has a socket for every type of data, with equal names.
+        first_socket, second_socket = (socket for socket in node.inputs if socket.type == "RGBA")
+        for value, socket in ((factor, node.inputs[0]), (first, first_socket), (second, second_socket)):
+            if isinstance(value, tuple):
+                socket.default_value = (*value, 1.0)
+            else:
+                self.link(value, socket)
+        return next(socket for socket in node.outputs if socket.type == "RGBA")
+
+    def surface(self, shader: Any) -> None:
+        """Use a node's first output as the surface."""
+        self.link(shader.outputs[0], self.output.inputs["Surface"])
+
+    def volume(self, shader: Any) -> None:
+        """Use a node's first output as the inside."""
+        self.link(shader.outputs[0], self.output.inputs["Volume"])
+
+
+def or_default(value: Value | None, default: Value) -> Value:
+    """The value, or a look's own where the job gives none."""
+    return default if value is None else value
+
+
+def mix_shaders(builder: NodeBuilder, factor: Any, first: Any, second: Any) -> Any:
+    """The first shader where the factor is 0, the second where it is 1."""
+    mix = builder.node("ShaderNodeMixShader")
+    builder.link(factor, mix.inputs[0])
+    builder.link(first.outputs[0], mix.inputs[1])
+    builder.link(second.outputs[0], mix.inputs[2])
+    return mix

@@ -1,0 +1,183 @@
+"""Looks of woven cloth: threads that cross over and under each other, on the sheet's coordinates at rest.
+
+Warp threads run along t, weft threads along s; u = s / d and v = t / d count them, d being their distance. In a weave
+of period n, warp thread i passes under weft thread j where a i + j is a multiple of n, and over all others. Its height
+is a triangle wave that is cut off above,
+
+    z = clamp(2 |(v + a i + n/2 - 1/2) mod n - n/2| - 1, -1, 1),
+
+that of a weft thread the negative of the same with u and b j, where b solves a b = 1 (mod n). Where pixels are larger
+than threads, Blender's bump fades by itself, as it looks at differences over a pixel, and colours mix: far away a woven
+cloth is a matt sheet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from blender_scripts.geometry import REST_UV
+from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
+
+
+@dataclass(frozen=True)
+class Weave:
+    """What a woven cloth looks like.
+
+    Attributes:
+        period: of the pattern [threads].
+        warp_step, weft_step: a and b: by how much the pattern moves from one thread to the next [threads].
+        thread_spacing: [m].
+        warp: colour of the warp threads, if the job gives none; the job's colours these.
+        weft: colour of the weft threads; that of the warp if None.
+        roughness: of the surface [-].
+        specular: of the surface, 0.5 as glass [-].
+        anisotropy: how much highlights are drawn out across the warp [-].
+        sheen: light that fibres on the surface scatter at grazing angles [-].
+        translucency: share of the scattered light that goes through [-].
+        unevenness: how much threads differ in brightness [-].
+        gaps: how dark it is between threads [-], 0 black.
+    """
+
+    period: int
+    warp_step: int
+    weft_step: int
+    thread_spacing: float
+    warp: Color
+    weft: Color | None
+    roughness: float
+    specular: float
+    anisotropy: float
+    sheen: float
+    translucency: float
+    unevenness: float
+    gaps: float
+
+
+COTTON = Weave(2, 1, 1, 0.5e-3, (0.72, 0.66, 0.56), None, 0.85, 0.2, 0.0, 0.5, 0.25, 0.10, 0.45)
+"""Plain weave of a shirting, some 20 threads a centimetre."""
+SILK = Weave(5, 2, -2, 0.15e-3, (0.42, 0.02, 0.035), None, 0.38, 0.5, 0.6, 0.25, 0.2, 0.04, 0.8)
+"""Five-end satin: long floats of fine threads, which shine across."""
+DENIM = Weave(4, 1, 1, 0.8e-3, (0.012, 0.030, 0.100), (0.15, 0.16, 0.18), 0.9, 0.15, 0.0, 0.15, 0.0, 0.3, 0.4)
+"""Twill of indigo warp over three, under one undyed weft; its back is mostly weft."""
+
+
+def build_cotton(builder: NodeBuilder, context: LookContext) -> None:
+    """Matt plain weave."""
+    _build(builder, context, COTTON)
+
+
+def build_silk(builder: NodeBuilder, context: LookContext) -> None:
+    """Shining satin."""
+    _build(builder, context, SILK)
+
+
+def build_denim(builder: NodeBuilder, context: LookContext) -> None:
+    """Coarse twill in two colours."""
+    _build(builder, context, DENIM)
+
+
+def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
+    spacing = or_default(context.thread_spacing, weave.thread_spacing)
+    u, v = _thread_numbers(builder, spacing)
+    warp_height, weft_height = _heights(builder, weave, u, v)
+    height = builder.math("MAXIMUM", warp_height, weft_height)
+    shows_weft = builder.math("GREATER_THAN", weft_height, warp_height)
+    color = _colors(builder, weave, or_default(context.color, weave.warp), shows_weft)
+    color = _shaded(builder, weave, color, height, (u, v))
+
+    bump = builder.node("ShaderNodeBump", Strength=0.7, Distance=0.5 * spacing)
+    builder.link(height, bump.inputs["Height"])
+    shader = builder.node(
+        "ShaderNodeBsdfPrincipled",
+        Roughness=or_default(context.roughness, weave.roughness),
+        Specular_IOR_Level=weave.specular,
+        Anisotropic=weave.anisotropy,
+        Sheen_Weight=weave.sheen,
+        Sheen_Roughness=0.5,
+    )
+    builder.link(color, shader.inputs["Base Color"])
+    builder.link(bump.outputs["Normal"], shader.inputs["Normal"])
+    if weave.anisotropy:
+        tangent = builder.node("ShaderNodeTangent")
+        tangent.direction_type, tangent.uv_map = "UV_MAP", REST_UV
+        builder.link(tangent.outputs[0], shader.inputs["Tangent"])
+    builder.surface(_with_light_through(builder, shader, color, weave.translucency))
+
+
+def _thread_numbers(builder: NodeBuilder, spacing: float) -> tuple[Any, Any]:
+    """u and v: where a point is, counted in threads."""
+    coordinates = builder.node("ShaderNodeUVMap")
+    coordinates.uv_map = REST_UV
+    separate = builder.node("ShaderNodeSeparateXYZ")
+    builder.link(coordinates.outputs[0], separate.inputs[0])
+    u, v = (builder.math("DIVIDE", separate.outputs[axis], spacing) for axis in ("X", "Y"))
+    return u, v
+
+
+def _heights(builder: NodeBuilder, weave: Weave, u: Any, v: Any) -> tuple[Any, Any]:
+    """Heights of the warp's and the weft's surface in thread radii: round threads that go up and down."""
+    warp = _undulation(builder, weave.period, v, u, weave.warp_step)
+    weft = builder.math("MULTIPLY", _undulation(builder, weave.period, u, v, weave.weft_step), -1.0)
+    return _round(builder, u, warp), _round(builder, v, weft)
+
+
+def _undulation(builder: NodeBuilder, period: int, along: Any, across: Any, step: int) -> Any:
+    """z of the module's docstring."""
+    thread = builder.math("MULTIPLY", builder.math("FLOOR", across), step)
+    place = builder.math("ADD", builder.math("ADD", along, thread), 0.5 * period - 0.5)
+    from_dip = builder.math(
+        "ABSOLUTE", builder.math("SUBTRACT", builder.math("FLOORED_MODULO", place, period), 0.5 * period)
+    )
+    wave = builder.math("SUBTRACT", builder.math("MULTIPLY", from_dip, 2.0), 1.0)
+    return builder.math("MINIMUM", wave, 1.0)
+
+
+def _round(builder: NodeBuilder, across: Any, undulation: Any) -> Any:
+    """A thread's surface, |sin(pi x)| across it, on its undulation of half a radius."""
+    profile = builder.math("ABSOLUTE", builder.math("SINE", builder.math("MULTIPLY", across, 3.14159265)))
+    return builder.math("ADD", profile, builder.math("MULTIPLY", undulation, 0.5))
+
+
+def _colors(builder: NodeBuilder, weave: Weave, warp: Color, shows_weft: Any) -> Any:
+    """Colour of the thread that is on top; seen from behind, that is the one that lies below here."""
+    back = builder.node("ShaderNodeNewGeometry").outputs["Backfacing"]
+    shown = builder.math("ABSOLUTE", builder.math("SUBTRACT", shows_weft, back))
+    return builder.mix_colors(shown, warp, weave.weft or warp)
+
+
+def _shaded(builder: NodeBuilder, weave: Weave, color: Any, height: Any, place: tuple[Any, Any]) -> Any:
+    """Colours that are uneven along threads, and darker between them."""
+    u, v = place
+    # Thick and thin places of a thread are some forty spacings long.
+    streaks = [_streaks(builder, *scaled) for scaled in ((u, 1.0, v, 0.025), (u, 0.025, v, 1.0))]
+    uneven = builder.math("ADD", *streaks)
+    uneven = builder.math("MULTIPLY_ADD", builder.math("SUBTRACT", uneven, 1.0), 2.0 * weave.unevenness, 1.0)
+    light = builder.math("MINIMUM", builder.math("MULTIPLY_ADD", height, 1.0 - weave.gaps, weave.gaps), 1.0)
+    brightness = builder.math("MULTIPLY", uneven, builder.math("MAXIMUM", light, 0.0))
+    product = builder.node("ShaderNodeVectorMath")
+    product.operation = "SCALE"
+    builder.link(color, product.inputs[0])
+    builder.link(brightness, product.inputs["Scale"])
+    return product.outputs[0]
+
+
+def _streaks(builder: NodeBuilder, u: Any, u_scale: float, v: Any, v_scale: float) -> Any:
+    """Noise [0, 1] about 0.5 that is drawn out along one direction of threads."""
+    place = builder.node("ShaderNodeCombineXYZ")
+    builder.link(builder.math("MULTIPLY", u, u_scale), place.inputs[0])
+    builder.link(builder.math("MULTIPLY", v, v_scale), place.inputs[1])
+    noise = builder.node("ShaderNodeTexNoise", Scale=0.7, Detail=2.0)
+    builder.link(place.outputs[0], noise.inputs["Vector"])
+    return noise.outputs[0]
+
+
+def _with_light_through(builder: NodeBuilder, shader: Any, color: Any, translucency: float) -> Any:
+    """Let a share of the light through to the other side of the sheet."""
+    if translucency == 0.0:
+        return shader
+    through = builder.node("ShaderNodeBsdfTranslucent")
+    builder.link(color, through.inputs["Color"])
+    factor = builder.node("ShaderNodeValue")
+    factor.outputs[0].default_value = translucency
+    return mix_shaders(builder, factor.outputs[0], shader, through)

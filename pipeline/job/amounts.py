@@ -1,0 +1,24 @@
+"""Numbers in words, as the checks tell them."""
+
+from __future__ import annotations
+
+import math
+
+
+def count(number: float) -> str:
+    """How many: `1.23 million`."""
+    for limit, unit in ((1e9, "billion"), (1e6, "million")):
+        if number >= limit:
+            return f"{number / limit:.3g} {unit}"
+    return f"{number:.0f}"
+
+
+def gigabytes(size_bytes: float) -> str:
+    """How much memory: `1.23 GB`."""
+    return f"{size_bytes / 1e9:.3g} GB"
+
+
+def rounded_up(value: float) -> float:
+    """To two significant digits, upwards, so that the number is short and still fits."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / step) * step:.2g}")

@@ -1,0 +1,251 @@
+"""Whether the cloths of a job can be built, held, and start where the job puts them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.job.amounts import count, gigabytes
+from pipeline.job.boxes import Box, domain_box, span, touch
+from pipeline.job.memory_budget import MemoryBudget
+from pipeline.job.mesh_checks import mesh_exists
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings
+from sim.cloth.parameters import RectangleSheet, shared_conflicts
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+    from sim.cloth.parameters import ClothParameters
+    from sim.cloth.sheet import RestSheet
+    from sim.scene import DomainParameters
+    from sim.shapes import Solid
+
+BYTES_PER_NODE = 6000
+"""What the solver takes: 2.7 kB for six springs, two triangles, what building them takes for a moment, and snapshots
+(measured with 62,500 nodes in a flat sheet), and room for some forty contacts a node in a bundle."""
+ROUND_OFF = 1.0e-6
+"""Cloth that is laid onto a body, in decimal numbers, may be so deep in it [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """A cloth where it starts.
+
+    Attributes:
+        path: of its table.
+        cloth: its parameters.
+        sheet: at rest.
+        position: of its nodes [m], (n, 3).
+        edges: (e, 2) node numbers.
+        held: whether a pin holds the node, (n,).
+    """
+
+    path: KeyPath
+    cloth: ClothParameters
+    sheet: RestSheet
+    position: NDArray[np.float64]
+    edges: NDArray[np.int32]
+    held: NDArray[np.bool_]
+
+    @property
+    def box(self) -> Box:
+        """What it spans."""
+        return np.array([self.position.min(axis=0), self.position.max(axis=0)])
+
+
+def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget, findings: Findings) -> int:
+    """Note what is wrong with the cloths.
+
+    Args:
+        job: the job.
+        solids: its solid shapes as far as they can be built, by path.
+        budget: memory that the simulation may take.
+        findings: where errors and warnings go.
+
+    Returns:
+        Number of nodes of all cloths, as far as they can be built.
+    """
+    for number, key, message in shared_conflicts(job.cloth):
+        findings.error(("cloth", number, key), message)
+    starts = [start for index in range(len(job.cloth)) if (start := _start(job, index, budget, findings)) is not None]
+    for number, start in enumerate(starts):
+        _check_place(start, job.domain, findings)
+        _check_spacing(start, findings)
+        _check_substeps(start, job.fps, findings)
+        for path, solid in solids.items():
+            if path[0] == "rigid":
+                _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
+        _check_crossings(start, starts[:number], findings)
+    return sum(len(start.position) for start in starts)
+
+
+def _start(job: Job, index: int, budget: MemoryBudget, findings: Findings) -> _Start | None:
+    """The cloth as the simulation will start it; None if it cannot be built."""
+    from sim.cloth.sheet import build_sheet
+    from sim.cloth.springs import edges_of
+    from sim.cloth.start import start_positions
+    from sim.shapes import ShapeError
+
+    path: KeyPath = ("cloth", index)
+    cloth = job.cloth[index]
+    if not mesh_exists(cloth.shape, path, findings) or not _fits(path, cloth, budget, findings):
+        return None
+    try:
+        sheet = build_sheet(cloth.shape)
+    except ShapeError as error:
+        findings.error((*path, "shape"), str(error))
+        return None
+    for warning in sheet.warnings:
+        findings.warn((*path, "shape"), warning)
+    position = start_positions(cloth, sheet)
+    held = _held(path, cloth, sheet, position, findings)
+    return _Start(path, cloth, sheet, position, edges_of(sheet.triangles).nodes, held)
+
+
+def _fits(path: KeyPath, cloth: ClothParameters, budget: MemoryBudget, findings: Findings) -> bool:
+    """Whether a rectangle fits into memory, before it is built; a mesh did when it was made."""
+    if not isinstance(cloth.shape, RectangleSheet):
+        return True
+    nodes = prod(cloth.shape.node_counts)
+    if nodes * BYTES_PER_NODE <= budget.bytes:
+        return True
+    key = "counts" if cloth.shape.counts is not None else "resolution"
+    findings.error(
+        (*path, "shape", key),
+        f"{count(nodes)} nodes need {gigabytes(nodes * BYTES_PER_NODE)}, {budget.owner} has "
+        f"{gigabytes(budget.bytes)}; at most {count(budget.bytes // BYTES_PER_NODE)} fit: divide it less finely",
+    )
+    return False
+
+
+def _held(
+    path: KeyPath, cloth: ClothParameters, sheet: RestSheet, position: NDArray[np.float64], findings: Findings
+) -> NDArray[np.bool_]:
+    """Which nodes pins hold at the start, (n,); notes pins that hold none, and moving ones that share a node."""
+    from sim.cloth.start import pinned_nodes
+
+    holders = np.full(len(position), -1)
+    for number, pin in enumerate(cloth.pin):
+        place = (*path, "pin", number)
+        try:
+            nodes = pinned_nodes(pin, sheet, position)
+        except ValueError as error:
+            findings.error(place, str(error))
+            continue
+        others = [int(other) for other in np.unique(holders[nodes]) if other >= 0]
+        moving = [other for other in others if pin.keyframe or cloth.pin[other].keyframe]
+        if moving:
+            findings.error(place, f"shares a node with pin[{moving[0]}], and one of them moves; pin each node once")
+        holders[nodes] = number
+    held: NDArray[np.bool_] = holders >= 0
+    return held
+
+
+def _check_place(start: _Start, domain: DomainParameters, findings: Findings) -> None:
+    """Refuse cloth out of sight, and cloth on both sides of a wall."""
+    box = domain_box(domain)
+    if not touch(start.box, box, margin=0.0):
+        findings.error(start.path, f"is wholly outside the domain: it spans {span(start.box)}, not {span(box)}")
+        return
+    free = start.position[~start.held]
+    for axis, letter in enumerate("xyz"):
+        for sign, beyond in (("-", box[0, axis] - free[:, axis]), ("+", free[:, axis] - box[1, axis])):
+            if f"{letter}{sign}" not in domain.open_faces and beyond.max(initial=0.0) > ROUND_OFF:
+                findings.error(
+                    start.path,
+                    f"passes through the wall {letter}{sign}, as at {_place(free[beyond.argmax()])}; move it, or name "
+                    "the face in domain.open_faces",
+                )
+
+
+def _check_spacing(start: _Start, findings: Findings) -> None:
+    """Layers keep the thickness where the sheet is folded; it cannot fold more sharply than its nodes allow."""
+    rest = start.sheet.vertices[start.edges]
+    shortest = float(np.linalg.norm(rest[:, 1] - rest[:, 0], axis=1).min())
+    if start.cloth.self_collision and start.cloth.thickness > shortest:
+        findings.warn(
+            (*start.path, "thickness"),
+            f"{start.cloth.thickness:g} m is more than the {shortest:.3g} m between neighbouring nodes: every node is "
+            "in contact with many others, which takes long; make it thinner, or the sheet coarser",
+        )
+
+
+def _check_substeps(start: _Start, fps: int, findings: Findings) -> None:
+    """Explicit springs are unstable beyond their step."""
+    from sim.cloth.springs import springs_of
+    from sim.cloth.stable_step import longest_explicit_step, too_few_substeps
+
+    cloth = start.cloth
+    if cloth.integrator != "explicit" or cloth.substeps is None:
+        return
+    families = [(springs, springs.stiffness(cloth), springs.damping(cloth)) for springs in springs_of(start.sheet)]
+    inverse_mass = np.where(start.held, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
+    if reason := too_few_substeps(cloth.substeps, 1.0 / fps, longest_explicit_step(families, inverse_mass)):
+        findings.error((*start.path, "substeps"), reason)
+
+
+def _check_inside(start: _Start, body: str, solid: Solid, findings: Findings) -> None:
+    """Refuse cloth in a body: nobody knows which way out is meant. Pinned nodes stay where they are, so they may be."""
+    if not touch(start.box, solid.bounds, margin=0.0):
+        return
+    triangles = start.sheet.triangles
+    points = np.concatenate(
+        [start.position[~start.held], *(_middles(start, parts) for parts in (start.edges, triangles))]
+    )
+    near = ((points >= solid.bounds[0]) & (points <= solid.bounds[1])).all(axis=1)
+    inside = points[near][solid.signed_distance(points[near]) < -ROUND_OFF] if near.any() else points[:0]
+    if len(inside):
+        findings.error(start.path, f'starts inside "{body}", as at {_place(inside[0])}; move one of them')
+
+
+def _middles(start: _Start, parts: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Middles of edges or triangles [m] without a pinned node."""
+    middles: NDArray[np.float64] = start.position[parts[~start.held[parts].any(axis=1)]].mean(axis=1)
+    return middles
+
+
+def _check_crossings(start: _Start, earlier: Sequence[_Start], findings: Findings) -> None:
+    """Refuse cloth that passes through another, or a mesh through itself: contacts keep what crosses crossed."""
+    from sim.cloth.start import first_crossing
+
+    if start.cloth.self_collision and not isinstance(start.cloth.shape, RectangleSheet):
+        point = first_crossing(start.position, start.edges, start.sheet.triangles)
+        if point is not None:
+            findings.error(
+                (*start.path, "shape"),
+                f"passes through itself at {_place(point)}; take it apart, or use self_collision = false",
+            )
+    for other in earlier:
+        if not touch(start.box, other.box, margin=0.0):
+            continue
+        points = (_crossing_of(one, two) for one, two in ((start, other), (other, start)))
+        point = next((each for each in points if each is not None), None)
+        if point is not None:
+            findings.error(
+                start.path, f'passes through cloth "{other.cloth.name}" at {_place(point)}; move one of them'
+            )
+
+
+def _crossing_of(one: _Start, other: _Start) -> NDArray[np.float64] | None:
+    """Where an edge of one cloth passes through a triangle of another [m]."""
+    from sim.cloth.start import first_crossing
+
+    position = np.concatenate([one.position, other.position])
+    edges = one.edges[_reaching(one.position[one.edges], other.box)]
+    triangles = other.sheet.triangles[_reaching(other.position[other.sheet.triangles], one.box)]
+    return first_crossing(position, edges, triangles + len(one.position))
+
+
+def _reaching(corners: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
+    """Which elements, with corners (m, c, 3), have a box that touches another one, (m,)."""
+    reaching: NDArray[np.bool_] = ((corners.max(axis=1) >= box[0]) & (corners.min(axis=1) <= box[1])).all(axis=1)
+    return reaching
+
+
+def _place(point: NDArray[np.float64]) -> str:
+    return "(" + ", ".join(f"{coordinate:.4g}" for coordinate in point) + ") m"

@@ -1,0 +1,32 @@
+"""Whether the mesh files that a job names are there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings, suggestion
+from sim.shapes.parameters import MeshShape
+
+
+def mesh_exists(shape: object, path: KeyPath, findings: Findings) -> bool:
+    """Whether a shape needs no file, or its file is there; notes what is wrong, and the name that may be meant.
+
+    Args:
+        shape: of a body or a cloth.
+        path: of the table that the shape is in.
+        findings: where errors go.
+    """
+    if not isinstance(shape, MeshShape):
+        return True
+    file, key = Path(shape.file), (*path, "shape", "file")
+    if file.is_file():
+        return True
+    if file.is_dir():
+        findings.error(key, f"{file} is a folder, not a mesh")
+    elif not file.parent.is_dir():
+        findings.error(key, f"no such file: {file}; there is no folder {file.parent}")
+    else:
+        neighbours = [each.name for each in file.parent.iterdir()]
+        findings.error(key, f"no such file: {file}{suggestion(file.name, neighbours)}")
+    return False

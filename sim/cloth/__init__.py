@@ -1,0 +1,1 @@
+"""Cloth: springs between points of mass, after XPBD with small steps."""

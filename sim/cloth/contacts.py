@@ -1,0 +1,22 @@
+"""What the cloth solver lets contacts do: change where nodes end up in a substep."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from sim.cloth.state import ClothState
+
+
+class ClothContacts(Protocol):
+    """A kind of contact: of cloths with themselves and each other, with bodies, with walls."""
+
+    def stable_dt(self, state: ClothState) -> float:
+        """Largest step [s] for the current state; infinite without a limit."""
+
+    def resolve(self, state: ClothState, dt: float) -> None:
+        """Change the displacements of a step of dt [s], after the springs have; pinned nodes stay as they are."""
+
+    def begin_frame(self) -> None:
+        """Reset the counters of the frame, and forget what a run that continues here would not know."""
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """Numbers about the contacts of the frame, by name."""

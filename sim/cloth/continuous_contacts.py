@@ -1,0 +1,222 @@
+"""Keeps cloths apart from themselves, from bodies and from walls, all through each substep."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.cloth.continuous_response import begin_push, finish_push, push_apart, repair_crossings, weigh_contacts
+from sim.cloth.continuous_zones import ImpactZones
+from sim.cloth.proximity_contacts import ContactList
+from sim.cloth.rigid_contact import RigidContact
+from sim.cloth.self_collision import SelfCollision, half_range
+from sim.cloth.self_collision_kernels import copy_vectors, largest_change
+
+if TYPE_CHECKING:
+    from sim.cloth.state import ClothState
+
+ITERATIONS = (8, 16)
+"""Steps of the contact iteration, and of those that follow where it is not there yet: two layers under their weight
+need one, stacks and impacts more."""
+
+TOLERANCE = 0.02
+"""Part of the thickness by which contacts may miss what they should keep."""
+
+REPAIRS = 4
+"""Rounds in which crossing pairs are pushed before they become impact zones."""
+
+MARGIN = 0.5
+"""How far contacts are expected to push, in thicknesses; where they push farther, pairs are looked at again."""
+
+LEAST_GAP = 0.02
+"""Layers are never let nearer than this, in thicknesses, as far as contacts and impact zones decide it."""
+
+RECOVERY_TIME_S = 0.01
+"""Layers that are too near go apart within about this time: fast enough not to be seen, too slow to bounce."""
+
+LARGEST_MOTION = 0.5
+"""How far vertices may get from their common motion in a step, in mean edges: farther, the lists grow too long."""
+
+IMPULSE_UNIT = 1.0e-10
+"""Unit of impulses times the step, in masses of a vertex times metres: contacts push by 1e-7 m and more."""
+
+
+class ContinuousContacts:
+    """Contacts of all cloths of a scene; implements `sim.cloth.contacts.ClothContacts`.
+
+    A substep: the pairs of elements that may meet, and what may meet bodies and walls; displacements that keep all of
+    them apart by their thickness, with friction; a test that no pair may have crossed on the way. Where it fails, the
+    pairs' vertices are pushed, and at last moved as one (`ImpactZones`). So cloth that starts without crossing has
+    none at the end of any substep, whatever its speed; pins that are led through each other are the exception.
+
+    Linear momentum is kept to rounding. Angular momentum is kept by what pushes along the line between the points that
+    touch; friction between layers acts on two points a thickness apart, and spins by that arm.
+
+    Attributes:
+        rigid: contacts with bodies and walls.
+
+    Args:
+        state: the cloths.
+        rigid: bodies and walls; None for cloths alone.
+    """
+
+    def __init__(self, state: ClothState, *, rigid: RigidContact | None = None) -> None:
+        self.rigid = rigid or RigidContact((), (), ())
+        self._pairs = SelfCollision(state)
+        n = state.vertex_count
+        self._contacts = ContactList(4 * n)
+        self._shares = ti.ndarray(ti.i32, n)
+        self._gathered = ti.ndarray(ti.i64, 3 * n)
+        self._gathered.fill(0)
+        self._predicted, self._start, self._reached = (ti.Vector.ndarray(3, ti.f32, n) for _ in range(3))
+        self._crossing = ti.ndarray(ti.i32, 4 * n)
+        self._state = state
+        self.begin_frame()
+
+    # --- what the solver asks ---------------------------------------------------------------------------------------
+
+    def stable_dt(self, state: ClothState) -> float:
+        """Largest step [s] in which cloth moves little against itself and against bodies."""
+        deviation, speed = half_range(state.velocity, state.vertex_count)
+        own = LARGEST_MOTION * self._pairs.mean_edge / deviation if deviation > 0.0 else math.inf
+        return min(own, self.rigid.stable_dt(speed))
+
+    def begin_frame(self) -> None:
+        """Count anew, and find pairs anew, so that a run that continues here does the same."""
+        self._pairs.forget(self._state)
+        self._change = 0.0
+        self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = 0
+        self._impulse_unit = IMPULSE_UNIT * float(self._state.mass.to_numpy().mean())
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """Numbers of the frame: contacts, with watched pairs, and iterations a substep; searches for pairs.
+
+        `repaired_crossings` counts pairs that contacts alone would have let cross, `impact_zone_vertices` the vertices
+        that had to move with others; both summed over the substeps.
+        """
+        return {
+            "contacts": self._found / max(self._substeps, 1),
+            "contact_iterations": self._iterations / max(self._substeps, 1),
+            "pair_searches": float(self._pairs.searches),
+            "repaired_crossings": float(self._repaired),
+            "impact_zone_vertices": float(self._zone_vertices),
+        }
+
+    def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Linear and angular impulse on every body since the last call [N s], [N m s], (b, 3) each, for steps of dt."""
+        linear, angular = self.rigid.bodies.take_impulses(self._impulse_unit)
+        return linear / dt, angular / dt
+
+    # --- the substep ------------------------------------------------------------------------------------------------
+
+    def resolve(self, state: ClothState, dt: float) -> None:
+        """Change the displacements of a substep of dt [s] so that nothing crosses."""
+        motion, _ = half_range(state.displacement, state.vertex_count)
+        if not math.isfinite(motion) or motion > 1.0e6:
+            return  # the solver says which quantity is not finite, or ran away
+        self.rigid.begin_substep(dt)
+        n = state.vertex_count
+        margin = max(MARGIN * self._pairs.thickness, 1.25 * self._change)
+        while True:
+            self._pairs.prepare(state, motion)
+            found = self._find(state, margin, dt)
+            if found:
+                copy_vectors(state.displacement, n, self._predicted)
+                self._push(state, found, is_first=True)
+                self._keep_apart(state, found)
+                self._change = float(largest_change(state.displacement, self._predicted, n))
+                motion, _ = half_range(state.displacement, n)
+                if not math.isfinite(self._change + motion):
+                    return  # as above
+            # What was pushed farther than foreseen may have met what was not looked at.
+            if not found or (self._change <= margin and self._pairs.covers(state, motion)):
+                break
+            margin = max(margin, 1.5 * self._change)
+        self._pairs.follow(state, motion)
+        self._substeps += 1
+        self._found += found
+
+    def _find(self, state: ClothState, margin: float, dt: float) -> int:
+        recovery = min(1.0, dt / RECOVERY_TIME_S)
+        while True:
+            self._contacts.counter.fill(0)
+            found = self._pairs.find(state, self._contacts, margin, recovery)
+            found = self.rigid.find(state, self._contacts, recovery, found)
+            if not self._contacts.make_room_for(found):
+                return found
+
+    def _push(self, state: ClothState, count: int, *, is_first: bool) -> None:
+        contacts, bodies, n = self._contacts, self.rigid.bodies, state.vertex_count
+        pushing = weigh_contacts(
+            count, contacts.vertices, contacts.weights, contacts.floor, contacts.kind, contacts.arm, contacts.mobility,
+            contacts.impulse, contacts.pushing, contacts.counter, n, state.inverse_mass, self._shares, bodies.count,
+            bodies.inverse_mass, bodies.inverse_inertia, bodies.load, bodies.load_unit, is_first,
+        )  # fmt: skip
+        if not pushing:
+            return
+        for iterations in ITERATIONS:
+            missing = self._iterate(state, int(pushing), iterations)
+            if missing <= TOLERANCE * self._pairs.thickness:
+                break
+
+    def _iterate(self, state: ClothState, count: int, iterations: int) -> float:
+        """Some steps of the contact iteration; the most that a contact misses then [m]."""
+        contacts, bodies, n = self._contacts, self.rigid.bodies, state.vertex_count
+        begin_push(
+            count, contacts.pushing, contacts.impulse, contacts.impulse_before, contacts.impulse_given, n,
+            state.displacement, self._start, self._reached, bodies.count, bodies.motion, bodies.motion_start,
+            bodies.motion_reached,
+        )  # fmt: skip
+        for k in range(iterations):
+            push_apart(
+                k / (k + 3.0), (k + 1.0) / (k + 4.0), count, contacts.pushing, contacts.vertices, contacts.weights,
+                contacts.normal, contacts.floor, contacts.kind, contacts.arm, contacts.friction, contacts.mobility,
+                contacts.impulse, contacts.impulse_before, n, state.displacement, self._reached, state.inverse_mass,
+                self._gathered, bodies.count, bodies.motion, bodies.motion_reached, bodies.inverse_mass,
+                bodies.inverse_inertia, bodies.gathered, self._impulse_unit,
+            )  # fmt: skip
+        self._iterations += iterations
+        return float(
+            finish_push(
+                count, contacts.pushing, contacts.vertices, contacts.weights, contacts.normal, contacts.floor,
+                contacts.kind, contacts.arm, contacts.impulse, contacts.impulse_given, n, state.displacement,
+                self._start, state.inverse_mass, self._gathered, bodies.count, bodies.motion, bodies.motion_start,
+                bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, bodies.impulse, self._impulse_unit,
+            )
+        )  # fmt: skip
+
+    def _keep_apart(self, state: ClothState, count: int) -> None:
+        """Push, and at last tie together, until no pair can have crossed."""
+        for _ in range(REPAIRS):
+            failed = self._crossings(state, count)
+            if not failed:
+                return
+            self._repaired += failed
+            self._push(state, count, is_first=False)
+        failed = self._crossings(state, count)
+        if failed:
+            zones = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0)
+            while failed and zones.join(self._contacts.vertices.to_numpy()[:count][self._crossing_rows(count)]):
+                state.displacement.from_numpy(zones.apply(state.displacement.to_numpy()))
+                failed = self._crossings(state, count)
+            self._zone_vertices += zones.vertex_count
+
+    def _crossings(self, state: ClothState, count: int) -> int:
+        contacts = self._contacts
+        if self._crossing.shape[0] < contacts.capacity:
+            self._crossing = ti.ndarray(ti.i32, contacts.capacity)
+        return int(
+            repair_crossings(
+                count, contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind,
+                contacts.impulse, state.position, state.displacement, state.inverse_mass,
+                LEAST_GAP * self._pairs.thickness, self._crossing,
+            )
+        )  # fmt: skip
+
+    def _crossing_rows(self, count: int) -> NDArray[np.bool_]:
+        return self._crossing.to_numpy()[:count] == 1

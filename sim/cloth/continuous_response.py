@@ -1,0 +1,289 @@
+"""What contacts do to the displacements of a substep: a projected Jacobi iteration that keeps momentum.
+
+The displacements u are those nearest to the predicted ones, in the norm of the masses, for which every contact has
+n . w >= floor, w = sum_k c_k u_k; friction then takes tangential displacement away, within Coulomb's cone. With
+P_c the impulse of contact c times the step, M u changes by sum_c c_k P_c, so that both sides get the same.
+
+All contacts push at once. That overshoots where vertices share contacts; by Cauchy's inequality
+|sum_c c_ic P_c|² <= S_i sum_c |c_ic| |P_c|², S_i = sum_c |c_ic|, the matrix of the problem is at most the diagonal
+D_c = sum_i |c_ic| S_i / m_i, and steps of the residual over D_c converge (mass splitting, Tonge et al. 2012, with
+weights). Where all contacts push alike, as between two layers, D_c is exact and one step does; momentum (Nesterov 1983,
+of contacts Mazhar et al. 2015) brings the others.
+
+Sums over contacts are sums of integers, in units far below anything that matters: the same for any order of contacts
+and threads.
+"""
+
+import taichi as ti
+
+from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, Floats, Integers, Quadruples, Vectors, Weights
+from sim.launch import fast_launch
+
+LongIntegers = ti.types.ndarray(dtype=ti.i64, ndim=1)
+Matrices = ti.types.ndarray(dtype=ti.math.mat3, ndim=1)
+
+SHARES_PER_UNIT = 65536.0
+"""Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
+
+LARGEST_SHARE = 0.9
+"""How much of a pair's separation a substep may use up: what is left keeps the sides apart for the next one."""
+
+KEPT_BY_REPAIR = 0.3
+"""Share of its separation that a pair keeps which would have crossed: above 1 - `LARGEST_SHARE`."""
+
+ROUNDING = 1.0e-6
+"""Relative rounding of a separation in float32, in lengths of the elements."""
+
+
+@fast_launch
+@ti.kernel
+def weigh_contacts(
+    count: ti.i32, vertices: Quadruples, weights: Weights, floor: Floats, kind: Integers, arm: Vectors,
+    mobility: Floats, impulse: Vectors, pushing: Integers, counter: Integers,
+    vertex_count: ti.i32, inverse_mass: Floats, shares: Integers,
+    body_count: ti.i32, body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_load: LongIntegers,
+    load_unit: ti.f32, is_first: ti.template(),
+) -> ti.i32:  # fmt: skip
+    """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses.
+
+    Returns how many there are. Contacts of what nothing moves do not push.
+    """
+    for i in range(vertex_count):
+        shares[i] = 0
+    for b in range(body_count):
+        body_load[b] = ti.cast(0, ti.i64)
+    counter[0] = 0
+    for c in range(count):
+        if floor[c] > 0.5 * INACTIVE:
+            mobile = 0.0
+            for k in ti.static(range(4)):
+                if weights[c][k] != 0.0:
+                    share = ti.cast(ti.ceil(ti.abs(weights[c][k]) * SHARES_PER_UNIT), ti.i32)
+                    ti.atomic_add(shares[vertices[c][k]], share)
+                    mobile += inverse_mass[vertices[c][k]]
+            b = kind[c]
+            if b >= 0:
+                most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
+                ti.atomic_add(body_load[b], ti.cast(ti.ceil(ti.sqrt(most) / load_unit), ti.i64))
+                mobile += most
+            if mobile > 0.0:
+                pushing[ti.atomic_add(counter[0], 1)] = c
+    for place in range(counter[0]):
+        c = pushing[place]
+        if ti.static(is_first):
+            impulse[c] = ti.math.vec3(0.0)
+        total = 0.0
+        for k in ti.static(range(4)):
+            weight = ti.abs(weights[c][k])
+            if weight > 0.0:
+                v = vertices[c][k]
+                total += weight * inverse_mass[v] * (ti.cast(shares[v], ti.f32) / SHARES_PER_UNIT)
+        b = kind[c]
+        if b >= 0:
+            most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
+            total += ti.sqrt(most) * ti.cast(body_load[b], ti.f32) * load_unit
+        mobility[c] = total
+    return counter[0]
+
+
+@ti.func
+def body_mobility(arm: ti.math.vec3, inverse_mass: ti.f32, inverse_inertia: ti.math.mat3) -> ti.f32:
+    """Upper bound of how much a body's point moves per impulse on it [1/kg]."""
+    return inverse_mass + arm.norm_sqr() * ti.math.mat3(inverse_inertia).norm()
+
+
+@ti.func
+def relative_displacement(
+    c: ti.i32, vertices: Quadruples, weights: Weights, displacement: Vectors, kind: Integers, arm: Vectors,
+    body_motion: Vectors,
+) -> ti.math.vec3:  # fmt: skip
+    """Of the first side of a contact against the second, or against the body [m]."""
+    w = ti.math.vec3(0.0)
+    for k in ti.static(range(4)):
+        if weights[c][k] != 0.0:
+            w += weights[c][k] * displacement[vertices[c][k]]
+    b = kind[c]
+    if b >= 0:
+        w -= body_motion[2 * b] + body_motion[2 * b + 1].cross(arm[c])
+    return w
+
+
+@ti.func
+def give(
+    push: ti.math.vec3, vertices: ti.types.vector(4, ti.i32), weights: ti.math.vec4, kind: ti.i32, arm: ti.math.vec3,
+    gathered: LongIntegers, body_gathered: LongIntegers,
+):  # fmt: skip
+    """Add an impulse, in units, to what the vertices and the body of a contact get."""
+    for k in ti.static(range(4)):
+        if weights[k] != 0.0:
+            for axis in ti.static(range(3)):
+                ti.atomic_add(gathered[3 * vertices[k] + axis], ti.cast(weights[k] * push[axis], ti.i64))
+    if kind >= 0:
+        twist = arm.cross(push)
+        for axis in ti.static(range(3)):
+            ti.atomic_add(body_gathered[6 * kind + axis], -ti.cast(push[axis], ti.i64))
+            ti.atomic_add(body_gathered[6 * kind + 3 + axis], -ti.cast(twist[axis], ti.i64))
+
+
+@ti.func
+def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
+    """Three sums of integers, which are zero then."""
+    push = ti.math.vec3(0.0)
+    for axis in ti.static(range(3)):
+        push[axis] = ti.cast(gathered[first + axis], ti.f32)
+        gathered[first + axis] = ti.cast(0, ti.i64)
+    return push
+
+
+@fast_launch
+@ti.kernel
+def begin_push(
+    count: ti.i32, pushing: Integers, impulse: Vectors, impulse_before: Vectors, impulse_given: Vectors,
+    vertex_count: ti.i32, displacement: Vectors, start: Vectors, reached: Vectors,
+    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors,
+):  # fmt: skip
+    """Note where the iteration starts."""
+    for i in range(vertex_count):
+        start[i] = displacement[i]
+        reached[i] = displacement[i]
+    for m in range(2 * body_count):
+        body_start[m] = body_motion[m]
+        body_reached[m] = body_motion[m]
+    for place in range(count):
+        c = pushing[place]
+        impulse_before[c] = impulse[c]
+        impulse_given[c] = impulse[c]
+
+
+@fast_launch
+@ti.kernel
+def push_apart(
+    momentum: ti.f32, next_momentum: ti.f32, count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights,
+    normal: Vectors, floor: Floats, kind: Integers, arm: Vectors, friction: Floats, mobility: Floats,
+    impulse: Vectors, impulse_before: Vectors,
+    vertex_count: ti.i32, displacement: Vectors, reached: Vectors, inverse_mass: Floats, gathered: LongIntegers,
+    body_count: ti.i32, body_motion: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
+    body_inverse_inertia: Matrices, body_gathered: LongIntegers, unit: ti.f32,
+):  # fmt: skip
+    """A step of the iteration, from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them.
+
+    Leaves the displacements of the next step, ahead by beta_{k+1} of those that it has `reached`.
+    """
+    for place in range(count):
+        c = pushing[place]
+        n = normal[c]
+        w = relative_displacement(c, vertices, weights, displacement, kind, arm, body_motion)
+        ahead = impulse[c] + momentum * (impulse[c] - impulse_before[c])
+        along = ti.max(ahead.dot(n) + (floor[c] - w.dot(n)) / mobility[c], 0.0)
+        sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / mobility[c]
+        most, length = friction[c] * along, sideways.norm()
+        if length > most:
+            sideways *= most / length
+        after = along * n + sideways
+        impulse_before[c] = impulse[c]
+        impulse[c] = after
+        give((after - ahead) / unit, vertices[c], weights[c], kind[c], arm[c], gathered, body_gathered)
+    for i in range(vertex_count):
+        u = displacement[i] + (inverse_mass[i] * unit) * take(gathered, 3 * i)
+        displacement[i] = u + next_momentum * (u - reached[i])
+        reached[i] = u
+    for b in range(body_count):
+        shift = body_motion[2 * b] + (body_inverse_mass[b] * unit) * take(body_gathered, 6 * b)
+        turn = body_motion[2 * b + 1] + unit * (body_inverse_inertia[b] @ take(body_gathered, 6 * b + 3))
+        body_motion[2 * b] = shift + next_momentum * (shift - body_reached[2 * b])
+        body_motion[2 * b + 1] = turn + next_momentum * (turn - body_reached[2 * b + 1])
+        body_reached[2 * b] = shift
+        body_reached[2 * b + 1] = turn
+
+
+@fast_launch
+@ti.kernel
+def finish_push(
+    count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats,
+    kind: Integers, arm: Vectors, impulse: Vectors, impulse_given: Vectors,
+    vertex_count: ti.i32, displacement: Vectors, start: Vectors, inverse_mass: Floats, gathered: LongIntegers,
+    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_inverse_mass: Floats,
+    body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, unit: ti.f32,
+) -> ti.f32:  # fmt: skip
+    """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
+
+    Returns the most that a contact's displacement is below its floor [m].
+    """
+    for place in range(count):
+        c = pushing[place]
+        push = (impulse[c] - impulse_given[c]) / unit
+        give(push, vertices[c], weights[c], kind[c], arm[c], gathered, body_gathered)
+    for i in range(vertex_count):
+        displacement[i] = start[i] + (inverse_mass[i] * unit) * take(gathered, 3 * i)
+    for b in range(body_count):
+        for axis in ti.static(range(6)):
+            body_impulse[6 * b + axis] += body_gathered[6 * b + axis]
+        body_motion[2 * b] = body_start[2 * b] + (body_inverse_mass[b] * unit) * take(body_gathered, 6 * b)
+        twist = unit * take(body_gathered, 6 * b + 3)
+        body_motion[2 * b + 1] = body_start[2 * b + 1] + body_inverse_inertia[b] @ twist
+    missing = 0.0
+    for place in range(count):
+        c = pushing[place]
+        w = relative_displacement(c, vertices, weights, displacement, kind, arm, body_motion)
+        ti.atomic_max(missing, floor[c] - w.dot(normal[c]))
+    return missing
+
+
+@fast_launch
+@ti.kernel
+def repair_crossings(
+    count: ti.i32, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers,
+    impulse: Vectors, position: Vectors, displacement: Vectors, inverse_mass: Floats, least_gap: ti.f32,
+    crossing: Integers,
+) -> ti.i32:  # fmt: skip
+    """Count the pairs that are not certainly apart all through the substep, and have their worst vertices pushed.
+
+    Two sides that a plane across n separates at the start, and one across n at the end, are separated all the time in
+    between: n . (x_a - x_b) of any two vertices is linear in time. So it is enough that the separation along n, that
+    of the nearest two vertices, keeps 1 - `LARGEST_SHARE` of what it was; or all of it where it was none.
+    `crossing` gets 1 for pairs that fail, else 0. Pairs whose vertices are all pinned are not looked at.
+    """
+    failed = 0
+    for c in range(count):
+        crossing[c] = 0
+        mobile = 0.0
+        for k in ti.static(range(4)):
+            mobile = ti.max(mobile, inverse_mass[vertices[c][k]])
+        if kind[c] < 0 and kind[c] >= EDGE_EDGE and mobile > 0.0:
+            n, v = normal[c], vertices[c]
+            first = ti.select(kind[c] == EDGE_EDGE, 2, 1)
+            origin, size = position[v[0]], 0.0
+            start = ti.math.vec4(0.0)
+            end = ti.math.vec4(0.0)
+            for k in ti.static(range(4)):
+                x = position[v[k]] - origin
+                start[k] = n.dot(x)
+                end[k] = start[k] + n.dot(displacement[v[k]])
+                size = ti.max(size, x.norm(), (displacement[v[k]] - displacement[v[0]]).norm())
+            low, low_start, high, high_start = 1.0e30, 1.0e30, -1.0e30, -1.0e30
+            lowest, highest = 0, 0
+            for k in ti.static(range(4)):
+                if k < first:
+                    low_start = ti.min(low_start, start[k])
+                    if end[k] < low:
+                        low, lowest = end[k], k
+                else:
+                    high_start = ti.max(high_start, start[k])
+                    if end[k] > high:
+                        high, highest = end[k], k
+            apart = low_start - high_start
+            least = ti.min(ti.max((1.0 - LARGEST_SHARE) * apart, least_gap), apart - ROUNDING * size)
+            if low - high < least:
+                failed += 1
+                crossing[c] = 1
+                pair = ti.math.vec4(0.0)
+                between = 0.0
+                for k in ti.static(range(4)):
+                    if k == lowest:
+                        pair[k], between = 1.0, between + start[k]
+                    if k == highest:
+                        pair[k], between = -1.0, between - start[k]
+                weights[c] = pair
+                floor[c] = ti.min(ti.max(KEPT_BY_REPAIR * apart, 2.0 * least_gap), apart) - between
+                impulse[c] = ti.math.vec3(0.0)
+    return failed

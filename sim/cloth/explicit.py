@@ -1,0 +1,101 @@
+"""Springs as explicit forces: symplectic Euler, the reference mode, with the longest step that is stable."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.cells import Floats, Integers, Vectors
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, coefficient, separation
+from sim.cloth.stable_step import longest_explicit_step
+from sim.cloth.state import ClothState, Lattice
+from sim.launch import fast_launch
+
+
+class ExplicitSprings:
+    """Forces -k (C + tau dC/dt) c_a d/|d| on the velocities, before nodes move.
+
+    Energy does not drift without damping: symplectic Euler keeps a nearby one. Forces of springs are stored, and each
+    node gathers its own in a fixed order.
+    """
+
+    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings]) -> None:
+        self._state, self._springs = state, springs
+        counts = [family.count for family in springs]
+        self._first = np.concatenate([[0], np.cumsum(counts)]).astype(int)
+        nodes = np.concatenate([family.host.nodes.ravel() for family in springs])
+        spring = np.concatenate(
+            [np.repeat(first + np.arange(family.count), family.arity)
+             for first, family in zip(self._first[:-1], springs, strict=True)]
+        )  # fmt: skip
+        coefficients = np.concatenate([family.host.coefficients.ravel() for family in springs])
+        order = np.argsort(nodes, kind="stable")
+        start = np.searchsorted(nodes[order], np.arange(state.vertex_count + 1))
+        self._start = _integers(start)
+        self._spring = _integers(spring[order])
+        self._coefficient = ti.ndarray(ti.f32, len(order))
+        self._coefficient.from_numpy(coefficients[order].astype(np.float32))
+        self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
+
+    def stable_dt(self) -> float:
+        """Longest stable step [s]."""
+        families = [(each.host, each.stiffness, each.damping) for each in self._springs]
+        return longest_explicit_step(families, self._state.inverse_mass.to_numpy())
+
+    def accelerate(self, dt: float) -> None:
+        """Give the springs' impulses of a step of dt [s] to the velocities."""
+        state = self._state
+        for first, springs in zip(self._first[:-1], self._springs, strict=True):
+            compute_spring_forces(
+                springs.nodes, springs.law, springs.coefficients, state.lattice, state.quantum, state.carry,
+                state.velocity, int(first), springs.count, springs.arity, self._force,
+            )  # fmt: skip
+        gather_spring_forces(
+            self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity
+        )
+
+    def displace(self, dt: float) -> None:
+        """Displacements follow from velocities alone."""
+
+
+def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
+    array = ti.ndarray(ti.i32, max(len(values), 1))
+    array.from_numpy(values.astype(np.int32))
+    return array
+
+
+@fast_launch
+@ti.kernel
+def compute_spring_forces(
+    nodes: Integers, law: Laws, coefficients: Floats, lattice: Lattice, quantum: ti.f32, carry: Vectors,
+    velocity: Vectors, first: ti.i32, count: ti.i32, arity: ti.template(), force: Vectors,
+):  # fmt: skip
+    """-k (C + tau dC/dt) d/|d| of each spring [N]."""
+    for s in range(count):
+        d = separation(nodes, coefficients, lattice, quantum, s, arity)
+        rate = ti.math.vec3(0.0)
+        for a in ti.static(range(arity)):
+            c_a = coefficient(coefficients, s, arity, a)
+            d += c_a * carry[nodes[arity * s + a]]
+            rate += c_a * velocity[nodes[arity * s + a]]
+        length = d.norm()
+        value = ti.math.vec3(0.0)
+        if length > TINY_LENGTH:
+            direction = d / length
+            value = -law[s][1] * (length - law[s][0] + law[s][2] * direction.dot(rate)) * direction
+        force[first + s] = value
+
+
+@fast_launch
+@ti.kernel
+def gather_spring_forces(
+    start: Integers, spring: Integers, coefficients: Floats, force: Vectors, inverse_mass: Floats, dt: ti.f32,
+    velocity: Vectors,
+):  # fmt: skip
+    """Accelerate every node by its springs."""
+    for i in range(velocity.shape[0]):
+        total = ti.math.vec3(0.0)
+        for k in range(start[i], start[i + 1]):
+            total += coefficients[k] * force[spring[k]]
+        velocity[i] += dt * inverse_mass[i] * total

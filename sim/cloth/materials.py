@@ -1,0 +1,61 @@
+"""Cloth materials by name: defaults that keys of a job override."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+Material = Literal["cotton", "silk", "denim", "rubber"]
+
+RUBBER_MODULUS, RUBBER_POISSON, RUBBER_DENSITY, RUBBER_THICKNESS = 1.5e6, 0.5, 1000.0, 1.0e-3
+"""Young's modulus [Pa], Poisson's ratio [-], density [kg/m³] and thickness [m] of a sheet of soft natural rubber (Gent
+2012, "Engineering with Rubber", ch. 3: 1-2 MPa, incompressible, 910-1200 kg/m³ with fillers)."""
+
+_PLANE = 1.0 - RUBBER_POISSON**2
+
+MATERIALS: Mapping[Material, Mapping[str, float]] = {
+    "cotton": {
+        "mass_per_area": 0.15,
+        "stretch_stiffness": 4.0e3,
+        "shear_stiffness": 50.0,
+        "bend_stiffness": 8.0e-6,
+        "thickness": 0.5e-3,
+        "friction": 0.5,
+    },
+    "silk": {
+        "mass_per_area": 0.07,
+        "stretch_stiffness": 3.0e3,
+        "shear_stiffness": 20.0,
+        "bend_stiffness": 2.5e-6,
+        "thickness": 0.2e-3,
+        "friction": 0.25,
+    },
+    "denim": {
+        "mass_per_area": 0.40,
+        "stretch_stiffness": 10.0e3,
+        "shear_stiffness": 150.0,
+        "bend_stiffness": 60.0e-6,
+        "thickness": 0.9e-3,
+        "friction": 0.6,
+    },
+    "rubber": {
+        "mass_per_area": RUBBER_DENSITY * RUBBER_THICKNESS,
+        "stretch_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS,
+        "shear_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS / (2.0 * (1.0 + RUBBER_POISSON)),
+        "bend_stiffness": RUBBER_MODULUS * RUBBER_THICKNESS**3 / (12.0 * _PLANE),
+        "thickness": RUBBER_THICKNESS,
+        "friction": 0.9,
+    },
+}
+"""Mass per area [kg/m²], stretch and shear stiffness [N/m], bending rigidity [N m], thickness [m], friction [-].
+
+Woven cloths lie within the ranges that Kawabata's instruments find at small loads (Kawabata 1980, "The standardization
+and analysis of hand evaluation"; Hu 2004, "Structure and mechanics of woven fabrics", ch. 4-6), here for a shirting of
+plain cotton, a light habotai silk and a 12 oz denim. His units convert so:
+
+- bending rigidity B: 1 gf cm²/cm = 98.1 uN m; cotton 0.05-0.1, silk 0.02-0.04, denim 0.4-1
+- shear G: 1 gf/(cm deg) = 56 N/m; cotton 0.5-1.5, silk 0.3-0.5, denim 2-4
+- tension: 500 gf/cm = 490 N/m at a strain of 3-15 %, as yarns straighten before they stretch: 3 to 16 kN/m
+
+Rubber is an isotropic elastic sheet: stretch E h, shear E h / (2 (1 + nu)), bending E h³ / (12 (1 - nu²)).
+"""

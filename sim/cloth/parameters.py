@@ -1,0 +1,237 @@
+"""Cloth as a job file names it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from sim.cloth.materials import MATERIALS, Material
+from sim.parameters import NonNegative, Parameters, Positive, Vector3
+from sim.shapes.parameters import MeshShape
+
+Corner = Literal["x-y-", "x+y-", "x-y+", "x+y+"]
+Edge = Literal["x-", "x+", "y-", "y+"]
+
+DEFAULT_SUBSTEPS = 20
+"""Steps per frame of XPBD where none are asked for: 0.8 ms at 60 frames a second."""
+
+
+class RectangleSheet(Parameters):
+    """A flat rectangle in its own x-y plane, centred on the origin; corners and edges are named after its axes."""
+
+    type: Literal["rectangle"]
+    size: tuple[Positive, Positive] = Field(description="Lengths along x and y [m].")
+    counts: tuple[Annotated[int, Field(ge=2, le=4096)], Annotated[int, Field(ge=2, le=4096)]] | None = Field(
+        default=None, description="Nodes along x and y [-]; give these or resolution."
+    )
+    resolution: Positive | None = Field(
+        default=None, description="Distance between nodes, about [m]; the sides are divided evenly."
+    )
+
+    @property
+    def node_counts(self) -> tuple[int, int]:
+        """Nodes along x and y."""
+        if self.counts is not None:
+            return self.counts
+        assert self.resolution is not None
+        along_x, along_y = (max(2, round(side / self.resolution) + 1) for side in self.size)
+        return along_x, along_y
+
+    @model_validator(mode="after")
+    def _is_divided_once(self) -> Self:
+        if (self.counts is None) == (self.resolution is None):
+            raise ValueError("give counts or resolution, one of them")
+        if self.resolution is not None and max(self.node_counts) > 4096:
+            raise ValueError(
+                f"resolution of {self.resolution:g} m makes {max(self.node_counts)} nodes on a side, 4096 at most"
+            )
+        return self
+
+
+Sheet = Annotated[RectangleSheet | MeshShape, Field(discriminator="type")]
+
+
+class BoxRegion(Parameters):
+    """An axis-aligned box of the world."""
+
+    type: Literal["box"]
+    min: Vector3 = Field(description="Lower corner [m].")
+    max: Vector3 = Field(description="Upper corner [m].")
+
+
+class SphereRegion(Parameters):
+    """A ball of the world."""
+
+    type: Literal["sphere"]
+    position: Vector3 = Field(description="Centre [m].")
+    radius: Positive = Field(description="Radius [m].")
+
+
+class PinKeyframeParameters(Parameters):
+    """How far a pin has been moved at one time."""
+
+    time_s: NonNegative = Field(description="Time [s]; later than that of the keyframe before.")
+    offset: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Way from where the pin started [m].")
+    rotation_deg: Vector3 = Field(
+        default=(0.0, 0.0, 0.0),
+        description="Rotation of the pinned points about their centre, about x, then y, then z (world axes) [degrees].",
+    )
+
+
+class PinParameters(Parameters):
+    """Nodes that are held: at rest, or moved along a path; for ever, or until they are let go."""
+
+    corner: Corner | None = Field(default=None, description="A corner of a rectangle, in its own axes.")
+    edge: Edge | None = Field(default=None, description="An edge of a rectangle, in its own axes.")
+    index: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
+        default=None,
+        min_length=1,
+        description="Numbers of nodes: of a rectangle along x first, of a mesh its vertices'.",
+    )
+    region: Annotated[BoxRegion | SphereRegion, Field(discriminator="type")] | None = Field(
+        default=None, description="All nodes that start in a box or a ball of the world."
+    )
+    keyframe: tuple[PinKeyframeParameters, ...] = Field(
+        default=(), description="Path of the pin; it rests before the first and after the last keyframe."
+    )
+    interpolation: Literal["cubic", "linear"] = Field(
+        default="cubic",
+        description="Between keyframes. cubic: velocities are continuous; linear: they are constant and jump.",
+    )
+    release_s: NonNegative | None = Field(default=None, description="When it lets go [s]; never if omitted.")
+
+    @model_validator(mode="after")
+    def _names_one_place(self) -> Self:
+        given = [key for key in ("corner", "edge", "index", "region") if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give one of corner, edge, index and region, got {' and '.join(given) or 'none'}")
+        for number, (before, after) in enumerate(pairwise(self.keyframe), start=1):
+            if after.time_s <= before.time_s:
+                raise ValueError(
+                    f"keyframe[{number}].time_s must be after {before.time_s:g} s, that of the keyframe before, "
+                    f"got {after.time_s:g} s"
+                )
+        if len(self.keyframe) == 1:
+            raise ValueError("keyframe: a path needs two keyframes at least; add one, or remove it")
+        if "interpolation" in self.model_fields_set and not self.keyframe:
+            raise ValueError("interpolation has no meaning without keyframes; remove it or add [[cloth.pin.keyframe]]")
+        return self
+
+
+class ClothParameters(Parameters):
+    """A cloth: its sheet at rest, where it starts, what it is made of, what holds it, and its numerics.
+
+    Stiffnesses are those of the sheet, per width, not of single springs: how finely the sheet is divided does not
+    change them. `sim.cloth.springs` converts them.
+    """
+
+    name: str = Field(description="Name of the cloth, unique in the job.", pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
+    shape: Sheet = Field(description="The sheet without loads: a rectangle, or any triangle mesh.")
+    position: Vector3 = Field(default=(0.0, 0.0, 0.0), description="World position of the sheet's centre [m].")
+    rotation_deg: Vector3 = Field(
+        default=(0.0, 0.0, 0.0), description="Rotation about x, then y, then z (world axes) [degrees]."
+    )
+    velocity: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Velocity at the start [m/s].")
+    material: Material = Field(
+        default="cotton", description="Where mass, stiffness, thickness and friction come from if they are omitted."
+    )
+    mass_per_area: Positive = Field(default=0.15, description="Mass per area [kg/m²]; the material's if omitted.")
+    stretch_stiffness: Positive = Field(
+        default=4.0e3,
+        description="Tension per width over strain, along the threads of a rectangle or in any direction of a mesh "
+        "[N/m]: Young's modulus times thickness; the material's if omitted.",
+    )
+    shear_stiffness: NonNegative | None = Field(
+        default=None,
+        description="Shear force per width over shear angle, of rectangles [N/m]; the material's if omitted. A mesh "
+        "has none of its own: it shears with 3/8 of its stretch stiffness, as its edges run in all directions.",
+    )
+    bend_stiffness: NonNegative = Field(
+        default=8.0e-6,
+        description="Bending rigidity: moment per width over curvature [N m]; the material's if omitted.",
+    )
+    damping: NonNegative = Field(
+        default=0.0,
+        description="Time in which a stretched or sheared cloth alone creeps back (Kelvin-Voigt) [s]: the damping of a "
+        "spring is so many times its stiffness. xpbd damps such motion by itself.",
+    )
+    bend_damping: NonNegative = Field(default=1.0e-2, description="Likewise, of bending [s].")
+    thickness: Positive = Field(
+        default=0.5e-3, description="Distance that its layers keep from each other [m]; the material's if omitted."
+    )
+    friction: NonNegative = Field(
+        default=0.5,
+        description="Coulomb friction [-]; a pair of bodies has the geometric mean of its two. "
+        "The material's if omitted.",
+    )
+    self_collision: bool = Field(default=True, description="Whether it collides with itself.")
+    wind: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Velocity of the air [m/s].")
+    air_density: NonNegative = Field(default=1.2, description="Density of the air [kg/m³]; 0 for a vacuum.")
+    drag: NonNegative = Field(
+        default=1.2, description="Drag coefficient of air that blows against it [-]; 1.2 of a square plate."
+    )
+    skin_drag: NonNegative = Field(
+        default=0.02, description="Drag coefficient of air that blows along it, both sides together [-]."
+    )
+    pin: tuple[PinParameters, ...] = Field(default=(), description="What is held.")
+    integrator: Literal["xpbd", "explicit"] = Field(
+        default="xpbd",
+        description="xpbd: compliant springs with small steps (Macklin et al. 2019), stable at any stiffness; "
+        "explicit: symplectic Euler, the reference, whose step the stiffest spring limits.",
+    )
+    substeps: Annotated[int, Field(ge=1, le=100_000)] | None = Field(
+        default=None,
+        description=f"Steps per frame [-]; if omitted {DEFAULT_SUBSTEPS}, and for explicit as many as it takes to keep "
+        "the energy.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_material(cls, data: Any) -> Any:
+        """What is omitted comes from the material."""
+        material = data.get("material", "cotton") if isinstance(data, dict) else None
+        if not isinstance(material, str) or material not in MATERIALS:
+            return data  # the field's own validation says what is wrong with it
+        defaults = dict(MATERIALS[material])
+        shape = data.get("shape")
+        if (shape.get("type") if isinstance(shape, dict) else getattr(shape, "type", None)) == "mesh":
+            del defaults["shear_stiffness"]
+        return {**defaults, **data}
+
+    @model_validator(mode="after")
+    def _fits_its_sheet(self) -> Self:
+        if self.shear_stiffness is not None and not isinstance(self.shape, RectangleSheet):
+            raise ValueError(
+                f"shear_stiffness is for rectangles; a mesh shears with 3/8 of its stretch_stiffness, "
+                f"{0.375 * self.stretch_stiffness:g} N/m; remove it"
+            )
+        for number, pin in enumerate(self.pin):
+            for key in ("corner", "edge"):
+                if getattr(pin, key) is not None and not isinstance(self.shape, RectangleSheet):
+                    raise ValueError(f"pin[{number}].{key} is for rectangles; pin a mesh by index or region")
+        return self
+
+
+SHARED_KEYS = ("integrator", "substeps")
+"""What all cloths of a scene have in common, as they step together."""
+
+
+def shared_conflicts(cloths: tuple[ClothParameters, ...]) -> list[tuple[int, str, str]]:
+    """Why cloths cannot step together: number of the cloth, its key, and a sentence, for each reason."""
+    return [
+        (
+            number,
+            key,
+            f"is {_written(getattr(cloth, key))}, but {_written(getattr(cloths[0], key))} in cloth[0] "
+            f'"{cloths[0].name}"; all cloths share it',
+        )
+        for number, cloth in enumerate(cloths[1:], start=1)
+        for key in SHARED_KEYS
+        if getattr(cloth, key) != getattr(cloths[0], key)
+    ]
+
+
+def _written(value: object) -> str:
+    return "omitted" if value is None else f'"{value}"' if isinstance(value, str) else f"{value}"

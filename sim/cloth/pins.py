@@ -1,0 +1,119 @@
+"""What holds nodes of a cloth: which nodes, along which path, and until when."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.cloth.motion import move_pinned
+from sim.cloth.parameters import ClothParameters, PinParameters
+from sim.cloth.sheet import RestSheet
+from sim.cloth.start import pinned_nodes
+from sim.cloth.state import ClothState
+from sim.rigid import rotation
+from sim.rigid.keyframes import KeyframePath
+
+Floats = NDArray[np.float64]
+
+ROUND_OFF_S = 1.0e-9
+"""Times that differ by less [s] are the same: sums of steps."""
+
+
+class Pin:
+    """One pin of one cloth.
+
+    Attributes:
+        nodes: that it holds, in the numbers of the scene, (p,).
+        release_s: when it lets go [s]; infinite if never.
+        path: where it is, None if it never moves.
+    """
+
+    def __init__(self, parameters: PinParameters, nodes: NDArray[np.int64], position: Floats) -> None:
+        self.nodes = nodes
+        self.release_s = np.inf if parameters.release_s is None else parameters.release_s
+        self.path: KeyframePath | None = None
+        if not parameters.keyframe:
+            return
+        self.path = KeyframePath(
+            [keyframe.time_s for keyframe in parameters.keyframe],
+            np.array([keyframe.offset for keyframe in parameters.keyframe], dtype=np.float64),
+            np.stack([rotation.from_degrees(keyframe.rotation_deg) for keyframe in parameters.keyframe]),
+            linear=parameters.interpolation == "linear",
+        )
+        arm = position[nodes] - position[nodes].mean(axis=0)
+        self._nodes = ti.ndarray(ti.i32, len(nodes))
+        self._nodes.from_numpy(nodes.astype(np.int32))
+        self._arm = ti.Vector.ndarray(3, ti.f32, len(nodes))
+        self._arm.from_numpy(arm.astype(np.float32))
+
+    def holds(self, time_s: float) -> bool:
+        """Whether it holds its nodes at a simulated time [s]."""
+        return bool(time_s < self.release_s - ROUND_OFF_S)
+
+    def displace(self, state: ClothState, time_s: float, dt: float) -> None:
+        """Move its nodes from where they are at a time [s] to where they will be dt later."""
+        if self.path is None:
+            return
+        before, after = self.path.at(time_s), self.path.at(time_s + dt)
+        shift = after.position - before.position
+        turn = rotation.matrices(after.orientation[None])[0] - rotation.matrices(before.orientation[None])[0]
+        if shift.any() or turn.any():
+            move_pinned(
+                self._nodes, self._arm, state.carry, *(ti.math.vec3(*row) for row in (shift, *turn)), state.displacement
+            )
+
+
+class Pins:
+    """All pins of a scene's cloths; a node of several is free when all have let go."""
+
+    def __init__(self, cloths: Sequence[ClothParameters], sheets: Sequence[RestSheet], state: ClothState) -> None:
+        """Find the nodes.
+
+        Raises:
+            ValueError: a pin holds nothing, or one that moves shares a node with another.
+        """
+        self._state = state
+        self._pins: list[Pin] = []
+        self._held: tuple[bool, ...] | None = None
+        position = state.host.position
+        for number, (cloth, sheet) in enumerate(zip(cloths, sheets, strict=True)):
+            first, last = state.host.first_node[number : number + 2]
+            for index, parameters in enumerate(cloth.pin):
+                place = f'cloth "{cloth.name}": pin[{index}]'
+                try:
+                    nodes = pinned_nodes(parameters, sheet, position[first:last]) + first
+                except ValueError as error:
+                    raise ValueError(f"{place}: {error}") from error
+                pin = Pin(parameters, nodes, position)
+                for other in self._pins:
+                    shared = np.intersect1d(nodes, other.nodes)
+                    if len(shared) and (pin.path is not None or other.path is not None):
+                        raise ValueError(
+                            f"{place} shares node {shared[0] - first} with another pin, and one of them moves; "
+                            "pin each node once"
+                        )
+                self._pins.append(pin)
+
+    def hold(self, time_s: float) -> bool:
+        """Hold what is pinned at a simulated time [s]; returns whether that differs from before."""
+        held = tuple(pin.holds(time_s) for pin in self._pins)
+        if held == self._held:
+            return False
+        self._held = held
+        self.hold_anew()
+        return True
+
+    def hold_anew(self) -> None:
+        """Hold the same nodes as before, after their masses changed."""
+        is_pinned = np.zeros(self._state.vertex_count, dtype=bool)
+        for pin, holds in zip(self._pins, self._held or (), strict=True):
+            if holds:
+                is_pinned[pin.nodes] = True
+        self._state.set_pinned(is_pinned)
+
+    def displace(self, time_s: float, dt: float) -> None:
+        """Move the nodes of pins that hold, from a time [s] on, for dt."""
+        for pin, holds in zip(self._pins, self._held or (), strict=True):
+            if holds:
+                pin.displace(self._state, time_s, dt)

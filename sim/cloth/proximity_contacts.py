@@ -1,0 +1,85 @@
+"""The contacts of a substep: what comes near what, and the least that their displacements must differ by."""
+
+import taichi as ti
+
+Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
+Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Vectors = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
+Quadruples = ti.types.ndarray(dtype=ti.types.vector(4, ti.i32), ndim=1)
+Weights = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
+
+VERTEX_TRIANGLE, EDGE_EDGE, WALL = -1, -2, -3
+"""What a contact is between; from 0 on it is the number of the body that the cloth touches."""
+
+INACTIVE = -1.0e30
+"""Floor of a pair that is watched but pushes nothing."""
+
+GROWTH = 1.5
+
+
+class ContactList:
+    """Contacts in no particular order, which no result depends on: all sums over them are sums of integers.
+
+    The points of a contact are weighted means of vertices, and so is the relative displacement
+    w = sum_k weights[k] u[vertices[k]], minus that of the body. It has to satisfy n . w >= floor.
+
+    Attributes:
+        vertices: up to four, (capacity,) of 4-vectors; of a vertex and a triangle in this order, of two edges in turn.
+        weights: signed, zero for vertices that do not count, (capacity,) of 4-vectors.
+        normal: unit vector from the second to the first, or out of the body, (capacity,) of 3-vectors.
+        floor: least relative displacement along the normal [m], or `INACTIVE`, (capacity,).
+        kind: `VERTEX_TRIANGLE`, `EDGE_EDGE`, `WALL`, or the number of a body, (capacity,).
+        arm: from the body's centre of mass to the point [m], (capacity,) of 3-vectors.
+        friction: Coulomb's coefficient [-], (capacity,).
+        mobility: what the relative displacement grows by per impulse, all contacts pushing alike [1/kg], (capacity,).
+        impulse: on the first, minus that on the second, times the step [kg m], (capacity,) of 3-vectors.
+        impulse_before, impulse_given: that of an iteration earlier, and that which displacements contain already.
+        pushing: numbers of the contacts that push, (capacity,).
+        counter: number of contacts found, also those beyond the capacity, (1,).
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.counter = ti.ndarray(ti.i32, 1)
+        self._allocate(capacity)
+
+    def make_room_for(self, found: int) -> bool:
+        """Whether so many contacts did not fit, so that they have to be found again; now there is room."""
+        if found <= self.capacity:
+            return False
+        self._allocate(int(GROWTH * found))
+        return True
+
+    @property
+    def found_arrays(self) -> tuple[ti.Ndarray, ...]:
+        """What a kernel writes that finds contacts."""
+        return (
+            self.vertices, self.weights, self.normal, self.floor, self.kind, self.arm, self.friction, self.counter,
+            self.capacity,
+        )  # fmt: skip
+
+    def _allocate(self, capacity: int) -> None:
+        self.capacity = max(capacity, 1)
+        self.vertices = ti.Vector.ndarray(4, ti.i32, self.capacity)
+        self.weights = ti.Vector.ndarray(4, ti.f32, self.capacity)
+        self.normal = ti.Vector.ndarray(3, ti.f32, self.capacity)
+        self.floor = ti.ndarray(ti.f32, self.capacity)
+        self.kind = ti.ndarray(ti.i32, self.capacity)
+        self.arm = ti.Vector.ndarray(3, ti.f32, self.capacity)
+        self.friction = ti.ndarray(ti.f32, self.capacity)
+        self.mobility = ti.ndarray(ti.f32, self.capacity)
+        self.impulse, self.impulse_before, self.impulse_given = (
+            ti.Vector.ndarray(3, ti.f32, self.capacity) for _ in range(3)
+        )
+        self.pushing = ti.ndarray(ti.i32, self.capacity)
+
+
+@ti.func
+def least_displacement(distance: ti.f32, wanted: ti.f32, recovery: ti.f32) -> ti.f32:
+    """Floor of a contact: farther apart than wanted may come nearer, nearer goes apart by a share of what is missing.
+
+    Args:
+        distance: at the start of the step [m].
+        wanted: distance to keep [m].
+        recovery: share of a missing distance that a step gives back [-].
+    """
+    return ti.select(distance >= wanted, wanted - distance, recovery * (wanted - distance))

@@ -1,0 +1,202 @@
+"""The sheet of a cloth at rest: its nodes, triangles and the share of its area that each node carries."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.cloth.parameters import RectangleSheet
+from sim.shapes.mesh_file import read_upright_triangles
+from sim.shapes.mesh_repair import drop_collapsed_and_repeated_faces, merge_vertices
+from sim.shapes.parameters import MeshShape
+from sim.shapes.solid import ShapeError
+
+Vectors = NDArray[np.float64]
+Indices = NDArray[np.int32]
+
+FLAT_TRIANGLE = 1.0e-4
+"""A triangle less high than this share of its longest edge is a line: its angles are round-off in a file's float32."""
+
+MERGED = 1.0e-5
+"""A vertex farther than this from its node, in diagonals of the mesh, was not merged into it but dropped."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How a rectangle is divided: node (i, j) has the number i + j * columns.
+
+    Attributes:
+        columns, rows: nodes along x and y.
+        step_x, step_y: distances of neighbours [m].
+    """
+
+    columns: int
+    rows: int
+    step_x: float
+    step_y: float
+
+
+@dataclass(frozen=True, eq=False)
+class RestSheet:
+    """A sheet without loads, in its own axes.
+
+    Attributes:
+        vertices: [m], (n, 3) float64.
+        triangles: corners, the same way round in the whole sheet, (k, 3) int32.
+        node_area: share of the area of each node [m²], (n,); sums to the area of the sheet.
+        uv: coordinates on the sheet at rest [m], (n, 2), from 0: along the sides of a rectangle; of a mesh as it is
+            seen along the shortest side of its bounding box.
+        node_of_vertex: node of each vertex of the mesh file, (m,) int32, -1 where no triangle uses it; of a rectangle
+            the nodes themselves.
+        grid: how it is divided if it is a rectangle.
+        warnings: what was repaired, a sentence each.
+    """
+
+    vertices: Vectors
+    triangles: Indices
+    node_area: NDArray[np.float64]
+    uv: NDArray[np.float64]
+    node_of_vertex: Indices
+    grid: Grid | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def build_sheet(shape: RectangleSheet | MeshShape) -> RestSheet:
+    """The sheet that a job describes.
+
+    Raises:
+        ShapeError: a mesh file is missing or unreadable, or its mesh is no sheet.
+    """
+    return rectangle(shape) if isinstance(shape, RectangleSheet) else _sheet_of_file(shape)
+
+
+def rectangle(shape: RectangleSheet) -> RestSheet:
+    """A flat rectangle about the origin; the diagonals of its cells alternate, so that no direction is preferred."""
+    columns, rows = shape.node_counts
+    grid = Grid(columns, rows, shape.size[0] / (columns - 1), shape.size[1] / (rows - 1))
+    j, i = (each.ravel() for each in np.mgrid[0:rows, 0:columns])
+    share = np.stack([i / (columns - 1), j / (rows - 1)], axis=1)
+    uv = share * shape.size
+    vertices = np.concatenate([(share - 0.5) * shape.size, np.zeros((len(uv), 1))], axis=1)
+
+    cell_j, cell_i = (each.ravel() for each in np.mgrid[0 : rows - 1, 0 : columns - 1])
+    a = cell_i + columns * cell_j
+    b, c, d = a + 1, a + columns + 1, a + columns
+    rising = ((cell_i + cell_j) % 2 == 0)[:, None, None]
+    triangles = np.where(
+        rising,
+        np.stack([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)], axis=1),
+        np.stack([np.stack([a, b, d], axis=1), np.stack([b, c, d], axis=1)], axis=1),
+    ).reshape(-1, 3)
+
+    share_x, share_y = np.ones(columns), np.ones(rows)
+    share_x[[0, -1]] = share_y[[0, -1]] = 0.5
+    node_area = grid.step_x * grid.step_y * share_x[i] * share_y[j]
+    return RestSheet(vertices, triangles.astype(np.int32), node_area, uv, np.arange(len(uv), dtype=np.int32), grid)
+
+
+def sheet_of_triangles(vertices: Vectors, triangles: NDArray[np.integer], *, label: str) -> RestSheet:
+    """A sheet from triangles as files hold them: split vertices are merged, and its sides made to agree.
+
+    Args:
+        vertices: [m], (n, 3).
+        triangles: (k, 3).
+        label: what errors call the mesh.
+
+    Raises:
+        ShapeError: no triangles; a triangle without area; an edge of three triangles or more; a sheet with one side.
+    """
+    import igl
+
+    if not len(triangles):
+        raise ShapeError(f'shape.file: "{label}" has no triangles; export it as a mesh')
+    if not np.isfinite(vertices).all():
+        number = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise ShapeError(f'shape.file: vertex {number} of "{label}" is not finite; export it again')
+    merged, faces = merge_vertices(np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64))
+    # Once more: corners of triangles that are dropped may be corners of no other.
+    merged, faces = merge_vertices(merged, drop_collapsed_and_repeated_faces(faces))
+    warnings = []
+    if len(merged) < len(vertices):
+        warnings.append(f'"{label}": merged {len(vertices) - len(merged)} split or unused vertices')
+    if len(faces) < len(triangles):
+        warnings.append(f'"{label}": dropped {len(triangles) - len(faces)} collapsed or repeated triangles')
+    _refuse_flat_triangles(merged, faces, label)
+    _refuse_branching_edges(merged, faces, label)
+    oriented, _ = igl.bfs_orient(faces)
+    turned = int(np.count_nonzero((oriented != faces).any(axis=1)))
+    if turned:
+        warnings.append(f'"{label}": turned {turned} of {len(faces)} triangles, so that the sides of the cloth agree')
+    _refuse_one_sided(merged, oriented, label)
+
+    area = triangle_areas(merged, oriented)
+    node_area = np.bincount(oriented.ravel(), weights=np.repeat(area / 3.0, 3), minlength=len(merged))
+    extent = np.ptp(merged, axis=0)
+    axes = np.sort(np.argsort(extent)[1:])
+    uv = merged[:, axes] - merged[:, axes].min(axis=0)
+    return RestSheet(
+        merged, oriented.astype(np.int32), node_area, uv, _nodes_of(vertices, merged), warnings=tuple(warnings)
+    )
+
+
+def _sheet_of_file(shape: MeshShape) -> RestSheet:
+    vertices, triangles = read_upright_triangles(shape)
+    return sheet_of_triangles(vertices, triangles, label=Path(shape.file).name)
+
+
+def _nodes_of(vertices: Vectors, nodes: Vectors) -> Indices:
+    """Which node each vertex has become; -1 for those that were dropped."""
+    from scipy.spatial import cKDTree
+
+    distance, nearest = cKDTree(nodes).query(vertices)
+    within = distance <= MERGED * np.linalg.norm(np.ptp(nodes, axis=0))
+    return np.where(within, nearest, -1).astype(np.int32)
+
+
+def triangle_areas(vertices: Vectors, triangles: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Area of each triangle [m²], (k,)."""
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    areas: NDArray[np.float64] = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return areas
+
+
+def _refuse_flat_triangles(vertices: Vectors, triangles: NDArray[np.int64], label: str) -> None:
+    corners = vertices[triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    flat = np.flatnonzero(2.0 * triangle_areas(vertices, triangles) <= FLAT_TRIANGLE * longest**2)
+    if len(flat):
+        raise ShapeError(
+            f'shape.file: {len(flat)} triangles of "{label}" have no area, the first at {_place(corners[flat[0]])}; '
+            "remove them (Blender: Mesh > Clean Up > Degenerate Dissolve)"
+        )
+
+
+def _refuse_branching_edges(vertices: Vectors, triangles: NDArray[np.int64], label: str) -> None:
+    edges, count = np.unique(
+        np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
+    )
+    branching = edges[count > 2]
+    if len(branching):
+        raise ShapeError(
+            f'shape.file: {len(branching)} edges of "{label}" have three triangles or more, the first at '
+            f"{_place(vertices[branching[0]])}; a cloth has two sides: split it there"
+        )
+
+
+def _refuse_one_sided(vertices: Vectors, triangles: NDArray[np.integer], label: str) -> None:
+    """After neighbours were made to agree: one edge passed twice the same way makes a Moebius strip."""
+    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    passed, count = np.unique(edges, axis=0, return_counts=True)
+    twice = passed[count > 1]
+    if len(twice):
+        raise ShapeError(
+            f'shape.file: "{label}" has one side only, like a Moebius strip, seen at {_place(vertices[twice[0]])}; '
+            "cut it open"
+        )
+
+
+def _place(points: Vectors) -> str:
+    return "(" + ", ".join(f"{coordinate:.4g}" for coordinate in points.mean(axis=0)) + ") m"

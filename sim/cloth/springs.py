@@ -1,0 +1,282 @@
+"""The springs of a cloth, and how the stiffness of a sheet becomes that of its springs.
+
+A spring holds a weighted sum of its nodes, d = sum_a c_a x_a with sum_a c_a = 0, at a length: C = |d| - rest. With two
+nodes and c = (1, -1) that is the usual spring; with three and c = (1, -2, 1) it is a bend spring that reaches over a
+node; with four it bends two triangles about their common edge. Its forces -k C c_a d/|d| add up to nothing and have no
+torque, as sum_a x_a x c_a d = d x d = 0.
+
+Why bend springs are no springs between the outer nodes: such a spring of a flat cloth shortens with the square of its
+curvature, so that it has no stiffness at all against the first bit of bending, and resists being stretched instead.
+
+Stiffness, so that a sheet does not depend on how finely it is divided (per width and per strain; w is the width that a
+spring stands for, half on the border):
+
+- stretch E [N/m]: k = E w / L along a rectangle's threads; k = E A / L² on edges of a mesh, where A is the area of its
+  triangles (Van Gelder 1998, "Approximate simulation of elastic membranes by triangulated spring meshes"). On a lattice
+  of equal triangles that is exact, with a Poisson ratio of 1/3.
+- shear G [N/m]: k = G L² / (2 dx dy) on both diagonals of a cell: under a shear angle g each changes by g dx dy / L.
+- bending B [N m]: k = B w / L³ over a node, where |d| = L² times the curvature; k = B / A about an edge, with the
+  cotangents of Bergou et al. 2006, "A quadratic bending model for inextensible surfaces", sec. 3, as c. Both give a
+  cylinder its energy B/2 curvature² per area, exactly on lattices of squares (along the threads) and equal triangles.
+
+A sheet of square cells has the stretch stiffness E + G and half of G across, because its diagonals are stretched too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.cloth.colouring import greedy_colours
+from sim.cloth.parameters import ClothParameters
+from sim.cloth.sheet import Grid, RestSheet, triangle_areas
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int32]
+
+STRETCH, SHEAR, BEND = range(3)
+"""Which stiffness of the sheet a spring takes."""
+
+SEGMENT_LENGTH = 64
+"""Springs of a thread that are solved at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Springs:
+    """Springs of as many nodes each; those of one colour share no node.
+
+    Attributes:
+        nodes: (m, arity) int32.
+        coefficients: c_a, (m, arity).
+        rest: length without loads [m], (m,).
+        share: stiffness over that of the sheet, (m,): [-] of stretch and shear, [1/m²] of bending.
+        kind: STRETCH, SHEAR or BEND, (m,).
+        colour: (m,).
+        segment: piece of a thread that the spring belongs to, -1 where springs are solved one by one, (m,). Springs of
+            a piece follow one another, each from the last node of the one before, and have one colour.
+    """
+
+    nodes: Indices
+    coefficients: Floats
+    rest: Floats
+    share: Floats
+    kind: Indices
+    colour: Indices
+    segment: Indices
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def in_segments(self) -> bool:
+        """Whether these are threads."""
+        return len(self) > 0 and bool(self.segment[0] >= 0)
+
+    @property
+    def arity(self) -> int:
+        """Nodes of each spring."""
+        return int(self.nodes.shape[1])
+
+    def stiffness(self, cloth: ClothParameters) -> Floats:
+        """k of each spring in a cloth [N/m], (m,)."""
+        sheet = (cloth.stretch_stiffness, cloth.shear_stiffness or 0.0, cloth.bend_stiffness)
+        return self.share * np.array(sheet)[self.kind]
+
+    def damping(self, cloth: ClothParameters) -> Floats:
+        """Damping of each spring over its stiffness [s], (m,)."""
+        return np.array([cloth.damping, cloth.damping, cloth.bend_damping])[self.kind]
+
+
+def springs_of(sheet: RestSheet) -> list[Springs]:
+    """All springs of a sheet, in the order in which they are solved."""
+    if sheet.grid is not None:
+        return [_grid_bends(sheet.grid), _grid_diagonals(sheet.grid), _grid_threads(sheet.grid)]
+    return [_mesh_bends(sheet), _mesh_edges(sheet)]
+
+
+# --- rectangles ----------------------------------------------------------------------------------------------------
+
+
+def _grid_diagonals(grid: Grid) -> Springs:
+    """Both of each cell; the colours alternate along each direction."""
+    number = _numbers(grid)
+    length = float(np.hypot(grid.step_x, grid.step_y))
+    row = np.broadcast_to(np.arange(grid.rows - 1)[:, None], (grid.rows - 1, grid.columns - 1)) % 2
+    share = length**2 / (2.0 * grid.step_x * grid.step_y)
+    ends = [(number[:-1, :-1], number[1:, 1:]), (number[:-1, 1:], number[1:, :-1])]
+    nodes = np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in ends])
+    count = len(nodes)
+    return Springs(
+        nodes, np.tile([1.0, -1.0], (count, 1)), np.full(count, length), np.full(count, share), _all(SHEAR, count),
+        np.concatenate([row.ravel(), 2 + row.ravel()]).astype(np.int32), _all(-1, count),
+    )  # fmt: skip
+
+
+def _grid_threads(grid: Grid) -> Springs:
+    """Along x, then along y, thread by thread; colours alternate along each thread from piece to piece."""
+    groups, pieces = [], 0
+    for axis, along, step, other in _directions(grid):
+        width = np.full((len(along), along.shape[1] - 1), other)
+        width[[0, -1]] *= 0.5
+        piece = np.arange(along.shape[1] - 1) // SEGMENT_LENGTH
+        nodes = np.stack([along[:, :-1], along[:, 1:]], axis=-1).reshape(-1, 2)
+        count = len(nodes)
+        segment = pieces + np.arange(len(along))[:, None] * (piece[-1] + 1) + piece
+        pieces += len(along) * (int(piece[-1]) + 1)
+        colour = np.broadcast_to(2 * axis + piece % 2, width.shape)
+        groups.append(
+            Springs(
+                nodes, np.tile([1.0, -1.0], (count, 1)), np.full(count, step), (width / step).ravel(),
+                _all(STRETCH, count), colour.ravel().astype(np.int32), segment.ravel().astype(np.int32),
+            )
+        )  # fmt: skip
+    return _joined(groups)
+
+
+def _grid_bends(grid: Grid) -> Springs:
+    """Over each inner node along x, then along y."""
+    groups = []
+    for axis, along, step, other in _directions(grid):
+        width = np.full((len(along), max(along.shape[1] - 2, 0)), other)
+        width[[0, -1]] *= 0.5
+        nodes = np.stack([along[:, :-2], along[:, 1:-1], along[:, 2:]], axis=-1).reshape(-1, 3)
+        count = len(nodes)
+        colour = np.broadcast_to(3 * axis + np.arange(width.shape[1]) % 3, width.shape)
+        groups.append(
+            Springs(
+                nodes, np.tile([1.0, -2.0, 1.0], (count, 1)), np.zeros(count), (width / step**3).ravel(),
+                _all(BEND, count), colour.ravel().astype(np.int32), _all(-1, count),
+            )
+        )  # fmt: skip
+    return _joined(groups)
+
+
+def _directions(grid: Grid) -> list[tuple[int, Indices, float, float]]:
+    """Of x and y: number of the axis, nodes of each thread (threads, nodes), their distance, that of threads [m]."""
+    number = _numbers(grid)
+    return [(0, number, grid.step_x, grid.step_y), (1, number.T, grid.step_y, grid.step_x)]
+
+
+def _numbers(grid: Grid) -> Indices:
+    return np.arange(grid.columns * grid.rows, dtype=np.int32).reshape(grid.rows, grid.columns)
+
+
+def _all(value: int, count: int) -> Indices:
+    return np.full(count, value, dtype=np.int32)
+
+
+# --- meshes --------------------------------------------------------------------------------------------------------
+
+
+def _mesh_edges(sheet: RestSheet) -> Springs:
+    """One along each edge."""
+    edges, triangle_area = edges_of(sheet.triangles), triangle_areas(sheet.vertices, sheet.triangles)
+    area = np.bincount(edges.of_side, weights=np.repeat(triangle_area, 3), minlength=len(edges.nodes))
+    ends = sheet.vertices[edges.nodes]
+    rest = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    return Springs(
+        edges.nodes,
+        np.tile([1.0, -1.0], (len(rest), 1)),
+        rest,
+        area / rest**2,
+        _all(STRETCH, len(rest)),
+        greedy_colours(edges.nodes, len(sheet.vertices)),
+        _all(-1, len(rest)),
+    )
+
+
+def _mesh_bends(sheet: RestSheet) -> Springs:
+    """One about each edge of two triangles: its two ends, then the corners opposite of it."""
+    edges, triangle_area = edges_of(sheet.triangles), triangle_areas(sheet.vertices, sheet.triangles)
+    order = np.argsort(edges.of_side, kind="stable")
+    inner = np.flatnonzero(np.bincount(edges.of_side) == 2)
+    first = np.searchsorted(edges.of_side[order], inner)
+    sides = order[np.stack([first, first + 1], axis=1)]  # side s of triangle t has the number 3 t + s
+    opposite = sheet.triangles[sides // 3, (sides + 2) % 3]
+    nodes = np.concatenate([edges.nodes[inner], opposite], axis=1).astype(np.int32)
+
+    a, b, *others = np.moveaxis(sheet.vertices[nodes], 1, 0)
+    at_a = [_cotangent(b - a, c - a) for c in others]
+    at_b = [_cotangent(a - b, c - b) for c in others]
+    coefficients = np.stack([at_b[0] + at_b[1], at_a[0] + at_a[1], -(at_a[0] + at_b[0]), -(at_a[1] + at_b[1])], axis=1)
+    lever = np.einsum("ma,mai->mi", coefficients, sheet.vertices[nodes])
+    rest = np.linalg.norm(lever, axis=1)
+    flat = rest < FLAT * np.abs(coefficients).max(axis=1) * np.linalg.norm(b - a, axis=1)
+    return Springs(
+        nodes,
+        coefficients,
+        np.where(flat, 0.0, rest),
+        1.0 / triangle_area[sides // 3].sum(axis=1),
+        _all(BEND, len(nodes)),
+        greedy_colours(nodes, len(sheet.vertices)),
+        _all(-1, len(nodes)),
+    )
+
+
+FLAT = 1.0e-5
+"""Two triangles that rise from their plane by less, in lengths of their common edge, are flat: files hold float32."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Edges of triangles.
+
+    Attributes:
+        nodes: their ends, the smaller number first, sorted, (e, 2) int32.
+        of_side: edge of each side of each triangle, (3 k,); side s of triangle t, from corner s on, is 3 t + s.
+    """
+
+    nodes: Indices
+    of_side: NDArray[np.int64]
+
+
+def edges_of(triangles: Indices) -> Edges:
+    """Each edge once."""
+    sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    nodes, of_side = np.unique(sides, axis=0, return_inverse=True)
+    return Edges(nodes.astype(np.int32), of_side.reshape(-1))
+
+
+def joined_springs(parts: list[list[Springs]], node_offsets: list[int]) -> list[tuple[Springs, Indices]]:
+    """Springs of several cloths, those that are solved alike together and sorted by colour, and the cloth of each.
+
+    Args:
+        parts: the springs of each cloth.
+        node_offsets: number of its first node.
+    """
+    families: dict[tuple[int, bool], list[tuple[int, Springs]]] = {}
+    for number, cloth in enumerate(parts):
+        for springs in cloth:
+            if len(springs):
+                families.setdefault((-springs.arity, springs.in_segments), []).append((number, springs))
+    joined = []
+    for key in sorted(families):
+        moved, pieces = [], 0
+        for number, springs in families[key]:
+            segment = np.where(springs.segment < 0, -1, springs.segment + pieces).astype(np.int32)
+            pieces = max(pieces, int(segment.max()) + 1)
+            nodes = (springs.nodes + node_offsets[number]).astype(np.int32)
+            moved.append(replace(springs, nodes=nodes, segment=segment))
+        cloth_of = np.concatenate([_all(number, len(springs)) for number, springs in families[key]])
+        springs = _joined(moved)
+        order = np.argsort(springs.colour, kind="stable")
+        joined.append((_mapped(lambda array, rows=order: array[rows], springs), cloth_of[order]))
+    return joined
+
+
+def _joined(parts: list[Springs]) -> Springs:
+    return _mapped(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+def _mapped(function: Callable[..., Any], *parts: Springs) -> Springs:
+    """Springs whose arrays are a function of those of others."""
+    return Springs(*(function(*(getattr(part, field.name) for part in parts)) for field in fields(Springs)))
+
+
+def _cotangent(first: Floats, second: Floats) -> Floats:
+    cotangent: Floats = np.einsum("mi,mi->m", first, second) / np.linalg.norm(np.cross(first, second), axis=1)
+    return cotangent

@@ -1,0 +1,134 @@
+"""How cloths start: where the nodes of a sheet are, which of them pins hold, and whether sheets cross."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from sim.cloth.parameters import ClothParameters, PinParameters, SphereRegion
+from sim.cloth.sheet import RestSheet
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.integer]
+
+REGION_MARGIN = 1.0e-6
+"""Nodes so far outside of a region still count [m]: sizes written in decimal do not add up exactly."""
+
+PAIRS_AT_ONCE = 1_000_000
+"""Edges and triangles that are held against each other at a time: 200 MB."""
+
+
+def start_positions(cloth: ClothParameters, sheet: RestSheet) -> Floats:
+    """Where the nodes of a cloth start [m], (n, 3)."""
+    turned: Floats = Rotation.from_euler("xyz", cloth.rotation_deg, degrees=True).apply(sheet.vertices)
+    return turned + np.asarray(cloth.position)
+
+
+# --- pins ----------------------------------------------------------------------------------------------------------
+
+
+def pinned_nodes(pin: PinParameters, sheet: RestSheet, position: Floats) -> NDArray[np.int64]:
+    """Numbers of the nodes that a pin holds, ascending.
+
+    Args:
+        pin: the pin.
+        sheet: of its cloth.
+        position: of the cloth's nodes at the start [m], (n, 3).
+
+    Raises:
+        ValueError: there is no such node, or none in the region.
+    """
+    if pin.index is not None:
+        count = len(sheet.node_of_vertex)
+        if beyond := [number for number in pin.index if number >= count]:
+            raise ValueError(f"index {beyond[0]} does not exist; the sheet has nodes 0 to {count - 1}")
+        nodes = sheet.node_of_vertex[list(pin.index)]
+        if (nodes < 0).any():
+            unused = pin.index[int(np.flatnonzero(nodes < 0)[0])]
+            raise ValueError(f"index {unused} is a vertex that no triangle of the mesh uses; pin another")
+        return np.unique(nodes).astype(np.int64)
+    if pin.region is not None:
+        return _nodes_in_region(pin, position)
+    assert sheet.grid is not None
+    last = (sheet.grid.columns - 1, sheet.grid.rows - 1)
+    j, i = np.divmod(np.arange(len(position)), sheet.grid.columns)
+    name = pin.corner or pin.edge or ""
+    within = np.ones(len(position), dtype=bool)
+    for axis, side in zip(name[::2], name[1::2], strict=True):
+        number = 0 if axis == "x" else 1
+        within &= (i, j)[number] == (last[number] if side == "+" else 0)
+    return np.flatnonzero(within)
+
+
+def _nodes_in_region(pin: PinParameters, position: Floats) -> NDArray[np.int64]:
+    region = pin.region
+    assert region is not None
+    if isinstance(region, SphereRegion):
+        within = np.linalg.norm(position - region.position, axis=1) <= region.radius + REGION_MARGIN
+    else:
+        low, high = np.asarray(region.min) - REGION_MARGIN, np.asarray(region.max) + REGION_MARGIN
+        within = ((position >= low) & (position <= high)).all(axis=1)
+    if not within.any():
+        low, high = position.min(axis=0), position.max(axis=0)
+        span = " ".join(f"{axis} {a:.4g}..{b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
+        raise ValueError(f"no node starts in its region; the cloth spans {span} m")
+    return np.flatnonzero(within)
+
+
+# --- crossings -----------------------------------------------------------------------------------------------------
+
+
+def first_crossing(position: Floats, edges: Indices, triangles: Indices) -> Floats | None:
+    """Where an edge passes through a triangle with which it shares no node [m], (3,); None if none does.
+
+    Two triangles that cross have such an edge. One that just touches counts, as in scenes made of round numbers sheets
+    cross at their nodes; sheets that lie in one plane do not cross.
+
+    Args:
+        position: of nodes [m], (n, 3).
+        edges: (e, 2) node numbers.
+        triangles: (k, 3) node numbers.
+    """
+    if not len(edges) or not len(triangles):
+        return None
+    ends, corners = position[edges], position[triangles]
+    middle, centre = ends.mean(axis=1), corners.mean(axis=1)
+    reach = np.linalg.norm(ends - middle[:, None], axis=2).max(axis=1)
+    radius = float(np.linalg.norm(corners - centre[:, None], axis=2).max())
+    tree = cKDTree(centre)
+    batch = max(1, PAIRS_AT_ONCE // 50)  # neighbours of an edge in a sheet of equal triangles
+    for first in range(0, len(edges), batch):
+        near = tree.query_ball_point(middle[first : first + batch], reach[first : first + batch] + radius)
+        counts = [len(each) for each in near]
+        if not any(counts):
+            continue
+        edge = first + np.repeat(np.arange(len(near)), counts)
+        triangle = np.concatenate([each for each in near if each]).astype(np.int64)
+        apart = (edges[edge][:, :, None] != triangles[triangle][:, None, :]).all(axis=(1, 2))
+        point = _first_piercing(ends[edge[apart]], corners[triangle[apart]])
+        if point is not None:
+            return point
+    return None
+
+
+def _first_piercing(ends: Floats, corners: Floats) -> Floats | None:
+    """The first point where a segment passes through the triangle of the same row, by signed volumes."""
+    (p, q), (a, b, c) = np.moveaxis(ends, 1, 0), np.moveaxis(corners, 1, 0)
+    normal = np.cross(b - a, c - a)
+    above, below = _dot(p - a, normal), _dot(q - a, normal)
+    sides = [_dot(q - p, np.cross(u - p, v - p)) for u, v in ((a, b), (b, c), (c, a))]
+    through = (above * below <= 0.0) & (above != below)
+    through &= np.all([side >= 0.0 for side in sides], axis=0) | np.all([side <= 0.0 for side in sides], axis=0)
+    if not through.any():
+        return None
+    row = int(np.flatnonzero(through)[0])
+    share = above[row] / (above[row] - below[row])
+    point: Floats = p[row] + share * (q[row] - p[row])
+    return point
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    product: Floats = np.einsum("ij,ij->i", a, b)
+    return product

@@ -1,0 +1,198 @@
+"""The state of all cloths of a scene on the device, one after the other in the same arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.cells import Vectors
+from sim.cloth.parameters import ClothParameters
+from sim.cloth.sheet import RestSheet
+from sim.cloth.springs import edges_of
+from sim.cloth.start import start_positions
+from sim.launch import fast_launch
+
+Lattice = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
+
+LATTICE_BITS = 30
+"""Positions are whole multiples of a quantum, up to 2^30 of them within reach; twice that is all an int32 holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class HostCloths:
+    """What the cloths of a scene start with, concatenated, on the host.
+
+    Attributes:
+        names: of the cloths, (b,).
+        first_node: number of the first node of each cloth, and of all nodes, (b + 1,).
+        first_triangle: likewise.
+        position: at the start [m], (n, 3) float64.
+        velocity: at the start [m/s], (n, 3).
+        node_area: share of the area of each node [m²], (n,).
+        uv: coordinates on the sheet at rest [m], (n, 2).
+        triangles: (k, 3) int32.
+        edges: of the triangles, each once, the smaller number first, sorted, (e, 2) int32.
+        body: cloth of each node, (n,) int32.
+    """
+
+    names: tuple[str, ...]
+    first_node: NDArray[np.int64]
+    first_triangle: NDArray[np.int64]
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    node_area: NDArray[np.float64]
+    uv: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+    edges: NDArray[np.int32]
+    body: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, cloths: Sequence[ClothParameters], sheets: Sequence[RestSheet]) -> "HostCloths":
+        """Place the sheets in the world."""
+        counts = [len(sheet.vertices) for sheet in sheets]
+        first_node = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        triangle_counts = [len(sheet.triangles) for sheet in sheets]
+        triangles = np.concatenate(
+            [sheet.triangles + first for sheet, first in zip(sheets, first_node[:-1], strict=True)]
+        ).astype(np.int32)
+        placed = [start_positions(cloth, sheet) for cloth, sheet in zip(cloths, sheets, strict=True)]
+        return cls(
+            names=tuple(cloth.name for cloth in cloths),
+            first_node=first_node,
+            first_triangle=np.concatenate([[0], np.cumsum(triangle_counts)]).astype(np.int64),
+            position=np.concatenate(placed),
+            velocity=np.concatenate([np.tile(cloth.velocity, (n, 1)) for cloth, n in zip(cloths, counts, strict=True)]),
+            node_area=np.concatenate([sheet.node_area for sheet in sheets]),
+            uv=np.concatenate([sheet.uv for sheet in sheets]),
+            triangles=triangles,
+            edges=edges_of(triangles).nodes,
+            body=np.repeat(np.arange(len(cloths), dtype=np.int32), counts),
+        )
+
+    def of_nodes(self, values: Sequence[float]) -> NDArray[np.float64]:
+        """A number of each cloth for each of its nodes, (n,)."""
+        return np.asarray(values, dtype=np.float64)[self.body]
+
+    def of_triangles(self, values: Sequence[float]) -> NDArray[np.float64]:
+        """A number of each cloth for each of its triangles, (k,)."""
+        return np.repeat(np.asarray(values, dtype=np.float64), np.diff(self.first_triangle))
+
+
+class ClothState:
+    """Nodes, triangles and edges; n nodes, k triangles, e edges, b cloths.
+
+    A substep starts at `lattice` times `quantum`, and `displacement` leads to where it ends; springs and contacts
+    change only that. What the lattice cannot hold of a displacement waits in `carry` and is part of the next one. So
+    neither velocities nor lengths of springs feel the rounding of positions, however short the step; float32 positions
+    of cloth a metre off the origin move in jumps of 0.1 um, 1 mm/s in a step of 0.1 ms.
+
+    Attributes:
+        host: what they started with, on the host.
+        lattice: at the start of the substep, in quanta, (n,) ivec3.
+        position: the same rounded to float32 [m], (n,) vec3.
+        carry: what the lattice lacks [m], (n,) vec3, at most half a quantum.
+        displacement: from the lattice's position to the end of the substep, `carry` included [m], (n,) vec3.
+        velocity: [m/s], (n,) vec3.
+        mass: of a node [kg], (n,), pinned or not.
+        inverse_mass: [1/kg], (n,); 0 where a node is pinned.
+        thickness: distance that layers keep [m], (n,).
+        friction: Coulomb's coefficient [-], (n,).
+        body: cloth of a node, (n,) int32.
+        triangles: (k,) ivec3.
+        edges: (e,) ivec2.
+        names: of the cloths.
+        self_collision: of each cloth: whether it collides with itself.
+        quantum: unit of the lattice [m].
+        limit: end of the lattice on each axis, in quanta; nodes that come there are stopped.
+    """
+
+    def __init__(self, host: HostCloths, *, reach: float) -> None:
+        """Place the cloths; masses and surfaces are set by `set_material`.
+
+        Args:
+            host: what they start with.
+            reach: how far from the origin, along an axis, cloth may come [m].
+        """
+        n = len(host.position)
+        self.host = host
+        self.quantum = float(2.0 ** (np.ceil(np.log2(reach)) - LATTICE_BITS))
+        self.limit = int(reach / self.quantum)
+        self.lattice = ti.Vector.ndarray(3, ti.i32, n)
+        self.position = ti.Vector.ndarray(3, ti.f32, n)
+        self.carry = ti.Vector.ndarray(3, ti.f32, n)
+        self.displacement = ti.Vector.ndarray(3, ti.f32, n)
+        self.velocity = ti.Vector.ndarray(3, ti.f32, n)
+        self.mass = ti.ndarray(ti.f32, n)
+        self.inverse_mass = ti.ndarray(ti.f32, n)
+        self.thickness = ti.ndarray(ti.f32, n)
+        self.friction = ti.ndarray(ti.f32, n)
+        self.body = ti.ndarray(ti.i32, n)
+        self.triangles = ti.Vector.ndarray(3, ti.i32, len(host.triangles))
+        self.edges = ti.Vector.ndarray(2, ti.i32, len(host.edges))
+        self.self_collision: tuple[bool, ...] = ()
+        self.body.from_numpy(host.body)
+        self.triangles.from_numpy(host.triangles)
+        self.edges.from_numpy(host.edges)
+        self.set_positions(host.position)
+        self.velocity.from_numpy(host.velocity.astype(np.float32))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the cloths."""
+        return self.host.names
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of nodes."""
+        return len(self.host.position)
+
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles."""
+        return len(self.host.triangles)
+
+    @property
+    def edge_count(self) -> int:
+        """Number of edges."""
+        return len(self.host.edges)
+
+    def set_positions(self, positions: NDArray[np.floating]) -> None:
+        """Put all nodes at world positions [m], (n, 3)."""
+        exact = np.asarray(positions, dtype=np.float64)
+        lattice = np.round(exact / self.quantum)
+        self.lattice.from_numpy(lattice.astype(np.int32))
+        self.carry.from_numpy((exact - lattice * self.quantum).astype(np.float32))
+        self.place_displaced()
+
+    def positions(self) -> NDArray[np.float64]:
+        """World positions [m], (n, 3) float64."""
+        positions: NDArray[np.float64] = self.lattice.to_numpy() * self.quantum + self.carry.to_numpy()
+        return positions
+
+    def place_displaced(self) -> None:
+        """Follow the lattice with what is derived from it: float32 positions, and displacements of nothing yet."""
+        round_positions(self.lattice, self.carry, self.quantum, self.position, self.displacement)
+
+    def set_material(self, cloths: Sequence[ClothParameters]) -> None:
+        """Take mass, thickness, friction and whether they collide with themselves from the cloths' parameters."""
+        mass = self.host.node_area * self.host.of_nodes([cloth.mass_per_area for cloth in cloths])
+        self.mass.from_numpy(mass.astype(np.float32))
+        self.thickness.from_numpy(self.host.of_nodes([cloth.thickness for cloth in cloths]).astype(np.float32))
+        self.friction.from_numpy(self.host.of_nodes([cloth.friction for cloth in cloths]).astype(np.float32))
+        self.self_collision = tuple(cloth.self_collision for cloth in cloths)
+
+    def set_pinned(self, is_pinned: NDArray[np.bool_]) -> None:
+        """Hold these nodes, (n,), and no others."""
+        mass = self.mass.to_numpy()
+        self.inverse_mass.from_numpy(np.where(is_pinned, 0.0, 1.0 / mass).astype(np.float32))
+
+
+@fast_launch
+@ti.kernel
+def round_positions(lattice: Lattice, carry: Vectors, quantum: ti.f32, position: Vectors, displacement: Vectors):
+    """float32 positions from the lattice; displacements that hold what it lacks."""
+    for i in range(lattice.shape[0]):
+        position[i] = ti.cast(lattice[i], ti.f32) * quantum
+        displacement[i] = carry[i]

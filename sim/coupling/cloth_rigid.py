@@ -1,0 +1,143 @@
+"""Two-way coupling of cloths and the rigid bodies that they touch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.rigid import rotation
+from sim.rigid.contacts import Poses
+from sim.rigid.geometry import BodyGeometry
+from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.walls import walls_of
+from sim.scene import DomainParameters
+
+if TYPE_CHECKING:
+    from sim.cloth.continuous_contacts import ContinuousContacts
+    from sim.cloth.solver import ClothSolver
+    from sim.cloth.state import ClothState
+    from sim.rigid.solver import RigidSolver
+
+
+ROUND_OFF = 1.0e-6
+"""Cloth that is laid onto a body, in decimal numbers, may be so deep in it [m]."""
+
+
+class ClothRigidCoupling:
+    """Bodies push cloth, and cloth pushes bodies.
+
+    A coupled step: contacts of the cloth's substep foresee how bodies move in it, gravity included, and push both sides
+    in every iteration, so that light bodies answer within the step; the bodies take the impulses, then gravity and
+    contacts among themselves, and move; the cloth's contacts follow. Impulses are opposite contact by contact, and act
+    on both sides at the same point: linear and angular momentum are kept to rounding. Contacts are inelastic, and
+    friction opposes sliding, so that they take energy away. Kinematic bodies push and feel nothing.
+
+    Approximate: contacts among bodies in the same step are not foreseen; cloth between two bodies gives way for it.
+
+    Attributes:
+        bodies: names of the cloth's and of the rigid solver.
+        force: mean force of the cloths on each moving body in the last step [N], (m, 3).
+        torque: likewise, about the centres of mass [N m], (m, 3).
+    """
+
+    def __init__(self, cloth: ClothSolver, rigid: RigidSolver, contacts: ContinuousContacts) -> None:
+        """Couple the two; `contacts` are those of the cloth, with the bodies of the rigid solver first."""
+        self.bodies = (cloth.name, rigid.name)
+        self._cloth, self._rigid, self._contacts = cloth, rigid, contacts
+        self.force: NDArray[np.float64] = np.zeros((len(rigid.bodies), 3))
+        self.torque: NDArray[np.float64] = np.zeros((len(rigid.bodies), 3))
+        self.follow(0.0)
+
+    def exchange(self, dt: float) -> None:
+        """Hand the cloth's impulses of its substep of dt [s] to the bodies."""
+        linear, angular = (each[: len(self._rigid.bodies)] for each in self._contacts.take_impulses(dt))
+        self._rigid.bodies.apply_impulses(linear, angular)
+        self.force, self.torque = linear / dt, angular / dt
+
+    def follow(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
+        """Tell the cloth's contacts where the bodies are after a substep of dt [s]; 0 before the first."""
+        from sim.cloth.rigid_contact import BodyMotion
+
+        bodies = self._rigid.bodies
+        motion = BodyMotion(
+            velocity=bodies.velocity,
+            angular_velocity=bodies.angular_velocity,
+            acceleration=np.where(bodies.is_free[:, None], np.asarray(self._cloth.gravity), 0.0),
+            inverse_mass=bodies.inverse_mass,
+            inverse_inertia=bodies.inverse_inertia(),
+        )
+        self._contacts.rigid.place(self._rigid.poses(), motion)
+
+    def resume(self) -> None:
+        """Tell the cloth's contacts where the restored bodies are."""
+        self.follow(0.0)
+
+
+def contacts_of_cloths(
+    cloth: ClothSolver,
+    bodies: Sequence[RigidBodyParameters],
+    *,
+    domain: DomainParameters,
+    rigid: RigidSolver | None = None,
+) -> ContinuousContacts:
+    """The contacts of all cloths with themselves, with bodies and with walls.
+
+    Args:
+        cloth: the cloths.
+        bodies: all rigid bodies of the scene.
+        domain: its closed faces are walls.
+        rigid: the solver of the bodies that move, if any do.
+
+    Raises:
+        ValueError: a cloth starts inside a body.
+    """
+    from sim.cloth.continuous_contacts import ContinuousContacts
+    from sim.cloth.rigid_contact import RigidContact
+
+    static = [body for body in bodies if body.kind == "static"]
+    moving = [body for body in bodies if body.kind != "static"]
+    geometries = [BodyGeometry(body) for body in static] if rigid is None else rigid.all_geometries
+    walls = walls_of(domain)
+    contact = RigidContact(geometries, [body.friction for body in (*moving, *static)], walls)
+    poses = _poses_of_static_bodies(static, geometries) if rigid is None else rigid.poses()
+    contact.place(poses)
+    names = [body.name for body in (*moving, *static)]
+    _refuse_start_inside(cloth.state, names, geometries, poses)
+    return ContinuousContacts(cloth.state, rigid=contact)
+
+
+def _poses_of_static_bodies(bodies: Sequence[RigidBodyParameters], geometries: Sequence[BodyGeometry]) -> Poses:
+    turned = np.array([rotation.matrices(rotation.from_degrees(body.rotation_deg)) for body in bodies]).reshape(
+        -1, 3, 3
+    )
+    arms = np.array([geometry.centre_of_mass for geometry in geometries]).reshape(-1, 3)
+    origins = np.array([body.position for body in bodies], dtype=np.float64).reshape(-1, 3)
+    return Poses(origins + np.einsum("nij,nj->ni", turned, arms), turned)
+
+
+def _refuse_start_inside(
+    state: ClothState, names: Sequence[str], geometries: Sequence[BodyGeometry], poses: Poses
+) -> None:
+    """Cloth that starts in a body would be pulled out of it through the nearest side, which need not be the right one.
+
+    Pinned nodes are where the job wants them, be it in a post.
+
+    Raises:
+        ValueError: some other nodes do; says which, and where.
+    """
+    positions, is_free = state.positions(), state.inverse_mass.to_numpy() > 0.0
+    for number, (name, geometry) in enumerate(zip(names, geometries, strict=True)):
+        relative = (positions - poses.position[number]) @ poses.rotation[number]
+        low, high = geometry.bounds
+        near = np.flatnonzero(is_free & np.all((relative > low) & (relative < high), axis=1))
+        distance = geometry.signed_distance(relative[near])
+        if len(near) and distance.min() < -ROUND_OFF:
+            inside, deepest = np.count_nonzero(distance < -ROUND_OFF), near[int(np.argmin(distance))]
+            where = ", ".join(f"{value:.3g}" for value in positions[deepest])
+            raise ValueError(
+                f'cloth "{state.names[int(state.host.body[deepest])]}" starts inside "{name}" with {inside} of '
+                f"its nodes, deepest at ({where}) m; move one of the two"
+            )

@@ -1,0 +1,193 @@
+"""Free bodies as unknowns of implicit viscosity: the fluid holds on to them, however light they are."""
+
+from collections.abc import Callable
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.cells import Floats, Integers, Vectors
+from sim.fluid.body_response import BodyResponse
+from sim.fluid.boundary import Boundary
+from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
+from sim.launch import fast_launch
+
+Friction = Callable[[ti.Ndarray, ti.Ndarray], NDArray[np.float64]]
+"""Forces and torques on the bodies [N], [N m], (bodies, 6), by the friction between particles and boundary samples of
+these velocities; linear in both together."""
+
+
+class BodyFriction:
+    """The bodies' rows of the matrix of `sim.fluid.viscosity_implicit`, and their share of its solution.
+
+    A change u = (dv, domega) of a body's velocities changes that of its sample b by J_b u = dv + domega x r_b. With the
+    friction k_ib of the particles' rows, per volume V of a particle as there:
+
+        M/V u + dt sum_ib J_b^T k_ib x_ib x_ib^T (J_b u - dv_i) = dt sum_ib J_b^T k_ib x_ib x_ib^T (v_i - v_b)
+
+    The same k_ib is in both kinds of rows, so that the whole matrix stays symmetric and positive definite. Friction
+    that is explicit in the velocity of the body throws a light body back and forth: the fluid that sticks to it within
+    a step of dt, sqrt(nu dt) deep, is heavier than the body.
+
+    Few numbers, in float64 on the host. Preconditioner: the 6 x 6 block of each body. Bodies on given paths are no
+    unknowns; they have zeros.
+
+    Attributes:
+        changes: J_b u of each boundary sample for the vector that was spread last [m/s]; 0 for the fixed ones.
+    """
+
+    def __init__(self, boundary: Boundary, response: BodyResponse | None) -> None:
+        """Take the bodies whose samples the fluid has, and how they move; None where there are none."""
+        self._boundary, self._response = boundary, response
+        self._twists = ti.ndarray(ti.f32, max(boundary.body_count, 1) * WRENCH_WIDTH)
+        self.changes = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
+        self._found = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
+        self.changes.fill(0.0)
+        self._change = self._residual = self._product = np.zeros((boundary.body_count, WRENCH_WIDTH))
+        self._direction = self._direction_product = self._preconditioned = self._given = self._change
+
+    @property
+    def are_free(self) -> bool:
+        """Whether any body is an unknown; if not, only `forget` and `found_velocity` may be called."""
+        return self._response is not None and self._response.is_needed
+
+    def prepare(
+        self, friction: Friction, velocity: ti.Ndarray, nothing: ti.Ndarray, *, volume: float, rest_density: float,
+        dt: float,
+    ) -> None:  # fmt: skip
+        """Find the blocks of the matrix and the right-hand side of a step.
+
+        Args:
+            friction: of the fluid.
+            velocity: of the particles [m/s].
+            nothing: velocity 0 of each particle [m/s].
+            volume: V of a particle [m³].
+            rest_density: rho0; a body counts as so many particles as have its mass [kg/m³].
+            dt: the step [s].
+        """
+        assert self._response is not None
+        weight = dt / volume
+        self._friction, self._weight, self._rest_density = friction, weight, rest_density
+        self._inverse_mass = volume * self._response.inverse_masses
+        is_free = self._inverse_mass[:, 0, 0] > 0.0
+        self._mass = np.zeros_like(self._inverse_mass)
+        self._mass[is_free] = np.linalg.inv(self._inverse_mass[is_free])
+        blocks = self._mass.copy()
+        for entry in range(WRENCH_WIDTH):
+            self.spread(np.broadcast_to(np.eye(WRENCH_WIDTH)[entry], self._change.shape) * is_free[:, None])
+            blocks[:, :, entry] -= weight * friction(nothing, self.changes)
+        self._inverse = np.zeros_like(blocks)
+        # Both halves are rounded sums of the same numbers.
+        self._inverse[is_free] = np.linalg.inv(0.5 * (blocks + blocks.transpose(0, 2, 1))[is_free])
+        self._given = self._projected(weight * friction(velocity, self._boundary.velocity))
+
+    def guess(self, change: ti.Ndarray) -> None:
+        """Begin with the change of the bodies at which their own rows hold, for this one of the particles [m/s]."""
+        self.spread(np.zeros_like(self._change))
+        self._change = _times(
+            self._inverse, self._given + self._projected(self._weight * self._friction(change, self.changes))
+        )
+        self.spread(self._change)
+
+    def forget(self) -> None:
+        """Begin with no change."""
+        self._change = np.zeros_like(self._change)
+        self.spread(self._change)
+
+    def restart(self, change: ti.Ndarray) -> None:
+        """Find the residual for a change of the particles [m/s], and that of the bodies so far, which is spread."""
+        self.spread(self._change)
+        self._residual = self._given - self._multiplied(self._change, change)
+        self._preconditioned = _times(self._inverse, self._residual)
+        self._direction = self._direction_product = np.zeros_like(self._change)
+
+    def norms(self) -> tuple[float, float, float]:
+        """The bodies' part in what `sum_norms` sums, each with the weight of as many particles [m²/s²]."""
+        asked = _times(self._inverse, self._given)
+        asked_squared = _dot(asked, _times(self._mass, asked)) / self._rest_density
+        return self._square(self._residual), self._square(self._given), asked_squared
+
+    def multiply(self, preconditioned: ti.Ndarray) -> None:
+        """The bodies' rows times u, which is spread, and this one of the particles [m/s]."""
+        self._product = self._multiplied(self._preconditioned, preconditioned)
+
+    def spread_preconditioned(self) -> None:
+        """Fill `changes` with u, the preconditioned residual."""
+        self.spread(self._preconditioned)
+
+    def products(self) -> tuple[float, float, float]:
+        """The bodies' part in what `sum_products` sums."""
+        return (
+            _dot(self._residual, self._preconditioned),
+            _dot(self._product, self._preconditioned),
+            self._square(self._residual),
+        )
+
+    def advance(self, alpha: float, beta: float) -> None:
+        """As `advance_solve` for the particles."""
+        self._direction = self._preconditioned + beta * self._direction
+        self._direction_product = self._product + beta * self._direction_product
+        self._change = self._change + alpha * self._direction
+        self._residual = self._residual - alpha * self._direction_product
+        self._preconditioned = _times(self._inverse, self._residual)
+
+    def found_velocity(self) -> ti.Ndarray:
+        """Velocity of each boundary sample with the change found [m/s]."""
+        if not self.are_free:
+            return self._boundary.velocity
+        self.spread(self._change)
+        add_vectors(self._boundary.velocity, self.changes, self._boundary.count, self._found)
+        return self._found
+
+    def spread(self, twists: NDArray[np.float64]) -> None:
+        """Fill `changes` with J_b u for the changes u of the bodies, (bodies, 6)."""
+        boundary = self._boundary
+        if boundary.moving_count == 0:
+            return
+        self._twists.from_numpy(np.ascontiguousarray(twists, dtype=np.float32).ravel())
+        spread_twists(
+            boundary.position, boundary.fixed_count, boundary.moving_count, boundary.body, boundary.states,
+            self._twists, self.changes,
+        )  # fmt: skip
+
+    def _multiplied(self, twists: NDArray[np.float64], vector: ti.Ndarray) -> NDArray[np.float64]:
+        friction = self._friction(vector, self.changes)
+        return _times(self._mass, twists) - self._projected(self._weight * friction)
+
+    def _projected(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Rows of the bodies that are unknowns, zeros for others."""
+        return rows * (self._inverse_mass[:, :1, 0] > 0.0)
+
+    def _square(self, rows: NDArray[np.float64]) -> float:
+        """Square of the velocities that such an impulse would give the bodies, with the weight of their mass."""
+        return _dot(rows, _times(self._inverse_mass, rows)) / self._rest_density
+
+
+def _times(matrices: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.einsum("bij,bj->bi", matrices, rows)
+
+
+def _dot(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    return float((one * other).sum())
+
+
+@fast_launch
+@ti.kernel
+def spread_twists(
+    sample_position: Vectors, first: ti.i32, count: ti.i32, body: Integers, states: Floats, twists: Floats,
+    velocity: Vectors,
+):  # fmt: skip
+    """J_b u = dv + domega x r_b of each moving sample."""
+    for b in range(count):
+        s, t = body[b] * STATE_WIDTH, body[b] * WRENCH_WIDTH
+        arm = sample_position[first + b] - ti.math.vec3(states[s], states[s + 1], states[s + 2])
+        spin = ti.math.vec3(twists[t + 3], twists[t + 4], twists[t + 5])
+        velocity[first + b] = ti.math.vec3(twists[t], twists[t + 1], twists[t + 2]) + spin.cross(arm)
+
+
+@fast_launch
+@ti.kernel
+def add_vectors(one: Vectors, other: Vectors, count: ti.i32, total: Vectors):
+    """total_i = one_i + other_i."""
+    for i in range(count):
+        total[i] = one[i] + other[i]

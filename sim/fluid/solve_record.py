@@ -1,0 +1,39 @@
+"""What the iterative solves of a frame took."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass
+class SolveRecord:
+    """What the solves of one kind took in a frame.
+
+    Attributes:
+        solves: how many there were.
+        iterations: of all of them.
+        worst_error: largest error with which one ended [-].
+        not_converged: how many ended before their error was below the tolerance.
+    """
+
+    solves: int = 0
+    iterations: int = 0
+    worst_error: float = 0.0
+    not_converged: int = 0
+
+    def add(self, iterations: int, error: float, *, converged: bool) -> None:
+        """Take one solve into account."""
+        self.merge(SolveRecord(1, iterations, error, int(not converged)))
+
+    def merge(self, other: "SolveRecord") -> None:
+        """Take all solves of another record into account."""
+        self.solves += other.solves
+        self.iterations += other.iterations
+        # A NaN is larger than any number here, and stays.
+        if not (other.worst_error <= self.worst_error or math.isnan(self.worst_error)):
+            self.worst_error = other.worst_error
+        self.not_converged += other.not_converged
+
+    @property
+    def mean_iterations(self) -> float:
+        """Iterations per solve."""
+        return self.iterations / max(self.solves, 1)

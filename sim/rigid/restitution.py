@@ -1,0 +1,203 @@
+"""Impacts: which contacts bounce, and how much of the energy that they take they give back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from sim.rigid.contact_solver import ContactSystem, Solution, solve_velocities
+from sim.rigid.contacts import Contacts
+from sim.rigid.states import MovingBodies
+
+Array = NDArray[np.float64]
+
+SLOWEST_BOUNCE = 0.02
+"""Bodies that approach more slowly do not bounce [m/s]; nor those that gravity gave that speed within two steps."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bounces:
+    """The impacts among contacts, (k,) each.
+
+    Attributes:
+        happens: whether the contact bounces.
+        is_placed: whether it is brought to where its bounce leads to by the end of the step.
+        restitution: speed after over speed before [-]; 0 where nothing bounces.
+        impact: normal velocity right before the impact [m/s].
+        rest: time from the impact to the end of the step [s].
+        fall: normal velocity that gravity adds in that time [m/s].
+    """
+
+    happens: NDArray[np.bool_]
+    is_placed: NDArray[np.bool_]
+    restitution: Array
+    impact: Array
+    rest: Array
+    fall: Array
+
+    @classmethod
+    def find(
+        cls,
+        contacts: Contacts,
+        bodies: MovingBodies,
+        *,
+        approach: Array,
+        restitution: Array,
+        gravity: Array,
+        dt: float,
+    ) -> Bounces:
+        """Contacts that close within the step fast enough to bounce.
+
+        Against what cannot move the instant of the impact counts: gravity acts before and after it, and the gap is
+        passed down and up at different speeds. Without that a ball would come back to e² h0 only to first order in
+        dt. Between free bodies gravity cancels, and an impulse at the start of the step keeps all momenta exactly.
+
+        Args:
+            contacts: of the step.
+            bodies: that move.
+            approach: normal velocities with all of the step's gravity, without impulses [m/s], (k,).
+            restitution: of the pairs [-], (k,).
+            gravity: [m/s²].
+            dt: the step [s].
+        """
+        first_free, second_free = bodies.are_free(contacts.first), bodies.are_free(contacts.second)
+        one_sided = first_free != second_free
+        pull = contacts.normal @ gravity
+        acceleration = np.where(first_free, pull, 0.0) - np.where(second_free, pull, 0.0)
+        gap = np.maximum(contacts.gap, 0.0)
+        before = approach - dt * acceleration
+        under_root = before**2 - 2.0 * acceleration * gap
+        falls = -before + np.sqrt(np.maximum(under_root, 0.0))
+        hits = (under_root >= 0.0) & (falls > 0.0)
+        time_s = np.where(hits, 2.0 * gap / np.where(hits, falls, 1.0), np.inf)
+        hits &= time_s <= dt
+        time_s = np.where(hits, time_s, 0.0)
+        impact = before + acceleration * time_s
+        slowest = max(SLOWEST_BOUNCE, 2.0 * dt * float(np.linalg.norm(gravity)))
+        happens = hits & (restitution > 0.0) & (impact < -slowest)
+        rest = np.where(happens, dt - time_s, 0.0)
+        return cls(
+            happens=happens,
+            is_placed=happens & one_sided & (contacts.gap > 0.0),
+            restitution=np.where(happens, restitution, 0.0),
+            impact=impact,
+            rest=rest,
+            fall=acceleration * rest,
+        )
+
+    def least_velocity(self, otherwise: Array, *, share: float) -> Array:
+        """Least normal velocities at the end of the step [m/s], (k,).
+
+        Args:
+            otherwise: of the contacts that do not bounce [m/s], (k,).
+            share: of the restitution: 1 as it is, 0 for the state in which the bodies no longer approach.
+        """
+        return np.where(self.happens, self.fall - share * self.restitution * self.impact, otherwise)
+
+    def displacement(self, normal_velocity: Array, gap: Array) -> Array:
+        """How far contacts have moved along their normals from the start to the end of the step [m], (k,).
+
+        Args:
+            normal_velocity: at its end [m/s], (k,).
+            gap: at its start [m], (k,).
+        """
+        displacement: Array = -np.maximum(gap, 0.0) + self.rest * (normal_velocity - 0.5 * self.fall)
+        return displacement
+
+
+def solve_impacts(
+    system: ContactSystem,
+    free: Array,
+    *,
+    bounces: Bounces,
+    least_normal: Array,
+    friction: Array,
+    start: Array,
+    tolerance: float,
+) -> Solution:
+    """Impulses with Newton's restitution, as far as energy allows; momenta are kept as by any impulses.
+
+    Newton's law w_n = -e b_n is of velocities. Together with friction, or with other contacts, the impulses that it
+    takes may do work on the bodies (Kane & Levinson 1985): 29 % of the energy that a cube brings, at e = 1. Stronge's
+    law (1990) is of energy: restitution gives back e² of what compression took by normal impulses. Here it is a
+    bound. With the impulses λ0 at which nothing approaches any more (the end of compression) and λ1, Newton's, the
+    work on the bodies of λ = λ0 + s (λ1 - λ0) is a convex polynomial E(s) of second degree, and s <= 1 is the largest
+    with
+
+        E(s) <= min(0, E(0) + sum_i e_i² |W_i|),    W_i = λ0_n (b_n + w0_n)/2 the work of a normal impulse.
+
+    λ is between two solutions: it pushes only, stays within friction and lets nothing approach, which are all convex.
+    Without friction E(1) is just the bound, as it is for all central impacts, so that Newton's law holds there. Each
+    group of bodies that touch has its own s.
+
+    Args:
+        system: of the contacts.
+        free: velocities at the contacts without their impulses [m/s], (k, 3).
+        bounces: the impacts among them.
+        least_normal: least normal velocities of the contacts that do not bounce [m/s], (k,).
+        friction: coefficients [-], (k,).
+        start: impulses to start from [N s], (k, 3).
+        tolerance: largest change of a contact velocity in the last sweep [m/s].
+    """
+    compression = solve_velocities(
+        system,
+        free,
+        least_normal=bounces.least_velocity(least_normal, share=0.0),
+        friction=friction,
+        start=start,
+        tolerance=tolerance,
+    )
+    if not bounces.happens.any():
+        return compression
+    before = compression.impulses
+    newton = solve_velocities(
+        system,
+        free,
+        least_normal=bounces.least_velocity(least_normal, share=1.0),
+        friction=friction,
+        start=(1.0 + bounces.restitution)[:, None] * before,
+        tolerance=tolerance,
+    )
+    islands = _islands(system)
+    step = newton.impulses - before
+    fall = np.stack([bounces.fall, np.zeros_like(bounces.fall), np.zeros_like(bounces.fall)], axis=1)
+    # Mean velocity while an impulse acts, at the instant of the impact.
+    mean_before = free + 0.5 * system.velocity_changes(before) - fall
+    change = system.velocity_changes(step)
+    work_before, linear, quadratic = (
+        np.bincount(islands, weights=terms)
+        for terms in (
+            np.sum(before * mean_before, axis=1),
+            np.sum(step * mean_before, axis=1) + 0.5 * np.sum(before * change, axis=1),
+            0.5 * np.sum(step * change, axis=1),
+        )
+    )
+    returned = -np.bincount(islands, weights=bounces.restitution**2 * before[:, 0] * mean_before[:, 0])
+    most = np.maximum(np.minimum(work_before + returned, 0.0), work_before)
+    share = np.array([_largest_share(*each) for each in zip(most - work_before, linear, quadratic, strict=True)])
+    return Solution(
+        before + share[islands][:, None] * step,
+        compression.iterations + newton.iterations,
+        compression.converged and newton.converged,
+    )
+
+
+def _islands(system: ContactSystem) -> NDArray[np.int64]:
+    """Numbers of the groups of contacts, (k,): impulses at one change velocities at others of its group only."""
+    k = len(system.axes)
+    is_linked = system.matrix.reshape(k, 3, k, 3).any(axis=(1, 3))
+    numbers: NDArray[np.int64] = connected_components(is_linked, directed=False)[1].astype(np.int64)
+    return numbers
+
+
+def _largest_share(room: float, linear: float, quadratic: float) -> float:
+    """The largest s in [0, 1] with linear s + quadratic s² <= room, for room >= 0 and quadratic >= 0."""
+    if linear + quadratic <= room:
+        return 1.0
+    root = math.sqrt(linear**2 + 4.0 * quadratic * room)
+    # Of the two forms of the root, that which does not subtract nearly equal numbers.
+    return 2.0 * room / (linear + root) if linear > 0.0 else (root - linear) / (2.0 * quadratic)

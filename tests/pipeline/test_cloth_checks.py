@@ -1,0 +1,209 @@
+"""Cloths of a job: what is told before any work starts."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.job.checks import check_job
+from pipeline.job.loading import LoadedJob, read_job
+from pipeline.job.problems import Findings
+
+SHEET = """\
+name = "drape"
+[domain]
+open_faces = ["x-", "x+", "y-", "y+", "z+"]
+[[cloth]]
+name = "sheet"
+shape = { type = "rectangle", size = [0.4, 0.4], counts = [9, 9] }
+position = [0.0, 0.0, 0.5]
+"""
+BALL = """
+[[rigid]]
+name = "ball"
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.3]
+"""
+SECOND = """
+[[cloth]]
+name = "second"
+shape = { type = "rectangle", size = [0.3, 0.3], counts = [7, 7] }
+position = [0.03, 0.0, 0.5]
+"""
+
+
+def look_at(text: str, folder: Path, **options) -> tuple[LoadedJob, Findings]:
+    path = folder / "drape.toml"
+    path.write_text(text)
+    loaded = read_job(path)
+    return loaded, check_job(loaded.job, **options)
+
+
+def errors(text: str, folder: Path, **options) -> list[str]:
+    loaded, findings = look_at(text, folder, **options)
+    return loaded.source.describe_all(findings.errors)
+
+
+def warnings(text: str, folder: Path) -> list[str]:
+    loaded, findings = look_at(text, folder)
+    assert findings.errors == []
+    return loaded.source.describe_all(findings.warnings)
+
+
+def test_a_cloth_over_a_ball_is_fine_and_its_nodes_are_counted(tmp_path):
+    _, findings = look_at(SHEET + BALL, tmp_path)
+    assert (findings.errors, findings.warnings) == ([], [])
+    assert findings.nodes == 81
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            SHEET.replace("0.5]", "9.5]"),
+            "drape.toml:4 cloth[0]: is wholly outside the domain: it spans x -0.2..0.2 y -0.2..0.2 z 9.5..9.5 m, "
+            "not x -0.5..0.5 y -0.5..0.5 z 0..1 m",
+        ),
+        (
+            SHEET.replace('"x-", ', "").replace("[0.0,", "[-0.4,"),
+            "drape.toml:4 cloth[0]: passes through the wall x-, as at (-0.6, -0.2, 0.5) m; "
+            "move it, or name the face in domain.open_faces",
+        ),
+        (
+            SHEET + BALL.replace("0.3]", "0.45]"),
+            'drape.toml:4 cloth[0]: starts inside "ball", as at (-0.05, -0.05, 0.5) m; move one of them',
+        ),
+        (
+            # Smaller than a cell of the sheet: no node is inside, but the middle of a triangle is.
+            SHEET + BALL.replace("radius = 0.1", "radius = 0.01").replace("0.0, 0.0, 0.3]", "0.0335, 0.0165, 0.5]"),
+            'drape.toml:4 cloth[0]: starts inside "ball", as at (0.03333, 0.01667, 0.5) m; move one of them',
+        ),
+        (
+            SHEET + SECOND + "rotation_deg = [0.0, 90.0, 0.0]",
+            'drape.toml:9 cloth[1]: passes through cloth "sheet" at (0.03, -0.15, 0.5) m; move one of them',
+        ),
+        (
+            SHEET + "[[cloth.pin]]\nindex = [3, 81]",
+            "drape.toml:8 cloth[0].pin[0]: index 81 does not exist; the sheet has nodes 0 to 80",
+        ),
+        (
+            SHEET + '[[cloth.pin]]\nregion = { type = "sphere", position = [0.0, 0.0, 0.9], radius = 0.1 }',
+            "drape.toml:8 cloth[0].pin[0]: no node starts in its region; "
+            "the cloth spans x -0.2..0.2 y -0.2..0.2 z 0.5..0.5 m",
+        ),
+        (
+            SHEET + '[[cloth.pin]]\nedge = "x-"\n[[cloth.pin]]\ncorner = "x-y-"\n'
+            "keyframe = [{ time_s = 0.0 }, { time_s = 1.0, offset = [0.1, 0.0, 0.0] }]",
+            "drape.toml:10 cloth[0].pin[1]: shares a node with pin[0], and one of them moves; pin each node once",
+        ),
+        (
+            SHEET + SECOND.replace("0.5]", "0.7]") + "substeps = 40",
+            'drape.toml:13 cloth[1].substeps: is 40, but omitted in cloth[0] "sheet"; all cloths share it',
+        ),
+        (
+            SHEET.replace('"rectangle", size = [0.4, 0.4], counts = [9, 9]', '"mesh", file = "shawl.ply"'),
+            "drape.toml:6 cloth[0].shape.file: no such file: FOLDER/shawl.ply",
+        ),
+        (
+            SHEET + '[material.sheet]\nlook = "smoke"',
+            'drape.toml:9 material.sheet.look: "smoke" is a look for [[smoke]]; "sheet" is in [[cloth]]',
+        ),
+        (
+            SHEET + BALL + '[material.ball]\nlook = "denim"',
+            'drape.toml:14 material.ball.look: "denim" is a look for [[cloth]]; "ball" is in [[rigid]]',
+        ),
+        (
+            SHEET + '[[smoke]]\nname = "cloth"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.2 }',
+            'drape.toml:9 smoke[0].name: "cloth" is what all cloths are called together; take another',
+        ),
+        (
+            SHEET + BALL.replace('"ball"', '"sheet"'),
+            'drape.toml:5 cloth[0].name: "sheet" is taken by rigid[0]; names are unique in a job',
+        ),
+    ],
+    ids=["outside", "wall", "inside", "inside a cell", "crossing", "pin index", "pin region", "moving pins", "shared",
+         "file", "smoke look", "woven look", "name of the solver", "name of a body"],
+)  # fmt: skip
+def test_what_cannot_start_is_refused_with_its_place(text, expected, tmp_path):
+    assert expected.replace("FOLDER", str(tmp_path)) in errors(text, tmp_path)
+
+
+def test_more_nodes_than_memory_holds_are_refused_with_the_number_that_fits(tmp_path):
+    text = SHEET.replace("[9, 9]", "[2000, 2000]")
+    (problem,) = errors(text, tmp_path, memory_bytes=10**9)
+    assert re.fullmatch(
+        r"drape\.toml:6 cloth\[0\]\.shape\.counts: 4 million nodes need \d+ GB, this machine has 1 GB; "
+        r"at most \d+ fit: divide it less finely",
+        problem,
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            SHEET + "thickness = 0.06",
+            "drape.toml:8 cloth[0].thickness: 0.06 m is more than the 0.05 m between neighbouring nodes",
+        ),
+        (SHEET + '[[smoke]]\nname = "plume"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.2 }',
+         "drape.toml: cloth and smoke do not act on each other in this version"),
+        (SHEET + '[material.sheet]\nlook = "plastic"\nthread_spacing = 0.001',
+         'drape.toml:10 material.sheet.thread_spacing: has no effect on the look "plastic"'),
+    ],
+    ids=["thickness", "smoke", "threads of plastic"],
+)  # fmt: skip
+def test_what_is_worth_a_look_is_said(text, expected, tmp_path):
+    assert any(line.startswith(expected) for line in warnings(text, tmp_path))
+
+
+def test_cloth_laid_onto_a_box_and_an_edge_pinned_inside_a_pole_are_fine(tmp_path):
+    table = BALL.replace('"sphere", radius = 0.1', '"box", size = [0.3, 0.3, 0.2]').replace("0.3]\n", "0.4]\n")
+    assert errors(SHEET + table, tmp_path) == []
+    pole = BALL.replace('"sphere", radius = 0.1', '"box", size = [0.02, 0.5, 0.5]').replace("[0.0,", "[-0.2,")
+    assert len(errors(SHEET + pole.replace("0.3]\n", "0.5]\n"), tmp_path)) == 1
+    assert errors(SHEET + '[[cloth.pin]]\nedge = "x-"\n' + pole.replace("0.3]\n", "0.5]\n"), tmp_path) == []
+
+
+def mesh_job(vertices, faces, folder: Path, suffix: str = "") -> str:
+    mesh = trimesh.Trimesh(np.asarray(vertices, dtype=float), np.asarray(faces), process=False)
+    mesh.export(folder / "shawl.ply")
+    shape = SHEET.replace('"rectangle", size = [0.4, 0.4], counts = [9, 9]', '"mesh", file = "shawl.ply"')
+    return shape + suffix
+
+
+SQUARE = [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, 0.0], [0.0, 0.2, 0.0]]
+
+
+def test_a_mesh_that_is_no_sheet_is_refused(tmp_path):
+    (problem,) = errors(mesh_job([*SQUARE, [0.1, 0.1, 0.1]], [[0, 1, 2], [0, 2, 3], [0, 2, 4]], tmp_path), tmp_path)
+    assert problem.startswith('drape.toml:6 cloth[0].shape: shape.file: 1 edges of "shawl.ply" have three triangles')
+
+
+def test_a_mesh_that_passes_through_itself_is_refused_unless_it_need_not_collide_with_itself(tmp_path):
+    spike = [[0.05, 0.1, -0.1], [0.15, 0.1, -0.1], [0.1, 0.1, 0.1]]
+    text = mesh_job([*SQUARE, *spike], [[0, 1, 2], [0, 2, 3], [4, 5, 6]], tmp_path)
+    (problem,) = errors(text, tmp_path)
+    assert problem == (
+        "drape.toml:6 cloth[0].shape: passes through itself at (0, 0, 0.5) m; "
+        "take it apart, or use self_collision = false"
+    )
+    assert errors(text + "self_collision = false", tmp_path) == []
+
+
+def test_what_was_repaired_in_a_mesh_is_said(tmp_path):
+    split = [*SQUARE[:3], SQUARE[0], SQUARE[2], SQUARE[3]]
+    (warning,) = warnings(mesh_job(split, [[0, 1, 2], [3, 4, 5]], tmp_path), tmp_path)
+    assert warning == 'drape.toml:6 cloth[0].shape: "shawl.ply": merged 2 split or unused vertices'
+
+
+def test_too_few_substeps_for_explicit_springs_are_refused_with_a_number_that_is_accepted(tmp_path):
+    def problems(substeps: int) -> list[str]:
+        return errors(f'{SHEET}integrator = "explicit"\nsubsteps = {substeps}', tmp_path)
+
+    (problem,) = problems(2)
+    place = r"drape\.toml:9 cloth\[0\]\.substeps: 2 substeps a frame are "
+    least = int(re.search(place + r".* give substeps = (\d+) or more", problem)[1])
+    assert problems(least) == []
+    assert len(problems(least - 1)) == 1

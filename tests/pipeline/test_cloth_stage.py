@@ -1,0 +1,171 @@
+"""Cloth through the pipeline: what is planned for it, and the mesh that Blender gets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.cache import read_frame, validate_frame, write_frame
+from pipeline.executors.base import Assignment, Finished
+from pipeline.executors.inline import InlineExecutor
+from pipeline.job.inputs import keep_inputs
+from pipeline.job.loading import read_job
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.plan import plan_job
+from pipeline.stages import STAGES
+from pipeline.stages.cloth import ClothStage
+from pipeline.stages.inputs import most_cloth_nodes
+from pipeline.stages.render import render_spec
+from render.meshes import read_ply
+from sim.snapshots import Snapshot
+from sim.world import FrameReport
+
+LAYOUT = JobLayout(Path("renders/drape"))
+JOB_FILE = """\
+name = "drape"
+frames = 3
+device = "cpu"
+[[cloth]]
+name = "sheet"
+shape = { type = "rectangle", size = [0.4, 0.3], counts = [5, 4] }
+position = [0.0, 0.0, 0.5]
+"""
+SHEET = {"name": "sheet", "shape": {"type": "rectangle", "size": (0.4, 0.3), "counts": (5, 4)}}
+DRAPE = {"name": "drape", "frames": 3, "device": "cpu", "cloth": (SHEET,)}
+
+
+def job(**changes) -> Job:
+    return Job.model_validate(DRAPE | changes)
+
+
+def digests(of: Job) -> dict[str, str]:
+    return {task.stage: task.parameters.digest for task in plan_job(of, LAYOUT, STAGES)}
+
+
+def test_every_frame_of_a_cloth_becomes_a_mesh_that_its_picture_waits_for():
+    tasks = {task.id: task for task in plan_job(job(), LAYOUT, STAGES)}
+    assert tasks["cloth/sheet/000002"].inputs == ("cache/000002.h5",)
+    assert tasks["render/000002"].inputs == ("cloths/sheet/000002.ply",)
+    (drawn,) = render_spec(job(), LAYOUT).objects
+    assert (drawn.type, drawn.file) == ("mesh_sequence", "cloths/sheet/{frame}.ply")
+
+
+@pytest.mark.parametrize(
+    ("change", "concerned"),
+    [
+        ({"cloth": (SHEET | {"friction": 0.1},)}, {"simulate"}),
+        ({"cloth": (SHEET | {"pin": ({"corner": "x-y-"},)},)}, {"simulate"}),
+        ({"cloth": (SHEET | {"material": "silk"},)}, {"simulate", "render"}),
+        ({"material": {"sheet": {"look": "denim"}}}, {"render"}),
+        ({"material": {"sheet": {"look": "cotton", "thread_spacing": 0.002}}}, {"render"}),
+    ],
+    ids=["friction", "pin", "material", "look", "threads"],
+)
+def test_a_change_of_the_cloth_concerns_only_the_stages_that_read_it(change, concerned):
+    before, after = digests(job()), digests(job(**change))
+    assert {stage for stage in before if before[stage] != after[stage]} == concerned
+
+
+@pytest.mark.parametrize("material", ["cotton", "silk", "denim", "rubber"])
+def test_a_cloth_looks_like_what_it_is_made_of(material):
+    assert job(cloth=(SHEET | {"material": material},)).material_of("sheet").look == material
+
+
+def with_mesh(folder: Path, *, width: float) -> Path:
+    mesh = trimesh.Trimesh([[0, 0, 0], [width, 0, 0], [width, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    mesh.export(folder / "shawl.ply")
+    path = folder / "drape.toml"
+    path.write_text(JOB_FILE.replace('"rectangle", size = [0.4, 0.3], counts = [5, 4]', '"mesh", file = "shawl.ply"'))
+    return path
+
+
+def test_a_mesh_of_a_cloth_is_kept_with_the_job_and_counts_by_its_content(tmp_path):
+    layout = JobLayout(tmp_path / "renders" / "drape")
+    first, text = keep_inputs(read_job(with_mesh(tmp_path, width=1.0)), layout)
+    (copy,) = layout.inputs.iterdir()
+    assert f'file = "inputs/{copy.name}"' in text
+    assert most_cloth_nodes(first) >= 4
+    digest = digests(read_job(with_mesh(tmp_path, width=1.0)).job)["simulate"]
+    assert digests(first)["simulate"] == digest
+    assert digests(read_job(with_mesh(tmp_path, width=2.0)).job)["simulate"] != digest
+
+
+@pytest.mark.parametrize(
+    ("written", "coarser"),
+    [
+        ("counts = [5, 4]", {"counts": (3, 3), "resolution": None}),
+        ("resolution = 0.05", {"counts": None, "resolution": 0.1}),
+    ],
+)
+def test_a_preview_has_cells_twice_as_large(written, coarser, tmp_path):
+    path = tmp_path / "drape.toml"
+    path.write_text(JOB_FILE.replace("counts = [5, 4]", written))
+    shape = read_job(path, preview=True).job.cloth[0].shape
+    assert {key: getattr(shape, key) for key in coarser} == coarser
+
+
+def test_a_preview_leaves_a_sheet_alone_whose_nodes_are_pinned_by_number(tmp_path):
+    path = tmp_path / "drape.toml"
+    path.write_text(JOB_FILE + "[[cloth.pin]]\nindex = [19]\n")
+    assert read_job(path, preview=True).job.cloth[0].shape.counts == (5, 4)
+
+
+@pytest.fixture
+def frame() -> dict[str, Snapshot]:
+    """A sheet of four triangles, folded by a right angle along x = 0."""
+    position = np.array([[0, 0, 1], [0, 2, 1], [1, 0, 1], [1, 2, 1], [0, 0, 0], [0, 2, 0]], np.float32)
+    triangles = np.array([[0, 2, 3], [0, 3, 1], [4, 0, 1], [4, 1, 5]], np.int32)
+    arrays = {
+        "position": position,
+        "velocity": position + 7,
+        "triangles": triangles,
+        "uv": np.array([[1, 0], [1, 2], [2, 0], [2, 2], [0, 0], [0, 2]], np.float32),
+    }
+    return {"sheet": Snapshot("cloth", arrays, {"thickness": 0.001})}
+
+
+def test_the_cache_gives_a_cloth_back_as_it_got_it(frame, tmp_path):
+    path = tmp_path / "000000.h5"
+    write_frame(path, frame, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
+    validate_frame(path)
+    read = read_frame(path, kind="cloth").bodies["sheet"]
+    assert (read.kind, read.attributes) == ("cloth", frame["sheet"].attributes)
+    for name, array in frame["sheet"].arrays.items():
+        assert read.arrays[name].dtype == array.dtype
+        np.testing.assert_array_equal(read.arrays[name], array)
+
+
+def test_the_mesh_has_the_frames_arrays_and_normals_of_its_own(frame, tmp_path):
+    layout = JobLayout(tmp_path / "drape")
+    layout.path(layout.frame_cache(0)).parent.mkdir(parents=True)
+    layout.job_file.write_text(JOB_FILE)
+    write_frame(layout.path(layout.frame_cache(0)), frame, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
+    task = ClothStage().plan(job(), layout)[0]
+    assignment = Assignment(
+        task=task,
+        attempt=1,
+        fingerprint="f",
+        inputs={},
+        threads=1,
+        job_file=layout.job_file,
+        root=layout.root,
+        stages="pipeline.stages:STAGES",
+    )
+    with InlineExecutor() as executor:
+        executor.submit(assignment)
+        assert isinstance(executor.wait(0.0)[-1], Finished)
+    mesh, given = read_ply(layout.path(layout.cloth("sheet", 0))), frame["sheet"].arrays
+    np.testing.assert_array_equal(mesh.vertices, given["position"])
+    np.testing.assert_array_equal(mesh.faces, given["triangles"])
+    np.testing.assert_array_equal(mesh.velocities, given["velocity"])
+    np.testing.assert_array_equal(mesh.uv, given["uv"])
+    # Up on the level half, along -x on the other; on the fold between, by the areas of the triangles that meet there.
+    level, fold, fold_too, upright = mesh.normals[2], mesh.normals[0], mesh.normals[1], mesh.normals[4]
+    np.testing.assert_allclose(level, [0, 0, 1], atol=1e-7)  # float32
+    np.testing.assert_allclose(upright, [-1, 0, 0], atol=1e-7)
+    np.testing.assert_allclose(fold, np.array([-1, 0, 2]) / np.sqrt(5), atol=1e-7)
+    np.testing.assert_allclose(fold_too, np.array([-2, 0, 1]) / np.sqrt(5), atol=1e-7)

@@ -1,0 +1,65 @@
+"""Woven cloth as Cycles draws it: tiny pictures, in child processes."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blender_scenes import RENDER_FRAMES, read, redness, run_python, spec_of
+
+from render.meshes import write_ply
+from render.parameters import MaterialParameters
+from render.spec import MeshSequenceObject
+from render.system_libraries import missing_libraries
+
+pytestmark = [
+    pytest.mark.skipif(
+        find_spec("bpy") is None or bool(missing_libraries()),
+        reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
+    ),
+    pytest.mark.slow,
+]
+
+THREADS = 12
+"""A side of the sheet, three periods of twill; a thread is two pixels wide."""
+
+
+def write_sheet(path: Path, *, turned: bool) -> None:
+    """An upright square in the middle of the picture, with its front or its back to the camera."""
+    vertices = np.array([[-0.4, 0, 0.1], [0.4, 0, 0.1], [0.4, 0, 0.9], [-0.4, 0, 0.9]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    path.parent.mkdir(exist_ok=True)
+    write_ply(
+        path,
+        vertices,
+        triangles[:, ::-1] if turned else triangles,
+        normals=np.tile([0, 1 if turned else -1, 0], (4, 1)),
+        velocities=np.zeros((4, 3)),
+        uv=vertices[:, [0, 2]] - vertices[0, [0, 2]],
+    )
+
+
+@pytest.fixture(scope="module")
+def red_pixels(tmp_path_factory: pytest.TempPathFactory) -> list[float]:
+    """Share of red pixels of a denim sheet with red warp, seen from its front and from its back."""
+    folder = tmp_path_factory.mktemp("denim")
+    material = MaterialParameters(look="denim", color=(0.8, 0.02, 0.02), thread_spacing=0.8 / THREADS)
+    sheet = MeshSequenceObject(name="sheet", file="sheet/{frame}.ply", material=material)
+    for frame, turned in enumerate((False, True)):
+        write_sheet(folder / f"sheet/{frame:06d}.ply", turned=turned)
+    spec_of(sheet, resolution=(128, 72), samples=16).write(folder / "spec.json")
+    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0,1")
+    # Well within the sheet: 0.8 m of the 1.8 m that the picture shows in width, at half its height.
+    inside = [read(folder / f"{frame}.png")[22:50, 42:86] for frame in (0, 1)]
+    return [float((redness(picture) > 0.45).mean()) for picture in inside]
+
+
+def test_twill_shows_three_of_four_crossings_in_the_colour_of_its_warp(red_pixels):
+    # Threads are round and dip, so that at the edges of a crossing the other thread may show: a band about 3/4.
+    assert 0.6 < red_pixels[0] < 0.9
+
+
+def test_the_back_of_twill_shows_the_weft(red_pixels):
+    assert 0.1 < red_pixels[1] < 0.4

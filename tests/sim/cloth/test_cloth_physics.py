@@ -1,0 +1,194 @@
+"""Cloth against theory: what benchmarks/validation/cloth.py does not compute, or not as strictly."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from cloth_scenes import (
+    GRAVITY,
+    SOFT,
+    UNDAMPED,
+    VACUUM,
+    WEIGHTLESS,
+    advance,
+    angular_momentum,
+    cloth,
+    momentum,
+    rectangle,
+    solver_of,
+    spring_energy,
+)
+
+from sim.cloth.springs import SEGMENT_LENGTH
+from sim.cloth.stable_step import STEP_SAFETY
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
+
+THREADS_ALONE = {"shear_stiffness": 0.0, "bend_stiffness": 0.0}
+BOTH = pytest.mark.parametrize("integrator", ["xpbd", "explicit"])
+
+
+def settle(solver, rounds: int, steps: int) -> None:
+    """Dynamic relaxation: let it move, and take all speed away, again and again."""
+    for _ in range(rounds):
+        for _ in range(steps):
+            solver.substep(solver.stable_dt())
+        solver.state.velocity.fill(0.0)
+
+
+def column(rows: int, integrator: str, stiffness: float):
+    """A strip of two threads that hangs from its upper edge; row 0 is the upper one."""
+    keys = {"mass_per_area": 0.15, "stretch_stiffness": stiffness, "damping": 2e-3, **THREADS_ALONE, **VACUUM}
+    strip = rectangle((0.05, 1.0), (2, rows))
+    return solver_of(cloth(shape=strip, rotation_deg=(90, 0, 0), pin=[{"edge": "y+"}], integrator=integrator, **keys))
+
+
+def row_stretches(solver, rows: int) -> np.ndarray:
+    heights = solver.state.positions()[:, 2].reshape(rows, 2)[::-1]
+    return -np.diff(heights, axis=0) - 1.0 / (rows - 1)
+
+
+@pytest.mark.parametrize(("integrator", "stiffness"), [("xpbd", 4000.0), ("explicit", 60.0)])
+def test_every_row_of_a_hanging_column_stretches_by_the_weight_below_it(integrator, stiffness):
+    """Row k by (N - k) m g / k_s within 1 %, at the full stiffness of cotton in XPBD at 20 steps a frame."""
+    rows = 11
+    solver = column(rows, integrator, stiffness)
+    # The column swings up and down with a quarter period of h (m / E)^(1/2), 6 ms and 50 ms.
+    settle(solver, *((30, 20) if integrator == "xpbd" else (12, round(0.05 / solver.stable_dt()))))
+    spacing = 1.0 / (rows - 1)
+    weight = 0.15 * 0.05 * GRAVITY * (np.arange(rows - 1, 0, -1) - 0.5) * spacing
+    theory = weight / (stiffness * 0.05 / spacing)
+    np.testing.assert_allclose(row_stretches(solver, rows), np.stack([theory, theory], axis=1), rtol=0.01)
+
+
+def test_xpbd_stretches_long_threads_more_than_they_should_by_what_is_said():
+    """The last spring of a piece of thread by n g dt² for n nodes below it, as `XPBDSprings` tells, and no other."""
+    rows = 101
+    solver = column(rows, "xpbd", 4000.0)
+    settle(solver, 10, 80)
+    stiffness = 4000.0 * 0.05 * (rows - 1)
+    weight = 0.15 * 0.05 * GRAVITY * (np.arange(rows - 1, 0, -1) - 0.5) / (rows - 1)
+    excess = row_stretches(solver, rows).mean(axis=1) - weight / stiffness
+    last = rows - 1 - SEGMENT_LENGTH  # threads are divided from the lower end on
+    assert excess[last] == pytest.approx(SEGMENT_LENGTH * GRAVITY * solver.stable_dt() ** 2, rel=0.05)
+    assert np.abs(np.delete(excess, last)).max() < 0.02 * excess[last]
+
+
+@pytest.mark.slow
+def test_energy_of_an_undamped_sheet_that_swings_for_ten_seconds_does_not_drift():
+    """Explicit, at its own step: below 1 % of m g L / 2, the energy that is turned over; 0.2 % is what it is."""
+    pins = [{"corner": "x-y-"}, {"corner": "x+y-"}]
+    shape = rectangle((0.2, 0.2), (6, 6))
+    solver = solver_of(cloth(shape=shape, pin=pins, integrator="explicit", **SOFT, **VACUUM, **UNDAMPED))
+    dt, energies = solver.stable_dt(), []
+    mass = solver.state.mass.to_numpy().astype(np.float64)
+    for step in range(round(10.0 / dt)):
+        solver.substep(dt)
+        if step % 40 == 0:
+            # Velocities are those of half a step ago (leapfrog); so are these positions.
+            velocity = solver.state.velocity.to_numpy().astype(np.float64)
+            positions = solver.state.positions() - 0.5 * dt * velocity
+            kinetic = 0.5 * mass @ (velocity**2).sum(axis=1)
+            elastic = sum(springs.energy(positions) for springs in solver._springs)
+            energies.append(kinetic + elastic + GRAVITY * float(mass @ positions[:, 2]))
+    assert np.abs(energies).max() < 0.01 * mass.sum() * GRAVITY * 0.1
+    assert solver.diagnostics()["kinetic_energy"] > 0.2 * mass.sum() * GRAVITY * 0.1  # it still moves
+
+
+@pytest.fixture
+def curved_mesh(tmp_path):
+    """A part of a sphere: triangles of many shapes, bent at rest, split along its edges as files often are."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.15)
+    ball.update_faces(ball.triangles_center[:, 2] > 0.05)
+    path = tmp_path / "cap.stl"
+    ball.export(path)
+    return {"type": "mesh", "file": str(path)}
+
+
+@BOTH
+@pytest.mark.parametrize("sheet", ["rectangle", "mesh"])
+def test_free_cloth_keeps_its_momentum_and_its_angular_momentum(integrator, sheet, curved_mesh):
+    """Crumpling in empty space, damping included: to rounding of float32, 1e-6 of what the parts have."""
+    keys = {**SOFT, **VACUUM, "damping": 1e-3, "bend_damping": 1e-2, "integrator": integrator}
+    shape = rectangle((0.2, 0.2), (12, 12)) if sheet == "rectangle" else curved_mesh
+    if sheet == "mesh":
+        del keys["shear_stiffness"]
+    solver = solver_of(cloth(shape=shape, **keys), gravity=WEIGHTLESS)
+    rng = np.random.default_rng(5)
+    velocity = rng.normal(scale=0.5, size=(solver.state.vertex_count, 3)) + np.array([1.0, -0.5, 0.25])
+    solver.state.velocity.from_numpy(velocity.astype(np.float32))
+    before = momentum(solver), angular_momentum(solver)
+    elastic = spring_energy(solver)
+    advance(solver, 0.1)
+    assert spring_energy(solver) > elastic + 1e-6
+    mass = solver.state.mass.to_numpy().astype(np.float64)
+    parts = mass @ np.linalg.norm(velocity, axis=1)
+    levers = mass @ np.linalg.norm(np.cross(solver.state.host.position, velocity), axis=1)
+    assert np.abs(momentum(solver) - before[0]).max() < 1e-6 * parts
+    # Velocities of symplectic Euler are half a step behind the positions, and XPBD's springs turn in their step: 1e-4.
+    assert np.abs(angular_momentum(solver) - before[1]).max() < 1e-4 * (levers + parts * 0.1)
+
+
+@pytest.mark.parametrize(("wind", "coefficient", "area_axis"), [((6.0, 0, 0), 0.04, 0), ((0, 0, 6.0), 1.5, 2)])
+def test_wind_pushes_with_its_dynamic_pressure_times_the_coefficient(wind, coefficient, area_axis):
+    """In the first step from rest; along the sheet skin drag alone, across it drag alone."""
+    keys = {"mass_per_area": 1.0, "air_density": 1.2, "drag": 1.5, "skin_drag": 0.04, "wind": wind}
+    solver = solver_of(cloth(**keys), gravity=WEIGHTLESS)
+    dt = solver.stable_dt()
+    solver.substep(dt)
+    force = 0.5 * 1.2 * coefficient * 36.0 * 0.04
+    expected = np.zeros(3)
+    expected[area_axis] = force * dt
+    # Implicit: less by twice dt rho C v / (2 mass per area), 5e-3 at most.
+    np.testing.assert_allclose(momentum(solver), expected, rtol=1e-2, atol=1e-9)
+
+
+def test_strong_wind_on_light_cloth_does_not_throw_it_about():
+    """1 g/m² in 100 m/s: an explicit force of a step would be 50 times what the sheet needs to follow the air."""
+    keys = {"mass_per_area": 1e-3, "wind": (0.0, 0.0, 100.0)}
+    solver = solver_of(cloth(**keys), gravity=WEIGHTLESS)
+    fastest = 0.0
+    for _ in range(20):
+        solver.substep(solver.stable_dt())
+        fastest = max(fastest, solver.diagnostics()["max_speed"])
+    assert fastest < 100.01
+    assert momentum(solver)[2] > 0.9 * 1e-3 * 0.04 * 100.0
+
+
+def test_the_stable_step_of_explicit_springs_is_a_bound_and_a_close_one():
+    """Against the eigenvalues of M^-1 K of the flat sheet, from differences of the springs' own energy."""
+    solver = solver_of(cloth(shape=rectangle((0.2, 0.15), (5, 4)), integrator="explicit", **SOFT, **UNDAMPED))
+    mass = np.repeat(solver.state.mass.to_numpy().astype(np.float64), 3)
+    stiffness = np.zeros((60, 60))
+    for springs in solver._springs:
+        for nodes, c, rest, k in zip(
+            springs.host.nodes, springs.host.coefficients, springs.host.rest, springs.stiffness, strict=True
+        ):
+            lever = c @ solver.state.host.position[nodes]
+            block = np.eye(3) if rest == 0.0 else np.outer(lever, lever) / (lever @ lever)
+            gradient = np.zeros((3, 60))
+            for node, c_a in zip(nodes, c, strict=True):
+                gradient[:, 3 * node : 3 * node + 3] += c_a * np.eye(3)
+            stiffness += k * gradient.T @ block @ gradient
+    largest = np.linalg.eigvalsh(stiffness / np.sqrt(np.outer(mass, mass))).max()
+    limit = solver._integrator.stable_dt() / STEP_SAFETY
+    assert limit <= 2.0 / math.sqrt(largest)
+    assert limit >= 0.5 * 2.0 / math.sqrt(largest)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damping", [0.0, 2e-3])
+def test_explicit_springs_are_stable_up_to_their_step(damping):
+    """Random speeds in empty space: at the longest step the energy stays what it was, or falls by damping."""
+    keys = {**SOFT, **VACUUM, "damping": damping, "bend_damping": damping, "integrator": "explicit"}
+    solver = solver_of(cloth(**keys), gravity=WEIGHTLESS)
+    velocity = np.random.default_rng(2).normal(scale=0.05, size=(81, 3))
+    solver.state.velocity.from_numpy(velocity.astype(np.float32))
+    start = solver.diagnostics()["kinetic_energy"]
+    dt = solver._integrator.stable_dt()
+    for _ in range(2000):
+        solver.substep(dt)
+    numbers = solver.diagnostics()
+    # At this step, energy of the fastest modes oscillates by as much as it is.
+    assert numbers["kinetic_energy"] + numbers["elastic_energy"] < 2.0 * start

@@ -1,0 +1,316 @@
+"""Cloth against bodies and walls: distances on the device, momentum both ways, friction, no passing through."""
+
+import numpy as np
+import pytest
+import taichi as ti
+from cloth_scenes import EARTH, GRAVITY, SOFT, WEIGHTLESS, cloth, rectangle, solver_of, spring_energy
+from contact_scenes import SPACE, cloth_of, contacts_of, displace, distances_to_body, momenta, rigid_of, world_of
+from crossing_triangles import crossings
+from device_distances import measure_distances
+
+from sim.cloth.continuous_contacts import ContinuousContacts
+from sim.cloth.rigid_contact import RigidContact
+from sim.cloth.rigid_contact_bodies import CollisionBodies
+from sim.rigid.contacts import Poses
+from sim.rigid.geometry import BodyGeometry
+from sim.rigid.parameters import RigidBodyParameters
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
+
+BALL = {"type": "sphere", "radius": 0.05}
+
+
+def geometry(shape, **keys):
+    return BodyGeometry(RigidBodyParameters.model_validate({"name": "body", "shape": shape, **keys}))
+
+
+# --- distances ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shape", "tolerance"),
+    [
+        ({"type": "sphere", "radius": 0.1}, 1e-6),
+        ({"type": "box", "size": (0.1, 0.2, 0.3)}, 1e-6),
+        ({"type": "cylinder", "radius": 0.1, "height": 0.2}, 1e-6),
+        ({"type": "capsule", "radius": 0.05, "height": 0.2}, 1e-6),
+        ({"type": "torus", "major_radius": 0.1, "minor_radius": 0.03}, 1e-6),
+        ({"type": "cone", "radius": 0.1, "height": 0.2}, 1e-6),
+        # A grid of 96 cells along 0.2 m: a trilinear cell errs by its diagonal times the change of slope at most.
+        pytest.param({"type": "duck", "length": 0.2}, 2e-3, marks=pytest.mark.slow),
+    ],
+)
+def test_device_has_the_distances_of_the_solids(shape, tolerance):
+    body = geometry(shape, scale=1.5)
+    bodies = CollisionBodies([body], [0.5])
+    low, high = 1.3 * body.bounds
+    points = np.random.default_rng(0).uniform(low, high, (2000, 3))
+    points[0] = 0.0
+    near = ti.Vector.ndarray(3, ti.f32, len(points))
+    near.from_numpy((points + body.centre_of_mass).astype(np.float32))
+    result = ti.ndarray(ti.f32, len(points))
+    measure_distances(
+        near, bodies.kind, bodies.size, bodies.grid_values, bodies.grid_first, bodies.grid_origin,
+        bodies.grid_spacing, bodies.grid_shape, result,
+    )  # fmt: skip
+    error = np.abs(result.to_numpy() - body.signed_distance(points))
+    inside_grid = np.all((points > body.bounds[0]) & (points < body.bounds[1]), axis=1)
+    assert error[inside_grid].max() < tolerance
+    # Outside of a grid the distance is an upper bound; primitives are exact everywhere.
+    assert tolerance > 1e-4 or error.max() < tolerance
+
+
+# --- momentum and energy --------------------------------------------------------------------------------------------
+
+
+def collision(integrator, density=1000.0, substeps=None):
+    """A spinning ball that hits a free sheet off its centre, with friction, in empty space."""
+    ball = {
+        "kind": "dynamic",
+        "density": density,
+        "shape": BALL,
+        "position": (0.03, 0.01, 0.06),
+        "velocity": (0.3, 0.0, -3.0),
+        "angular_velocity": (0.0, 20.0, 5.0),
+    }
+    sheet = {"shape": rectangle((0.3, 0.3), (11, 11)), "thickness": 2e-3, "integrator": integrator}
+    return world_of({**SOFT, **sheet, "substeps": substeps}, bodies=[ball], domain=SPACE, gravity=WEIGHTLESS)
+
+
+def kinetic_energy(world):
+    solver, bodies = cloth_of(world), rigid_of(world).bodies
+    mass = solver.state.mass.to_numpy().astype(np.float64)
+    moving = 0.5 * mass @ np.square(solver.state.velocity.to_numpy().astype(np.float64)).sum(axis=1)
+    spin = np.sum(bodies.angular_momentum() * bodies.angular_velocity)
+    return float(moving + 0.5 * (bodies.mass @ np.square(bodies.velocity).sum(axis=1) + spin))
+
+
+@pytest.mark.parametrize("density", [1000.0, 30.0])
+def test_a_ball_and_a_sheet_keep_linear_and_angular_momentum(density):
+    """Explicit springs keep both themselves; contacts and friction with the ball must not change either."""
+    world = collision("explicit", density)
+    before = momenta(world)
+    velocity = rigid_of(world).bodies.velocity.copy()
+    spin = rigid_of(world).bodies.angular_velocity.copy()
+    for _ in range(4):
+        world.advance_frame()
+    after = momenta(world)
+    exchanged = rigid_of(world).bodies.mass[0] * np.linalg.norm(rigid_of(world).bodies.velocity - velocity)
+    assert exchanged > 0.02 * np.linalg.norm(before[0])
+    assert np.abs(rigid_of(world).bodies.angular_velocity - spin).max() > 0.1
+    # Positions and velocities of nodes are float32: 6e-8 of each impulse, some hundred times.
+    assert np.linalg.norm(after[0] - before[0]) < 1e-6 * np.linalg.norm(before[0])
+    assert np.linalg.norm(after[1] - before[1]) < 1e-5 * np.linalg.norm(before[1])
+
+
+@pytest.mark.parametrize("density", [1000.0, 30.0])
+def test_impacts_take_energy_and_give_none(density):
+    world = collision("explicit", density)
+    solver = cloth_of(world)
+    energies = [kinetic_energy(world)]
+    for _ in range(5):
+        world.advance_frame()
+        energies.append(kinetic_energy(world) + spring_energy(solver))
+    # Undamped explicit springs let energy sway by under 1 %; the rest goes into contacts, and damping.
+    assert max(energies) < 1.001 * energies[0]
+    assert energies[-1] < energies[0]
+
+
+def test_forces_on_both_sides_are_opposite_in_every_substep():
+    world = collision("xpbd")
+    solver, bodies = cloth_of(world), rigid_of(world).bodies
+    contacts = contacts_of(solver)
+    resolve, differences = contacts.resolve, []
+
+    def weigh(state, dt):
+        mass, u = state.mass.to_numpy().astype(np.float64)[:, None], state.displacement
+        x, before = state.position.to_numpy().astype(np.float64), u.to_numpy().astype(np.float64)
+        resolve(state, dt)
+        impulse = mass * (u.to_numpy().astype(np.float64) - before) / dt
+        linear, angular = contacts.take_impulses(dt)
+        bodies.apply_impulses(linear, angular)
+        torque = angular[0] + np.cross(bodies.position[0], linear[0])
+        differences.append(
+            (
+                np.linalg.norm(impulse.sum(axis=0) + linear[0]),
+                np.linalg.norm(np.cross(x, impulse).sum(axis=0) + torque),
+                np.linalg.norm(linear[0]),
+            )
+        )
+
+    contacts.resolve = weigh
+    world.advance_frame()
+    differences = np.array(differences)
+    strongest = differences[:, 2].max()
+    assert strongest > 0.0
+    assert differences[:, 0].max() < 1e-6 * strongest
+    assert differences[:, 1].max() < 1e-6 * strongest  # about the origin, from which nothing is farther than 0.2 m
+
+
+# --- passing through ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [BALL, {"type": "box", "size": (0.08, 0.08, 0.08)}])
+def test_a_fast_heavy_body_does_not_pass_through_a_sheet(shape):
+    """At 20 m/s, 25 times as heavy as the sheet: it takes the sheet along, and no node ends up inside."""
+    bullet = {
+        "kind": "dynamic",
+        "density": 2000.0,
+        "shape": shape,
+        "position": (0.01, 0.02, 0.08),
+        "rotation_deg": (20.0, 30.0, 0.0),
+        "velocity": (0.0, 0.0, -20.0),
+    }
+    sheet = {"shape": rectangle((0.3, 0.3), (13, 13)), "thickness": 3e-3, "mass_per_area": 0.4}
+    world = world_of(sheet, bodies=[bullet], domain=SPACE, gravity=WEIGHTLESS)
+    energy = kinetic_energy(world)
+    for _ in range(2):
+        world.advance_frame()
+        assert distances_to_body(world, 0).min() > 0.0
+    bodies = rigid_of(world).bodies
+    assert bodies.position[0, 2] < -0.3
+    state = cloth_of(world).state
+    hit = np.hypot(*(state.host.position[:, :2] - [0.01, 0.02]).T) < 0.03
+    assert hit.any()
+    assert (state.positions()[hit, 2] < bodies.position[0, 2]).all()  # in front of it, the edges trail behind
+    assert kinetic_energy(world) < energy
+    assert len(crossings(state.positions(), state.host.triangles)) == 0
+
+
+def test_a_pinned_sheet_catches_a_heavy_ball():
+    corners = [{"corner": corner} for corner in ("x-y-", "x+y-", "x-y+", "x+y+")]
+    sheet = {
+        "shape": rectangle((0.3, 0.3), (13, 13)), "thickness": 2e-3, "position": (0.0, 0.0, 0.5), "pin": corners,
+        "material": "rubber", "damping": 5e-3,
+    }  # fmt: skip
+    ball = {"kind": "dynamic", "density": 1500.0, "shape": BALL, "position": (0.02, 0.01, 0.7)}
+    world = world_of(sheet, bodies=[ball])
+    for _ in range(40):
+        world.advance_frame()
+    bodies = rigid_of(world).bodies
+    assert 0.25 < bodies.position[0, 2] < 0.6
+    assert distances_to_body(world, 0).min() > 0.0
+
+
+@pytest.mark.parametrize("shape", ["box", "cone"])
+def test_sharp_bodies_do_not_stick_out_between_the_nodes(shape):
+    """Nodes 25 mm apart over an edge or a tip: midpoints of edges and triangles lie on it, too."""
+    shapes = {"box": {"type": "box", "size": (0.1, 0.1, 0.1)}, "cone": {"type": "cone", "radius": 0.1, "height": 0.15}}
+    obstacle = {
+        "shape": shapes[shape],
+        "position": (0.003, 0.004, 0.1),
+        "rotation_deg": (45.0 * (shape == "box"), 0, 0),
+    }
+    sheet = {"shape": rectangle((0.3, 0.3), (13, 13)), "thickness": 4e-3, "position": (0.0, 0.0, 0.2)}
+    world = world_of(sheet, bodies=[obstacle])
+    for _ in range(25):
+        world.advance_frame()
+    solver = cloth_of(world)
+    x, triangles = solver.state.positions(), solver.state.host.triangles
+    body = geometry(shapes[shape])
+    turned = solver.contacts[0].rigid.bodies.rotation.to_numpy()[0]
+    centre = solver.contacts[0].rigid.bodies.position.to_numpy()[0]
+    weights = np.array([(i, j, 6 - i - j) for i in range(7) for j in range(7 - i)]) / 6.0
+    points = np.einsum("wk,tkx->twx", weights, x[triangles]).reshape(-1, 3)
+    deepest = body.signed_distance((points - centre) @ turned).min()
+    # A quarter of the spacing at most lies between a point and the nearest that is looked at: a tip may show by as
+    # much, a right-angled edge by half of it.
+    assert deepest > -(0.25 if shape == "cone" else 0.5 * 0.25) * 0.025
+    assert body.signed_distance((x - centre) @ turned).min() > 0.0
+
+
+# --- friction -------------------------------------------------------------------------------------------------------
+
+
+def slide(slope, friction, frames=12):
+    """Speed and way of a sheet on the floor when gravity leans, and the time [s]."""
+    gravity = (GRAVITY * np.sin(slope), 0.0, -GRAVITY * np.cos(slope))
+    sheet = {
+        "shape": rectangle((0.1, 0.1), (5, 5)), "thickness": 2e-3, "friction": friction, "position": (-0.5, 0.0, 1e-3)
+    }  # fmt: skip
+    world = world_of(sheet, gravity=gravity)
+    for _ in range(frames):
+        world.advance_frame()
+    state = cloth_of(world).state
+    return state.velocity.to_numpy()[:, 0].mean(), state.positions()[:, 0].mean() + 0.5, frames / 60.0
+
+
+def test_a_sheet_on_a_slope_sticks_below_the_angle_of_friction():
+    speed, way, _ = slide(np.arctan(0.4), 0.5)
+    # It comes to the floor with the first step's fall, and creeps no more.
+    assert abs(speed) < 1e-4
+    assert abs(way) < 1e-4
+
+
+def test_a_sheet_on_a_slope_slides_with_what_friction_leaves():
+    slope = np.arctan(1.0)
+    speed, _, time_s = slide(slope, 0.5)
+    expected = GRAVITY * (np.sin(slope) - 0.5 * np.cos(slope)) * time_s
+    # Coulomb's law is met contact by contact; what remains is the 5 % by which contacts may miss their floor.
+    assert speed == pytest.approx(expected, rel=0.02)
+
+
+def test_a_moving_body_takes_cloth_along_by_friction():
+    table = {"kind": "kinematic", "shape": {"type": "box", "size": (0.4, 0.4, 0.1)}, "position": (0, 0, 0.1),
+             "velocity": (0.2, 0.0, 0.0)}  # fmt: skip
+    sheet = {"shape": rectangle((0.1, 0.1), (5, 5)), "thickness": 2e-3, "friction": 0.5, "position": (0, 0, 0.152)}
+    world = world_of(sheet, bodies=[table])
+    for _ in range(12):
+        world.advance_frame()
+    velocity = cloth_of(world).state.velocity.to_numpy()
+    # sqrt(0.5 * 0.5) g takes 0.04 s to give it the table's speed; then it rests on it.
+    np.testing.assert_allclose(velocity, np.tile([0.2, 0.0, 0.0], (25, 1)), atol=2e-3)
+
+
+# --- walls and starts -----------------------------------------------------------------------------------------------
+
+
+def test_walls_hold_cloth_and_open_faces_do_not():
+    sheet = {"shape": rectangle((0.2, 0.2), (7, 7)), "thickness": 4e-3, "velocity": (8.0, 0.0, 0.0)}
+    domain = {"min": (-0.3, -0.3, 0.0), "max": (0.3, 0.3, 1.0), "open_faces": ("z+", "y+")}
+    world = world_of({**sheet, "position": (0.0, 0.0, 0.5), "rotation_deg": (0.0, 90.0, 0.0)}, domain=domain)
+    for _ in range(6):
+        world.advance_frame()
+    x = cloth_of(world).state.positions()
+    assert x[:, 0].max() < 0.3
+    assert x[:, 0].max() == pytest.approx(0.298, abs=1e-3)  # half a thickness in front of the wall
+    leaving = world_of({**sheet, "velocity": (0.0, 8.0, 0.0), "position": (0.0, 0.0, 0.5)}, domain=domain)
+    for _ in range(6):
+        leaving.advance_frame()
+    assert cloth_of(leaving).state.positions()[:, 1].min() > 0.3
+
+
+def test_a_cloth_that_starts_inside_a_body_is_refused():
+    obstacle = {"shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.5)}
+    with pytest.raises(ValueError, match=r'cloth "cloth0" starts inside "body0" with \d+ of its nodes, deepest at'):
+        world_of({"shape": rectangle((0.4, 0.4), (9, 9)), "position": (0.0, 0.0, 0.55)}, bodies=[obstacle])
+
+
+def test_cloth_is_not_pushed_by_what_it_only_passes():
+    solver = solver_of(cloth(shape=rectangle((0.2, 0.2), (5, 5)), thickness=2e-3), gravity=EARTH)
+    body = geometry(BALL)
+    contact = RigidContact([body], [0.5], ())
+    contact.place(Poses(np.array([[0.0, 0.0, 0.0517]]), np.eye(3)[None]))
+    solver.add_contacts(ContinuousContacts(solver.state, rigid=contact))
+    sideways = np.zeros((25, 3))
+    sideways[:, 0] = 5e-4
+    np.testing.assert_array_equal(displace(solver, sideways), sideways.astype(np.float32))
+
+
+# --- whole scenes ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_cloth_over_a_sphere_comes_to_rest_on_it_without_crossings():
+    sphere = {"shape": {"type": "sphere", "radius": 0.15}, "position": (0.0, 0.0, 0.2)}
+    sheet = {"shape": rectangle((0.7, 0.7), (41, 41)), "thickness": 3e-3, "position": (0.01, 0.02, 0.4)}
+    world = world_of(sheet, bodies=[sphere])
+    solver = cloth_of(world)
+    for frame in range(80):
+        world.advance_frame()
+        if frame % 10 == 9:
+            x = solver.state.positions()
+            assert len(crossings(x, solver.state.host.triangles)) == 0
+            # Half a thickness off; folds that are pulled against it press some nodes nearer.
+            assert np.linalg.norm(x - [0.0, 0.0, 0.2], axis=1).min() > 0.15
+    assert solver.state.positions()[:, 2].max() == pytest.approx(0.3515, abs=2e-3)

@@ -1,0 +1,90 @@
+"""Where cloths start, and whether they cross, held against an independent count of crossing triangles."""
+
+import numpy as np
+import pytest
+from crossing_triangles import crossings
+
+from sim.build import build_world
+from sim.cloth.parameters import ClothParameters
+from sim.cloth.sheet import build_sheet
+from sim.cloth.springs import edges_of
+from sim.cloth.start import first_crossing, start_positions
+from sim.scene import SceneParameters
+
+
+def soup(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Twelve loose triangles in a box so large that about half of the soups have a crossing."""
+    random = np.random.default_rng(seed)
+    corners = random.uniform(0.0, 2.5, (12, 1, 3)) + random.uniform(-0.6, 0.6, (12, 3, 3))
+    return corners.reshape(-1, 3), np.arange(36, dtype=np.int32).reshape(-1, 3)
+
+
+def test_loose_triangles_cross_exactly_where_the_independent_count_says_so():
+    answers = []
+    for seed in range(60):
+        position, triangles = soup(seed)
+        point = first_crossing(position, edges_of(triangles).nodes, triangles)
+        answers.append(point is not None)
+        assert answers[-1] == (len(crossings(position, triangles)) > 0), seed
+        if point is not None:
+            # On a triangle, up to round-off of coordinates of some metres.
+            normals = np.cross(*(position[triangles[:, k]] - position[triangles[:, 0]] for k in (1, 2)))
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            heights = np.einsum("ij,ij->i", normals, point - position[triangles[:, 0]])
+            assert np.abs(heights).min() < 1e-12
+    assert 10 < sum(answers) < 50  # both kinds were seen
+
+
+def test_how_many_are_looked_at_together_does_not_change_the_answer(monkeypatch):
+    scenes = [soup(seed) for seed in range(20)]
+    at_once = [first_crossing(position, edges_of(triangles).nodes, triangles) for position, triangles in scenes]
+    monkeypatch.setattr("sim.cloth.start.PAIRS_AT_ONCE", 1)
+    one_by_one = [first_crossing(position, edges_of(triangles).nodes, triangles) for position, triangles in scenes]
+    assert any(point is not None for point in at_once)
+    assert [point is None for point in at_once] == [point is None for point in one_by_one]
+
+
+def test_sheets_in_one_plane_do_not_cross_but_one_that_touches_with_an_edge_does():
+    position = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 0], [0.9, 0.2, 0], [0.2, 0.9, 0]], dtype=float)
+    triangles = np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32)
+    edges = edges_of(triangles).nodes
+    assert first_crossing(position, edges, triangles) is None
+    position[5] += [0.0, 0.0, 0.5]
+    assert first_crossing(position, edges, triangles) is not None
+
+
+def test_a_cloth_starts_turned_about_its_middle_and_moved():
+    cloth = ClothParameters(
+        name="sheet",
+        shape={"type": "rectangle", "size": (2.0, 1.0), "counts": (3, 2)},
+        position=(5.0, 0.0, 1.0),
+        rotation_deg=(90.0, 0.0, 0.0),
+    )
+    corner = start_positions(cloth, build_sheet(cloth.shape))[0]
+    np.testing.assert_allclose(corner, [4.0, 0.0, 0.5], atol=1e-15)
+
+
+def scene(*, pinned: bool) -> SceneParameters:
+    """A sheet whose edge is in the middle of a post."""
+    sheet = {
+        "name": "flag",
+        "shape": {"type": "rectangle", "size": (0.4, 0.3), "counts": (5, 4)},
+        "position": (0.2, 0, 0.5),
+    }
+    post = {"name": "post", "shape": {"type": "box", "size": (0.04, 0.4, 0.2)}, "position": (0.0, 0.0, 0.5)}
+    return SceneParameters.model_validate(
+        {"cloth": (sheet | ({"pin": ({"edge": "x-"},)} if pinned else {}),), "rigid": (post,)}
+    )
+
+
+@pytest.mark.usefixtures("taichi_cpu")
+def test_an_edge_may_be_pinned_inside_a_post_but_not_start_there_free():
+    with pytest.raises(ValueError, match=r'cloth "flag" starts inside "post" with 4 of its nodes, deepest at \(0, '):
+        build_world(scene(pinned=False), frames_per_second=60)
+    world = build_world(scene(pinned=True), frames_per_second=60)
+    before = world.snapshots()["flag"].arrays["position"]
+    world.advance_frame()
+    after = world.snapshots()["flag"].arrays["position"]
+    held = before[:, 0] < 0.01
+    np.testing.assert_array_equal(after[held], before[held])
+    assert (after[~held, 2] < before[~held, 2]).any()

@@ -1,0 +1,321 @@
+"""Cloth against cloth: nothing crosses, momentum is kept, layers stay apart; and the checker that says so."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cloth_scenes import SOFT, WEIGHTLESS, cloth, rectangle, solver_of
+from contact_scenes import (
+    SPACE,
+    cloth_of,
+    contacts_of,
+    displace,
+    point_triangle_distances,
+    segment_distances,
+    world_of,
+)
+from crossing_triangles import crossings, edges_of_triangles
+
+from sim.cloth.continuous_contacts import ContinuousContacts
+from sim.cloth.self_collision import SelfCollision
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
+
+TRIANGLE = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]
+
+
+# --- the checker ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("other", "count"),
+    [
+        ([(0.2, 0.2, -1.0), (0.2, 0.2, 1.0), (3.0, 3.0, 1.0)], 2),  # an edge through the face, and the other way round
+        ([(0.2, 0.2, 1e-9), (0.2, 0.2, 1.0), (3.0, 3.0, 1.0)], 0),  # a billionth above it
+        ([(0.2, 0.2, 0.0), (0.2, 0.2, 1.0), (0.3, 0.3, 1.0)], 2),  # a corner of two edges that touches it
+        ([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0), (0.0, 1.0, 1.0)], 0),  # parallel
+    ],
+)
+def test_checker_counts_edges_through_triangles(other, count):
+    assert len(crossings(np.array([*TRIANGLE, *other]), np.array([[0, 1, 2], [3, 4, 5]]))) == count
+
+
+def test_checker_sees_triangles_with_a_common_corner_cross():
+    points = np.array([*TRIANGLE, (1.0, 1.0, 0.5), (1.0, 1.0, -0.5)])
+    assert len(crossings(points, np.array([[0, 1, 2], [0, 3, 4]]))) == 1
+    flat = np.array([*TRIANGLE, (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
+    assert len(crossings(flat, np.array([[0, 1, 2], [0, 3, 4]]))) == 0
+
+
+# --- pairs ----------------------------------------------------------------------------------------------------------
+
+
+def test_search_lists_all_pairs_within_reach_once_and_no_others():
+    solver = solver_of(cloth(shape=rectangle((0.2, 0.2), (7, 7)), thickness=0.02), gravity=WEIGHTLESS)
+    state = solver.state
+    x = np.random.default_rng(1).uniform(-0.06, 0.06, (49, 3))  # crumpled beyond recognition: cells hold many
+    state.set_positions(x)
+    state.displacement.from_numpy(
+        np.repeat([[[0.0, 0.0, 0.01], [0.0, 0.0, -0.01]]], 25, axis=0).reshape(50, 3)[:49].astype(np.float32)
+    )
+    pairs = SelfCollision(state)
+    pairs.prepare(state, 0.01)
+    radius = 0.02 + 4.5 * 0.01  # thickness, and the skin that this motion asks for
+
+    found = pairs.with_triangles.vertices.to_numpy()[: pairs.with_triangles.count].tolist()
+    triangles = state.host.triangles
+    vertex, triangle = (each.ravel() for each in np.mgrid[0:49, 0 : len(triangles)])
+    apart = (triangles[triangle] != vertex[:, None]).all(axis=1)
+    vertex, corners = vertex[apart], triangles[triangle[apart]]
+    distance = point_triangle_distances(x[vertex], *np.moveaxis(x[corners], 1, 0))
+    _expect_listed(found, np.concatenate([vertex[:, None], corners], axis=1), distance, radius)
+
+    found = pairs.of_edges.vertices.to_numpy()[: pairs.of_edges.count].tolist()
+    edges = edges_of_triangles(triangles)
+    first, second = np.triu_indices(len(edges), k=1)
+    apart = ~(edges[first][:, :, None] == edges[second][:, None, :]).any(axis=(1, 2))
+    both = np.concatenate([edges[first[apart]], edges[second[apart]]], axis=1)
+    _expect_listed(found, both, segment_distances(*np.moveaxis(x[both], 1, 0)), radius)
+
+
+def _expect_listed(found, candidates, distance, radius):
+    assert 0 < np.count_nonzero(distance < radius) < len(distance)
+    listed = {tuple(row) for row in found}
+    assert len(listed) == len(found)
+    clear = np.abs(distance - radius) > 1e-6  # float32 cannot tell at the rim
+    expected = {tuple(row) for row in candidates[clear & (distance < radius)].tolist()}
+    unwanted = {tuple(row) for row in candidates[clear & (distance > radius)].tolist()}
+    assert expected <= listed
+    assert not unwanted & listed
+
+
+# --- the guarantee --------------------------------------------------------------------------------------------------
+
+
+def crumpled(count, contacts=True):
+    solver = solver_of(cloth(shape=rectangle((0.3, 0.3), (count, count)), thickness=5e-3), gravity=WEIGHTLESS)
+    if contacts:
+        solver.add_contacts(ContinuousContacts(solver.state))
+    return solver
+
+
+def test_violent_displacements_never_make_cloth_cross_itself_and_keep_momentum():
+    """Every node is thrown by a third of an edge at random, ten times: without contacts all triangles cross."""
+    count = 9
+    held, free = crumpled(count), crumpled(count, contacts=False)
+    generator = np.random.default_rng(0)
+    mass = held.state.mass.to_numpy().astype(np.float64)[:, None]
+    for _ in range(10):
+        thrown = generator.normal(0.0, 0.33 * 0.3 / (count - 1), (count**2, 3)).astype(np.float32)
+        displace(free, thrown)
+        change = mass * (displace(held, thrown) - thrown)
+        assert len(crossings(held.state.positions(), held.state.host.triangles)) == 0
+        # Sums of integers are exact; what is left is the rounding of float32, 6e-8 of each change.
+        assert np.abs(change.sum(axis=0)).max() < 1e-6 * np.abs(change).sum()
+    assert len(crossings(free.state.positions(), free.state.host.triangles)) > 100
+
+
+def test_layers_do_not_pass_through_each_other_however_fast():
+    """A sheet that covers twenty thicknesses in one substep, on to another one."""
+    sheet = {"shape": rectangle((0.2, 0.2), (7, 7)), "thickness": 2e-3}
+    world = world_of(
+        {**sheet, "position": (0.003, 0.005, 0.03)}, {**sheet, "rotation_deg": (0, 0, 20)}, domain=SPACE,
+        gravity=WEIGHTLESS,
+    )  # fmt: skip
+    solver = cloth_of(world)
+    thrown = np.zeros((98, 3))
+    thrown[:49, 2] = -0.04
+    displace(solver, thrown)
+    positions = solver.state.positions()
+    assert len(crossings(positions, solver.state.host.triangles)) == 0
+    assert positions[:49, 2].min() > positions[49:, 2].max()
+
+
+def test_impact_zones_hold_what_contacts_cannot():
+    """Nodes that are driven against each other so hard that contact iterations do not suffice still do not cross."""
+    solver = crumpled(9)
+    generator = np.random.default_rng(3)
+    zones = 0.0
+    for _ in range(12):
+        displace(solver, generator.normal(0.0, 0.1, (81, 3)))
+        zones += contacts_of(solver).diagnostics()["impact_zone_vertices"]
+        assert len(crossings(solver.state.positions(), solver.state.host.triangles)) == 0
+    assert zones > 0
+
+
+# --- thickness ------------------------------------------------------------------------------------------------------
+
+
+def test_pressed_layers_stay_a_thickness_apart():
+    """Two sheets on the floor under twenty times their weight."""
+    thickness = 4e-3
+    sheets = [
+        {
+            **SOFT,
+            "shape": rectangle((0.12, 0.12), (7, 7)),
+            "thickness": thickness,
+            "position": (0.002 * k, 0.001 * k, 0.003 + 0.006 * k),
+            "rotation_deg": (0, 0, 17 * k),
+        }
+        for k in range(2)
+    ]
+    world = world_of(*sheets, gravity=(0.0, 0.0, -200.0))
+    for _ in range(15):
+        world.advance_frame()
+    solver = cloth_of(world)
+    state = solver.state
+    x, triangles = state.positions(), state.host.triangles
+    assert len(crossings(x, triangles)) == 0
+    lower, upper = (np.flatnonzero(state.host.body == number) for number in (0, 1))
+    inner = upper[np.abs(x[upper, :2]).max(axis=1) < 0.04]
+    corners = np.moveaxis(x[triangles[np.isin(triangles[:, 0], lower)]], 1, 0)
+    distance = point_triangle_distances(x[inner][:, None], *(each[None] for each in corners)).min(axis=1)
+    # Contacts are inelastic constraints, not springs: what is missing is what some iterations leave of a load that
+    # comes anew in each substep, g dt² = 0.14 mm or 3.5 % of the thickness, and 5 % that the iteration tolerates.
+    assert distance.min() > 0.85 * thickness
+    assert distance.max() < 1.1 * thickness
+    # The floor carries both: twice the load, on contacts of half the distance.
+    assert x[lower, 2].min() > 0.65 * 0.5 * thickness
+
+
+def test_folded_cloth_may_lie_nearer_than_its_thickness_to_its_own_neighbours():
+    """Thickness above the node spacing must not blow a flat sheet up: neighbours keep their distance at rest."""
+    world = world_of({"shape": rectangle((0.1, 0.1), (11, 11)), "thickness": 0.015}, domain=SPACE, gravity=WEIGHTLESS)
+    start = cloth_of(world).state.positions()
+    world.advance_frame()
+    assert np.abs(cloth_of(world).state.positions() - start).max() < 1e-6
+
+
+def test_cloth_that_is_not_to_collide_with_itself_crosses_itself_but_no_other():
+    sheet = {"shape": rectangle((0.2, 0.2), (7, 7)), "thickness": 2e-3, "self_collision": False}
+    world = world_of(sheet, {**sheet, "position": (0.0, 0.0, 0.1)}, domain=SPACE, gravity=WEIGHTLESS)
+    solver = cloth_of(world)
+    generator = np.random.default_rng(2)
+    for _ in range(6):
+        displace(solver, generator.normal(0.0, 0.02, (98, 3)))
+    crossing = solver.state.host.body[crossings(solver.state.positions(), solver.state.host.triangles)]
+    assert len(crossing) > 0
+    assert (crossing == crossing[:, :1]).all()
+
+
+# --- drops ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_sheet_that_falls_on_its_edge_and_folds_does_not_cross_itself():
+    world = world_of(
+        {
+            "shape": rectangle((0.2, 0.3), (11, 16)),
+            "thickness": 3e-3,
+            "position": (0.0, 0.0, 0.17),
+            "rotation_deg": (85.0, 5.0, 0.0),
+        }
+    )
+    _fold_down(world, frames=30, highest=0.1)
+
+
+@pytest.mark.slow
+def test_a_larger_sheet_folded_by_its_fall_ends_without_crossings():
+    world = world_of(
+        {
+            "shape": rectangle((1.0, 1.0), (41, 41)),
+            "thickness": 3e-3,
+            "position": (0.0, 0.0, 0.55),
+            "rotation_deg": (85.0, 7.0, 0.0),
+        }
+    )
+    _fold_down(world, frames=70, highest=0.35)
+
+
+def _fold_down(world, *, frames, highest):
+    solver = cloth_of(world)
+    contacts = 0.0
+    for frame in range(frames):
+        world.advance_frame()
+        contacts = max(contacts, contacts_of(solver).diagnostics()["contacts"])
+        if frame % 5 == 4 or frame == frames - 1:
+            assert len(crossings(solver.state.positions(), solver.state.host.triangles)) == 0
+    assert contacts > solver.state.vertex_count
+    assert solver.state.positions()[:, 2].max() < highest
+    # Half a thickness above the floor; a few substeps may press it nearer.
+    assert solver.state.positions()[:, 2].min() > 0.0
+
+
+# --- the same bits --------------------------------------------------------------------------------------------------
+
+
+FALL = {
+    "shape": rectangle((0.15, 0.15), (9, 9)),
+    "thickness": 3e-3,
+    "position": (0.0, 0.0, 0.06),
+    "rotation_deg": (70.0, 5.0, 0.0),
+}
+
+
+def test_contacts_do_not_depend_on_when_pairs_were_searched_for():
+    listed, anew = world_of(FALL), world_of(FALL)
+    pairs = contacts_of(cloth_of(anew))._pairs
+    search = pairs.prepare
+
+    def search_always(state, motion):
+        pairs.forget(state)
+        search(state, motion)
+
+    pairs.prepare = search_always
+    for _ in range(12):
+        listed.advance_frame()
+        anew.advance_frame()
+    assert contacts_of(cloth_of(listed)).diagnostics()["contacts"] > 0.0
+    for name, array in listed.checkpoint().items():
+        np.testing.assert_array_equal(anew.checkpoint()[name], array, err_msg=name)
+
+
+def test_a_run_with_contacts_continues_bit_for_bit():
+    through, resumed = world_of(FALL), world_of(FALL)
+    for _ in range(10):
+        through.advance_frame()
+    saved = {name: array.copy() for name, array in through.checkpoint().items()}
+    for _ in range(4):
+        through.advance_frame()
+    resumed.restore(10, saved)
+    for _ in range(4):
+        resumed.advance_frame()
+    for name, array in through.checkpoint().items():
+        np.testing.assert_array_equal(resumed.checkpoint()[name], array, err_msg=name)
+
+
+STEP_AND_PRINT_DIGEST = """
+import hashlib, sys
+from sim.runtime import initialize
+initialize("cpu", threads=int(sys.argv[1]))
+from contact_scenes import cloth_of, contacts_of, world_of
+from cloth_scenes import rectangle
+sheet = {"shape": rectangle((0.2, 0.2), (11, 11)), "thickness": 4e-3, "rotation_deg": (60.0, 5.0, 0.0)}
+ball = {"kind": "dynamic", "density": 300.0, "shape": {"type": "sphere", "radius": 0.04}, "position": (0.0, 0.0, 0.3)}
+world = world_of({**sheet, "position": (0.0, 0.0, 0.12)}, bodies=[{**ball, "velocity": (0.0, 0.0, -2.0)}])
+for _ in range(14):
+    world.advance_frame()
+digest = hashlib.sha256()
+for name, array in sorted(world.checkpoint().items()):
+    digest.update(array.tobytes())
+print(digest.hexdigest(), contacts_of(cloth_of(world)).diagnostics()["contacts"] > 0.0)
+"""
+
+
+@pytest.mark.slow
+def test_contacts_do_not_depend_on_the_number_of_threads():
+    here = Path(__file__).resolve().parent
+    digests = [
+        subprocess.run(
+            [sys.executable, "-c", STEP_AND_PRINT_DIGEST, str(threads)],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[2]), str(here)])},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in (1, 2)
+    ]
+    assert digests[0].split()[1] == "True"
+    assert digests[0] == digests[1]
