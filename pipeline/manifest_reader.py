@@ -168,6 +168,14 @@ class ManifestReader:
             counts.setdefault(stage, {})[TaskState(state)] = count
         return [StageSummary(stage, states) for stage, states in counts.items()]
 
+    def subjects(self, stage: str) -> frozenset[str]:
+        """What a stage's planned tasks are about, such as the fluids that have whitewater."""
+        rows = self._rows(
+            "SELECT DISTINCT subject FROM task WHERE position IS NOT NULL AND stage = ? AND subject IS NOT NULL",
+            (stage,),
+        )
+        return frozenset(subject for (subject,) in rows)
+
     def history(self, task: TaskId) -> list[AttemptRow]:
         """Every attempt of a task, first to last."""
         rows = self._rows("SELECT * FROM attempt WHERE task = ? ORDER BY number", (task,))

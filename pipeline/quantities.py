@@ -96,6 +96,7 @@ _KNOWN = {
         Quantity("emission_capped", "emission capped", "", "Particles not emitted", counted=True),
         Quantity("contacts", "contacts", "", "Contacts", counted=True),
         Quantity("repaired_crossings", "crossings repaired", "", "Cloth crossings repaired", counted=True),
+        Quantity("crossings_left", "crossings left", "", "Cloth crossings left", counted=True),
         Quantity("impact_zone_vertices", "nodes moved as one", "", "Cloth nodes moved as one", counted=True),
         Quantity("pair_searches", "searches for pairs", "", "Searches for pairs per frame", counted=True),
         Quantity("max_strain", "largest strain", SHARE, "Strain"),
@@ -171,6 +172,11 @@ WARNINGS = (
         "whitewater_capped",
         "particle was not made, as there are max_particles",
         "particles were not made, as there are max_particles",
+    ),
+    CountedEvent(
+        "crossings_left",
+        "crossing of cloth could not be prevented",
+        "crossings of cloth could not be prevented",
     ),
     CountedEvent(
         "nodes_lost",

@@ -11,11 +11,18 @@ from pipeline.cache import FrameNumbers, read_numbers
 from pipeline.errors import InvalidArtifactError
 from pipeline.executors.base import Committed
 from pipeline.layout import JobLayout
+from pipeline.manifest_reader import ManifestReader
 from pipeline.plan import frame_ranges
 from pipeline.quantities import WARNINGS, CountedEvent, in_order, quantity
 from pipeline.run_events import RunEvent
 from pipeline.task import ArtifactPath
-from pipeline.whitewater_numbers import WHITEWATER, parts_of, read_whitewater_numbers, whitewater_numbers
+from pipeline.whitewater_numbers import (
+    WHITEWATER,
+    parts_of,
+    read_whitewater_numbers,
+    unreadable_whitewater,
+    whitewater_numbers,
+)
 from sim.solver import Diagnostics
 
 SIMULATE = "simulate"
@@ -50,9 +57,7 @@ class SimulationNumbers:
         if self.unreadable:
             frames = frame_ranges(self.unreadable, range(min(self.unreadable), max(self.unreadable) + 1))
             lines.append(f"frames of the cache that cannot be read: {frames}; see: pipeline verify")
-        if self.unreadable_whitewater:
-            files = ", ".join(self.unreadable_whitewater)
-            lines.append(f"whitewater that cannot be read: {files}; see: pipeline verify")
+        lines += [f"{told}; see: pipeline verify" for told in unreadable_whitewater(self.unreadable_whitewater)]
         return lines
 
     def as_json(self) -> dict[str, object]:
@@ -107,10 +112,14 @@ def simulation_numbers(layout: JobLayout, *, history: bool = False) -> Simulatio
     Args:
         layout: the job's folder.
         history: read all numbers of all frames; else all of the last frame, and of the others what warnings need.
+
+    Raises:
+        ManifestError: the record, which tells the fluids with whitewater, cannot be read.
     """
     only = None if history else [event.name for event in WARNINGS]
     receipts = _frame_receipts(layout)
-    clouds = whitewater_numbers(layout, receipts)
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        clouds = whitewater_numbers(layout, receipts, manifest.subjects(WHITEWATER))
 
     def numbers(receipt: Receipt, only: list[str] | None) -> FrameNumbers:
         of_cache = read_numbers(layout.path(receipt.artifact), only)

@@ -20,17 +20,20 @@ KINDS = ("spray", "foam", "bubbles")
 """Names of the values of `kind`, from 0."""
 
 _ROW = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "vx", "vy", "vz", "radius", "lifetime")), ("kind", "u1")])
+_COMMENT = "comment not_made {not_made}\n"
 _HEADER = (
-    "ply\nformat binary_little_endian 1.0\ncomment not_made {not_made}\nelement vertex {count}\n"
+    f"ply\nformat binary_little_endian 1.0\n{_COMMENT}element vertex {{count}}\n"
     + "".join(f"property {'uchar' if _ROW[name].kind == 'u' else 'float'} {name}\n" for name in _ROW.names or ())
     + "end_header\n"
 )
 _PATTERN = re.compile(
     re.escape(_HEADER)
+    .replace(re.escape(_COMMENT), f"(?:{re.escape(_COMMENT)})?")
     .replace(re.escape("{count}"), r"(?P<count>0|[1-9]\d{0,9})")
     .replace(re.escape("{not_made}"), r"(?P<not_made>0|[1-9]\d{0,18})")
     .encode("ascii")
 )
+"""Files of earlier versions lack the comment."""
 _LONGEST_HEADER = len(_HEADER) + 32
 
 
@@ -61,11 +64,11 @@ class PointCounts:
 
     Attributes:
         points: how many there are.
-        not_made: how many had no room.
+        not_made: how many had no room; None in files of earlier versions, which do not tell it.
     """
 
     points: int
-    not_made: int
+    not_made: int | None
 
 
 def write_point_cloud(path: Path, cloud: PointCloud) -> None:
@@ -97,6 +100,8 @@ def read_point_cloud(path: Path) -> PointCloud:
     """
     content = path.read_bytes()
     header = _header(path, content)
+    if header["not_made"] is None:
+        raise InvalidFileError(path, "does not tell what had no room, being of an earlier version; make it anew")
     count = int(header["count"])
     size = header.end() + count * _ROW.itemsize
     if len(content) != size:
@@ -113,7 +118,7 @@ def read_point_cloud(path: Path) -> PointCloud:
 
 
 def read_point_counts(path: Path) -> PointCounts:
-    """Read the header of a cloud alone.
+    """Read the header of a cloud alone, be it of an earlier version.
 
     Raises:
         InvalidFileError: it is not of this layout.
@@ -121,7 +126,8 @@ def read_point_counts(path: Path) -> PointCounts:
     """
     with path.open("rb") as file:
         header = _header(path, file.read(_LONGEST_HEADER))
-    return PointCounts(int(header["count"]), int(header["not_made"]))
+    not_made = header["not_made"]
+    return PointCounts(int(header["count"]), None if not_made is None else int(not_made))
 
 
 def validate_point_cloud(path: Path) -> None:

@@ -54,7 +54,7 @@ class CellGrid:
         """
         cell_size = search_radius / reach
         size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
-        shape = np.maximum(np.ceil(size / cell_size), 1.0) + 2.0 * reach
+        shape = _shape_covering(size, search_radius, reach)
         if not shape.prod() <= MAX_CELLS:
             raise ValueError(
                 f"a box of {' x '.join(f'{edge:g}' for edge in size)} m has {shape.prod():.3g} neighbour cells of "
@@ -63,11 +63,37 @@ class CellGrid:
         origin = np.asarray(low, dtype=np.float64) - search_radius
         return cls(tuple(origin.tolist()), cell_size, tuple(shape.astype(int).tolist()), reach)
 
+    @classmethod
+    def covering_as_finely_as_fits(
+        cls, low: NDArray[np.floating], high: NDArray[np.floating], search_radius: float, *, reach: int
+    ) -> "CellGrid":
+        """As `covering`, but with cells as wide as the radius where those of the wanted reach would be too many.
+
+        Smaller cells are only faster; a box that can be searched at all is not to be refused for them.
+
+        Args:
+            low: lower corner.
+            high: upper corner.
+            search_radius: within which neighbours are wanted [m].
+            reach: cells that it is to span.
+
+        Raises:
+            ValueError: the box holds more than `MAX_CELLS` cells as wide as the radius.
+        """
+        size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
+        fits = _shape_covering(size, search_radius, reach).prod() <= MAX_CELLS
+        return cls.covering(low, high, search_radius, reach=reach if fits else 1)
+
     @property
     def cell_count(self) -> int:
         """Number of cells, the outer layers included."""
         nx, ny, nz = self.shape
         return nx * ny * nz
+
+
+def _shape_covering(size: NDArray[np.float64], search_radius: float, reach: int) -> NDArray[np.float64]:
+    """Cells along each axis, the outer layers included; floats, as their product may be beyond any integer."""
+    return np.maximum(np.ceil(size / (search_radius / reach)), 1.0) + 2.0 * reach
 
 
 class CellSort:

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from pipeline.job.amounts import count, gigabytes
 from pipeline.job.boxes import Box, domain_box, span, touch
+from pipeline.job.cloth_bodies import check_bodies_for_cloth
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.mesh_checks import mesh_exists
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
 from sim.cloth.parameters import RectangleSheet, shared_conflicts
+from sim.shapes.parameters import MeshShape
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
@@ -32,6 +34,31 @@ ROUND_OFF = 1.0e-6
 """Cloth that is laid onto a body, in decimal numbers, may be so deep in it [m]."""
 
 
+@dataclass(frozen=True)
+class _Room:
+    """Memory for one more cloth.
+
+    Attributes:
+        budget: of all cloths.
+        nodes_before: of the cloths that have their place.
+    """
+
+    budget: MemoryBudget
+    nodes_before: int
+
+    def refusal(self, nodes: int) -> str | None:
+        """Why a cloth of so many nodes does not fit; None if it does."""
+        need = (self.nodes_before + nodes) * BYTES_PER_NODE
+        if need <= self.budget.bytes:
+            return None
+        together = f" and {count(self.nodes_before)} of the cloths before it" if self.nodes_before else ""
+        possible = max(0, self.budget.bytes // BYTES_PER_NODE - self.nodes_before)
+        return (
+            f"{count(nodes)} nodes{together} need {gigabytes(need)}, {self.budget.owner} has "
+            f"{gigabytes(self.budget.bytes)}; at most {count(possible)} fit"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class _Start:
     """A cloth where it starts.
@@ -42,7 +69,8 @@ class _Start:
         sheet: at rest.
         position: of its nodes [m], (n, 3).
         edges: (e, 2) node numbers.
-        held: whether a pin holds the node, (n,).
+        held: whether a pin holds the node at the start, (n,).
+        kept: whether one holds it for ever, (n,).
     """
 
     path: KeyPath
@@ -51,6 +79,13 @@ class _Start:
     position: NDArray[np.float64]
     edges: NDArray[np.int32]
     held: NDArray[np.bool_]
+    kept: NDArray[np.bool_]
+
+    @property
+    def longest_edge(self) -> float:
+        """Longest distance of neighbouring nodes [m]."""
+        ends = self.position[self.edges]
+        return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max())
 
     @property
     def box(self) -> Box:
@@ -72,7 +107,11 @@ def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
     """
     for number, key, message in shared_conflicts(job.cloth):
         findings.error(("cloth", number, key), message)
-    starts = [start for index in range(len(job.cloth)) if (start := _start(job, index, budget, findings)) is not None]
+    starts: list[_Start] = []
+    for index in range(len(job.cloth)):
+        before = sum(len(start.position) for start in starts)
+        if (start := _start(job, index, _Room(budget, before), findings)) is not None:
+            starts.append(start)
     for number, start in enumerate(starts):
         _check_place(start, job.domain, findings)
         _check_spacing(start, findings)
@@ -81,10 +120,11 @@ def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
             if path[0] == "rigid":
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
         _check_crossings(start, starts[:number], findings)
+    check_bodies_for_cloth(job, solids, {int(start.path[1]): start.longest_edge for start in starts}, findings)
     return sum(len(start.position) for start in starts)
 
 
-def _start(job: Job, index: int, budget: MemoryBudget, findings: Findings) -> _Start | None:
+def _start(job: Job, index: int, room: _Room, findings: Findings) -> _Start | None:
     """The cloth as the simulation will start it; None if it cannot be built."""
     from sim.cloth.sheet import build_sheet
     from sim.cloth.springs import edges_of
@@ -93,43 +133,39 @@ def _start(job: Job, index: int, budget: MemoryBudget, findings: Findings) -> _S
 
     path: KeyPath = ("cloth", index)
     cloth = job.cloth[index]
-    if not mesh_exists(cloth.shape, path, findings) or not _fits(path, cloth, budget, findings):
+    if not mesh_exists(cloth.shape, path, findings):
         return None
+    if isinstance(cloth.shape, RectangleSheet):
+        key = "counts" if cloth.shape.counts is not None else "resolution"
+        if refusal := room.refusal(prod(cloth.shape.node_counts)):
+            findings.error((*path, "shape", key), f"{refusal}: divide it less finely")
+            return None
     try:
         sheet = build_sheet(cloth.shape)
     except ShapeError as error:
         findings.error((*path, "shape"), str(error))
         return None
+    # How many nodes a mesh has is known only now.
+    if isinstance(cloth.shape, MeshShape) and (refusal := room.refusal(len(sheet.vertices))):
+        findings.error((*path, "shape", "file"), f"{refusal}: take a coarser mesh")
+        return None
     for warning in sheet.warnings:
         findings.warn((*path, "shape"), warning)
     position = start_positions(cloth, sheet)
-    held = _held(path, cloth, sheet, position, findings)
-    return _Start(path, cloth, sheet, position, edges_of(sheet.triangles).nodes, held)
-
-
-def _fits(path: KeyPath, cloth: ClothParameters, budget: MemoryBudget, findings: Findings) -> bool:
-    """Whether a rectangle fits into memory, before it is built; a mesh did when it was made."""
-    if not isinstance(cloth.shape, RectangleSheet):
-        return True
-    nodes = prod(cloth.shape.node_counts)
-    if nodes * BYTES_PER_NODE <= budget.bytes:
-        return True
-    key = "counts" if cloth.shape.counts is not None else "resolution"
-    findings.error(
-        (*path, "shape", key),
-        f"{count(nodes)} nodes need {gigabytes(nodes * BYTES_PER_NODE)}, {budget.owner} has "
-        f"{gigabytes(budget.bytes)}; at most {count(budget.bytes // BYTES_PER_NODE)} fit: divide it less finely",
-    )
-    return False
+    held, kept = _held(path, cloth, sheet, position, findings)
+    return _Start(path, cloth, sheet, position, edges_of(sheet.triangles).nodes, held, kept)
 
 
 def _held(
     path: KeyPath, cloth: ClothParameters, sheet: RestSheet, position: NDArray[np.float64], findings: Findings
-) -> NDArray[np.bool_]:
-    """Which nodes pins hold at the start, (n,); notes pins that hold none, and moving ones that share a node."""
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which nodes pins hold at the start, and which for ever, (n,) each.
+
+    Notes pins that hold none, and moving ones that share a node.
+    """
     from sim.cloth.start import pinned_nodes
 
-    holders = np.full(len(position), -1)
+    holders, kept = np.full(len(position), -1), np.zeros(len(position), dtype=bool)
     for number, pin in enumerate(cloth.pin):
         place = (*path, "pin", number)
         try:
@@ -142,8 +178,8 @@ def _held(
         if moving:
             findings.error(place, f"shares a node with pin[{moving[0]}], and one of them moves; pin each node once")
         holders[nodes] = number
-    held: NDArray[np.bool_] = holders >= 0
-    return held
+        kept[nodes] |= pin.release_s is None
+    return holders >= 0, kept
 
 
 def _check_place(start: _Start, domain: DomainParameters, findings: Findings) -> None:
@@ -184,7 +220,8 @@ def _check_substeps(start: _Start, fps: int, findings: Findings) -> None:
     if cloth.integrator != "explicit" or cloth.substeps is None:
         return
     families = [(springs, springs.stiffness(cloth), springs.damping(cloth)) for springs in springs_of(start.sheet)]
-    inverse_mass = np.where(start.held, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
+    # Nodes that are let go later need shorter steps from then on.
+    inverse_mass = np.where(start.kept, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
     if reason := too_few_substeps(cloth.substeps, 1.0 / fps, longest_explicit_step(families, inverse_mass)):
         findings.error((*start.path, "substeps"), reason)
 

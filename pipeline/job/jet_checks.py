@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeline.job.boxes import Box, touch
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path
 from sim.fluid.nozzles import is_same_nozzle
@@ -99,7 +100,8 @@ def _room_before(
     points = (opening.points[None] + shifts).reshape(-1, 3)
     blocked = _beyond_walls(points, domain)
     for solid in bodies:
-        blocked |= solid.signed_distance(points) < 0.0
+        if touch(solid.bounds, _box_around(points), margin=0.0):
+            blocked |= solid.signed_distance(points) < 0.0
     share = np.maximum.accumulate(blocked.reshape(len(ahead), -1), axis=0).mean(axis=1)
     reached = np.flatnonzero(share > MOST_BLOCKED)
     return float(ahead[reached[0]]) if len(reached) else needed
@@ -108,17 +110,13 @@ def _room_before(
 def _fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float) -> _Way:
     """The way of a jet's middle until it meets a wall, a body or a block, leaves the domain, or the film ends."""
     gravity = np.asarray(job.gravity, dtype=np.float64)
-    corners = np.array(list(product(*zip(job.domain.min, job.domain.max, strict=True))))
-    farthest = float(np.linalg.norm(corners - opening.centre, axis=1).max())
-    driven_s = opening.nozzle_depth / opening.speed
-    # Without gravity it would be out of the domain by then; with it, sooner or after a fall from its turning point.
     strength = float(np.linalg.norm(gravity))
-    end_s = driven_s + farthest / opening.speed
-    if strength > 0.0:
-        end_s = min(
-            end_s, driven_s + (opening.speed + math.sqrt(opening.speed**2 + 2.0 * strength * farthest)) / strength
-        )
-    end_s = min(end_s, job.frame_count / job.fps - opening.start_s)
+    corners = np.array(list(product(*zip(job.domain.min, job.domain.max, strict=True))))
+    farthest = opening.nozzle_depth + float(np.linalg.norm(corners - opening.centre, axis=1).max())
+    driven_s = opening.nozzle_depth / opening.speed
+    end_s = min(
+        driven_s + _longest_flight(opening.speed, strength, farthest), job.frame_count / job.fps - opening.start_s
+    )
     if end_s <= 0.0:
         return _Way(np.zeros((0, 3)), np.zeros(0))
     fastest = opening.speed + strength * end_s
@@ -126,12 +124,35 @@ def _fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float)
     times = np.linspace(0.0, end_s, steps + 1)
     flown = np.maximum(times - driven_s, 0.0)[:, None]
     points = opening.centre + times[:, None] * opening.velocity + 0.5 * flown**2 * gravity
-    stopped = ((points < job.domain.min) | (points > job.domain.max)).any(axis=1)
+    inside = _until_first(((points < job.domain.min) | (points > job.domain.max)).any(axis=1))
+    points, times = points[:inside], times[:inside]
+    stopped = np.zeros(inside, dtype=bool)
     for solid in obstacles:
-        # What it comes out of is not in its way: blocks around a nozzle are pushed aside.
-        stopped |= (solid.signed_distance(points) < 0.0) & (times > driven_s)
-    kept = int(np.argmax(stopped)) if stopped.any() else len(points)
+        if inside and touch(solid.bounds, _box_around(points), margin=0.0):
+            # What it comes out of is not in its way: blocks around a nozzle are pushed aside.
+            stopped |= (solid.signed_distance(points) < 0.0) & (times > driven_s)
+    kept = _until_first(stopped)
     return _Way(points[:kept], times[:kept])
+
+
+def _longest_flight(speed: float, gravity: float, distance: float) -> float:
+    """By when what is thrown has been so far away from where it began, whatever its direction [s].
+
+    After t it is at least |v t - g t²/2| away, which is exact straight up. There, fast enough, it gets that far
+    before it turns, v²/2g above; else it has to fall back past its start.
+
+    Args:
+        speed: at first [m/s].
+        gravity: its strength [m/s²].
+        distance: how far [m].
+    """
+    if gravity == 0.0:
+        return distance / speed
+    turning = speed**2 - 2.0 * gravity * distance
+    if turning >= 0.0:
+        # (v - sqrt(v² - 2 g D)) / g, without the difference of nearly equal numbers where gravity is weak.
+        return 2.0 * distance / (speed + math.sqrt(turning))
+    return (speed + math.sqrt(speed**2 + 2.0 * gravity * distance)) / gravity
 
 
 def _arrival(way: _Way, opening: Opening, other: Opening, spacing: float) -> float | None:
@@ -142,6 +163,16 @@ def _arrival(way: _Way, opening: Opening, other: Opening, spacing: float) -> flo
     distance, _ = nozzle.query(way.points)
     near = np.flatnonzero(distance < min(opening.half_size))
     return float(way.times[near[0]]) if len(near) else None
+
+
+def _box_around(points: Points) -> Box:
+    """Bounds of at least one point."""
+    return np.array([points.min(axis=0), points.max(axis=0)])
+
+
+def _until_first(flags: NDArray[np.bool_]) -> int:
+    """How many there are before the first that is true."""
+    return int(np.argmax(flags)) if flags.any() else len(flags)
 
 
 def _beyond_walls(points: Points, domain: DomainParameters) -> NDArray[np.bool_]:

@@ -29,8 +29,9 @@ def preview_overrides(job: Job) -> list[Override]:
     for index, smoke in enumerate(job.smoke):
         changes.append((("smoke", index, "cell_size"), smoke.cell_size * COARSENING))
     for index, cloth in enumerate(job.cloth):
-        # Nodes that pins name by their numbers would be others in a coarser sheet.
-        if isinstance(cloth.shape, RectangleSheet) and all(pin.index is None for pin in cloth.pin):
+        # Pins would hold others in a coarser sheet where they name nodes by number, and others or none in a region.
+        by_place = all(pin.index is None and pin.region is None for pin in cloth.pin)
+        if isinstance(cloth.shape, RectangleSheet) and by_place:
             changes.append(_coarser(("cloth", index, "shape"), cloth.shape))
     return [Override(path, value, PREVIEW) for path, value in changes]
 

@@ -1,16 +1,41 @@
-"""Whether the bodies that move can start where the job puts them."""
+"""Whether the bodies that move can start where the job puts them, and their ballast lies in them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from pipeline.job.boxes import span
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
-    from sim.shapes import Solid
+    from sim.shapes import PlacedSolid, Solid
+
+ROUND_OFF = 1.0e-6
+"""Share of a body's size by which ballast on its surface may be outside, as decimals do not add up exactly."""
+
+
+def check_ballast(job: Job, solids: Mapping[KeyPath, PlacedSolid], findings: Findings) -> None:
+    """Note ballast that lies outside of its body: a slip of the unit, most likely, that would topple the body."""
+    for index, body in enumerate(job.rigid):
+        solid = solids.get(("rigid", index))
+        if not body.ballast or solid is None:
+            continue
+        unturned = replace(solid, rotation=np.eye(3), position=np.zeros(3))
+        low, high = unturned.bounds
+        distances = unturned.signed_distance(np.array([ballast.position for ballast in body.ballast]))
+        for number, distance in enumerate(distances):
+            if distance > ROUND_OFF * float(np.max(high - low)):
+                findings.error(
+                    ("rigid", index, "ballast", number, "position"),
+                    f"lies {distance:.3g} m outside of the body, whose shape spans {span(unturned.bounds)}; "
+                    "give it in metres from the shape's centre, before the body is turned",
+                )
 
 
 def check_rigid_start(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:

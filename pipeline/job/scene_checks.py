@@ -19,14 +19,14 @@ from pipeline.job.models import Job
 from pipeline.job.placements import placements
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
-from pipeline.job.rigid_checks import check_rigid_start
+from pipeline.job.rigid_checks import check_ballast, check_rigid_start
 from pipeline.job.step_checks import check_time_steps
 from sim.fluid.parameters import FluidParameters
 from sim.scene import DomainParameters
 from sim.smoke.parameters import SmokeParameters
 
 if TYPE_CHECKING:
-    from sim.shapes import Solid
+    from sim.shapes import PlacedSolid, Solid
 
 BYTES_PER_PARTICLE = 1024
 """Upper bound of what the fluid solvers take, neighbour search and snapshots included."""
@@ -53,6 +53,7 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
     solids = _build_solids(job, findings)
     _check_rigid_bodies(job, solids, findings)
     check_rigid_start(job, solids, findings)
+    check_ballast(job, solids, findings)
     _check_camera(job, solids, findings)
     check_fluids(job, solids, findings)
     check_time_steps(job, solids, findings)
@@ -65,7 +66,7 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
 # --- shapes --------------------------------------------------------------------------------------------------------
 
 
-def _build_solids(job: Job, findings: Findings) -> Mapping[KeyPath, Solid]:
+def _build_solids(job: Job, findings: Findings) -> Mapping[KeyPath, PlacedSolid]:
     """Every shape that can be built, by its path."""
     from sim.shapes import ShapeError, build_solid
 

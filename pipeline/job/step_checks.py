@@ -1,4 +1,4 @@
-"""Whether a fixed time step can hold the speeds that the start of a job foretells."""
+"""Whether a fixed time step can hold the speeds that the start of a job foretells, and impacts on walls."""
 
 from __future__ import annotations
 
@@ -24,10 +24,19 @@ REST_NUMBER = {"wcsph": math.inf, "dfsph": 0.1, "pcisph": 0.05}
 """Largest step over sqrt(d/g), whatever the speed, by solver."""
 SPEED_OF_SOUND_IN_SPEEDS = 10.0
 """The numerical speed of sound over the largest expected speed, for less than 1 % compression."""
+FREQUENCY_AT_REST = 1.1
+"""omega d/c_s of a particle in a lattice; this and what follows: docs/decisions/0021-fixed-steps-at-impacts.md."""
+STIFFENING_AT_WALLS = math.sqrt(28.0)
+"""At most omega of a particle that is shot onto the samples of a wall, over that."""
+COMPRESSION_BY_IMPACTS = 1.9
+"""Compression of a particle that hits a wall at v, over v/c_s, measured; omega grows with the cube of its density."""
+WALL_FRICTION_AT_IMPACTS = 1.0
+ARTIFICIAL_VISCOSITY_AT_IMPACTS = 0.1
+"""With these two longer steps bear impacts too: they take a particle's speed before it is pressed onto the samples."""
 
 
 def check_time_steps(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    """Warn of fixed steps above what will be stable.
+    """Warn of fixed steps above what will be stable, in the flow or where it hits a wall.
 
     Args:
         job: the job.
@@ -37,11 +46,19 @@ def check_time_steps(job: Job, solids: Mapping[KeyPath, Solid], findings: Findin
     for index, fluid in enumerate(job.fluid):
         if fluid.dt == "adaptive":
             continue
-        stable = _stable_dt(job, fluid, expected_speed(job, solids))
+        speed = expected_speed(job, solids)
+        stable, bearing = _stable_dt(job, fluid, speed), _dt_bearing_impacts(fluid, speed)
         if fluid.dt > stable:
             findings.warn(
                 ("fluid", index, "dt"),
                 f'{fluid.dt:g} s is above the stable step of about {stable:.2g} s and may blow up; use "adaptive"',
+            )
+        elif fluid.dt > bearing:
+            findings.warn(
+                ("fluid", index, "dt"),
+                f"{fluid.dt:g} s is above the {bearing:.2g} s that bear an impact on a wall, and may blow up there; "
+                f'use "adaptive" or that, or wall_friction = {WALL_FRICTION_AT_IMPACTS:g} and artificial_viscosity = '
+                f"{ARTIFICIAL_VISCOSITY_AT_IMPACTS:g}, or more of each",
             )
 
 
@@ -74,9 +91,28 @@ def _body_speed(body: RigidBodyParameters, solid: Solid, fall: float) -> float:
 def _stable_dt(job: Job, fluid: FluidParameters, speed: float) -> float:
     """The limits by signals, cfl k d / (c_s + v), and by gravity [s]."""
     spacing, gravity = 2.0 * fluid.particle_radius, math.hypot(*job.gravity)
-    explicit = fluid.solver == "wcsph"
-    sound = (fluid.sound_speed or SPEED_OF_SOUND_IN_SPEEDS * speed) if explicit else 0.0
+    sound = _speed_of_sound(fluid, speed)
     way = fluid.cfl * WAY_IN_SPACINGS[fluid.solver] * spacing
     by_signals = way / (sound + speed) if sound + speed > 0.0 else math.inf
     by_gravity = REST_NUMBER[fluid.solver] * math.sqrt(spacing / gravity) if gravity > 0.0 else math.inf
     return min(by_signals, by_gravity)
+
+
+def _dt_bearing_impacts(fluid: FluidParameters, speed: float) -> float:
+    """The limit omega dt < 2 by the stiffest particle at a wall [s]; none where friction and viscosity soften it."""
+    softened = (
+        fluid.wall_friction >= WALL_FRICTION_AT_IMPACTS
+        and fluid.artificial_viscosity >= ARTIFICIAL_VISCOSITY_AT_IMPACTS
+    )
+    sound = _speed_of_sound(fluid, speed)
+    if softened or sound == 0.0:
+        return math.inf
+    at_rest = FREQUENCY_AT_REST * sound / (2.0 * fluid.particle_radius)
+    return 2.0 / (at_rest * STIFFENING_AT_WALLS * (1.0 + COMPRESSION_BY_IMPACTS * speed / sound) ** 3)
+
+
+def _speed_of_sound(fluid: FluidParameters, speed: float) -> float:
+    """The numerical one [m/s]; 0 in implicit solvers, which have none."""
+    if fluid.solver != "wcsph":
+        return 0.0
+    return fluid.sound_speed or SPEED_OF_SOUND_IN_SPEEDS * speed

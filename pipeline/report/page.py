@@ -13,6 +13,7 @@ from pipeline.plan import frame_ranges
 from pipeline.report.chart import line_chart, swatch
 from pipeline.report.job_report import JobReport, as_data
 from pipeline.report.panels import Panel, panels_of
+from pipeline.whitewater_numbers import unreadable_whitewater
 
 
 def page(reports: Sequence[JobReport], *, written: str) -> str:
@@ -61,8 +62,7 @@ def _warnings(report: JobReport) -> str:
     if report.unreadable:
         frames = frame_ranges(report.unreadable, range(report.unreadable[-1] + 1))
         sentences.append(f"frames of the cache that cannot be read: {frames}")
-    if report.unreadable_whitewater:
-        sentences.append(f"whitewater that cannot be read: {', '.join(report.unreadable_whitewater)}")
+    sentences += unreadable_whitewater(report.unreadable_whitewater)
     items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
     return f'<ul class="warnings">{items}</ul>' if items else '<p class="quiet">No warnings.</p>'
 

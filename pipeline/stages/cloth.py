@@ -8,11 +8,13 @@ from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
 from pipeline.stages.body_frames import tasks_of_bodies
-from pipeline.stages.inputs import tool_version
+from pipeline.stages.inputs import estimated_nodes, tool_version
 from pipeline.task import Resources, Task
 
-MEMORY_BYTES = 400_000_000
-"""Interpreter, numpy and h5py, and a quarter of a million nodes (512 x 512), which take 150 MB."""
+BASE_BYTES = 250_000_000
+"""Interpreter, numpy and h5py."""
+BYTES_PER_NODE = 600
+"""The frame's arrays, the normals of its triangles and the mesh as it is written: 512 x 512 nodes take 150 MB."""
 
 
 class ClothStage:
@@ -24,8 +26,10 @@ class ClothStage:
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a cloth and frame."""
         parameters = ParameterSet.of(stage=self.name, version=self.version, tools={"numpy": tool_version("numpy")})
-        resources = Resources(memory_bytes=MEMORY_BYTES)
-        cloths = [(cloth.name, resources) for cloth in job.cloth]
+        cloths = [
+            (cloth.name, Resources(memory_bytes=BASE_BYTES + BYTES_PER_NODE * estimated_nodes(cloth)))
+            for cloth in job.cloth
+        ]
         return tasks_of_bodies(self.name, job, layout, bodies=cloths, output=layout.cloth, parameters=parameters)
 
     def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002

@@ -21,8 +21,9 @@ ABSENT = "absent"
 
 P = TypeVar("P", Placement, ClothParameters)
 
-BYTES_PER_VERTEX = 12
-"""Least that a vertex takes in a mesh file: three float32; its triangles come on top."""
+BYTES_PER_VERTEX = 8
+"""What a vertex takes in a mesh file, with its share of the triangles, at the low end, which is OBJ of short numbers
+(float32 coordinates are 12); only files that compress or quantise take less."""
 
 
 @cache
@@ -71,18 +72,24 @@ def most_particles(scene: SceneParameters) -> float:
     return sum(min(volume / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf) for fluid in scene.fluid)
 
 
-def most_cloth_nodes(scene: SceneParameters) -> int:
-    """Upper bound of the number of nodes of all cloths; of meshes by the size of the file, which is not read.
+def estimated_cloth_nodes(scene: SceneParameters) -> int:
+    """About how many nodes all cloths have, `estimated_nodes` of each.
 
     Raises:
         MissingInputError: a mesh file cannot be read.
     """
-    return sum(
-        prod(cloth.shape.node_counts)
-        if isinstance(cloth.shape, RectangleSheet)
-        else _status(cloth.shape.file).st_size // BYTES_PER_VERTEX
-        for cloth in scene.cloth
-    )
+    return sum(estimated_nodes(cloth) for cloth in scene.cloth)
+
+
+def estimated_nodes(cloth: ClothParameters) -> int:
+    """Number of nodes of a rectangle; of a mesh an estimate on the high side by the file's size, without reading it.
+
+    Raises:
+        MissingInputError: a mesh file cannot be read.
+    """
+    if isinstance(cloth.shape, RectangleSheet):
+        return prod(cloth.shape.node_counts)
+    return _status(cloth.shape.file).st_size // BYTES_PER_VERTEX
 
 
 def _content_name(file: str) -> str:

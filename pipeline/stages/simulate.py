@@ -24,7 +24,7 @@ from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import (
     bodies_by_content,
     domain_volume,
-    most_cloth_nodes,
+    estimated_cloth_nodes,
     most_particles,
     tool_version,
 )
@@ -70,7 +70,7 @@ class SimulateStage:
                 parameters=ParameterSet.of(
                     stage=self.name,
                     version=self.version,
-                    tools={name: tool_version(name) for name in ("taichi", "libigl", "numpy")},
+                    tools={name: tool_version(name) for name in ("taichi", "libigl", "numpy", "scipy", "trimesh")},
                     fps=job.fps,
                     **scene | bodies_by_content(job),
                 ),
@@ -193,12 +193,16 @@ class _Simulation:
         """
         path = self._folder / f"{frame:06d}.h5"
         part = self._folder / f".{path.name}.part.{self._context.attempt}"
-        with _saying(f"while the checkpoint of frame {frame} was written"):
-            write_checkpoint(part, Checkpoint(frame, self._context.fingerprint, self._device, arrays))
-            read_checkpoint(part)
-            sync(part)
-        part.replace(path)
-        sync(self._folder)
+        try:
+            with _saying(f"while the checkpoint of frame {frame} was written"):
+                write_checkpoint(part, Checkpoint(frame, self._context.fingerprint, self._device, arrays))
+                read_checkpoint(part)
+                sync(part)
+            part.replace(path)
+            sync(self._folder)
+        finally:
+            # Half a checkpoint would keep a full disk full.
+            part.unlink(missing_ok=True)
         so_far = sorted(each for each in self._folder.glob("[0-9]*.h5") if each.name <= path.name)
         for old in so_far[:-CHECKPOINTS_KEPT]:
             old.unlink()
@@ -227,9 +231,9 @@ def _resources(job: Job) -> Resources:
 
 
 def _snapshot_bytes(job: Job) -> int:
-    """Upper bound of what a snapshot or a checkpoint takes: no fluid holds more than fills the domain."""
+    """What a snapshot or a checkpoint takes: an upper bound for fluids and smoke, an estimate for cloths of meshes."""
     cells = sum(domain_volume(job) / smoke.cell_size**3 for smoke in job.smoke)
-    nodes = most_cloth_nodes(job)
+    nodes = estimated_cloth_nodes(job)
     return ceil(most_particles(job) * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL + nodes * BYTES_PER_CLOTH_NODE)
 
 

@@ -113,16 +113,22 @@ def give(
     push: ti.math.vec3, vertices: ti.types.vector(4, ti.i32), weights: ti.math.vec4, kind: ti.i32, arm: ti.math.vec3,
     gathered: LongIntegers, body_gathered: LongIntegers,
 ):  # fmt: skip
-    """Add an impulse, in units, to what the vertices and the body of a contact get."""
+    """Add an impulse, in units, to what the vertices and the body of a contact get, to the nearest unit."""
     for k in ti.static(range(4)):
         if weights[k] != 0.0:
             for axis in ti.static(range(3)):
-                ti.atomic_add(gathered[3 * vertices[k] + axis], ti.cast(weights[k] * push[axis], ti.i64))
+                ti.atomic_add(gathered[3 * vertices[k] + axis], ti.round(weights[k] * push[axis], ti.i64))
     if kind >= 0:
         twist = arm.cross(push)
         for axis in ti.static(range(3)):
-            ti.atomic_add(body_gathered[6 * kind + axis], -ti.cast(push[axis], ti.i64))
-            ti.atomic_add(body_gathered[6 * kind + 3 + axis], -ti.cast(twist[axis], ti.i64))
+            ti.atomic_add(body_gathered[6 * kind + axis], -ti.round(push[axis], ti.i64))
+            ti.atomic_add(body_gathered[6 * kind + 3 + axis], -ti.round(twist[axis], ti.i64))
+
+
+@ti.func
+def thickness_between(vertices: ti.types.vector(4, ti.i32), thickness: Floats) -> ti.f32:
+    """Distance that the sides of a pair keep [m]; of a contact with a body or a wall, the thickness of the cloth."""
+    return 0.5 * (thickness[vertices[0]] + thickness[vertices[3]])
 
 
 @ti.func
@@ -201,13 +207,13 @@ def push_apart(
 def finish_push(
     count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats,
     kind: Integers, arm: Vectors, impulse: Vectors, impulse_given: Vectors,
-    vertex_count: ti.i32, displacement: Vectors, start: Vectors, inverse_mass: Floats, gathered: LongIntegers,
-    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_inverse_mass: Floats,
+    vertex_count: ti.i32, displacement: Vectors, start: Vectors, inverse_mass: Floats, thickness: Floats,
+    gathered: LongIntegers, body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_inverse_mass: Floats,
     body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, unit: ti.f32,
 ) -> ti.f32:  # fmt: skip
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
-    Returns the most that a contact's displacement is below its floor [m].
+    Returns the most that a contact's displacement is below its floor, in thicknesses of what touches.
     """
     for place in range(count):
         c = pushing[place]
@@ -225,7 +231,7 @@ def finish_push(
     for place in range(count):
         c = pushing[place]
         w = relative_displacement(c, vertices, weights, displacement, kind, arm, body_motion)
-        ti.atomic_max(missing, floor[c] - w.dot(normal[c]))
+        ti.atomic_max(missing, (floor[c] - w.dot(normal[c])) / thickness_between(vertices[c], thickness))
     return missing
 
 
@@ -233,8 +239,8 @@ def finish_push(
 @ti.kernel
 def repair_crossings(
     count: ti.i32, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers,
-    impulse: Vectors, position: Vectors, displacement: Vectors, inverse_mass: Floats, least_gap: ti.f32,
-    crossing: Integers,
+    impulse: Vectors, position: Vectors, displacement: Vectors, inverse_mass: Floats, thickness: Floats,
+    least_gap_in_thicknesses: ti.f32, crossing: Integers,
 ) -> ti.i32:  # fmt: skip
     """Count the pairs that are not certainly apart all through the substep, and have their worst vertices pushed.
 
@@ -272,6 +278,7 @@ def repair_crossings(
                     if end[k] > high:
                         high, highest = end[k], k
             apart = low_start - high_start
+            least_gap = least_gap_in_thicknesses * thickness_between(v, thickness)
             least = ti.min(ti.max((1.0 - LARGEST_SHARE) * apart, least_gap), apart - ROUNDING * size)
             if low - high < least:
                 failed += 1

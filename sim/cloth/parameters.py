@@ -17,6 +17,10 @@ Edge = Literal["x-", "x+", "y-", "y+"]
 DEFAULT_SUBSTEPS = 20
 """Steps per frame of XPBD where none are asked for: 0.8 ms at 60 frames a second."""
 
+BODY_GRID_CELLS = 96
+"""Cells along the longest edge of a mesh, of the grid of distances by which cloth meets it: 1 cm of a body of 1 m, as
+coarse as cloth. Walls thinner than two cells leak."""
+
 
 class RectangleSheet(Parameters):
     """A flat rectangle in its own x-y plane, centred on the origin; corners and edges are named after its axes."""
@@ -94,7 +98,9 @@ class PinParameters(Parameters):
         default=None, description="All nodes that start in a box or a ball of the world."
     )
     keyframe: tuple[PinKeyframeParameters, ...] = Field(
-        default=(), description="Path of the pin; it rests before the first and after the last keyframe."
+        default=(),
+        description="Path of the pin, the first keyframe where it starts; it rests before the first and after the last "
+        "keyframe.",
     )
     interpolation: Literal["cubic", "linear"] = Field(
         default="cubic",
@@ -113,6 +119,12 @@ class PinParameters(Parameters):
                     f"keyframe[{number}].time_s must be after {before.time_s:g} s, that of the keyframe before, "
                     f"got {after.time_s:g} s"
                 )
+        if self.keyframe and any((*self.keyframe[0].offset, *self.keyframe[0].rotation_deg)):
+            raise ValueError(
+                f"keyframe[0] is where the pin starts, so its offset and rotation_deg must be zero, got "
+                f"{_written(self.keyframe[0].offset)} m and {_written(self.keyframe[0].rotation_deg)} degrees; move or "
+                "turn the cloth itself, or add a keyframe without them before it"
+            )
         if len(self.keyframe) == 1:
             raise ValueError("keyframe: a path needs two keyframes at least; add one, or remove it")
         if "interpolation" in self.model_fields_set and not self.keyframe:

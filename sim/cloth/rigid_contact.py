@@ -37,7 +37,12 @@ LARGEST_ADVANCE = 0.25
 """How far cloth and bodies may move against each other in a step, in half shortest edges of the smallest body."""
 
 WALL_DEPTH = 4.0
-"""Walls hold what is at most so far behind them, in thicknesses: what left through an open face falls on outside."""
+"""Walls hold what is at most so far behind them, in thicknesses, or as far as a mean edge or the node's motion in the
+step, if that is more: what left through an open face falls on outside."""
+
+SMALL_BODY = 4.0
+"""Round bodies with a shorter edge, in mean edges of the cloth, are looked at between its vertices, too: larger ones
+show by an eighth of an edge at most where vertices alone meet them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +67,9 @@ class BodyMotion:
 class RigidContact:
     """Finds where cloth touches bodies and walls.
 
-    Cloth stays half its thickness away from both. Its vertices are looked at, and where a body has sharp edges also
-    the midpoints of its edges and triangles: so much of a corner may show through cloth as fits between them.
+    Cloth stays half its thickness away from both. Its vertices are looked at, and where a body has sharp edges or is
+    small (`set_spacing`) also the midpoints of its edges and triangles: so much of a corner may show through cloth as
+    fits between them, and a body that fits between them, thinner than 0.7 edges or so, passes.
     The side that cloth is on is the one where the substep starts, so that nothing tunnels while bodies and cloth move
     by less than `LARGEST_ADVANCE` (`stable_dt`).
 
@@ -78,19 +84,34 @@ class RigidContact:
         self._motion: BodyMotion | None = None
         self._surface_speed = 0.0
         self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
+        self._spacing = 0.0
         self._wall_count = len(walls)
         room = max(len(walls), 1)
         self._wall_plane = ti.Vector.ndarray(4, ti.f32, room)
-        self._wall_low, self._wall_high = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(2))
+        self._wall_low, self._wall_high, self._joined_low, self._joined_high = (
+            ti.Vector.ndarray(3, ti.f32, room) for _ in range(4)
+        )
         if walls:
             low, high = np.full((room, 3), -np.inf), np.full((room, 3), np.inf)
+            joined = {side: np.zeros((room, 3)) for side in (1.0, -1.0)}
             for number, wall in enumerate(walls):
                 others = [axis for axis in range(3) if axis != wall.axis]
                 low[number, others], high[number, others] = wall.lower, wall.upper
+                for other in walls:
+                    if other.axis != wall.axis:
+                        joined[other.side][number, other.axis] = 1.0
             planes = np.array([[*wall.normal, wall.side * wall.offset] for wall in walls])
             self._wall_plane.from_numpy(planes.astype(np.float32))
             self._wall_low.from_numpy(low.astype(np.float32))
             self._wall_high.from_numpy(high.astype(np.float32))
+            self._joined_low.from_numpy(joined[1.0].astype(np.float32))
+            self._joined_high.from_numpy(joined[-1.0].astype(np.float32))
+
+    def set_spacing(self, mean_edge: float) -> None:
+        """Say how far vertices of the cloth are from each other [m]: what is small, and how deep walls hold."""
+        self._spacing = mean_edge
+        self.bodies.look_between_vertices(SMALL_BODY * mean_edge)
+        self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
 
     def place(self, poses: Poses, motion: BodyMotion | None = None) -> None:
         """Say where the bodies are at the start of a substep, and how they move; without motion they stand still."""
@@ -136,7 +157,7 @@ class RigidContact:
         if self._wall_count:
             found = find_wall_contacts(
                 state.vertex_count, *cloth, self._wall_count, self._wall_plane, self._wall_low, self._wall_high,
-                recovery, *contacts.found_arrays,
+                self._joined_low, self._joined_high, self._spacing, recovery, *contacts.found_arrays,
             )  # fmt: skip
         if not self.bodies.count:
             return int(found)
@@ -161,19 +182,25 @@ class RigidContact:
 @ti.kernel
 def find_wall_contacts(
     vertex_count: ti.i32, position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
-    wall_count: ti.i32, plane: Planes, low: Vectors, high: Vectors, recovery: ti.f32,
+    wall_count: ti.i32, plane: Planes, low: Vectors, high: Vectors, joined_low: Vectors, joined_high: Vectors,
+    spacing: ti.f32, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
     friction: Floats, counter: Integers, capacity: ti.i32,
 ) -> ti.i32:  # fmt: skip
-    """Append the vertices that reach a wall; walls are flat, so that vertices are enough."""
+    """Append the vertices that reach a wall; walls are flat, so that vertices are enough.
+
+    Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
+    both.
+    """
     for i in range(vertex_count):
         x, half = position[i], 0.5 * thickness[i]
         for w in range(wall_count):
             n = plane[w].xyz
             distance = n.dot(x) - plane[w].w
             least = least_displacement(distance, half, recovery)
-            is_beside = (x >= low[w]).all() and (x <= high[w]).all() and distance > -2.0 * WALL_DEPTH * half
-            if is_beside and (distance < half or n.dot(displacement[i]) < least):
+            depth = ti.max(2.0 * WALL_DEPTH * half, spacing, displacement[i].norm())
+            is_beside = (x >= low[w] - depth * joined_low[w]).all() and (x <= high[w] + depth * joined_high[w]).all()
+            if is_beside and distance > -depth and (distance < half or n.dot(displacement[i]) < least):
                 slot = ti.atomic_add(counter[0], 1)
                 if slot < capacity:
                     vertices[slot], weights[slot] = Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0)

@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.cloth.parameters import BODY_GRID_CELLS
 from sim.cloth.rigid_contact_shapes import BOX, CAPSULE, CONE, CYLINDER, GRID, SPHERE, TORUS
 from sim.rigid.contacts import Poses
 from sim.rigid.geometry import BodyGeometry
@@ -15,9 +16,6 @@ from sim.shapes.level_set import LevelSet
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 
 Array = NDArray[np.float64]
-
-GRID_CELLS = 96
-"""Cells of a mesh's distance grid along its longest edge: 1 cm of a body of 1 m, as coarse as cloth."""
 
 GRID_PADDING = 3.0
 """How far the grid reaches past the mesh, in cells: distances beyond are upper bounds."""
@@ -48,7 +46,7 @@ class CollisionBodies:
         count: number of bodies, b.
         kind: of the shape, (b,).
         size: of a primitive, (b,) vec3, scaled.
-        has_edges: whether more than vertices must be looked at, as the shape has sharp edges, (b,).
+        has_edges: whether more than vertices must be looked at, as the shape has sharp edges or is small, (b,).
         centre_of_mass: in the frame of the shape [m], (b,) vec3.
         radius: largest distance from the centre of mass [m], (b,).
         step: half width of differences for normals [m], (b,).
@@ -112,6 +110,12 @@ class CollisionBodies:
         mobility = inverse_mass + reach**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
         self.load_unit = LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0
 
+    def look_between_vertices(self, length: float) -> None:
+        """Look at more than vertices where a body has sharp edges, or its box an edge that is shorter [m]."""
+        if self.count:
+            is_small = np.array([geometry.shortest_edge < length for geometry in self.geometries])
+            self.has_edges.from_numpy((~np.isin(self.kind.to_numpy(), _ROUND) | is_small).astype(np.int32))
+
     def set_motion(self, shift: Array, turn: Array) -> None:
         """Say how the bodies would move in a substep without cloth.
 
@@ -147,7 +151,7 @@ class CollisionBodies:
                 step[number] = GRADIENT_STEP * geometry.shortest_edge
                 continue
             if id(geometry) not in sampled:
-                cell = float(np.max(np.ptp(geometry.bounds, axis=0))) / GRID_CELLS
+                cell = float(np.max(np.ptp(geometry.bounds, axis=0))) / BODY_GRID_CELLS
                 level_set = LevelSet.sample(solid, cell, padding=GRID_PADDING * cell)
                 sampled[id(geometry)] = sum(each.size for each in values), level_set
                 values.append(level_set.values.ravel())

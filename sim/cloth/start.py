@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -17,7 +19,7 @@ REGION_MARGIN = 1.0e-6
 """Nodes so far outside of a region still count [m]: sizes written in decimal do not add up exactly."""
 
 PAIRS_AT_ONCE = 1_000_000
-"""Edges and triangles that are held against each other at a time: 200 MB."""
+"""Pairs of an edge and a triangle that are looked at together, up to 400 MB; more only where one edge has more."""
 
 
 def start_positions(cloth: ClothParameters, sheet: RestSheet) -> Floats:
@@ -84,7 +86,8 @@ def first_crossing(position: Floats, edges: Indices, triangles: Indices) -> Floa
     """Where an edge passes through a triangle with which it shares no node [m], (3,); None if none does.
 
     Two triangles that cross have such an edge. One that just touches counts, as in scenes made of round numbers sheets
-    cross at their nodes; sheets that lie in one plane do not cross.
+    cross at their nodes; sheets that lie in one plane do not cross. Triangles of like size are searched together, so
+    that large ones do not make the search around small ones wide.
 
     Args:
         position: of nodes [m], (n, 3).
@@ -96,21 +99,30 @@ def first_crossing(position: Floats, edges: Indices, triangles: Indices) -> Floa
     ends, corners = position[edges], position[triangles]
     middle, centre = ends.mean(axis=1), corners.mean(axis=1)
     reach = np.linalg.norm(ends - middle[:, None], axis=2).max(axis=1)
-    radius = float(np.linalg.norm(corners - centre[:, None], axis=2).max())
-    tree = cKDTree(centre)
-    batch = max(1, PAIRS_AT_ONCE // 50)  # neighbours of an edge in a sheet of equal triangles
-    for first in range(0, len(edges), batch):
-        near = tree.query_ball_point(middle[first : first + batch], reach[first : first + batch] + radius)
-        counts = [len(each) for each in near]
-        if not any(counts):
-            continue
-        edge = first + np.repeat(np.arange(len(near)), counts)
-        triangle = np.concatenate([each for each in near if each]).astype(np.int64)
-        apart = (edges[edge][:, :, None] != triangles[triangle][:, None, :]).all(axis=(1, 2))
-        point = _first_piercing(ends[edge[apart]], corners[triangle[apart]])
-        if point is not None:
-            return point
+    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    power_of_two = np.frexp(radius)[1]
+    for power in np.unique(power_of_two):
+        group = np.flatnonzero(power_of_two == power)
+        for edge, member in _near_pairs(cKDTree(centre[group]), middle, reach + radius[group].max()):
+            triangle = group[member]
+            apart = (edges[edge][:, :, None] != triangles[triangle][:, None, :]).all(axis=(1, 2))
+            point = _first_piercing(ends[edge[apart]], corners[triangle[apart]])
+            if point is not None:
+                return point
     return None
+
+
+def _near_pairs(
+    tree: cKDTree, centres: Floats, reaches: Floats
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Numbers of centres (n, 3) and of the tree's points within their reaches (n,) [m], some pairs at a time, (m,)."""
+    counts = tree.query_ball_point(centres, reaches, return_length=True)
+    meeting = np.flatnonzero(counts)
+    batch = np.cumsum(counts[meeting]) // PAIRS_AT_ONCE
+    for numbers in np.split(meeting, np.flatnonzero(np.diff(batch)) + 1):
+        if len(numbers):
+            near = tree.query_ball_point(centres[numbers], reaches[numbers])
+            yield np.repeat(numbers, counts[numbers]), np.concatenate(near).astype(np.int64)
 
 
 def _first_piercing(ends: Floats, corners: Floats) -> Floats | None:

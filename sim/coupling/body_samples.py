@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
 from sim.fluid.boundary_akinci2012 import BoundarySamples, sink_samples
-from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate
+from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, wall_calibration
 
 if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver
@@ -34,8 +34,9 @@ OUTWARD_ROUNDS = 4
 """Steps by which points of the surface are moved out to where particles touch it."""
 
 LEAST_FACTOR = 0.25
-"""With a quarter a particle amid the samples of a sheet still has 6/4 of the rest density from them alone, so that none
-gets through."""
+"""Least factor at the usual support: with a quarter a particle amid the samples of a sheet still has 6/4 of the rest
+density from them alone, so that none gets through. Samples for a wider support are weaker, 4 at 2.5 spacings and 2.5 at
+4 instead of 6, and `least_factor` is larger."""
 
 
 def samples_of_moving_bodies(
@@ -55,6 +56,12 @@ def samples_of_moving_bodies(
         factors = completing_factors(sunk, surface, signed_distance, spacing, support_in_spacings)
         samples.append(sunk.scaled(factors))
     return BoundarySamples.of_bodies(*samples)
+
+
+def least_factor(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Least factor on a sample's volume [-]: a sheet of such samples has 1.5 times the rest density at any support."""
+    usual, wide = wall_calibration(), wall_calibration(support_in_spacings)
+    return LEAST_FACTOR * (usual.volume_factor / wide.volume_factor)
 
 
 def completing_factors(
@@ -99,10 +106,13 @@ def completing_factors(
     reached = given_by_reached > 0.0
     if not reached.any():
         return np.ones(len(points))
+    if not (weights.T @ lacking).any():
+        # So small that its inside falls between the points of the quadrature.
+        return np.full(len(points), least_factor(support_in_spacings))
     factors = (weights.T @ lacking)[reached] / given_by_reached[reached]
     # Means that weigh strong points more are too low; over the whole surface nothing is to lack.
     factors *= lacking.sum() / (weights[:, np.flatnonzero(reached)] @ factors).sum()
-    factors = np.maximum(factors, LEAST_FACTOR)
+    factors = np.maximum(factors, least_factor(support_in_spacings))
     # A large body has too few probes for all its samples: the others do as those nearby.
     return factors[cKDTree(points[reached]).query(points)[1]]
 
@@ -115,9 +125,9 @@ def _share_inside(probes: NDArray[np.float64], signed_distance: SignedDistance, 
     weights = evaluate(np.linalg.norm(offsets, axis=1), support)
     weights /= weights.sum()
     shares = [np.empty(0)]
-    for batch in np.array_split(probes, math.ceil(len(probes) / PROBES_AT_A_TIME)):
+    for batch in np.array_split(probes, max(1, math.ceil(len(probes) / PROBES_AT_A_TIME))):
         inside = signed_distance((batch[:, None] + offsets).reshape(-1, 3)) < 0.0
-        shares.append(inside.reshape(len(batch), -1) @ weights)
+        shares.append(inside.reshape(len(batch), len(offsets)) @ weights)
     return np.concatenate(shares)
 
 

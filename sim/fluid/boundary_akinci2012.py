@@ -6,7 +6,8 @@ the samples belong together: with both, one layer of samples has the density and
 (`sim.fluid.kernels.wall_calibration`). In the fluid's density a sample counts as Psi_b = rho0 V_b (eq. 5).
 
 A support wider than usual takes two layers, each with its own factor and distance (`sim.fluid.kernels.wall_layers`),
-and volumes that multiply where walls meet (`domain_wall_samples`).
+and volumes that multiply where walls meet (`domain_wall_samples`). Bodies too thin for the second one keep to one
+layer, whose push alone lets nothing pass.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ SignedDistance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6
 """Rounds in which samples sink into a body, each by this part of the way that is left: 0.4 % of it is left then."""
+
+DEEP_ENOUGH = 0.95
+"""Part of the second layer's depth at which its samples still do what they should; less in a body has one layer."""
 
 FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
@@ -69,6 +73,8 @@ class BoundarySamples:
             )
         if not np.isfinite(self.positions).all():
             raise ValueError("boundary samples must be finite numbers")
+        if self.factor is not None and not np.isfinite(self.factor).all():
+            raise ValueError("factors of boundary samples must be finite numbers")
 
     @classmethod
     def of_bodies(cls, *bodies: NDArray[np.floating] | BoundarySamples) -> BoundarySamples:
@@ -159,9 +165,12 @@ def sink_samples(
 ) -> BoundarySamples:
     """Samples 0.95 spacings inside of a body's surface, so that fluid at rest touches the surface.
 
-    Where a body is thinner than twice that, its samples stop at the middle, and fluid keeps a gap. With a support
-    wider than usual there are two layers of them. What cannot lie as deep as the second one should has as much less
-    volume as leaves its field at the fluid that touches the surface the same.
+    Where a body is thinner than twice that, its samples stop at the middle, and fluid keeps a gap.
+
+    With a support wider than usual there are two layers of them. What cannot lie quite as deep as the second one should
+    has as much less volume as leaves its field at the fluid that touches the surface the same. Where the body is too
+    thin for the second layer, one layer stands for both: the first of two has about the volume of a layer of fluid,
+    which has less than rest density when it is alone, and keeps nothing out.
 
     Args:
         samples: points on the surface [m], (m, 3).
@@ -169,23 +178,21 @@ def sink_samples(
         spacing: particle spacing of the fluid [m].
         support_in_spacings: support radius of its kernel.
     """
-    layers = wall_layers(support_in_spacings)
-    sunk, factors = [], []
-    for layer in layers:
-        depth = (layer.standoff_in_spacings - 0.5) * spacing
-        points, reached = _sunk(samples, signed_distance, spacing, depth)
-        sunk.append(points)
-        factor = np.full(len(points), layer.volume_factor / wall_calibration(support_in_spacings).volume_factor)
-        if len(layers) > 1:
-            factor *= _weakened(reached / spacing + 0.5, layer.standoff_in_spacings, support_in_spacings)
-        factors.append(factor)
-    positions = np.concatenate(sunk)
-    return BoundarySamples(
-        positions,
-        np.zeros(len(positions), dtype=np.int32),
-        factor=np.concatenate(factors),
-        layer=np.repeat(np.arange(len(layers), dtype=np.int32), len(samples)),
-    )
+    alone = wall_calibration(support_in_spacings)
+    positions, _ = _sunk(samples, signed_distance, spacing, (alone.standoff_in_spacings - 0.5) * spacing)
+    factor, layer = np.ones(len(positions)), np.zeros(len(positions), dtype=np.int32)
+    if support_in_spacings != SUPPORT_IN_SPACINGS:
+        near, far = wall_layers(support_in_spacings)
+        far_depth = (far.standoff_in_spacings - 0.5) * spacing
+        far_positions, reached = _sunk(samples, signed_distance, spacing, far_depth)
+        is_deep = reached >= DEEP_ENOUGH * far_depth
+        near_positions, _ = _sunk(samples, signed_distance, spacing, (near.standoff_in_spacings - 0.5) * spacing)
+        positions = np.concatenate([np.where(is_deep[:, None], near_positions, positions), far_positions[is_deep]])
+        weakened = _weakened(reached[is_deep] / spacing + 0.5, far.standoff_in_spacings, support_in_spacings)
+        near_factor = np.where(is_deep, near.volume_factor / alone.volume_factor, 1.0)
+        factor = np.concatenate([near_factor, far.volume_factor / alone.volume_factor * weakened])
+        layer = np.repeat(np.arange(2, dtype=np.int32), [len(samples), np.count_nonzero(is_deep)])
+    return BoundarySamples(positions, np.zeros(len(positions), dtype=np.int32), factor=factor, layer=layer)
 
 
 def _sunk(

@@ -156,7 +156,7 @@ class Emission:
         grid = self._grid
         find_free_places(
             places, count, moved, particles.position, particles.cells.cell_start, sorted_count, particles.count,
-            ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape),
+            ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape), grid.reach,
             BLOCKED_IN_SPACINGS * min(self._spacing, opening.layer_distance), self._free,
         )  # fmt: skip
         added = exclusive_scan(self._free, count, self._scratch, self._order)
@@ -209,21 +209,21 @@ def drive_nozzle(
 def find_free_places(
     places: Vectors, count: ti.i32, moved: ti.math.vec3, position: Vectors, cell_start: Integers,
     sorted_count: ti.i32, particle_count: ti.i32,
-    origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, clearance: ti.f32, free: Integers,
+    origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, reach: ti.i32, clearance: ti.f32, free: Integers,
 ):  # fmt: skip
     """1 for each place without a particle nearer than the clearance, else 0.
 
-    Particles have moved by less than the skin since they were sorted; a cell is wider than both together. Those that
-    other layers brought in this step, from `sorted_count` on, are in no cell yet.
+    Particles have moved by less than the skin since they were sorted; the cells to either side are wider than both
+    together. Those that other layers brought in this step, from `sorted_count` on, are in no cell yet.
     """
     for k in range(count):
         x_k = places[k] + moved
-        cell = cell_of_point(x_k, origin, inverse_cell_size, shape)
+        cell = cell_of_point(x_k, origin, inverse_cell_size, shape, reach)
         near = 0
-        for dz in range(-1, 2):
-            for dy in range(-1, 2):
+        for dz in range(-reach, reach + 1):
+            for dy in range(-reach, reach + 1):
                 row = row_of_cell(cell, dy, dz, shape)
-                for j in range(cell_start[row - 1], cell_start[row + 2]):
+                for j in range(cell_start[row - reach], cell_start[row + reach + 1]):
                     near += ti.cast((position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)
         for j in range(sorted_count, particle_count):
             near += ti.cast((position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)

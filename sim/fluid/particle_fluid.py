@@ -98,7 +98,7 @@ class ParticleFluid(ABC):
         self._openings = box.openings
         self._stepper = ParticleStepper(box)
         self._search_radius = (1.0 + self.parameters.skin) * self.support_radius
-        self._grid = CellGrid.covering(
+        self._grid = CellGrid.covering_as_finely_as_fits(
             np.array(domain.min), np.array(domain.max), self._search_radius,
             reach=cells_per_radius(self.parameters.support_in_spacings),
         )  # fmt: skip

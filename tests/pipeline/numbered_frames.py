@@ -19,6 +19,7 @@ from sim.world import FrameReport
 JOB = """
 name = "{name}"
 frames = 30
+[whitewater.water]
 [[fluid]]
 name = "water"
 [[fluid.block]]
@@ -27,12 +28,31 @@ shape = {{ type = "box", size = [0.3, 0.3, 0.3] }}
 
 
 def submitted(folder: Path, *, name: str = "tank") -> JobLayout:
-    """A job without a single frame."""
+    """A job without a single frame, whose fluid has whitewater."""
     layout = JobLayout(folder)
     layout.root.mkdir(parents=True)
     layout.job_file.write_text(JOB.format(name=name))
-    Manifest(layout.manifest).close()
+    plan(layout, whitewater_task(layout, 0))
     return layout
+
+
+def plan(layout: JobLayout, *tasks: Task) -> None:
+    """Make these the job's tasks."""
+    with Manifest(layout.manifest) as manifest:
+        manifest.record_plan(tasks)
+
+
+def whitewater_task(layout: JobLayout, frame: int, *, fluid: str = "water", **parameters: float) -> Task:
+    """The task of a fluid's whitewater of one frame."""
+    return Task(
+        TaskId(f"whitewater/{fluid}/{frame:06d}"),
+        "whitewater",
+        (layout.frame_cache(frame),),
+        (layout.whitewater(fluid, frame),),
+        ParameterSet.of(stage="whitewater", version=1, tools={}, **parameters),
+        subject=fluid,
+        frame=frame,
+    )
 
 
 def commit(layout: JobLayout, frame: int, *, fingerprint: str = "f", **water: float) -> Receipt:
@@ -54,16 +74,19 @@ def commit(layout: JobLayout, frame: int, *, fingerprint: str = "f", **water: fl
     return new.receipt
 
 
-def commit_whitewater(layout: JobLayout, frame: int, cached: Receipt, *, points: int = 3, not_made: int = 0) -> Receipt:
+def commit_whitewater(
+    layout: JobLayout,
+    frame: int,
+    cached: Receipt,
+    *,
+    points: int = 3,
+    not_made: int = 0,
+    fluid: str = "water",
+    **parameters: float,
+) -> Receipt:
     """The fluid's whitewater of a frame, as it is committed; `cached` is the receipt of that frame of the cache."""
     vectors, numbers = np.zeros((points, 3), np.float32), np.ones(points, np.float32)
-    task = Task(
-        TaskId(f"whitewater/water/{frame:06d}"),
-        "whitewater",
-        (cached.artifact,),
-        (layout.whitewater("water", frame),),
-        ParameterSet.of(stage="whitewater", version=1, tools={}),
-    )
+    task = whitewater_task(layout, frame, fluid=fluid, **parameters)
     with committing(
         layout,
         task.outputs[0],

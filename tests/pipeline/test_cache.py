@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import h5py
 import numpy as np
 import pytest
 
@@ -64,6 +65,13 @@ def test_the_same_frame_gives_the_same_bytes(tmp_path):
     for name in ("a.h5", "b.h5"):
         write_frame(tmp_path / name, bodies(), REPORT, device="cpu")
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_a_frame_made_in_memory_has_the_bytes_that_hdf5_writes_to_the_disk(tmp_path, monkeypatch):
+    write_frame(tmp_path / "memory.h5", bodies(), REPORT, device="cpu")
+    monkeypatch.setattr("pipeline.cache._new_file", lambda path: h5py.File(path, "w", libver=("v108", "v110")))
+    write_frame(tmp_path / "disk.h5", bodies(), REPORT, device="cpu")
+    assert (tmp_path / "memory.h5").read_bytes() == (tmp_path / "disk.h5").read_bytes()
 
 
 def test_a_fluid_without_particles_is_a_frame_too(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from pipeline.job.checks import check_job
+from pipeline.job.cloth_checks import BYTES_PER_NODE
 from pipeline.job.loading import LoadedJob, read_job
 from pipeline.job.problems import Findings
 
@@ -140,6 +141,16 @@ def test_more_nodes_than_memory_holds_are_refused_with_the_number_that_fits(tmp_
     )
 
 
+def test_cloths_that_fit_one_by_one_but_not_together_are_refused(tmp_path):
+    text = SHEET + SECOND.replace("0.5]", "0.7]")
+    assert errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * (81 + 49)) == []
+    (problem,) = errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * (81 + 49) - 1)
+    assert problem == (
+        "drape.toml:11 cloth[1].shape.counts: 49 nodes and 81 of the cloths before it need 0.00078 GB, "
+        "this machine has 0.00078 GB; at most 48 fit: divide it less finely"
+    )
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -181,6 +192,16 @@ def test_a_mesh_that_is_no_sheet_is_refused(tmp_path):
     assert problem.startswith('drape.toml:6 cloth[0].shape: shape.file: 1 edges of "shawl.ply" have three triangles')
 
 
+def test_a_mesh_of_more_nodes_than_memory_holds_is_refused(tmp_path):
+    text = mesh_job(SQUARE, [[0, 1, 2], [0, 2, 3]], tmp_path)
+    assert errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * 4) == []
+    (problem,) = errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * 3)
+    assert problem == (
+        "drape.toml:6 cloth[0].shape.file: 4 nodes need 2.4e-05 GB, this machine has 1.8e-05 GB; "
+        "at most 3 fit: take a coarser mesh"
+    )
+
+
 def test_a_mesh_that_passes_through_itself_is_refused_unless_it_need_not_collide_with_itself(tmp_path):
     spike = [[0.05, 0.1, -0.1], [0.15, 0.1, -0.1], [0.1, 0.1, 0.1]]
     text = mesh_job([*SQUARE, *spike], [[0, 1, 2], [0, 2, 3], [4, 5, 6]], tmp_path)
@@ -207,3 +228,34 @@ def test_too_few_substeps_for_explicit_springs_are_refused_with_a_number_that_is
     least = int(re.search(place + r".* give substeps = (\d+) or more", problem)[1])
     assert problems(least) == []
     assert len(problems(least - 1)) == 1
+
+
+def test_explicit_springs_need_the_substeps_of_nodes_that_are_let_go_from_the_start(tmp_path):
+    """Nodes that are held bear steps of any length."""
+
+    def problems(release: str) -> list[str]:
+        pin = f"[[cloth.pin]]\nindex = {list(range(81))}\n{release}"
+        return errors(f'{SHEET}integrator = "explicit"\nsubsteps = 20\n{pin}', tmp_path)
+
+    assert problems("") == []
+    (problem,) = problems("release_s = 0.5")
+    assert re.search(r"cloth\[0\]\.substeps: 20 substeps a frame are .* give substeps = \d+ or more", problem)
+
+
+def test_bodies_that_fit_between_the_nodes_are_told(tmp_path):
+    small = BALL.replace("radius = 0.1", "radius = 0.06")
+    (warning,) = warnings(SHEET + small, tmp_path)
+    assert warning.startswith(
+        'drape.toml:6 cloth[0].shape: "ball" is 0.12 m across, less than two of the longest edges, 0.0707 m each'
+    )
+
+
+@pytest.mark.parametrize(("wall", "is_told"), [(0.004, True), (0.02, False)])
+def test_bowls_with_thinner_walls_than_cloth_can_feel_are_told(wall, is_told, tmp_path):
+    shell = trimesh.creation.icosphere(3, 0.2)
+    inner = trimesh.creation.icosphere(3, 0.2 - wall)
+    inner.invert()
+    trimesh.util.concatenate([shell, inner]).export(tmp_path / "shell.ply")
+    body = BALL.replace('"sphere", radius = 0.1', '"mesh", file = "shell.ply"').replace("0.3]", "0.25]")
+    told = [line for line in warnings(SHEET + body, tmp_path) if "on walls thinner than 0.00833 m" in line]
+    assert len(told) == is_told

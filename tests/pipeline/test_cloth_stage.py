@@ -11,6 +11,7 @@ import trimesh
 from pipeline.cache import read_frame, validate_frame, write_frame
 from pipeline.executors.base import Assignment, Finished
 from pipeline.executors.inline import InlineExecutor
+from pipeline.job.checks import load_checked_job
 from pipeline.job.inputs import keep_inputs
 from pipeline.job.loading import read_job
 from pipeline.job.models import Job
@@ -18,9 +19,10 @@ from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
 from pipeline.stages import STAGES
 from pipeline.stages.cloth import ClothStage
-from pipeline.stages.inputs import most_cloth_nodes
+from pipeline.stages.inputs import estimated_cloth_nodes, estimated_nodes
 from pipeline.stages.render import render_spec
 from render.meshes import read_ply
+from sim.cloth.sheet import build_sheet
 from sim.snapshots import Snapshot
 from sim.world import FrameReport
 
@@ -88,10 +90,31 @@ def test_a_mesh_of_a_cloth_is_kept_with_the_job_and_counts_by_its_content(tmp_pa
     first, text = keep_inputs(read_job(with_mesh(tmp_path, width=1.0)), layout)
     (copy,) = layout.inputs.iterdir()
     assert f'file = "inputs/{copy.name}"' in text
-    assert most_cloth_nodes(first) >= 4
+    assert estimated_cloth_nodes(first) >= 4
     digest = digests(read_job(with_mesh(tmp_path, width=1.0)).job)["simulate"]
     assert digests(first)["simulate"] == digest
     assert digests(read_job(with_mesh(tmp_path, width=2.0)).job)["simulate"] != digest
+
+
+def test_nodes_of_a_mesh_are_not_estimated_too_low_by_a_file_of_short_numbers(tmp_path):
+    octagon = ["3 0", "6 0", "9 3", "9 6", "6 9", "3 9", "0 6", "0 3"]
+    path = tmp_path / "shawl.obj"
+    path.write_text("".join(f"v {point} 0\n" for point in octagon) + "f 1 2 3 4 5 6 7 8\n")
+    cloth = job(cloth=({"name": "sheet", "shape": {"type": "mesh", "file": str(path)}},)).cloth[0]
+    assert len(build_sheet(cloth.shape).vertices) == 8
+    assert estimated_nodes(cloth) >= 8
+
+
+def test_memory_of_a_mesh_task_grows_with_the_nodes_of_its_cloth():
+    def memory(counts: tuple[int, int]) -> int:
+        shape = SHEET["shape"] | {"counts": counts}
+        (task, *_) = ClothStage().plan(job(cloth=(SHEET | {"shape": shape},)), LAYOUT)
+        return task.resources.memory_bytes
+
+    small, large = memory((5, 4)), memory((2001, 2000))
+    # Two triangles a node of 3 x 4 bytes, and position, velocity and normal: read, and written once more.
+    assert large - small > 2 * (2 * 12 + 3 * 12) * 4_000_000
+    assert small > 100_000_000  # the interpreter with its libraries
 
 
 @pytest.mark.parametrize(
@@ -108,9 +131,19 @@ def test_a_preview_has_cells_twice_as_large(written, coarser, tmp_path):
     assert {key: getattr(shape, key) for key in coarser} == coarser
 
 
-def test_a_preview_leaves_a_sheet_alone_whose_nodes_are_pinned_by_number(tmp_path):
+@pytest.mark.parametrize(
+    "place",
+    [
+        "index = [19]",
+        # In a sheet of half as many cells no node starts here: the job would be refused.
+        'region = { type = "sphere", position = [-0.1, 0.05, 0.5], radius = 0.01 }',
+    ],
+    ids=["number", "region"],
+)
+def test_a_preview_leaves_a_sheet_alone_of_which_it_would_pin_other_nodes(place, tmp_path):
     path = tmp_path / "drape.toml"
-    path.write_text(JOB_FILE + "[[cloth.pin]]\nindex = [19]\n")
+    path.write_text(f"{JOB_FILE}[[cloth.pin]]\n{place}\n")
+    assert load_checked_job(path)[1].errors == load_checked_job(path, preview=True)[1].errors == []
     assert read_job(path, preview=True).job.cloth[0].shape.counts == (5, 4)
 
 

@@ -9,7 +9,12 @@ import pytest
 
 from pipeline.job.checks import check_job
 from pipeline.job.fluid_checks import MOST_CELLS, particle_room
+from pipeline.job.jet_checks import _longest_flight, check_jets
 from pipeline.job.loading import read_job
+from pipeline.job.problems import Findings
+from sim.fluid.opening import Opening
+from sim.shapes import build_solid
+from sim.shapes.placement import PlacedSolid
 
 HEAD = 'name = "tank"\nframes = 60\n'
 WATER = """
@@ -150,6 +155,7 @@ speed = {speed}
 
 JETS = JET.partition("[[fluid.emitter]]")[0]
 ACROSS = emitter("[-0.45, 0.0, 0.5]", "[1, 0, 0]", speed=5.0)
+FOUNTAIN = emitter("[0.0, 0.0, 0.16]", "[0.17365, 0, 0.98481]", speed=3.0)
 
 
 @pytest.mark.parametrize(
@@ -160,8 +166,11 @@ ACROSS = emitter("[-0.45, 0.0, 0.5]", "[1, 0, 0]", speed=5.0)
         (emitter("[0.1, 0.0, 0.25]", "[0, 0, -1]") + emitter("[0.1, 0.0, 0.9]", "[0, 0, -1]"), "0.2"),
         # On a parabola over 0.6 m, which is 9 cm lower there than a straight line.
         (emitter("[0.3, 0.0, 0.22]", "[0, 0, -1]") + emitter("[-0.4, 0.0, 0.55]", "[1, 0, 0]", speed=3.0), "0.2"),
+        # Up at 80 degrees through a nozzle of 8 cm, which takes 0.03 s, and down again after 2 v sin(80°)/g = 0.60 s,
+        # 0.31 m away: 1.6 times as long as it would take to the far corner without gravity.
+        (emitter("[0.3, 0.0, 0.16]", "[0, 0, 1]", more="start_s = 0.9") + FOUNTAIN, "0.63"),
     ],
-    ids=["head-on", "from above", "on a parabola"],
+    ids=["head-on", "from above", "on a parabola", "fountain"],
 )
 def test_a_jet_that_runs_into_another_nozzle_is_warned_of(text, arrival, tmp_path):
     errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
@@ -191,6 +200,44 @@ def test_jets_that_meet_something_else_first_pass_without_a_word(text, tmp_path)
     errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
     assert errors == []
     assert not [warning for warning in warnings if "its jet" in warning or "before its opening" in warning]
+
+
+@pytest.mark.parametrize("gravity", [0.0, 1e-9, 1.62, 9.81])
+@pytest.mark.parametrize("speed", [0.5, 3.0, 6.0])
+def test_a_jet_is_followed_until_it_has_left_whatever_its_direction_and_hardly_longer(speed, gravity):
+    """Through a distance of 1.1 m, in directions from straight down to straight up, of which the last takes longest."""
+    end_s = _longest_flight(speed, gravity, 1.1)
+    up = np.linspace(-1.0, 1.0, 41)[:, None]
+    t = np.linspace(0.0, end_s, 5001)
+    across = np.sqrt(1.0 - up**2) * speed * t
+    away = np.hypot(across, up * speed * t - 0.5 * gravity * t**2)
+    # The last step alone is as short as 0.02 % of the way.
+    assert (away.max(axis=1) >= 1.1 * (1.0 - 1e-9)).all()
+    assert away[-1, :-1].max() < 1.1
+
+
+def test_a_body_out_of_a_jets_way_is_not_asked_for_distances(tmp_path, monkeypatch):
+    """Those of a mesh take long, and thousands of places are looked at."""
+    bodies = {"plate": "[0.0, 0.0, 0.3]", "far": "[0.4, 0.4, 0.5]"}
+    text = "".join(
+        f'[[rigid]]\nname = "{name}"\nshape = {{ type = "box", size = [0.1, 0.1, 0.1] }}\nposition = {position}\n'
+        for name, position in bodies.items()
+    )
+    path = tmp_path / "tank.toml"
+    path.write_text(HEAD + JET + text)
+    job = read_job(path).job
+    solids = {("rigid", index): build_solid(body) for index, body in enumerate(job.rigid)}
+    asked = []
+    distance = PlacedSolid.signed_distance
+
+    def record(solid, points):
+        asked.append(solid)
+        return distance(solid, points)
+
+    monkeypatch.setattr(PlacedSolid, "signed_distance", record)
+    opening = Opening.of(job.fluid[0].emitter[0], 0.04, 0.04**3, 2.0)
+    check_jets(job, solids, {("fluid", 0, "emitter", 0): opening}, 0.04, Findings())
+    assert {id(solid) for solid in asked} == {id(solids["rigid", 0])}
 
 
 PLATE = '[[rigid]]\nname = "plate"\nshape = {{ type = "box", size = [0.5, 0.5, 0.02] }}\nposition = [0, 0, {height}]\n'

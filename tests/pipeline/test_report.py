@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from numbered_frames import commit, commit_whitewater, submitted
+from numbered_frames import commit, commit_whitewater, submitted, whitewater_task
 from PIL import Image
 
 from pipeline.artifacts import committing
@@ -237,7 +237,7 @@ def layout(tmp_path) -> JobLayout:
     task = Task(TaskId("simulate"), "simulate", (), (), ParameterSet.of(stage="simulate", version=1, tools={}))
     with Manifest(layout.manifest) as manifest:
         manifest.begin_run("tank")
-        manifest.record_plan([task], {task.id: TaskState.PENDING})
+        manifest.record_plan([task, whitewater_task(layout, 0)])
         lost = manifest.start_attempt(task.id)
         manifest.finish_attempt(task.id, lost, failure=FailureKind.WORKER_LOST, message="gone", seconds=1.0)
         manifest.finish_attempt(task.id, manifest.start_attempt(task.id), seconds=3.0, peak_memory_bytes=5 << 20)
@@ -319,7 +319,7 @@ def test_the_report_warns_of_whitewater_that_had_no_room_or_is_damaged(layout):
     write_report([layout], layout.report)
     text = layout.report.read_text()
     assert "whitewater of water: 11 particles were not made, as there are max_particles, frame 3" in text
-    assert "whitewater that cannot be read: whitewater/water/000004.ply" in text
+    assert "whitewater of water that cannot be read: frame 4" in text
 
 
 def test_a_name_is_text_and_no_markup(tmp_path):

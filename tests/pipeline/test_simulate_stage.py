@@ -16,7 +16,7 @@ import pytest
 from simulation_on_a_full_disk import FRAMES as FRAMES_OF_FULL_DISK
 
 from pipeline.artifacts import is_committed, sweep_parts
-from pipeline.cache import read_frame, write_frame
+from pipeline.cache import Checkpoint, read_frame, write_checkpoint, write_frame
 from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.layout import JobLayout
 from pipeline.task import FailureKind
@@ -195,3 +195,22 @@ def test_a_disk_that_is_full_for_a_frame_is_told_as_such(layout: JobLayout, monk
     assert ended.message.endswith("; while frame 2 was written")
     assert not list(layout.checkpoints.glob("*.h5"))  # it would be ahead of the frames
     assert isinstance(simulate(layout, frames=6, attempt=2), Finished)
+
+
+def test_a_checkpoint_that_meets_a_full_disk_leaves_nothing_of_it(
+    layout: JobLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it had written so far would keep the disk full, until the job is run again."""
+
+    def fill_up(path: Path, checkpoint: Checkpoint) -> None:
+        write_checkpoint(path, checkpoint)
+        os.truncate(path, path.stat().st_size // 2)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as full_disk:
+        full_disk.setattr("pipeline.stages.simulate.write_checkpoint", fill_up)
+        ended = simulate(layout, frames=2)
+    assert isinstance(ended, Failed)
+    assert ended.kind is FailureKind.DISK_FULL
+    assert ended.message.endswith("; while the checkpoint of frame 1 was written")
+    assert list(layout.checkpoints.iterdir()) == []

@@ -6,14 +6,17 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from numbered_frames import commit, commit_whitewater, submitted
+from numbered_frames import commit, commit_whitewater, plan, submitted, whitewater_task
 
 from pipeline.cache import read_numbers
 from pipeline.cli import main
 from pipeline.executors.base import Committed
+from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
+from pipeline.plan import plan_job
 from pipeline.quantities import quantity
 from pipeline.solver_numbers import SolverWatch, simulation_numbers
+from pipeline.stages import STAGES
 from pipeline.task import TaskId
 
 
@@ -61,6 +64,14 @@ def test_what_is_counted_since_the_start_is_not_counted_again_in_every_frame(lay
     for frame, total in enumerate([0, 0, 1, 1, 3, 3]):
         commit(layout, frame, bodies_lost=float(total))
     assert "warning: water: 3 bodies fell out of sight and were stopped, frames 2, 4\n" in status(layout)
+
+
+def test_crossings_of_cloth_that_were_left_are_a_warning_with_their_frames(layout):
+    for frame, count in enumerate([0, 2, 0, 1]):
+        commit(layout, frame, crossings_left=float(count))
+    text = status(layout)
+    assert "warning: water: 3 crossings of cloth could not be prevented, frames 1, 3\n" in text
+    assert "crossings left 1\n" in text
 
 
 def test_status_for_machines_has_all_of_it(layout):
@@ -134,11 +145,62 @@ def test_whitewater_of_an_earlier_version_of_the_simulation_does_not_count(layou
 
 
 def test_whitewater_that_cannot_be_read_is_said(layout):
-    receipt = commit_whitewater(layout, 0, commit(layout, 0))
-    layout.path(receipt.artifact).write_bytes(b"gone")
+    plan(layout, *(whitewater_task(layout, 0, fluid=fluid) for fluid in ("oil", "water")))
+    for frame in range(5):
+        cached = commit(layout, frame)
+        for fluid in ("oil", "water"):
+            receipt = commit_whitewater(layout, frame, cached, fluid=fluid)
+            if frame in ((2,) if fluid == "oil" else (0, 3, 4)):
+                layout.path(receipt.artifact).write_bytes(b"gone")
     text = status(layout)
-    assert "water, frame 0" in text
-    assert "whitewater that cannot be read: whitewater/water/000000.ply; see: pipeline verify" in text
+    assert "water, frame 4" in text
+    assert "whitewater of oil that cannot be read: frame 2; see: pipeline verify" in text
+    assert "whitewater of water that cannot be read: frames 0, 3-4; see: pipeline verify" in text
+    assert json.loads(status(layout, "--json"))["simulation"]["unreadable_whitewater"] == [
+        "whitewater/oil/000002.ply",
+        *(f"whitewater/water/00000{frame}.ply" for frame in (0, 3, 4)),
+    ]
+
+
+def test_whitewater_of_an_earlier_format_is_counted_without_what_had_no_room(layout):
+    receipt = commit_whitewater(layout, 0, commit(layout, 0), points=7)
+    path = layout.path(receipt.artifact)
+    path.write_bytes(path.read_bytes().replace(b"comment not_made 0\n", b""))
+    numbers = simulation_numbers(layout)
+    assert numbers.unreadable_whitewater == ()
+    assert numbers.last.solvers["whitewater of water"] == {"whitewater_particles": 7.0}
+
+
+def test_whitewater_of_replaced_parameters_does_not_count(layout):
+    """Of a run that was stopped after two frames of five had been made anew; the other fluid's are as they were."""
+    plan(layout, *(whitewater_task(layout, 0, fluid=fluid) for fluid in ("oil", "water")))
+    cached = [commit(layout, frame) for frame in range(5)]
+    for frame, of in enumerate(cached):
+        commit_whitewater(layout, frame, of, fluid="oil", not_made=1, rate=1.0)
+        commit_whitewater(layout, frame, of, not_made=10, rate=1.0)
+    for frame in (0, 1):
+        commit_whitewater(layout, frame, cached[frame], not_made=2, rate=2.0)
+    assert {each.solver: (each.count, each.frames) for each in simulation_numbers(layout).warnings()} == {
+        "whitewater of oil": (5, (0, 1, 2, 3, 4)),
+        "whitewater of water": (4, (0, 1)),
+    }
+
+
+def test_whitewater_that_the_stages_plan_for_the_job_counts(layout):
+    plan(layout, *plan_job(load_job(layout.job_file), layout, STAGES))
+    commit_whitewater(layout, 0, commit(layout, 0), points=4)
+    assert simulation_numbers(layout).last.solvers["whitewater of water"]["whitewater_particles"] == 4.0
+
+
+def test_whitewater_that_the_job_no_longer_has_does_not_count(layout):
+    cached = commit(layout, 0)
+    commit_whitewater(layout, 0, cached, points=4)
+    commit_whitewater(layout, 0, cached, fluid="oil", not_made=3)
+    numbers = simulation_numbers(layout)
+    assert numbers.warnings() == []
+    assert set(numbers.last.solvers) == {"water", "whitewater of water"}
+    plan(layout)
+    assert set(simulation_numbers(layout).last.solvers) == {"water"}
 
 
 def test_a_run_tells_when_whitewater_first_has_no_room(layout):

@@ -16,6 +16,7 @@ from pipeline.plan import plan_job
 from pipeline.scheduler import Scheduler
 from pipeline.scheduler_events import Start
 from pipeline.stages import STAGES
+from pipeline.stages.inputs import tool_version
 from pipeline.stages.render import render_spec
 from pipeline.task import Resources
 from sim.shapes import build_solid
@@ -179,6 +180,15 @@ def test_volumes_depend_on_the_openvdb_that_writes_them(monkeypatch):
     installed = digests(job())["volume"]
     monkeypatch.setattr("pipeline.stages.volume.tool_version", lambda package: "12.1" if package == "openvdb" else "6")
     assert before != installed == digests(job())["volume"]
+
+
+@pytest.mark.parametrize("package", ["taichi", "libigl", "numpy", "scipy", "trimesh"])
+def test_frames_depend_on_every_package_that_computes_them(monkeypatch, package):
+    before = digests(job())["simulate"]
+    monkeypatch.setattr(
+        "pipeline.stages.simulate.tool_version", lambda name: "0.0.1" if name == package else tool_version(name)
+    )
+    assert digests(job())["simulate"] != before
 
 
 def test_a_blender_that_is_not_there_is_said_before_any_work(tmp_path):

@@ -60,6 +60,13 @@ def test_what_had_no_room_is_told_by_the_header_alone(tmp_path):
         read_point_counts(path)
 
 
+def test_a_file_of_an_earlier_version_is_counted_but_not_read(file):
+    file.write_bytes(file.read_bytes().replace(b"comment not_made 0\n", b""))
+    assert read_point_counts(file) == PointCounts(points=50, not_made=None)
+    with pytest.raises(InvalidFileError, match="of an earlier version; make it anew"):
+        read_point_cloud(file)
+
+
 def test_other_software_reads_the_file(file):
     loaded = trimesh.load(file, process=False)
     np.testing.assert_array_equal(loaded.vertices, some_points().position)

@@ -41,6 +41,18 @@ def test_a_box_of_as_many_cells_as_fit_is_taken():
     assert CellGrid.covering(np.zeros(3), np.array([1022.0, 1022.0, 254.0]), 1.0).cell_count == 2**28
 
 
+@pytest.mark.parametrize(("size", "reach"), [((510.0, 510.0, 126.0), 2), ((510.0, 510.0, 126.1), 1)])
+def test_a_box_of_too_many_half_sized_cells_gets_whole_ones(size, reach):
+    low, high = np.zeros(3), np.array(size)
+    grid = CellGrid.covering_as_finely_as_fits(low, high, 1.0, reach=2)
+    assert grid == CellGrid.covering(low, high, 1.0, reach=reach)
+
+
+def test_a_box_of_too_many_whole_cells_is_refused_however_fine_they_were_wanted():
+    with pytest.raises(ValueError, match=r"neighbour cells of 1 m"):
+        CellGrid.covering_as_finely_as_fits(np.zeros(3), np.array([1022.0, 1022.0, 254.1]), 1.0, reach=2)
+
+
 def find_neighbors(
     points: np.ndarray, boundary: np.ndarray, moving: np.ndarray | None = None, *, stride: int = 1, reach: int = 1
 ) -> tuple[list[set[int]], list[set[int]], np.ndarray, np.ndarray]:
@@ -87,17 +99,20 @@ def test_neighbors_equal_those_of_a_search_tree(taichi_cpu, stride, moving_count
     assert solid == [set(near) for near in boundary_tree.query_ball_point(points, RADIUS)]
 
 
-def test_a_thousand_particles_in_one_spot_do_not_overflow(taichi_cpu):
+# A GPU's list is interleaved and may come from half-sized cells, which are searched in another way.
+@pytest.mark.parametrize(("stride", "reach"), [(1, 1), (32, 1), (32, 2)])
+def test_a_thousand_particles_in_one_spot_do_not_overflow(taichi_cpu, stride, reach):
     points = np.full((1000, 3), 0.5, dtype=np.float32)
-    fluid, _, _, _ = find_neighbors(points, np.full((1, 3), 0.9, dtype=np.float32))
+    fluid, _, _, _ = find_neighbors(points, np.full((1, 3), 0.9, dtype=np.float32), stride=stride, reach=reach)
     assert all(len(near) == 999 for near in fluid)
 
 
-def test_a_particle_at_nan_finds_nobody_and_keeps_a_place_of_its_own(taichi_cpu):
+@pytest.mark.parametrize(("stride", "reach"), [(1, 1), (32, 1), (32, 2)])
+def test_a_particle_at_nan_finds_nobody_and_keeps_a_place_of_its_own(taichi_cpu, stride, reach):
     points = np.random.default_rng(4).uniform(0.0, 1.0, (500, 3)).astype(np.float32)
     for k, axis in enumerate((0, 1, 2, slice(None))):
         points[100 * k, axis] = np.nan
-    fluid, solid, points, _ = find_neighbors(points, np.full((1, 3), 0.9, dtype=np.float32))
+    fluid, solid, points, _ = find_neighbors(points, np.full((1, 3), 0.9, dtype=np.float32), stride=stride, reach=reach)
     lost = np.isnan(points).any(axis=1)
     assert lost.sum() == 4
     assert all(len(fluid[i]) + len(solid[i]) == 0 for i in np.flatnonzero(lost))

@@ -66,7 +66,7 @@ def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float 
         contacts.resolve(state, dt)
     allowed = state.displacement.to_numpy().astype(np.float64)
     finish_step(
-        state.displacement, state.quantum, state.limit, 1.0 / dt, state.lattice, state.position, state.carry,
+        state.displacement, state.quantum, state.limit, dt, state.lattice, state.position, state.carry,
         state.velocity,
     )  # fmt: skip
     return allowed

@@ -40,6 +40,14 @@ def test_rubber_is_the_isotropic_sheet_that_its_docstring_says():
             {"pin": [{"edge": "x-", "keyframe": [{"time_s": 1.0}, {"time_s": 1.0}]}]},
             r"keyframe\[1\].time_s must be after",
         ),
+        (
+            {"pin": [{"edge": "x-", "keyframe": [{"time_s": 0.5, "offset": (0, 0, 0.1)}, {"time_s": 1.0}]}]},
+            r"keyframe\[0\] is where the pin starts, .* got \(0.0, 0.0, 0.1\) m and \(0.0, 0.0, 0.0\) degrees; move or",
+        ),
+        (
+            {"pin": [{"edge": "x-", "keyframe": [{"time_s": 0.0, "rotation_deg": (0, 9, 0)}, {"time_s": 1.0}]}]},
+            "or add a keyframe without them before it",
+        ),
         ({"pin": [{"edge": "x-", "interpolation": "linear"}]}, "no meaning without keyframes"),
         ({"shape": {"type": "mesh", "file": "a.obj"}, "pin": [{"edge": "x-"}]}, "pin a mesh by index or region"),
         ({"shape": {"type": "mesh", "file": "a.obj"}, "shear_stiffness": 3.0}, "shear_stiffness is for rectangles"),

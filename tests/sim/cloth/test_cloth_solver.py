@@ -130,6 +130,18 @@ def test_what_would_need_a_new_cloth_cannot_change():
         solver.change("sheet", mass_per_area=-1.0)
 
 
+def test_a_change_that_explicit_springs_do_not_bear_leaves_the_solver_as_it_was():
+    keys = {**SOFT, **FLAG, "integrator": "explicit", "substeps": 200}
+    touched, untouched = solver_of(cloth(**keys)), solver_of(cloth(**keys))
+    with pytest.raises(ValueError, match="give substeps = "):
+        touched.change("sheet", stretch_stiffness=1e5, mass_per_area=0.1, wind=(9.0, 0.0, 0.0))
+    assert touched.parameters == untouched.parameters
+    assert touched.stable_dt() == untouched.stable_dt()
+    for solver in (touched, untouched):
+        advance(solver, 0.01)
+    same_checkpoints(touched, untouched)
+
+
 # --- the same bits -------------------------------------------------------------------------------------------------
 
 
@@ -146,6 +158,24 @@ def test_continued_run_equals_the_uninterrupted_one_bit_for_bit(integrator):
             solver.begin_frame(frame / 60.0)
             advance(solver, 1.0 / 60.0)
     same_checkpoints(whole, second)
+
+
+def test_a_run_continues_bit_for_bit_where_a_pin_lets_go_between_two_frames():
+    """Springs at free nodes bear shorter steps than at held ones, and both runs have to know from the first step on."""
+    corner = {"index": list(range(80)), "release_s": 2.0 / 60.0}
+    keys = {**SOFT, "integrator": "explicit", "pin": [corner], "stretch_stiffness": 1e3, "velocity": (0.0, 0.0, 1.0)}
+    whole, continued = solver_of(cloth(**keys)), solver_of(cloth(**keys))
+    for frame in (0, 1):
+        whole.begin_frame(frame / 60.0)
+        held = whole.stable_dt()
+        advance(whole, 1.0 / 60.0)
+    continued.restore(whole.checkpoint())
+    for solver in (whole, continued):
+        solver.begin_frame(2.0 / 60.0)
+    assert whole.stable_dt() == continued.stable_dt() < held
+    for solver in (whole, continued):
+        advance(solver, 0.01)
+    same_checkpoints(whole, continued)
 
 
 def test_a_checkpoint_of_another_cloth_is_refused():

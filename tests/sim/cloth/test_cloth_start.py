@@ -1,5 +1,7 @@
 """Where cloths start, and whether they cross, held against an independent count of crossing triangles."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from crossing_triangles import crossings
@@ -42,6 +44,33 @@ def test_how_many_are_looked_at_together_does_not_change_the_answer(monkeypatch)
     one_by_one = [first_crossing(position, edges_of(triangles).nodes, triangles) for position, triangles in scenes]
     assert any(point is not None for point in at_once)
     assert [point is None for point in at_once] == [point is None for point in one_by_one]
+
+
+def beside_a_giant(height: float) -> tuple[np.ndarray, np.ndarray]:
+    """A sheet of 1,250 triangles of a few centimetres, and one of 20 m that stands so high above its middle."""
+    sheet = build_sheet(
+        ClothParameters(name="s", shape={"type": "rectangle", "size": (1, 1), "counts": (26, 26)}).shape
+    )
+    giant = np.array([[0.013, 0.0, height], [10.0, 0.0, 20.0 + height], [-10.0, 0.0, 20.0 + height]])
+    corners = len(sheet.vertices) + np.arange(3)
+    return np.concatenate([sheet.vertices, giant]), np.concatenate([sheet.triangles, [corners]])
+
+
+def test_one_giant_triangle_does_not_make_every_triangle_a_neighbour_of_every_edge():
+    position, triangles = beside_a_giant(0.01)
+    tracemalloc.start()
+    assert first_crossing(position, edges_of(triangles).nodes, triangles) is None
+    _, most_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # 1,928 edges, each with the triangles near it, take 3 MB; each with all 1,251 triangles 900 MB.
+    assert most_bytes < 40e6
+
+
+def test_a_giant_triangle_that_passes_through_small_ones_is_found():
+    position, triangles = beside_a_giant(-0.01)
+    point = first_crossing(position, edges_of(triangles).nodes, triangles)
+    # The giant is 0.02 m wide where it meets the sheet, about its lowest corner.
+    np.testing.assert_allclose(point, [0.013, 0.0, 0.0], atol=0.011)
 
 
 def test_sheets_in_one_plane_do_not_cross_but_one_that_touches_with_an_edge_does():

@@ -4,10 +4,13 @@ import math
 
 import numpy as np
 import pytest
+import taichi as ti
 from scipy.spatial import cKDTree
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.build import build_world
+from sim.cells import CellGrid, Cells, CellSort
+from sim.fluid.emitter import find_free_places
 from sim.fluid.nozzles import nozzle_collision, pipes
 from sim.fluid.opening import Opening, obstruction, pipe_clearance
 from sim.fluid.parameters import EmitterParameters
@@ -283,3 +286,28 @@ def test_an_inflow_may_change_its_speed(taichi_cpu, order):
     np.testing.assert_allclose(arrays["velocity"][held, 2], 1.0, rtol=1e-6)
     # Layers of the first at 0, 40 and 80 ms; those of the second, 20 ms apart, but for the one that has no room.
     assert fluid.diagnostics()["particles_emitted"] == (3 + 4 - 1) * 16
+
+
+@pytest.mark.parametrize("reach", [1, 2])
+def test_a_place_is_taken_by_a_particle_within_the_clearance_in_cells_of_either_size(taichi_cpu, reach):
+    rng = np.random.default_rng(6)
+    cloud, wanted = (rng.uniform(0.0, 1.0, (n, 3)).astype(np.float32) for n in (60, 200))
+    radius = 0.2
+    grid = CellGrid.covering(np.zeros(3), np.ones(3), radius, reach=reach)
+    positions, places = ti.Vector.ndarray(3, ti.f32, len(cloud)), ti.Vector.ndarray(3, ti.f32, len(wanted))
+    ids, free = ti.ndarray(ti.i32, len(cloud)), ti.ndarray(ti.i32, len(wanted))
+    positions.from_numpy(cloud)
+    places.from_numpy(wanted)
+    ids.from_numpy(np.arange(len(cloud), dtype=np.int32))
+    cells = CellSort(grid, len(cloud))
+    cells.sort(positions, ids, len(cloud), (0.0,) * 3, (1.0,) * 3)
+    positions.from_numpy(cloud[cells.order.to_numpy()])
+    clearance = 0.9 * radius
+    find_free_places(
+        places, len(wanted), ti.math.vec3(0.0), positions, cells.cell_start, len(cloud), len(cloud),
+        ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape), grid.reach, clearance, free,
+    )  # fmt: skip
+    distance, _ = cKDTree(cloud).query(wanted)
+    expected = distance > clearance
+    assert 0 < expected.sum() < len(wanted)
+    np.testing.assert_array_equal(free.to_numpy(), expected)
