@@ -9,12 +9,10 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.arrays import Integers, Vectors
 from sim.launch import fast_launch
 from sim.scan import scan_in_parallel, scan_scratch_length
 
-Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
-Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
-Vectors = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
 Cells = ti.types.vector(3, ti.i32)
 
 MAX_CELLS = 2**28

@@ -2,7 +2,8 @@
 
 import taichi as ti
 
-from sim.cells import Cells, Floats, Integers, Vectors, cell_of_point, row_of_cell
+from sim.arrays import Floats, Integers, Vectors
+from sim.cells import Cells, cell_of_point, row_of_cell
 from sim.launch import fast_launch
 from sim.scan import scan_in_parallel
 

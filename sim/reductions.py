@@ -10,9 +10,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.arrays import Floats
 from sim.launch import fast_launch
-
-Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 CPU_LANES = 256
 GPU_LANES = 32768

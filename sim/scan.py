@@ -2,9 +2,8 @@
 
 import taichi as ti
 
+from sim.arrays import Integers
 from sim.launch import fast_launch
-
-Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
 
 RUN = 32
 """Values that a thread adds up: int32 of one cache line of a GPU, which its thread reads and no other."""

@@ -16,11 +16,9 @@ and threads.
 
 import taichi as ti
 
-from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, Floats, Integers, Quadruples, Vectors, Weights
+from sim.arrays import Floats, Integers, LongIntegers, Matrices, Vectors
+from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, Quadruples, Weights
 from sim.launch import fast_launch
-
-LongIntegers = ti.types.ndarray(dtype=ti.i64, ndim=1)
-Matrices = ti.types.ndarray(dtype=ti.math.mat3, ndim=1)
 
 SHARES_PER_UNIT = 65536.0
 """Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import Floats, Integers
+from sim.arrays import Floats, Integers
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.springs import Springs
 from sim.cloth.state import Lattice

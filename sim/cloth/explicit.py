@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, coefficient, separation
 from sim.cloth.stable_step import longest_explicit_step
 from sim.cloth.state import ClothState, Lattice

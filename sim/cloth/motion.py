@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.state import Lattice
 from sim.launch import fast_launch
 from sim.reductions import is_finite

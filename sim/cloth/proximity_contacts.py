@@ -2,9 +2,6 @@
 
 import taichi as ti
 
-Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
-Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
-Vectors = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
 Quadruples = ti.types.ndarray(dtype=ti.types.vector(4, ti.i32), ndim=1)
 Weights = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 

@@ -8,17 +8,9 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.arrays import Floats, Integers, Matrices, Vectors
 from sim.cloth.proximity import unit_or
-from sim.cloth.proximity_contacts import (
-    WALL,
-    ContactList,
-    Floats,
-    Integers,
-    Quadruples,
-    Vectors,
-    Weights,
-    least_displacement,
-)
+from sim.cloth.proximity_contacts import WALL, ContactList, Quadruples, Weights, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.rigid_contact_shapes import GRID, Counts, grid_distance, primitive_distance
 from sim.cloth.self_collision_kernels import Four, Pairs, Triples
@@ -29,7 +21,6 @@ from sim.rigid.geometry import BodyGeometry
 from sim.rigid.walls import Wall
 
 Array = NDArray[np.float64]
-Matrices = ti.types.ndarray(dtype=ti.math.mat3, ndim=1)
 CountTriples = ti.types.ndarray(dtype=Counts, ndim=1)
 Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 

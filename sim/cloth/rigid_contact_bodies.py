@@ -90,6 +90,7 @@ class CollisionBodies:
         self.grid_values = ti.ndarray(ti.f32, 1)
         if self.count:
             self._describe_shapes(np.asarray(friction))
+            self.look_between_vertices(0.0)
 
     def place(self, poses: Poses, inverse_mass: Array, inverse_inertia: Array) -> None:
         """Say where the bodies are, and how easily they move.
@@ -163,7 +164,6 @@ class CollisionBodies:
             self.grid_values.from_numpy(np.concatenate(values))
         for integers, numbers in (
             (self.kind, kind),
-            (self.has_edges, ~np.isin(kind, _ROUND)),
             (self.grid_first, first),
             (self.grid_shape, shape),
         ):

@@ -5,7 +5,7 @@ The formulas are those of `sim.shapes.primitives`, exact on both sides of the su
 
 import taichi as ti
 
-from sim.cloth.proximity_contacts import Floats
+from sim.arrays import Floats
 
 Vector3 = ti.math.vec3
 Counts = ti.types.vector(3, ti.i32)

@@ -111,11 +111,6 @@ class SelfCollision:
         self.thickness = float(state.thickness.to_numpy().max())
         self._collides.from_numpy(np.array(state.self_collision, dtype=np.int32))
 
-    @property
-    def pair_count(self) -> int:
-        """Number of listed pairs."""
-        return self.with_triangles.count + self.of_edges.count
-
     def prepare(self, state: ClothState, whole: float) -> None:
         """Have all pairs listed that vertices can bring within their thickness, or together, in this substep.
 

@@ -2,6 +2,7 @@
 
 import taichi as ti
 
+from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.proximity import (
     closest_on_edges,
     closest_on_triangle,
@@ -9,17 +10,7 @@ from sim.cloth.proximity import (
     distance_to_triangle,
     unit_or,
 )
-from sim.cloth.proximity_contacts import (
-    EDGE_EDGE,
-    INACTIVE,
-    VERTEX_TRIANGLE,
-    Floats,
-    Integers,
-    Quadruples,
-    Vectors,
-    Weights,
-    least_displacement,
-)
+from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, Quadruples, Weights, least_displacement
 from sim.cloth.spatial_hash import Spheres, cell_of, slot_of
 from sim.launch import fast_launch
 

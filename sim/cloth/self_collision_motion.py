@@ -3,8 +3,8 @@
 import numpy as np
 import taichi as ti
 
+from sim.arrays import Integers, Vectors
 from sim.cells import Cells
-from sim.cloth.proximity_contacts import Integers, Vectors
 from sim.cloth.self_collision_kernels import range_of_vectors
 from sim.launch import fast_launch
 

@@ -6,10 +6,10 @@ which a search visits are one range, or two where the table ends. Teschner et al
 
 import taichi as ti
 
+from sim.arrays import Integers
 from sim.launch import fast_launch
 from sim.scan import scan_in_parallel, scan_scratch_length
 
-Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
 Spheres = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 Cell = ti.types.vector(3, ti.i32)
 

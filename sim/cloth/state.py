@@ -7,7 +7,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import Vectors
+from sim.arrays import Vectors
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import RestSheet
 from sim.cloth.springs import edges_of

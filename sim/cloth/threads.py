@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.device_springs import COLOURS_AT_ONCE, TINY_LENGTH, DeviceSprings, Laws
 from sim.cloth.state import ClothState, Lattice
 from sim.launch import fast_launch

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.device_springs import DeviceSprings, Laws, coefficient, separation
 from sim.cloth.state import ClothState, Lattice
 from sim.launch import fast_launch

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.device_springs import COLOURS_AT_ONCE, TINY_LENGTH, DeviceSprings, Laws, coefficient, separation
 from sim.cloth.state import ClothState, Lattice
 from sim.cloth.threads import ThreadSolver

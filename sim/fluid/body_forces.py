@@ -6,7 +6,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import CellGrid, Cells, Floats, Integers, SortedPoints, Vectors, cell_of_point, row_of_cell
+from sim.arrays import Floats, Integers, Vectors
+from sim.cells import CellGrid, Cells, SortedPoints, cell_of_point, row_of_cell
 from sim.fluid.body_response import BodyResponse, weigh_errors
 from sim.fluid.boundary import Boundary
 from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.fluid.boundary import Boundary
 from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
 from sim.fluid.kernels import TINY_DISTANCE, spline, spline_slope

@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.launch import fast_launch
 
 STATE_WIDTH = 18

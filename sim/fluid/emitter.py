@@ -7,7 +7,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import CellGrid, Cells, Integers, Vectors, cell_of_point, row_of_cell
+from sim.arrays import Integers, Vectors
+from sim.cells import CellGrid, Cells, cell_of_point, row_of_cell
 from sim.fluid.opening import Opening
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import ParticleSet

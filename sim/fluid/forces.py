@@ -7,7 +7,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import Cells, Floats, Integers, Vectors, cell_of_point, row_of_cell
+from sim.arrays import Floats, Integers, Vectors
+from sim.cells import Cells, cell_of_point, row_of_cell
 from sim.fluid.kernels import inverse_distance, spline_slope
 from sim.fluid.material_fluid import MaterialFluid
 from sim.fluid.surface_tension import cohesion_becker_teschner2007

@@ -6,7 +6,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import CellGrid, CellSort, Floats, Integers, SortedPoints, Vectors
+from sim.arrays import Floats, Integers, Vectors
+from sim.cells import CellGrid, CellSort, SortedPoints
 from sim.launch import fast_launch
 from sim.neighbors import NeighborList, list_stride
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.fluid.implicit_fluid import ImplicitFluid, momentum
 from sim.fluid.kernels import distance, spline
 from sim.fluid.pressure_kernels import add_scaled, copy_scalars, not_negative

@@ -10,7 +10,7 @@ the forces of pressure are F = -V D^T P with P_i = p_i/(rho_i/rho0)², and what 
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.fluid.kernels import distance, inverse_distance, spline, spline_slope
 from sim.launch import fast_launch
 from sim.reductions import Results, is_finite, reduced

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from sim.cells import Vectors
+from sim.arrays import Floats, Vectors
 from sim.fluid.box import Box
 from sim.launch import fast_launch
-from sim.reductions import Floats, LaneReduction, Results, is_finite, reduced
+from sim.reductions import LaneReduction, Results, is_finite, reduced
 
 MAXIMA, COUNTS = 4, 3
 

@@ -3,7 +3,7 @@
 import numpy as np
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.fluid.kernels import inverse_distance, lattice_offsets, particle_volume, spline_slope
 from sim.launch import fast_launch
 

@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.fluid.kernels import TINY_DISTANCE, spline_slope
 from sim.fluid.viscosity import pair_viscosity
 from sim.launch import fast_launch

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from sim.cells import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.fluid.forces import SPHFluid
 from sim.fluid.implicit_fluid import largest_eigenvalue
 from sim.fluid.kernels import distance, spline

@@ -6,9 +6,8 @@ those of Ihmsen et al. 2012: W = 1 - r/h for potentials, the cubic spline for th
 
 import taichi as ti
 
-from sim.cells import Cells, Integers, Vectors, cell_of_point, row_of_cell
-
-Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
+from sim.arrays import Floats, Integers, Vectors
+from sim.cells import Cells, cell_of_point, row_of_cell
 
 TINY = 1.0e-6
 """Two particles closer than this share of h have no direction to each other."""

@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from sim.cloth.proximity_contacts import Floats, Integers, Vectors
+from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.rigid_contact import CountTriples, distance_at
 
 

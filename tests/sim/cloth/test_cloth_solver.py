@@ -1,14 +1,10 @@
 """The cloth solver as the world sees it: pins, live changes, restarts, threads, faults."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
 from cloth_scenes import EARTH, SOFT, VACUUM, WEIGHTLESS, advance, cloth, rectangle, solver_of
+from thread_counts import outputs_by_threads
 
 from sim.build import build_world
 from sim.cloth.solver import ClothSolver
@@ -203,17 +199,7 @@ print(digest.hexdigest())
 
 
 def test_results_do_not_depend_on_the_number_of_threads():
-    here = Path(__file__).resolve().parent
-    digests = [
-        subprocess.run(
-            [sys.executable, "-c", STEP_AND_PRINT_DIGEST, str(threads)],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[2]), str(here)])},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for threads in (1, 2)
-    ]
+    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, beside=__file__)
     assert len(digests[0].strip()) == 64
     assert digests[0] == digests[1]
 

@@ -1,10 +1,5 @@
 """Cloth against cloth: nothing crosses, momentum is kept, layers stay apart; and the checker that says so."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from cloth_scenes import SOFT, WEIGHTLESS, cloth, rectangle, solver_of
@@ -18,6 +13,7 @@ from contact_scenes import (
     world_of,
 )
 from crossing_triangles import crossings, edges_of_triangles
+from thread_counts import outputs_by_threads
 
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.self_collision import SelfCollision
@@ -373,16 +369,6 @@ print(digest.hexdigest(), contacts_of(cloth_of(world)).diagnostics()["contacts"]
 
 @pytest.mark.slow
 def test_contacts_do_not_depend_on_the_number_of_threads():
-    here = Path(__file__).resolve().parent
-    digests = [
-        subprocess.run(
-            [sys.executable, "-c", STEP_AND_PRINT_DIGEST, str(threads)],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[2]), str(here)])},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for threads in (1, 2)
-    ]
+    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, beside=__file__)
     assert digests[0].split()[1] == "True"
     assert digests[0] == digests[1]

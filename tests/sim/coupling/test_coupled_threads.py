@@ -1,9 +1,6 @@
 """Coupled steps give the same bits whatever the number of threads."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
+from thread_counts import outputs_by_threads
 
 STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
@@ -27,17 +24,7 @@ print(digest.hexdigest(), float(abs(tank.coupling.force).max()) > 0.0)
 
 
 def test_fluid_and_bodies_do_not_depend_on_the_number_of_threads():
-    here = Path(__file__).resolve().parent
     for solver in ("wcsph", "dfsph"):
-        digests = [
-            subprocess.run(
-                [sys.executable, "-c", STEP_AND_PRINT_DIGEST, str(threads), solver],
-                env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[2]), str(here)])},
-                capture_output=True,
-                text=True,
-                check=True,
-            ).stdout
-            for threads in (1, 2)
-        ]
+        digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, solver, beside=__file__)
         assert digests[0].split()[1] == "True"
         assert digests[0] == digests[1]

@@ -1,12 +1,9 @@
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
+from thread_counts import outputs_by_threads
 
 from sim.fluid.boundary_akinci2012 import sink_samples
 from sim.fluid.expected_speed import expected_speed
@@ -206,17 +203,7 @@ print(digest.hexdigest())
 
 
 def test_results_do_not_depend_on_the_number_of_threads():
-    here = Path(__file__).resolve().parent
-    digests = [
-        subprocess.run(
-            [sys.executable, "-c", STEP_AND_PRINT_DIGEST, str(threads)],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here.parents[2]), str(here)])},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for threads in (1, 2)
-    ]
+    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, beside=__file__)
     assert len(digests[0].strip()) == 64
     assert digests[0] == digests[1]
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from thread_counts import outputs_by_threads
 from whitewater_scenes import ALL_FACES, FPS, GRAVITY, NO_FLUID, RADIUS, SPACING, cloud, fluid, jets, lattice, solver
 
 from sim.scene import DomainParameters
@@ -17,7 +14,6 @@ from sim.whitewater.generation import generation_rate
 from sim.whitewater.motion import FluidMotion, FluidState
 from sim.whitewater.parameters import WhitewaterParameters
 
-PROJECT = Path(__file__).resolve().parents[3]
 DT = 1.0 / FPS
 
 
@@ -207,7 +203,6 @@ def test_the_same_frame_gives_the_same_bits_and_another_seed_does_not(taichi_cpu
 
 DIGEST = """
 import hashlib, sys
-sys.path.insert(0, "tests/sim/whitewater")
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 from whitewater_scenes import RADIUS, jets, solver
@@ -223,11 +218,5 @@ print(len(cloud), hashlib.sha256(cloud.position.tobytes() + cloud.velocity.tobyt
 
 @pytest.mark.slow
 def test_threads_do_not_change_a_bit():
-    printed = {
-        subprocess.run(
-            [sys.executable, "-c", DIGEST, str(threads)], cwd=PROJECT, capture_output=True, text=True, check=True
-        ).stdout
-        for threads in (1, 3)
-    }
-    (line,) = printed
+    (line,) = set(outputs_by_threads(DIGEST, beside=__file__, counts=(1, 3)))
     assert int(line.split()[0]) > 300

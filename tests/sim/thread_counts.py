@@ -1,0 +1,32 @@
+"""The same code on different numbers of threads, each in a process of its own, as Taichi starts once a process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def outputs_by_threads(code: str, *arguments: str, beside: str, counts: tuple[int, ...] = (1, 2)) -> list[str]:
+    """What the code prints for each number of threads, which is its `sys.argv[1]`.
+
+    Args:
+        code: a program; it may import the project, and the modules that lie beside the test.
+        arguments: further ones of the program.
+        beside: `__file__` of the test.
+        counts: numbers of threads.
+    """
+    paths = [str(ROOT), str(Path(beside).resolve().parent), os.environ.get("PYTHONPATH", "")]
+    return [
+        subprocess.run(
+            [sys.executable, "-c", code, str(threads), *arguments],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in counts
+    ]
