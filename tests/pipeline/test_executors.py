@@ -86,11 +86,7 @@ def failure(events: list[TaskEvent]) -> Failed:
 
 
 class ExecutorContract:
-    """What the runner relies on; every executor's test class inherits these tests."""
-
-    @pytest.fixture
-    def executor(self) -> Iterator[Executor]:
-        raise NotImplementedError("each executor's class gives its own")
+    """What the runner relies on; every executor's test class inherits these tests and has a fixture `executor`."""
 
     def test_an_attempt_starts_commits_and_finishes(self, executor: Executor, layout: JobLayout) -> None:
         events = run(executor, assign(layout, "steps"))

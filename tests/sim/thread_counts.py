@@ -19,14 +19,14 @@ def outputs_by_threads(code: str, *arguments: str, beside: str, counts: tuple[in
         beside: `__file__` of the test.
         counts: numbers of threads.
     """
-    paths = [str(ROOT), str(Path(beside).resolve().parent), os.environ.get("PYTHONPATH", "")]
-    return [
-        subprocess.run(
-            [sys.executable, "-c", code, str(threads), *arguments],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for threads in counts
-    ]
+    here = Path(__file__).resolve().parent
+    paths = [str(ROOT), str(here), str(Path(beside).resolve().parent), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    outputs = []
+    for threads in counts:
+        child = subprocess.run(
+            [sys.executable, "-c", code, str(threads), *arguments], env=environment, capture_output=True, text=True
+        )
+        assert child.returncode == 0, f"the program on {threads} threads ended with {child.returncode}:\n{child.stderr}"
+        outputs.append(child.stdout)
+    return outputs
