@@ -25,7 +25,11 @@ def outputs_by_threads(code: str, *arguments: str, beside: str, counts: tuple[in
     outputs = []
     for threads in counts:
         child = subprocess.run(
-            [sys.executable, "-c", code, str(threads), *arguments], env=environment, capture_output=True, text=True
+            [sys.executable, "-c", code, str(threads), *arguments],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert child.returncode == 0, f"the program on {threads} threads ended with {child.returncode}:\n{child.stderr}"
         outputs.append(child.stdout)
