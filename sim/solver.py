@@ -69,19 +69,22 @@ class Solver(Protocol):
 
 
 class Coupling(Protocol):
-    """Exchanges momentum between two solvers, which share their substeps.
+    """Exchanges momentum between two solvers.
 
     Attributes:
         bodies: names of the two; the first takes its substep before the second.
+        is_loose: whether the second keeps its own steps, over each of which the first takes as many as it needs; they
+            share their substeps otherwise.
     """
 
     bodies: tuple[str, str]
+    is_loose: bool
 
     def exchange(self, dt: float) -> None:
-        """Between the two substeps of dt [s]: hand the impulses of the first to the second."""
+        """Right before the second's step of dt [s], which the first has made: hand the impulses of the first to it."""
 
     def follow(self, dt: float) -> None:
-        """After both substeps of dt [s]: tell the first where the second is now."""
+        """After both have made a step of dt [s]: tell the first where the second is now."""
 
     def resume(self) -> None:
         """After both were restored from a checkpoint: make up for what the solvers do not save."""

@@ -47,9 +47,11 @@ class World:
 
     Solvers that a coupling connects share their substeps; the others advance at their own step. A substep takes the
     solvers in the order given: a coupling exchanges impulses right before its second solver's turn, and tells the first
-    what became of the second when all have had theirs. Every group lands
-    exactly on the frame: with dt_max stable, the rest of the frame is cut into n = ceil(rest / dt_max) equal steps,
-    one is taken, and the division is made anew for what is left.
+    what became of the second when all have had theirs. The second solver of a loose coupling keeps its own steps: the
+    solvers that it is coupled to go ahead to the end of its step, in as many substeps as they need, then it takes it.
+
+    All land exactly on the frame: with dt_max stable, the rest of the frame is cut into n = ceil(rest / dt_max) equal
+    steps, one is taken, and the division is made anew for what is left; in the same way substeps land on a longer step.
     """
 
     def __init__(
@@ -69,7 +71,7 @@ class World:
         for first, second in (coupling.bodies for coupling in self._couplings):
             if order.index(first) >= order.index(second):
                 raise ValueError(f'"{first}" must stand before "{second}", which it is coupled to, among the solvers')
-        self._groups = _coupled_groups(self._solvers, self._couplings)
+        self._teams = _teams(self._solvers, self._couplings)
 
     @property
     def time_s(self) -> float:
@@ -86,10 +88,14 @@ class World:
         smallest_dt: dict[str, float] = {}
         for solver in self._solvers.values():
             solver.begin_frame(self.time_s)
-        for group, couplings in self._groups:
-            count, dt = self._advance_group(group, couplings)
-            substeps |= dict.fromkeys((solver.name for solver in group), count)
-            smallest_dt |= dict.fromkeys((solver.name for solver in group), dt)
+        for last in self._teams:
+            teams = [team for team in (last.ahead, last) if team is not None]
+            for team in teams:
+                team.begin_frame()
+            self._advance_team(last, 1.0 / self._frames_per_second, 0.0)
+            for team in teams:
+                substeps |= dict.fromkeys((solver.name for solver in team.solvers), team.taken)
+                smallest_dt |= dict.fromkeys((solver.name for solver in team.solvers), team.smallest_dt_s)
         self.frame += 1
         return FrameReport(self.frame, self.time_s, substeps, smallest_dt, self.diagnostics())
 
@@ -124,41 +130,35 @@ class World:
             coupling.resume()
         self.frame = frame
 
-    def _advance_group(self, group: Sequence[Solver], couplings: Sequence[Coupling]) -> tuple[int, float]:
-        remaining = 1.0 / self._frames_per_second
-        taken, smallest_dt = 0, math.inf
+    def _advance_team(self, team: _Team, duration_s: float, start_s: float) -> None:
+        """Advance a team by a duration [s] from a moment of the frame [s] on."""
+        remaining = duration_s
         while remaining > 0.0:
-            stable_dt = min(solver.stable_dt() for solver in group)
-            left = self._steps_left(remaining, stable_dt, taken, group)
+            elapsed_s = start_s + (duration_s - remaining)
+            left = self._steps_left(team, remaining, elapsed_s)
             dt = remaining / left
-            for solver in group:
-                for coupling in couplings:
-                    if coupling.bodies[1] == solver.name:
-                        coupling.exchange(dt)
-                solver.substep(dt)
-            for coupling in couplings:
-                coupling.follow(dt)
+            if team.ahead is not None:
+                self._advance_team(team.ahead, dt, elapsed_s)
+            team.substep(dt)
             remaining = remaining - dt if left > 1 else 0.0
-            taken += 1
-            smallest_dt = min(smallest_dt, dt)
-            if taken % SUBSTEPS_BETWEEN_CHECKS == 0 or remaining == 0.0:
-                self._check(group, 1.0 / self._frames_per_second - remaining)
-        return taken, smallest_dt
+            if team.taken % SUBSTEPS_BETWEEN_CHECKS == 0 or remaining == 0.0:
+                self._check(team, start_s + (duration_s - remaining))
 
-    def _steps_left(self, remaining: float, stable_dt: float, taken: int, group: Sequence[Solver]) -> int:
-        if not stable_dt > 0.0 or taken + remaining / stable_dt > MAX_SUBSTEPS_PER_FRAME:
-            self._check(group, 1.0 / self._frames_per_second - remaining)
+    def _steps_left(self, team: _Team, remaining: float, elapsed_s: float) -> int:
+        stable_dt = min(solver.stable_dt() for solver in team.solvers)
+        if not stable_dt > 0.0 or team.taken + remaining / stable_dt > MAX_SUBSTEPS_PER_FRAME:
+            self._check(team, elapsed_s)
             raise SimulationDivergedError(
-                " + ".join(solver.name for solver in group),
+                " + ".join(solver.name for solver in team.solvers),
                 self.frame + 1,
-                self.time_s + 1.0 / self._frames_per_second - remaining,
+                self.time_s + elapsed_s,
                 f"the stable time step fell to {stable_dt:.3g} s",
                 "lower initial speeds, or give a larger particle radius or cell size",
             )
         return max(1, math.ceil(remaining / stable_dt * (1.0 - 1.0e-9)))
 
-    def _check(self, group: Sequence[Solver], elapsed_s: float) -> None:
-        for solver in group:
+    def _check(self, team: _Team, elapsed_s: float) -> None:
+        for solver in team.solvers:
             quantity = solver.first_bad_quantity()
             if quantity is not None:
                 raise SimulationDivergedError(
@@ -170,18 +170,61 @@ class World:
                 )
 
 
-def _coupled_groups(
-    solvers: Mapping[str, Solver], couplings: Sequence[Coupling]
-) -> list[tuple[list[Solver], list[Coupling]]]:
-    """Connected components of the solvers under the couplings, in the order of the solvers."""
+class _Team:
+    """Solvers that take the same substeps, and the couplings by which they get impulses.
+
+    Attributes:
+        solvers: in the order of their turns.
+        couplings: those whose second solver is one of them.
+        ahead: solvers that have to get to the end of a step before these take it.
+        taken: substeps in this frame.
+        smallest_dt_s: smallest of them [s].
+    """
+
+    def __init__(self, solvers: Sequence[Solver], couplings: Sequence[Coupling], ahead: _Team | None = None) -> None:
+        self.solvers, self.ahead = tuple(solvers), ahead
+        names = {solver.name for solver in solvers}
+        self.couplings = tuple(coupling for coupling in couplings if coupling.bodies[1] in names)
+        self.begin_frame()
+
+    def begin_frame(self) -> None:
+        self.taken, self.smallest_dt_s = 0, math.inf
+
+    def substep(self, dt: float) -> None:
+        for solver in self.solvers:
+            for coupling in self.couplings:
+                if coupling.bodies[1] == solver.name:
+                    coupling.exchange(dt)
+            solver.substep(dt)
+        for coupling in self.couplings:
+            coupling.follow(dt)
+        self.taken += 1
+        self.smallest_dt_s = min(self.smallest_dt_s, dt)
+
+
+def _teams(solvers: Mapping[str, Solver], couplings: Sequence[Coupling]) -> list[_Team]:
+    """A team for each connected component of the solvers under the couplings, in the order of the solvers.
+
+    Those of a component that a loose coupling leads to follow the others at their own steps.
+
+    Raises:
+        ValueError: such a solver is coupled to another one in a way that needs shared substeps.
+    """
     component = {name: name for name in solvers}
     for coupling in couplings:
         kept, merged = (component[body] for body in coupling.bodies)
         component = {name: kept if label == merged else label for name, label in component.items()}
-    return [
-        (
-            [solver for name, solver in solvers.items() if component[name] == label],
-            [coupling for coupling in couplings if component[coupling.bodies[0]] == label],
-        )
-        for label in dict.fromkeys(component.values())
-    ]
+    late = {coupling.bodies[1] for coupling in couplings if coupling.is_loose}
+    for coupling in couplings:
+        for body in coupling.bodies[: 1 if coupling.is_loose else 2]:
+            if body in late:
+                first, second = coupling.bodies
+                raise ValueError(f'"{body}" has steps of its own and cannot share those of "{first}" and "{second}"')
+    teams = []
+    for label in dict.fromkeys(component.values()):
+        own = [solver for name, solver in solvers.items() if component[name] == label]
+        punctual = [solver for solver in own if solver.name not in late]
+        team = _Team(punctual, couplings)
+        following = [solver for solver in own if solver.name in late]
+        teams.append(_Team(following, couplings, ahead=team) if following else team)
+    return teams

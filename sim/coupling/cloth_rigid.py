@@ -43,6 +43,8 @@ class ClothRigidCoupling:
         torque: likewise, about the centres of mass [N m], (m, 3).
     """
 
+    is_loose = False
+
     def __init__(self, cloth: ClothSolver, rigid: RigidSolver, contacts: ContinuousContacts) -> None:
         """Couple the two; `contacts` are those of the cloth, with the bodies of the rigid solver first."""
         self.bodies = (cloth.name, rigid.name)

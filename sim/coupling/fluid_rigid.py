@@ -26,6 +26,8 @@ class FluidRigidCoupling:
         torque: likewise, about the centres of mass [N m], (n, 3).
     """
 
+    is_loose = False
+
     def __init__(self, fluid: SPHFluid, rigid: RigidSolver) -> None:
         """Couple the two; places the fluid's samples where the bodies are."""
         self.bodies = (fluid.name, rigid.name)

@@ -48,8 +48,8 @@ class Oscillator:
 class Spring:
     """Counts the exchanges, to show that coupled solvers share their substeps."""
 
-    def __init__(self, *bodies: str) -> None:
-        self.bodies = bodies
+    def __init__(self, *bodies: str, is_loose: bool = False) -> None:
+        self.bodies, self.is_loose = bodies, is_loose
         self.exchanged: list[float] = []
         self.followed: list[float] = []
 
@@ -89,6 +89,38 @@ def test_coupled_solvers_share_substeps_and_others_keep_their_own():
     assert len(spring.exchanged) == 10
     assert sum(spring.exchanged) == pytest.approx(1 / 60, rel=1e-12)
     assert spring.followed == spring.exchanged
+
+
+class Witness(Spring):
+    """Notes at every exchange how far the two solvers have got."""
+
+    def __init__(self, first: Oscillator, second: Oscillator) -> None:
+        super().__init__(first.name, second.name, is_loose=True)
+        self.solvers = first, second
+        self.seen: list[tuple[float, float]] = []
+
+    def exchange(self, dt: float) -> None:
+        super().exchange(dt)
+        self.seen.append(tuple(solver.time_s for solver in self.solvers))
+
+
+def test_a_loose_coupling_lets_the_second_solver_keep_its_longer_steps():
+    fine, coarse = Oscillator("fine", 1 / 1000), Oscillator("coarse", 1 / 180)
+    witness = Witness(fine, coarse)
+    report = World([fine, coarse], frames_per_second=60, couplings=[witness]).advance_frame()
+    # 1/180 s takes six steps of at most 1/1000 s.
+    assert report.substeps == {"fine": 18, "coarse": 3}
+    assert report.smallest_dt_s["fine"] == pytest.approx(1 / 1080, rel=1e-12)
+    # The first is at the end of the step, the second at its start; sums of up to 18 steps: rounding only.
+    assert witness.seen == [pytest.approx((k / 180, (k - 1) / 180), abs=1e-12) for k in (1, 2, 3)]
+    assert witness.exchanged == witness.followed == pytest.approx([1 / 180] * 3, rel=1e-12)
+
+
+def test_a_solver_with_steps_of_its_own_cannot_share_those_of_others_too():
+    solvers = [Oscillator(name, 1.0) for name in ("water", "flag", "air")]
+    couplings = [Spring("water", "air", is_loose=True), Spring("flag", "air")]
+    with pytest.raises(ValueError, match='"air" has steps of its own and cannot share those of "flag" and "air"'):
+        World(solvers, frames_per_second=60, couplings=couplings)
 
 
 def test_ten_frames_equal_five_then_restore_then_five():
