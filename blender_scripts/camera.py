@@ -95,6 +95,11 @@ def choose_view(spec: dict[str, Any]) -> View:
     return View(tuple(position), tuple((box_min + box_max) / 2) if look_at is None else tuple(look_at))
 
 
+def pixel_angle(spec: dict[str, Any]) -> float:
+    """Width of a pixel in the middle of the picture, at a distance of 1 m [m/m]."""
+    return SENSOR_WIDTH_MM / spec["camera"]["focal_length_mm"] / max(spec["render"]["resolution"])
+
+
 def add_camera(spec: dict[str, Any], view: View) -> None:
     """Put the camera into the scene and make it the active one."""
     parameters = spec["camera"]

@@ -23,13 +23,14 @@ _SMOKE_OPTICAL_SIZE = 22.0
 """Optical depth of smoke of density 1 across the whole domain."""
 
 
-def new_material(name: str, parameters: dict[str, Any], *, domain_size: float) -> Any:
+def new_material(name: str, parameters: dict[str, Any], *, domain_size: float, pixel_angle: float) -> Any:
     """The material for a body.
 
     Args:
         name: of the body.
         parameters: `look`, `color`, `roughness`, `density` and `thread_spacing` of the specification.
         domain_size: diagonal of the domain [m].
+        pixel_angle: width of a pixel at a distance of 1 m [m/m].
 
     Returns:
         A Blender material.
@@ -37,6 +38,7 @@ def new_material(name: str, parameters: dict[str, Any], *, domain_size: float) -
     color = parameters["color"]
     context = LookContext(
         domain_size,
+        pixel_angle,
         None if color is None else tuple(color),
         parameters["roughness"],
         parameters["density"],

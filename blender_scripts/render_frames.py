@@ -110,7 +110,9 @@ class SceneRenderer:
 
     def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> None:
         name, kind = description["name"], description["type"]
-        material = looks.new_material(name, description["material"], domain_size=_domain_size(spec))
+        material = looks.new_material(
+            name, description["material"], domain_size=_domain_size(spec), pixel_angle=camera.pixel_angle(spec)
+        )
         if kind in ("mesh", "moving_mesh"):
             blender_object = geometry.new_mesh_object(name, geometry.read_ply(self._folder / description["file"]))
             blender_object.rotation_mode = "QUATERNION"

@@ -17,6 +17,7 @@ class LookContext:
 
     Attributes:
         domain_size: diagonal of the domain [m].
+        pixel_angle: width of a pixel at a distance of 1 m [m/m].
         color: base colour or tint from the job, linear RGB, or None.
         roughness: from the job [-], or None.
         density: from the job, or None; see `render.parameters.MaterialParameters`.
@@ -24,6 +25,7 @@ class LookContext:
     """
 
     domain_size: float
+    pixel_angle: float
     color: Color | None
     roughness: float | None
     density: float | None

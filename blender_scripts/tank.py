@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from blender_scripts.camera import pixel_angle
 from blender_scripts.geometry import TriangleMesh, new_mesh_object
 from blender_scripts.looks import new_material
 
@@ -41,7 +42,8 @@ def add_tank(spec: dict[str, Any]) -> None:
             edges.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2])))
     for name, boxes in (("tank_glass", panes), ("tank_edge", edges)):
         tank = new_mesh_object(name, _boxes(boxes))
-        tank.data.materials.append(new_material(name, {"look": name, **_OWN_MATERIAL}, domain_size=size))
+        own = {"look": name, **_OWN_MATERIAL}
+        tank.data.materials.append(new_material(name, own, domain_size=size, pixel_angle=pixel_angle(spec)))
         tank.data.shade_flat()
 
 

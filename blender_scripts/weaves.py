@@ -6,15 +6,19 @@ is a triangle wave that is cut off above,
 
     z = clamp(2 |(v + a i + n/2 - 1/2) mod n - n/2| - 1, -1, 1),
 
-that of a weft thread the negative of the same with u and b j, where b solves a b = 1 (mod n). Where pixels are larger
-than threads, Blender's bump fades by itself, as it looks at differences over a pixel, and colours mix: far away a woven
-cloth is a matt sheet.
+that of a weft thread the negative of the same with u and b j, where b solves a b = 1 (mod n).
+
+A pattern that is finer than the pixels would beat against them (moiré), and its normals and colours, another in every
+sample, would be noise that the denoiser takes for detail. So threads fade from RESOLVED to UNRESOLVED into what they
+are on average: far away a woven cloth is a matt sheet of their mean colour.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from blender_scripts.geometry import REST_UV
 from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
@@ -61,6 +65,12 @@ SILK = Weave(5, 2, -2, 0.15e-3, (0.42, 0.02, 0.035), None, 0.38, 0.5, 0.6, 0.25,
 DENIM = Weave(4, 1, 1, 0.8e-3, (0.012, 0.030, 0.100), (0.15, 0.16, 0.18), 0.9, 0.15, 0.0, 0.15, 0.0, 0.3, 0.4)
 """Twill of indigo warp over three, under one undyed weft; its back is mostly weft."""
 
+RESOLVED, UNRESOLVED = 0.5, 1.0
+"""Threads per pixel: up to the first, Nyquist's, threads are drawn as they are; from the second on there are none."""
+
+HALF_UNDULATION = 0.5
+"""How far a thread goes up and down, in its radii."""
+
 
 def build_cotton(builder: NodeBuilder, context: LookContext) -> None:
     """Matt plain weave."""
@@ -83,10 +93,15 @@ def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
     warp_height, weft_height = _heights(builder, weave, u, v)
     height = builder.math("MAXIMUM", warp_height, weft_height)
     shows_weft = builder.math("GREATER_THAN", weft_height, warp_height)
-    color = _colors(builder, weave, or_default(context.color, weave.warp), shows_weft)
-    color = _shaded(builder, weave, color, height, (u, v))
+    detail = _detail(builder, context.pixel_angle / spacing)
+    weft_share, brightness = mean_appearance(weave)
+    color = _colors(
+        builder, weave, or_default(context.color, weave.warp), _faded(builder, shows_weft, weft_share, detail)
+    )
+    color = _scaled(builder, color, _faded(builder, _brightness(builder, weave, height, (u, v)), brightness, detail))
 
-    bump = builder.node("ShaderNodeBump", Strength=0.7, Distance=0.5 * spacing)
+    bump = builder.node("ShaderNodeBump", Distance=0.5 * spacing)
+    builder.link(builder.math("MULTIPLY", detail, 0.7), bump.inputs["Strength"])
     builder.link(height, bump.inputs["Height"])
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
@@ -103,6 +118,54 @@ def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
         tangent.direction_type, tangent.uv_map = "UV_MAP", REST_UV
         builder.link(tangent.outputs[0], shader.inputs["Tangent"])
     builder.surface(_with_light_through(builder, shader, color, weave.translucency))
+
+
+def mean_appearance(weave: Weave, *, samples: int = 64) -> tuple[float, float]:
+    """What a weave is on average over its period: the share of weft on its front, and the brightness of its threads.
+
+    Args:
+        weave: the pattern; its unevenness has no mean effect.
+        samples: a thread, along and across.
+    """
+    place = (np.arange(weave.period * samples) + 0.5) / samples
+    u, v = np.meshgrid(place, place, indexing="ij")
+
+    def surface(along: np.ndarray, across: np.ndarray, step: int, sign: float) -> np.ndarray:
+        from_dip = np.abs(
+            (along + step * np.floor(across) + 0.5 * weave.period - 0.5) % weave.period - 0.5 * weave.period
+        )
+        undulation = sign * np.minimum(2.0 * from_dip - 1.0, 1.0)
+        return np.abs(np.sin(np.pi * across)) + HALF_UNDULATION * undulation
+
+    warp, weft = surface(v, u, weave.warp_step, 1.0), surface(u, v, weave.weft_step, -1.0)
+    light = np.clip(weave.gaps + (1.0 - weave.gaps) * np.maximum(warp, weft), 0.0, 1.0)
+    return float((weft > warp).mean()), float(light.mean())
+
+
+def _detail(builder: NodeBuilder, threads_per_pixel_at_1_m: float) -> Any:
+    """1 where threads are drawn, 0 where there are too many of them to a pixel.
+
+    A pixel's footprint on the sheet is that of its angle at this distance, longer where the sheet is seen aslant.
+    """
+    geometry = builder.node("ShaderNodeNewGeometry")
+    facing = builder.node("ShaderNodeVectorMath")
+    facing.operation = "DOT_PRODUCT"
+    builder.link(geometry.outputs["Normal"], facing.inputs[0])
+    builder.link(geometry.outputs["Incoming"], facing.inputs[1])
+    cosine = builder.math("MAXIMUM", builder.math("ABSOLUTE", facing.outputs["Value"]), 1.0e-3)
+    distance = builder.node("ShaderNodeCameraData").outputs["View Distance"]
+    threads = builder.math("DIVIDE", builder.math("MULTIPLY", distance, threads_per_pixel_at_1_m), cosine)
+    fade = builder.node("ShaderNodeMapRange")
+    fade.interpolation_type = "SMOOTHSTEP"
+    builder.link(threads, fade.inputs["Value"])
+    for socket, value in (("From Min", RESOLVED), ("From Max", UNRESOLVED), ("To Min", 1.0), ("To Max", 0.0)):
+        fade.inputs[socket].default_value = value
+    return fade.outputs[0]
+
+
+def _faded(builder: NodeBuilder, value: Any, mean: float, detail: Any) -> Any:
+    """The value where detail is 1, its mean where it is 0."""
+    return builder.math("MULTIPLY_ADD", builder.math("SUBTRACT", value, mean), detail, mean)
 
 
 def _thread_numbers(builder: NodeBuilder, spacing: float) -> tuple[Any, Any]:
@@ -136,7 +199,7 @@ def _undulation(builder: NodeBuilder, period: int, along: Any, across: Any, step
 def _round(builder: NodeBuilder, across: Any, undulation: Any) -> Any:
     """A thread's surface, |sin(pi x)| across it, on its undulation of half a radius."""
     profile = builder.math("ABSOLUTE", builder.math("SINE", builder.math("MULTIPLY", across, 3.14159265)))
-    return builder.math("ADD", profile, builder.math("MULTIPLY", undulation, 0.5))
+    return builder.math("ADD", profile, builder.math("MULTIPLY", undulation, HALF_UNDULATION))
 
 
 def _colors(builder: NodeBuilder, weave: Weave, warp: Color, shows_weft: Any) -> Any:
@@ -146,19 +209,23 @@ def _colors(builder: NodeBuilder, weave: Weave, warp: Color, shows_weft: Any) ->
     return builder.mix_colors(shown, warp, weave.weft or warp)
 
 
-def _shaded(builder: NodeBuilder, weave: Weave, color: Any, height: Any, place: tuple[Any, Any]) -> Any:
-    """Colours that are uneven along threads, and darker between them."""
+def _brightness(builder: NodeBuilder, weave: Weave, height: Any, place: tuple[Any, Any]) -> Any:
+    """A factor on colours, which are uneven along threads and darker between them."""
     u, v = place
     # Thick and thin places of a thread are some forty spacings long.
     streaks = [_streaks(builder, *scaled) for scaled in ((u, 1.0, v, 0.025), (u, 0.025, v, 1.0))]
     uneven = builder.math("ADD", *streaks)
     uneven = builder.math("MULTIPLY_ADD", builder.math("SUBTRACT", uneven, 1.0), 2.0 * weave.unevenness, 1.0)
     light = builder.math("MINIMUM", builder.math("MULTIPLY_ADD", height, 1.0 - weave.gaps, weave.gaps), 1.0)
-    brightness = builder.math("MULTIPLY", uneven, builder.math("MAXIMUM", light, 0.0))
+    return builder.math("MULTIPLY", uneven, builder.math("MAXIMUM", light, 0.0))
+
+
+def _scaled(builder: NodeBuilder, color: Any, factor: Any) -> Any:
+    """A colour times a factor."""
     product = builder.node("ShaderNodeVectorMath")
     product.operation = "SCALE"
     builder.link(color, product.inputs[0])
-    builder.link(brightness, product.inputs["Scale"])
+    builder.link(factor, product.inputs["Scale"])
     return product.outputs[0]
 
 

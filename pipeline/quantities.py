@@ -81,6 +81,7 @@ _KNOWN = {
         Quantity("max_compression", "largest compression", SHARE, _ERROR),
         Quantity("residual", "residual", "", "Residual"),
         Quantity("divergence", "largest divergence", "1/s", "Divergence"),
+        Quantity("compression", "compression of closed air", "1/s", "Compression of closed air"),
         Quantity("not_converged", "solves at their iteration limit", "", "Solves at their limit", counted=True),
         Quantity("squeezed", "squeezed beyond 20 %", "", "Frames with squeezed particles", counted=True),
         Quantity("linear_solves", "solves made linear", "", "Solves made linear", counted=True),
@@ -112,6 +113,8 @@ _KNOWN = {
         Quantity("elastic_energy", "elastic energy", "J", _ENERGY),
         Quantity("mass", "mass", "kg", _MASS),
         Quantity("emitted_mass", "emitted", "kg", _MASS),
+        Quantity("covered_mass", "covered by obstacles", "kg", _MASS),
+        Quantity("uncovered_mass", "left by obstacles", "kg", _MASS),
         *(Quantity(f"momentum_{axis}", f"momentum {axis}", "kg m/s", _MOMENTUM) for axis in "xyz"),
         *(Quantity(f"angular_momentum_{axis}", f"angular momentum {axis}", "kg m²/s", _ANGULAR) for axis in "xyz"),
     )

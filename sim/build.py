@@ -17,15 +17,17 @@ from sim.fluid.parameters import shared_conflicts
 from sim.rigid.static import StaticBody
 from sim.scene import DomainParameters, SceneParameters
 from sim.shapes.placement import build_solid
-from sim.smoke.parameters import SmokeParameters
+from sim.smoke.parameters import SmokeParameters, boxes_overlap
 from sim.solver import Coupling, Solver
 from sim.world import World
 
 if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver
+    from sim.coupling.cloth_samples import ClothSamples
     from sim.fluid.forces import SPHFluid
     from sim.rigid.solver import RigidSolver
     from sim.shapes.solid import Solid
+    from sim.smoke.solver import SmokeSolver
 
 
 def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
@@ -37,22 +39,40 @@ def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
     """
     bodies = [StaticBody(parameters) for parameters in scene.rigid if parameters.kind == "static"]
     rigid = _build_rigid(scene)
-    fluids = [_build_fluids(scene, bodies, rigid)] if scene.fluid else []
-    smokes = [_build_smoke(smoke, scene, bodies) for smoke in scene.smoke]
     cloths = [_build_cloths(scene, frames_per_second)] if scene.cloth else []
+    samples = _sample_cloths(scene, cloths)
+    fluids = [_build_fluids(scene, bodies, rigid, samples)] if scene.fluid else []
+    smokes = [_build_smoke(smoke, scene, bodies) for smoke in scene.smoke]
     solvers: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
         contacts = contacts_of_cloths(cloth, scene.rigid, domain=scene.domain, rigid=rigid)
         cloth.add_contacts(contacts)
         couplings += [] if rigid is None else [ClothRigidCoupling(cloth, rigid, contacts)]
+        if samples is not None:
+            from sim.coupling.cloth_fluid import ClothFluidCoupling
+
+            couplings += [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
+    couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
     return World(solvers, frames_per_second=frames_per_second, couplings=couplings, static_bodies=bodies)
 
 
-def _build_fluids(scene: SceneParameters, bodies: Sequence[StaticBody], rigid: RigidSolver | None) -> SPHFluid:
-    """One solver for all fluids, as they share the tank; of moving bodies it has the samples."""
+def _sample_cloths(scene: SceneParameters, cloths: Sequence[ClothSolver]) -> ClothSamples | None:
+    """The samples of all cloths that a fluid feels; None where there is no fluid, or no cloth."""
+    from sim.coupling.cloth_samples import ClothSamples
+
+    if not (cloths and scene.fluid):
+        return None
+    fluid = scene.fluid[0]
+    return ClothSamples.of(cloths[0], 2.0 * fluid.particle_radius, fluid.support_in_spacings)
+
+
+def _build_fluids(
+    scene: SceneParameters, bodies: Sequence[StaticBody], rigid: RigidSolver | None, cloth: ClothSamples | None
+) -> SPHFluid:
+    """One solver for all fluids, as they share the tank; of what moves it has the samples."""
     from sim.coupling.body_samples import samples_of_moving_bodies
-    from sim.coupling.body_speed import expected_body_speed
+    from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
     from sim.fluid.kernels import particle_volume
     from sim.fluid.solvers import SOLVERS
@@ -67,7 +87,11 @@ def _build_fluids(scene: SceneParameters, bodies: Sequence[StaticBody], rigid: R
     moving = [build_solid(body) for body in movers]
     openings = _build_openings(scene, [*solids, *moving], spacing, volume)
     around = pipes(openings, spacing)
-    filling = fill_fluids(scene.fluid, scene.domain, [*solids, *moving], np.concatenate([NO_POINTS, *around]))
+    sheets = [] if cloth is None else [cloth.start]
+    in_the_way = np.concatenate([NO_POINTS, *around, *sheets])
+    filling = fill_fluids(scene.fluid, scene.domain, [*solids, *moving], in_the_way)
+    speeds = [] if rigid is None else [expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity)]
+    speeds += [] if cloth is None else [expected_cloth_speed(scene.cloth, cloth.start, scene.domain, scene.gravity)]
     samples = [
         sink_samples(
             _reachable(body.surface_samples(spacing), scene.domain, support * spacing),
@@ -87,8 +111,9 @@ def _build_fluids(scene: SceneParameters, bodies: Sequence[StaticBody], rigid: R
         phase=filling.phase,
         boundary=boundary,
         moving=None if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
+        sheets=None if cloth is None else cloth.sheets,
         body_count=len(moving),
-        body_speed=0.0 if rigid is None else expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity),
+        body_speed=max(speeds, default=0.0),
         capacity=particle_capacity(scene.fluid, scene.domain, filling.count_of(len(scene.fluid)), volume),
     )
 
@@ -142,7 +167,43 @@ def _build_cloths(scene: SceneParameters, frames_per_second: float) -> ClothSolv
     return ClothSolver(scene.cloth, domain=scene.domain, gravity=scene.gravity, frames_per_second=frames_per_second)
 
 
-def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> Solver:
+def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> SmokeSolver:
+    """The solver of one smoke, with static bodies in it, and room for what will move in it."""
     from sim.smoke.solver import SmokeSolver
 
-    return SmokeSolver(smoke, domain=scene.domain, gravity=scene.gravity, solids=[body.solid for body in bodies])
+    moving = _meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid)
+    return SmokeSolver(
+        smoke, domain=scene.domain, gravity=scene.gravity, solids=[body.solid for body in bodies], moving=moving
+    )
+
+
+def _meets_fluid(smoke: SmokeParameters, scene: SceneParameters) -> bool:
+    """Whether fluid, which stays in the domain, could come into the smoke's box."""
+    domain = scene.domain
+    return bool(scene.fluid) and boxes_overlap(smoke.corners(domain), (domain.min, domain.max))
+
+
+def _couple_smokes(
+    smokes: Sequence[SmokeSolver],
+    scene: SceneParameters,
+    *,
+    fluids: Sequence[SPHFluid],
+    cloths: Sequence[ClothSolver],
+    rigid: RigidSolver | None,
+) -> list[Coupling]:
+    """Each smoke with what is in its way, which is put there, and with what hangs in it."""
+    from sim.coupling.smoke_cloth import SmokeClothCoupling
+    from sim.coupling.smoke_fluid import SmokeFluidCoupling
+    from sim.coupling.smoke_rigid import SmokeRigidCoupling
+
+    couplings: list[Coupling] = []
+    for number, smoke in enumerate(smokes):
+        in_the_way: list[Coupling] = []
+        if _meets_fluid(smoke.parameters, scene):
+            in_the_way += [SmokeFluidCoupling(fluid, smoke, domain=scene.domain) for fluid in fluids]
+        in_the_way += [] if rigid is None else [SmokeRigidCoupling(rigid, smoke)]
+        for coupling in in_the_way:
+            coupling.exchange(0.0)
+        smoke.move_obstacles()
+        couplings += [*in_the_way, *(SmokeClothCoupling(cloth, smoke, number=number) for cloth in cloths)]
+    return couplings

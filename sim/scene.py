@@ -10,7 +10,7 @@ from sim.cloth.parameters import ClothParameters
 from sim.fluid.parameters import FluidParameters
 from sim.parameters import Parameters, Vector3
 from sim.rigid.parameters import RigidBodyParameters
-from sim.smoke.parameters import Face, SmokeParameters
+from sim.smoke.parameters import Face, SmokeParameters, boxes_overlap
 
 Device = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 
@@ -59,4 +59,15 @@ class SceneParameters(Parameters):
                 f'adhesion of "{sticky[0]}" has no reaction on bodies in this version, and would drive "{free[0]}" by '
                 'itself; set adhesion = 0, or make the bodies "static" or "kinematic"'
             )
+        return self
+
+    @model_validator(mode="after")
+    def _has_one_air(self) -> Self:
+        for number, smoke in enumerate(self.smoke):
+            for other in self.smoke[:number]:
+                if self.cloth and boxes_overlap(smoke.corners(self.domain), other.corners(self.domain)):
+                    raise ValueError(
+                        f'the boxes of smoke "{other.name}" and "{smoke.name}" overlap, and cloth can only be in one '
+                        "air; give them min and max"
+                    )
         return self

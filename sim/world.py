@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -77,6 +78,11 @@ class World:
     def time_s(self) -> float:
         """Simulated time [s]; frame k is at k / fps, never a sum of steps."""
         return self.frame / self._frames_per_second
+
+    @property
+    def solvers(self) -> Mapping[str, Solver]:
+        """All solvers by name; what they let change may be changed between frames."""
+        return MappingProxyType(self._solvers)
 
     def advance_frame(self) -> FrameReport:
         """Advance to the next frame.

@@ -14,7 +14,6 @@ from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.scene_checks import check_scene
-from sim.smoke.parameters import SmokeParameters
 
 MANY_FRAMES = 100_000
 
@@ -30,6 +29,7 @@ def check_job(job: Job, *, memory_bytes: int | None = None) -> Findings:
     """
     findings = Findings()
     _check_bodies(job, findings)
+    _check_wind(job, findings)
     _check_whitewater(job, findings)
     _check_materials(job, findings)
     _check_faces(job, findings)
@@ -47,27 +47,11 @@ def named_bodies(job: Job) -> Iterator[tuple[KeyPath, str, str]]:
             yield (kind, index), kind, body.name
 
 
-def _shares_space(smoke: SmokeParameters, job: Job) -> bool:
-    """Whether fluid and smoke could meet: the domain and the smoke's box overlap."""
-    lower, upper = smoke.min or job.domain.min, smoke.max or job.domain.max
-    return all(
-        low < end and high > begin
-        for low, high, begin, end in zip(lower, upper, job.domain.min, job.domain.max, strict=True)
-    )
-
-
 def _check_bodies(job: Job, findings: Findings) -> None:
     if not job.body_names:
         findings.error((), "has no body; add [[fluid]], [[smoke]], [[cloth]] or [[rigid]]")
     elif not (job.fluid or job.smoke or job.cloth) and all(body.kind == "static" for body in job.rigid):
         findings.warn((), "has neither fluid nor smoke nor cloth, so nothing will move")
-    if job.smoke and any(body.kind != "static" for body in job.rigid):
-        findings.warn((), "smoke passes through bodies that move in this version; only static ones are in its way")
-    if job.fluid and any(_shares_space(smoke, job) for smoke in job.smoke):
-        findings.warn((), "fluid and smoke do not act on each other in this version")
-    for kind in ("fluid", "smoke"):
-        if job.cloth and getattr(job, kind):
-            findings.warn((), f"cloth and {kind} do not act on each other in this version")
     for kind, solver in (("rigid", "moving bodies"), ("cloth", "cloths")):
         moves = job.cloth if kind == "cloth" else [body for body in job.rigid if body.kind != "static"]
         for path, of_kind, name in named_bodies(job):
@@ -79,6 +63,19 @@ def _check_bodies(job: Job, findings: Findings) -> None:
         if other := taken.get(name.casefold()):
             findings.error((*path, "name"), f'"{name}" is taken by {format_path(other)}; names are unique in a job')
         taken.setdefault(name.casefold(), path)
+
+
+def _check_wind(job: Job, findings: Findings) -> None:
+    for index, cloth in enumerate(job.cloth):
+        for smoke in job.smoke:
+            lower, upper = smoke.corners(job.domain)
+            starts_inside = all(a <= x <= b for a, x, b in zip(lower, cloth.position, upper, strict=True))
+            if any(cloth.wind) and starts_inside:
+                findings.warn(
+                    ("cloth", index, "wind"),
+                    f'does not blow in the box of smoke "{smoke.name}", where the cloth starts: the air of the smoke '
+                    "moves it there; give a source of the smoke a velocity, or the smoke another box",
+                )
 
 
 def _check_whitewater(job: Job, findings: Findings) -> None:

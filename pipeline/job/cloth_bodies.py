@@ -9,21 +9,13 @@ import numpy as np
 
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
-from sim.cloth.parameters import BODY_GRID_CELLS
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
     from sim.shapes import Solid
-    from sim.shapes.mesh_solid import MeshSolid
 
 LEAST_EDGES = 2.0
 """A body whose shortest side has fewer edges of the cloth may show between its nodes, and pass with less than half."""
-
-PROBES = 1000
-"""Points of a mesh's surface below which its thickness is looked at."""
-
-THIN_SHARE = 0.1
-"""Share of a mesh's surface that may be thin: what is beside its sharp edges always is."""
 
 
 def check_bodies_for_cloth(
@@ -37,7 +29,7 @@ def check_bodies_for_cloth(
         longest_edges: longest distance of neighbouring nodes of the cloths, by their numbers [m].
         findings: where warnings go.
     """
-    from sim.shapes.mesh_solid import MeshSolid
+    from sim.cloth.body_grids import CELLS_PER_WALL, THIN_SHARE, grid_spacing, thin_wall
     from sim.shapes.placement import PlacedSolid
 
     if not longest_edges:
@@ -55,23 +47,12 @@ def check_bodies_for_cloth(
                 f'"{body}" is {sides.min():.3g} m across, less than two of the longest edges, {longest:.3g} m each: '
                 "it may show or pass between the nodes; divide the sheet more finely, or make the body larger",
             )
-        if isinstance(solid.shape, MeshSolid):
-            cell = float(sides.max()) / BODY_GRID_CELLS
-            share = _thin_share(solid.shape, cell / solid.scale)
-            if share > THIN_SHARE:
-                findings.warn(
-                    (*path[:2], "shape"),
-                    f"{share:.0%} of its surface is on walls thinner than {2.0 * cell:.3g} m, two cells of the grid "
-                    f"that cloth meets it by, its longest side over {BODY_GRID_CELLS}: cloth may pass through them; "
-                    "make them thicker, or build the body of several",
-                )
-
-
-def _thin_share(solid: MeshSolid, cell: float) -> float:
-    """Share of a mesh's surface that has less than half a cell [m] of solid around a point one cell below it."""
-    from sim.shapes.sampling import stratified_points
-
-    points, face = stratified_points(solid.mesh, PROBES)
-    inwards = -solid.mesh.area_vectors[face]
-    inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
-    return float((solid.signed_distance(points + cell * inwards) > -0.5 * cell).mean())
+        wall = thin_wall(solid)
+        cell = grid_spacing(solid, wall)
+        if wall < CELLS_PER_WALL * cell:
+            findings.warn(
+                (*path[:2], "shape"),
+                f"{THIN_SHARE:.0%} of its surface or more is on walls of {wall:.3g} m or thinner; the finest grid that "
+                f"cloth may meet it by has cells of {cell:.3g} m and feels walls of {CELLS_PER_WALL:g}: cloth may pass "
+                "through them; make them thicker, or build the body of several",
+            )

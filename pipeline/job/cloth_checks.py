@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import prod
+from functools import cached_property
+from math import hypot, prod
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,9 +16,10 @@ from pipeline.job.boxes import Box, domain_box, span, touch
 from pipeline.job.cloth_bodies import check_bodies_for_cloth
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.mesh_checks import mesh_exists
+from pipeline.job.pin_checks import check_pin_speed, check_pin_times
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
-from sim.cloth.parameters import RectangleSheet, shared_conflicts
+from sim.cloth.parameters import RUNAWAY_SPEED, RectangleSheet, shared_conflicts
 from sim.shapes.parameters import MeshShape
 
 if TYPE_CHECKING:
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
 BYTES_PER_NODE = 6000
 """What the solver takes: 2.7 kB for six springs, two triangles, what building them takes for a moment, and snapshots
 (measured with 62,500 nodes in a flat sheet), and room for some forty contacts a node in a bundle."""
+VAST = 20.0
+"""A mesh that is so many times as large as the domain is in other units, most likely."""
 ROUND_OFF = 1.0e-6
 """Cloth that is laid onto a body, in decimal numbers, may be so deep in it [m]."""
 
@@ -69,8 +73,7 @@ class _Start:
         sheet: at rest.
         position: of its nodes [m], (n, 3).
         edges: (e, 2) node numbers.
-        held: whether a pin holds the node at the start, (n,).
-        kept: whether one holds it for ever, (n,).
+        pinned: nodes of each pin, by its number.
     """
 
     path: KeyPath
@@ -78,10 +81,25 @@ class _Start:
     sheet: RestSheet
     position: NDArray[np.float64]
     edges: NDArray[np.int32]
-    held: NDArray[np.bool_]
-    kept: NDArray[np.bool_]
+    pinned: Mapping[int, NDArray[np.int64]]
+
+    @cached_property
+    def held(self) -> NDArray[np.bool_]:
+        """Whether a pin holds the node at the start, (n,)."""
+        held = np.zeros(len(self.position), dtype=bool)
+        for nodes in self.pinned.values():
+            held[nodes] = True
+        return held
 
     @property
+    def kept(self) -> NDArray[np.bool_]:
+        """Whether one holds it for ever, (n,)."""
+        kept = np.zeros(len(self.position), dtype=bool)
+        for number, nodes in self.pinned.items():
+            kept[nodes] |= self.cloth.pin[number].release_s is None
+        return kept
+
+    @cached_property
     def longest_edge(self) -> float:
         """Longest distance of neighbouring nodes [m]."""
         ends = self.position[self.edges]
@@ -107,6 +125,9 @@ def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
     """
     for number, key, message in shared_conflicts(job.cloth):
         findings.error(("cloth", number, key), message)
+    check_pin_times(job, findings)
+    for number, cloth in enumerate(job.cloth):
+        _check_speeds(("cloth", number), cloth, findings)
     starts: list[_Start] = []
     for index in range(len(job.cloth)):
         before = sum(len(start.position) for start in starts)
@@ -114,7 +135,9 @@ def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
             starts.append(start)
     for number, start in enumerate(starts):
         _check_place(start, job.domain, findings)
+        _check_size(start, job.domain, findings)
         _check_spacing(start, findings)
+        _check_pin_speeds(start, job.fps, findings)
         _check_substeps(start, job.fps, findings)
         for path, solid in solids.items():
             if path[0] == "rigid":
@@ -152,20 +175,20 @@ def _start(job: Job, index: int, room: _Room, findings: Findings) -> _Start | No
     for warning in sheet.warnings:
         findings.warn((*path, "shape"), warning)
     position = start_positions(cloth, sheet)
-    held, kept = _held(path, cloth, sheet, position, findings)
-    return _Start(path, cloth, sheet, position, edges_of(sheet.triangles).nodes, held, kept)
+    pinned = _pinned(path, cloth, sheet, position, findings)
+    return _Start(path, cloth, sheet, position, edges_of(sheet.triangles).nodes, pinned)
 
 
-def _held(
+def _pinned(
     path: KeyPath, cloth: ClothParameters, sheet: RestSheet, position: NDArray[np.float64], findings: Findings
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which nodes pins hold at the start, and which for ever, (n,) each.
+) -> dict[int, NDArray[np.int64]]:
+    """The nodes of each pin, by its number.
 
-    Notes pins that hold none, and moving ones that share a node.
+    Notes pins that hold none, which are left out, and moving ones that share a node.
     """
     from sim.cloth.start import pinned_nodes
 
-    holders, kept = np.full(len(position), -1), np.zeros(len(position), dtype=bool)
+    holders, pinned = np.full(len(position), -1), {}
     for number, pin in enumerate(cloth.pin):
         place = (*path, "pin", number)
         try:
@@ -178,8 +201,8 @@ def _held(
         if moving:
             findings.error(place, f"shares a node with pin[{moving[0]}], and one of them moves; pin each node once")
         holders[nodes] = number
-        kept[nodes] |= pin.release_s is None
-    return holders >= 0, kept
+        pinned[number] = nodes
+    return pinned
 
 
 def _check_place(start: _Start, domain: DomainParameters, findings: Findings) -> None:
@@ -199,6 +222,27 @@ def _check_place(start: _Start, domain: DomainParameters, findings: Findings) ->
                 )
 
 
+def _check_speeds(path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:
+    """Refuse speeds at which the simulation stops; warn of wind that blows through the cloth."""
+    for key in ("velocity", "wind"):
+        if (speed := hypot(*getattr(cloth, key))) >= RUNAWAY_SPEED:
+            findings.error((*path, key), f"must be below {RUNAWAY_SPEED:g} m/s, got {speed:g} m/s; units are SI")
+    if any(cloth.wind) and not cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0:
+        none = "air_density" if not cloth.air_density else "drag and skin_drag"
+        findings.warn((*path, "wind"), f"has no effect without {none}; give that a value, or remove the wind")
+
+
+def _check_size(start: _Start, domain: DomainParameters, findings: Findings) -> None:
+    """A mesh in millimetres is a thousand times too large; nothing else would tell, if faces are open."""
+    largest, room = float(np.ptp(start.box, axis=0).max()), float(np.ptp(domain_box(domain), axis=0).max())
+    if isinstance(start.cloth.shape, MeshShape) and largest > VAST * room:
+        findings.warn(
+            (*start.path, "shape", "file"),
+            f"is {largest:.4g} m across, the domain {room:.4g} m; files have no unit and are read in metres: "
+            "give shape.size",
+        )
+
+
 def _check_spacing(start: _Start, findings: Findings) -> None:
     """Layers keep the thickness where the sheet is folded; it cannot fold more sharply than its nodes allow."""
     rest = start.sheet.vertices[start.edges]
@@ -208,6 +252,20 @@ def _check_spacing(start: _Start, findings: Findings) -> None:
             (*start.path, "thickness"),
             f"{start.cloth.thickness:g} m is more than the {shortest:.3g} m between neighbouring nodes: every node is "
             "in contact with many others, which takes long; make it thinner, or the sheet coarser",
+        )
+
+
+def _check_pin_speeds(start: _Start, fps: int, findings: Findings) -> None:
+    """Nodes follow a pin by their springs, from substep to substep."""
+    for number, nodes in start.pinned.items():
+        position = start.position[nodes]
+        check_pin_speed(
+            (*start.path, "pin", number),
+            start.cloth,
+            reach=float(np.linalg.norm(position - position.mean(axis=0), axis=1).max()),
+            longest_edge=start.longest_edge,
+            fps=fps,
+            findings=findings,
         )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.job.amounts import count, gigabytes, rounded_up
 from pipeline.job.boxes import Box, domain_box, overlap, span, touch
@@ -34,8 +35,9 @@ BYTES_PER_PARTICLE_ON_GPU = 600
 """The same without the snapshots, which are the host's."""
 NEIGHBOR_BYTES = 240
 """The neighbour list's part of that at a support of two spacings; it grows with the cube of the support."""
-BYTES_PER_CELL = 200
-"""Upper bound of what the smoke solver takes, multigrid levels and snapshot included."""
+BYTES_PER_CELL = 250
+"""Upper bound of what the smoke solver takes, multigrid levels and snapshot included: 92 for itself and what moves in
+it, 28 for fluid, 24 for cloth."""
 BYTES_PER_SEARCH_CELL = 16
 """Starts and counts of fluid and boundary; a cell is as wide as the support radius, two particle spacings."""
 BYTES_PER_WALL_SAMPLE = 150
@@ -254,7 +256,7 @@ def _check_smoke(
     cells = float(np.prod(np.ceil(extent / smoke.cell_size)))
     if cells * BYTES_PER_CELL > budget.bytes:
         possible = budget.bytes // BYTES_PER_CELL
-        size = smoke.cell_size * (cells / possible) ** (1.0 / 3.0)
+        size = _cell_size_that_fits(extent, smoke.cell_size, possible)
         findings.error(
             ("smoke", index, "cell_size"),
             f"{count(cells)} cells need {gigabytes(cells * BYTES_PER_CELL)}, "
@@ -265,6 +267,16 @@ def _check_smoke(
         if path[:3] == ("smoke", index, "source"):
             _check_source(path, solid, box, smoke.cell_size, findings)
     return int(cells)
+
+
+def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, most_cells: int) -> float:
+    """The smallest cell size [m], not below a given one, that cuts a box into at most so many cells, or one."""
+    most = max(1, most_cells)
+    size = max(cell_size, float(np.cbrt(np.prod(extent) / most)))
+    while np.prod(layers := np.ceil(extent / size)) > most:
+        # Counts are rounded up: the next size of use is the one that saves a layer of cells.
+        size = float(np.min(extent[layers > 1.0] / (layers[layers > 1.0] - 1.0))) * (1.0 + 1.0e-9)
+    return size
 
 
 def _check_source(path: KeyPath, solid: Solid, grid: Box, cell_size: float, findings: Findings) -> None:

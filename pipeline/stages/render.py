@@ -50,7 +50,7 @@ class RenderStage:
     """One PNG a frame. A worker keeps Blender and the scene warm from frame to frame."""
 
     name = "render"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""

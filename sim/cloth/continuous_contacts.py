@@ -72,7 +72,8 @@ class ContinuousContacts:
         self.rigid.set_spacing(self._pairs.mean_edge)
         n = state.vertex_count
         self._contacts = ContactList(4 * n)
-        self._shares = ti.ndarray(ti.i32, n)
+        self._shares, self._touched = ti.ndarray(ti.i32, n), ti.ndarray(ti.i32, n)
+        self._counter = ti.ndarray(ti.i32, 2)
         self._gathered = ti.ndarray(ti.i64, 3 * n)
         self._gathered.fill(0)
         self._predicted, self._start, self._reached = (ti.Vector.ndarray(3, ti.f32, n) for _ in range(3))
@@ -97,8 +98,9 @@ class ContinuousContacts:
         self._mean_mass = float(self._state.mass.to_numpy().mean())
 
     def diagnostics(self) -> Mapping[str, float]:
-        """Numbers of the frame: contacts, with watched pairs, and iterations a substep; searches for pairs.
+        """Numbers of the frame: contacts, with watched pairs, and iterations a substep.
 
+        `pair_searches` is how many pairs of patches were searched for near elements, over the number of patches;
         `repaired_crossings` counts pairs that contacts alone would have let cross, `impact_zone_vertices` the vertices
         that had to move with others, `crossings_left` pairs that even so may have crossed, as where pins are led
         through each other; all summed over the substeps.
@@ -129,22 +131,22 @@ class ContinuousContacts:
         n = state.vertex_count
         margin = max(MARGIN * self._pairs.thickness, 1.25 * self._change)
         while True:
-            self._pairs.prepare(state, motion)
+            self._pairs.prepare(state, motion, margin)
             found = self._find(state, margin, dt)
-            left = 0
+            left, change = 0, 0.0
             if found:
                 copy_vectors(state.displacement, n, self._predicted)
                 self._push(state, found, is_first=True)
                 left = self._keep_apart(state, found)
-                self._change = float(largest_change(state.displacement, self._predicted, n))
-                motion, _ = half_range(state.displacement, n)
-                if not math.isfinite(self._change + motion):
+                self._change = change = float(largest_change(state.displacement, self._predicted, n))
+                if not math.isfinite(change):
                     return  # as above
             # What was pushed farther than foreseen may have met what was not looked at.
-            if not found or (self._change <= margin and self._pairs.covers(state, motion)):
+            if change <= margin:
                 break
-            margin = max(margin, 1.5 * self._change)
-        self._pairs.follow(state, motion)
+            margin = 1.5 * change
+            motion, _ = half_range(state.displacement, n)
+        self._pairs.follow(state, motion, change)
         self._substeps += 1
         self._found += found
         self._left += left
@@ -160,22 +162,24 @@ class ContinuousContacts:
 
     def _push(self, state: ClothState, count: int, *, is_first: bool) -> None:
         contacts, bodies, n = self._contacts, self.rigid.bodies, state.vertex_count
-        pushing = weigh_contacts(
+        pushing, touched = weigh_contacts(
             count, contacts.vertices, contacts.weights, contacts.floor, contacts.kind, contacts.arm, contacts.mobility,
-            contacts.impulse, contacts.pushing, contacts.counter, n, state.inverse_mass, self._shares, bodies.count,
-            bodies.inverse_mass, bodies.inverse_inertia, bodies.load, bodies.load_unit, is_first,
-        )  # fmt: skip
+            contacts.impulse, contacts.pushing, self._counter, n, state.inverse_mass, self._shares,
+            self._touched, bodies.count, bodies.inverse_mass, bodies.inverse_inertia, bodies.load, bodies.load_unit,
+            is_first,
+        )[:2]  # fmt: skip
         if not pushing:
             return
         for iterations in ITERATIONS:
-            if self._iterate(state, int(pushing), iterations) <= TOLERANCE:
+            if self._iterate(state, int(pushing), int(touched), iterations) <= TOLERANCE:
                 break
 
-    def _iterate(self, state: ClothState, count: int, iterations: int) -> float:
+    def _iterate(self, state: ClothState, count: int, touched: int, iterations: int) -> float:
         """Some steps of the contact iteration; the most that a contact misses then, in its thickness."""
-        contacts, bodies, n = self._contacts, self.rigid.bodies, state.vertex_count
+        contacts, bodies = self._contacts, self.rigid.bodies
+        vertices = (touched, self._touched)
         begin_push(
-            count, contacts.pushing, contacts.impulse, contacts.impulse_before, contacts.impulse_given, n,
+            count, contacts.pushing, contacts.impulse, contacts.impulse_before, contacts.impulse_given, *vertices,
             state.displacement, self._start, self._reached, bodies.count, bodies.motion, bodies.motion_start,
             bodies.motion_reached,
         )  # fmt: skip
@@ -183,18 +187,18 @@ class ContinuousContacts:
             push_apart(
                 k / (k + 3.0), (k + 1.0) / (k + 4.0), count, contacts.pushing, contacts.vertices, contacts.weights,
                 contacts.normal, contacts.floor, contacts.kind, contacts.arm, contacts.friction, contacts.mobility,
-                contacts.impulse, contacts.impulse_before, n, state.displacement, self._reached, state.inverse_mass,
-                self._gathered, bodies.count, bodies.motion, bodies.motion_reached, bodies.inverse_mass,
-                bodies.inverse_inertia, bodies.gathered, self._impulse_unit,
+                contacts.impulse, contacts.impulse_before, *vertices, state.displacement, self._reached,
+                state.inverse_mass, self._gathered, bodies.count, bodies.motion, bodies.motion_reached,
+                bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, self._impulse_unit,
             )  # fmt: skip
         self._iterations += iterations
         return float(
             finish_push(
                 count, contacts.pushing, contacts.vertices, contacts.weights, contacts.normal, contacts.floor,
-                contacts.kind, contacts.arm, contacts.impulse, contacts.impulse_given, n, state.displacement,
-                self._start, state.inverse_mass, state.thickness, self._gathered, bodies.count, bodies.motion,
-                bodies.motion_start, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, bodies.impulse,
-                self._impulse_unit,
+                contacts.kind, contacts.arm, contacts.impulse, contacts.impulse_given, *vertices,
+                state.displacement, self._start, state.inverse_mass, state.thickness, self._gathered, bodies.count,
+                bodies.motion, bodies.motion_start, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered,
+                bodies.impulse, self._impulse_unit,
             )
         )  # fmt: skip
 

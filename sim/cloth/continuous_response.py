@@ -17,11 +17,15 @@ and threads.
 import taichi as ti
 
 from sim.arrays import Floats, Integers, LongIntegers, Matrices, Vectors
-from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, Quadruples, Weights
+from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, WALL, Quadruples, Weights
 from sim.launch import fast_launch
 
 SHARES_PER_UNIT = 65536.0
 """Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
+
+LEAST_FREE_WEIGHT = 0.05
+"""A contact pushes only if its vertices that no pin holds have so much of its weight, so that none moves more than
+twenty times what the contact lacks. Others are only watched: a corner far from a contact of two pins is no lever."""
 
 LARGEST_SHARE = 0.9
 """How much of a pair's separation a substep may use up: what is left keeps the sides apart for the next one."""
@@ -38,33 +42,36 @@ ROUNDING = 1.0e-6
 def weigh_contacts(
     count: ti.i32, vertices: Quadruples, weights: Weights, floor: Floats, kind: Integers, arm: Vectors,
     mobility: Floats, impulse: Vectors, pushing: Integers, counter: Integers,
-    vertex_count: ti.i32, inverse_mass: Floats, shares: Integers,
+    vertex_count: ti.i32, inverse_mass: Floats, shares: Integers, touched: Integers,
     body_count: ti.i32, body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_load: LongIntegers,
     load_unit: ti.f32, is_first: ti.template(),
-) -> ti.i32:  # fmt: skip
+) -> ti.math.ivec2:  # fmt: skip
     """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses.
 
-    Returns how many there are. Contacts of what nothing moves do not push.
+    Returns how many there are, and how many vertices they push, which are listed too. Contacts whose free vertices
+    weigh less than `LEAST_FREE_WEIGHT` do not push.
     """
     for i in range(vertex_count):
         shares[i] = 0
     for b in range(body_count):
         body_load[b] = ti.cast(0, ti.i64)
-    counter[0] = 0
+    counter[0], counter[1] = 0, 0
     for c in range(count):
         if floor[c] > 0.5 * INACTIVE:
-            mobile = 0.0
+            free = 0.0
             for k in ti.static(range(4)):
                 if weights[c][k] != 0.0:
                     share = ti.cast(ti.ceil(ti.abs(weights[c][k]) * SHARES_PER_UNIT), ti.i32)
                     ti.atomic_add(shares[vertices[c][k]], share)
-                    mobile += inverse_mass[vertices[c][k]]
+                    if inverse_mass[vertices[c][k]] > 0.0:
+                        free += ti.abs(weights[c][k])
             b = kind[c]
             if b >= 0:
                 most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
-                ti.atomic_add(body_load[b], ti.cast(ti.ceil(ti.sqrt(most) / load_unit), ti.i64))
-                mobile += most
-            if mobile > 0.0:
+                if most > 0.0:
+                    ti.atomic_add(body_load[b], ti.cast(ti.ceil(ti.sqrt(most) / load_unit), ti.i64))
+                    free = 1.0
+            if free >= LEAST_FREE_WEIGHT:
                 pushing[ti.atomic_add(counter[0], 1)] = c
     for place in range(counter[0]):
         c = pushing[place]
@@ -81,7 +88,10 @@ def weigh_contacts(
             most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
             total += ti.sqrt(most) * ti.cast(body_load[b], ti.f32) * load_unit
         mobility[c] = total
-    return counter[0]
+    for i in range(vertex_count):
+        if shares[i] > 0:
+            touched[ti.atomic_add(counter[1], 1)] = i
+    return ti.math.ivec2(counter[0], counter[1])
 
 
 @ti.func
@@ -143,11 +153,12 @@ def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
 @ti.kernel
 def begin_push(
     count: ti.i32, pushing: Integers, impulse: Vectors, impulse_before: Vectors, impulse_given: Vectors,
-    vertex_count: ti.i32, displacement: Vectors, start: Vectors, reached: Vectors,
+    touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, reached: Vectors,
     body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors,
 ):  # fmt: skip
     """Note where the iteration starts."""
-    for i in range(vertex_count):
+    for place in range(touched_count):
+        i = touched[place]
         start[i] = displacement[i]
         reached[i] = displacement[i]
     for m in range(2 * body_count):
@@ -165,7 +176,8 @@ def push_apart(
     momentum: ti.f32, next_momentum: ti.f32, count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights,
     normal: Vectors, floor: Floats, kind: Integers, arm: Vectors, friction: Floats, mobility: Floats,
     impulse: Vectors, impulse_before: Vectors,
-    vertex_count: ti.i32, displacement: Vectors, reached: Vectors, inverse_mass: Floats, gathered: LongIntegers,
+    touched_count: ti.i32, touched: Integers, displacement: Vectors, reached: Vectors, inverse_mass: Floats,
+    gathered: LongIntegers,
     body_count: ti.i32, body_motion: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
     body_inverse_inertia: Matrices, body_gathered: LongIntegers, unit: ti.f32,
 ):  # fmt: skip
@@ -186,8 +198,14 @@ def push_apart(
         after = along * n + sideways
         impulse_before[c] = impulse[c]
         impulse[c] = after
-        give((after - ahead) / unit, vertices[c], weights[c], kind[c], arm[c], gathered, body_gathered)
-    for i in range(vertex_count):
+        if (after - ahead).norm_sqr() > 0.0:
+            # What nothing moves need not hear of it before the end: its sums are in the way of all threads.
+            mobile = kind[c]
+            if mobile >= 0 and body_mobility(arm[c], body_inverse_mass[mobile], body_inverse_inertia[mobile]) == 0.0:
+                mobile = WALL
+            give((after - ahead) / unit, vertices[c], weights[c], mobile, arm[c], gathered, body_gathered)
+    for place in range(touched_count):
+        i = touched[place]
         u = displacement[i] + (inverse_mass[i] * unit) * take(gathered, 3 * i)
         displacement[i] = u + next_momentum * (u - reached[i])
         reached[i] = u
@@ -205,9 +223,10 @@ def push_apart(
 def finish_push(
     count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats,
     kind: Integers, arm: Vectors, impulse: Vectors, impulse_given: Vectors,
-    vertex_count: ti.i32, displacement: Vectors, start: Vectors, inverse_mass: Floats, thickness: Floats,
-    gathered: LongIntegers, body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_inverse_mass: Floats,
-    body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, unit: ti.f32,
+    touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, inverse_mass: Floats,
+    thickness: Floats, gathered: LongIntegers, body_count: ti.i32, body_motion: Vectors, body_start: Vectors,
+    body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_gathered: LongIntegers,
+    body_impulse: LongIntegers, unit: ti.f32,
 ) -> ti.f32:  # fmt: skip
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
@@ -217,7 +236,8 @@ def finish_push(
         c = pushing[place]
         push = (impulse[c] - impulse_given[c]) / unit
         give(push, vertices[c], weights[c], kind[c], arm[c], gathered, body_gathered)
-    for i in range(vertex_count):
+    for place in range(touched_count):
+        i = touched[place]
         displacement[i] = start[i] + (inverse_mass[i] * unit) * take(gathered, 3 * i)
     for b in range(body_count):
         for axis in ti.static(range(6)):

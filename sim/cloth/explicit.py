@@ -20,7 +20,13 @@ class ExplicitSprings:
     node gathers its own in a fixed order.
     """
 
-    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings]) -> None:
+    def __init__(
+        self,
+        state: ClothState,
+        springs: Sequence[DeviceSprings],
+        *,
+        iterations: int,  # noqa: ARG002  (the integrators' protocol)
+    ) -> None:
         self._state, self._springs = state, springs
         counts = [family.count for family in springs]
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(int)

@@ -1,4 +1,4 @@
-"""Kernels that start and end a substep of the nodes, and what air does to them."""
+"""Kernels that start and end a substep of the nodes."""
 
 import taichi as ti
 
@@ -9,50 +9,6 @@ from sim.reductions import is_finite
 
 LARGEST_MOVE = 2.0**29
 """Most quanta in a step: a quarter of the lattice, so that integers do not overflow."""
-
-Triangles = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
-
-
-@ti.func
-def slowed(speed: ti.f32, rate: ti.f32, dt: ti.f32) -> ti.f32:
-    """s after dt of ds/dt = -rate s² from `speed`, by implicit Euler: never beyond rest, however light the cloth."""
-    return 2.0 * speed / (1.0 + ti.sqrt(1.0 + 4.0 * dt * rate * speed))
-
-
-@fast_launch
-@ti.kernel
-def blow_on_triangles(
-    position: Vectors, velocity: Vectors, triangles: Triangles, air_velocity: Vectors, drag: Vectors,
-    air_share: Floats, gravity: ti.math.vec3, dt: ti.f32, air_force: Vectors,
-):  # fmt: skip
-    """Force of the air on each triangle [N], normal and tangential, quadratic in the speed of the air past it.
-
-        F = rho A / 2 (C_n |v_n| v_n + C_t |v_t| v_t),   v_n + v_t = air - cloth
-
-    with the speeds at the end of the step, as far as gravity and the air change them: stable for light cloth in strong
-    wind, and exact at terminal speed. `drag` is (rho C_n / 2, rho C_t / 2, mass per area).
-    """
-    for t in range(triangles.shape[0]):
-        a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
-        x_a = position[a]
-        cross = (position[b] - x_a).cross(position[c] - x_a)
-        squared = cross.dot(cross)
-        force = ti.math.vec3(0.0)
-        if squared > 0.0:
-            inverse = ti.rsqrt(squared)
-            normal = inverse * cross
-            mean = air_share[a] * velocity[a] + air_share[b] * velocity[b] + air_share[c] * velocity[c]
-            past = air_velocity[t] - mean - dt * gravity
-            v_n = past.dot(normal)
-            v_t = past - v_n * normal
-            s_t = v_t.norm()
-            along = slowed(ti.abs(v_n), drag[t][0] / drag[t][2], dt)
-            force = drag[t][0] * along * along * ti.math.sign(v_n) * normal
-            if s_t > 0.0:
-                across = slowed(s_t, drag[t][1] / drag[t][2], dt)
-                force += drag[t][1] * across * across / s_t * v_t
-            force *= 0.5 * squared * inverse
-        air_force[t] = force
 
 
 @fast_launch

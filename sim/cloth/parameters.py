@@ -17,9 +17,8 @@ Edge = Literal["x-", "x+", "y-", "y+"]
 DEFAULT_SUBSTEPS = 20
 """Steps per frame of XPBD where none are asked for: 0.8 ms at 60 frames a second."""
 
-BODY_GRID_CELLS = 96
-"""Cells along the longest edge of a mesh, of the grid of distances by which cloth meets it: 1 cm of a body of 1 m, as
-coarse as cloth. Walls thinner than two cells leak."""
+RUNAWAY_SPEED = 1.0e4
+"""No cloth of a film moves at thirty times the speed of sound [m/s]."""
 
 
 class RectangleSheet(Parameters):
@@ -64,6 +63,13 @@ class BoxRegion(Parameters):
     min: Vector3 = Field(description="Lower corner [m].")
     max: Vector3 = Field(description="Upper corner [m].")
 
+    @model_validator(mode="after")
+    def _has_its_corners_in_order(self) -> Self:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if low > high:
+                raise ValueError(f"max must not be below min along {axis}, got {low:g} m to {high:g} m; swap them")
+        return self
+
 
 class SphereRegion(Parameters):
     """A ball of the world."""
@@ -92,7 +98,8 @@ class PinParameters(Parameters):
     index: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
         default=None,
         min_length=1,
-        description="Numbers of nodes: of a rectangle along x first, of a mesh its vertices'.",
+        description="Numbers of nodes, from 0: of a rectangle along x first; of a mesh its vertices as the file counts "
+        "them, v lines of an OBJ whatever its seams and objects.",
     )
     region: Annotated[BoxRegion | SphereRegion, Field(discriminator="type")] | None = Field(
         default=None, description="All nodes that start in a box or a ball of the world."
@@ -106,7 +113,7 @@ class PinParameters(Parameters):
         default="cubic",
         description="Between keyframes. cubic: velocities are continuous; linear: they are constant and jump.",
     )
-    release_s: NonNegative | None = Field(default=None, description="When it lets go [s]; never if omitted.")
+    release_s: Positive | None = Field(default=None, description="When it lets go [s]; never if omitted.")
 
     @model_validator(mode="after")
     def _names_one_place(self) -> Self:
@@ -127,6 +134,11 @@ class PinParameters(Parameters):
             )
         if len(self.keyframe) == 1:
             raise ValueError("keyframe: a path needs two keyframes at least; add one, or remove it")
+        if self.keyframe and self.release_s is not None and self.release_s <= self.keyframe[0].time_s:
+            raise ValueError(
+                f"release_s is {self.release_s:g} s, before its path starts at {self.keyframe[0].time_s:g} s: "
+                "release it later, or remove its keyframes"
+            )
         if "interpolation" in self.model_fields_set and not self.keyframe:
             raise ValueError("interpolation has no meaning without keyframes; remove it or add [[cloth.pin.keyframe]]")
         return self
@@ -179,7 +191,10 @@ class ClothParameters(Parameters):
         "The material's if omitted.",
     )
     self_collision: bool = Field(default=True, description="Whether it collides with itself.")
-    wind: Vector3 = Field(default=(0.0, 0.0, 0.0), description="Velocity of the air [m/s].")
+    wind: Vector3 = Field(
+        default=(0.0, 0.0, 0.0),
+        description="Velocity of the air [m/s]; in the box of a smoke the smoke's air blows instead.",
+    )
     air_density: NonNegative = Field(default=1.2, description="Density of the air [kg/m³]; 0 for a vacuum.")
     drag: NonNegative = Field(
         default=1.2, description="Drag coefficient of air that blows against it [-]; 1.2 of a square plate."
@@ -197,6 +212,12 @@ class ClothParameters(Parameters):
         default=None,
         description=f"Steps per frame [-]; if omitted {DEFAULT_SUBSTEPS}, and for explicit as many as it takes to keep "
         "the energy.",
+    )
+    iterations: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=1,
+        description="Sweeps of xpbd over its springs in every step [-]. A sweep does not let every spring know of all "
+        "that hangs on it: cloth that hangs from single points, and any mesh, stretches too much there, by less with "
+        "each sweep and with the square of the step; max_strain in the diagnostics tells.",
     )
 
     @model_validator(mode="before")
@@ -219,6 +240,8 @@ class ClothParameters(Parameters):
                 f"shear_stiffness is for rectangles; a mesh shears with 3/8 of its stretch_stiffness, "
                 f"{0.375 * self.stretch_stiffness:g} N/m; remove it"
             )
+        if self.integrator == "explicit" and self.iterations > 1:
+            raise ValueError(f'iterations = {self.iterations} has no meaning for integrator = "explicit"; remove it')
         for number, pin in enumerate(self.pin):
             for key in ("corner", "edge"):
                 if getattr(pin, key) is not None and not isinstance(self.shape, RectangleSheet):
@@ -226,7 +249,7 @@ class ClothParameters(Parameters):
         return self
 
 
-SHARED_KEYS = ("integrator", "substeps")
+SHARED_KEYS = ("integrator", "substeps", "iterations")
 """What all cloths of a scene have in common, as they step together."""
 
 

@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 
 from sim.cloth.motion import move_pinned
 from sim.cloth.parameters import ClothParameters, PinParameters
+from sim.cloth.pin_paths import path_of_pin
 from sim.cloth.sheet import RestSheet
 from sim.cloth.start import pinned_nodes
 from sim.cloth.state import ClothState
+from sim.parameters import Vector3
 from sim.rigid import rotation
 from sim.rigid.keyframes import KeyframePath
 
@@ -35,17 +37,26 @@ class Pin:
         self.path: KeyframePath | None = None
         if not parameters.keyframe:
             return
-        self.path = KeyframePath(
-            [keyframe.time_s for keyframe in parameters.keyframe],
-            np.array([keyframe.offset for keyframe in parameters.keyframe], dtype=np.float64),
-            np.stack([rotation.from_degrees(keyframe.rotation_deg) for keyframe in parameters.keyframe]),
-            linear=parameters.interpolation == "linear",
-        )
-        arm = position[nodes] - position[nodes].mean(axis=0)
+        self.path = path_of_pin(parameters)
+        self._take(nodes, position[nodes] - position[nodes].mean(axis=0))
+
+    def _take(self, nodes: NDArray[np.int64], arm: Floats) -> None:
+        """Hold nodes that have these places about the centre [m], (p, 3)."""
+        self.nodes, self._host_arm = nodes, arm
         self._nodes = ti.ndarray(ti.i32, len(nodes))
         self._nodes.from_numpy(nodes.astype(np.int32))
         self._arm = ti.Vector.ndarray(3, ti.f32, len(nodes))
         self._arm.from_numpy(arm.astype(np.float32))
+
+    def drop(self, nodes: NDArray[np.int64]) -> bool:
+        """Hold these nodes no longer; returns whether any others are left."""
+        kept = ~np.isin(self.nodes, nodes)
+        if not kept.any():
+            return False
+        if self.path is not None:
+            self._take(self.nodes[kept], self._host_arm[kept])
+        self.nodes = self.nodes[kept]
+        return True
 
     def holds(self, time_s: float) -> bool:
         """Whether it holds its nodes at a simulated time [s]."""
@@ -75,6 +86,7 @@ class Pins:
         """
         self._state = state
         self._pins: list[Pin] = []
+        self._grips: list[Pin] = []  # those of them that no job has
         self._held: tuple[bool, ...] | None = None
         position = state.host.position
         for number, (cloth, sheet) in enumerate(zip(cloths, sheets, strict=True)):
@@ -111,6 +123,32 @@ class Pins:
             if holds:
                 is_pinned[pin.nodes] = True
         self._state.set_pinned(is_pinned)
+
+    def grip(self, nodes: NDArray[np.int64], shift: Vector3, *, time_s: float, within_s: float) -> None:
+        """Hold more nodes from a time [s] on, and lead them by a way [m] in so many seconds; `hold` does the rest.
+
+        Raises:
+            ValueError: a pin leads one of the nodes along its own path.
+        """
+        for pin in self._pins:
+            if pin.path is not None and pin not in self._grips and np.isin(nodes, pin.nodes).any():
+                raise ValueError("a pin that moves holds one of the nodes; let it go first")
+        # Those that were gripped before are led on from where they are.
+        self._pins = [pin for pin in self._pins if pin not in self._grips or pin.drop(nodes)]
+        keys: dict[str, object] = {"index": nodes.tolist()}
+        if any(shift):
+            keys["keyframe"] = [{"time_s": time_s}, {"time_s": time_s + within_s, "offset": shift}]
+            keys["interpolation"] = "linear"
+        parameters = PinParameters.model_validate(keys)
+        grip = Pin(parameters, nodes, self._state.positions())
+        self._grips = [*(pin for pin in self._grips if pin in self._pins), grip]
+        self._pins.append(grip)
+        self._held = None
+
+    def let_go(self, nodes: NDArray[np.int64]) -> None:
+        """Let nodes go, whatever holds them; `hold` does the rest."""
+        self._pins = [pin for pin in self._pins if pin.drop(nodes)]
+        self._held = None
 
     def displace(self, time_s: float, dt: float) -> None:
         """Move the nodes of pins that hold, from a time [s] on, for dt."""

@@ -189,10 +189,13 @@ def find_wall_contacts(
             n = plane[w].xyz
             distance = n.dot(x) - plane[w].w
             least = least_displacement(distance, half, recovery)
-            depth = ti.max(2.0 * WALL_DEPTH * half, spacing, displacement[i].norm())
-            is_beside = (x >= low[w] - depth * joined_low[w]).all() and (x <= high[w] + depth * joined_high[w]).all()
-            if is_beside and distance > -depth and (distance < half or n.dot(displacement[i]) < least):
-                slot = ti.atomic_add(counter[0], 1)
+            if distance < half or n.dot(displacement[i]) < least:
+                depth = ti.max(2.0 * WALL_DEPTH * half, spacing, displacement[i].norm())
+                is_above = (x >= low[w] - depth * joined_low[w]).all()
+                is_below = (x <= high[w] + depth * joined_high[w]).all()
+                slot = capacity
+                if is_above and is_below and distance > -depth:
+                    slot = ti.atomic_add(counter[0], 1)
                 if slot < capacity:
                     vertices[slot], weights[slot] = Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0)
                     normal[slot], floor[slot], kind[slot] = n, least, WALL

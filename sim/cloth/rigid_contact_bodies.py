@@ -8,7 +8,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.parameters import BODY_GRID_CELLS
+from sim.cloth.body_grids import EXACT_WITHIN, GRID_PADDING, grid_spacing, thin_wall
 from sim.cloth.rigid_contact_shapes import BOX, CAPSULE, CONE, CYLINDER, GRID, SPHERE, TORUS
 from sim.rigid.contacts import Poses
 from sim.rigid.geometry import BodyGeometry
@@ -16,9 +16,6 @@ from sim.shapes.level_set import LevelSet
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 
 Array = NDArray[np.float64]
-
-GRID_PADDING = 3.0
-"""How far the grid reaches past the mesh, in cells: distances beyond are upper bounds."""
 
 GRADIENT_STEP = 1.0e-3
 """Half width of the differences that give a primitive's normal, in shortest edges: float32 errs by 1e-4 then."""
@@ -152,8 +149,8 @@ class CollisionBodies:
                 step[number] = GRADIENT_STEP * geometry.shortest_edge
                 continue
             if id(geometry) not in sampled:
-                cell = float(np.max(np.ptp(geometry.bounds, axis=0))) / BODY_GRID_CELLS
-                level_set = LevelSet.sample(solid, cell, padding=GRID_PADDING * cell)
+                cell = grid_spacing(solid, thin_wall(solid))
+                level_set = LevelSet.sample(solid, cell, padding=GRID_PADDING * cell, exact_within=EXACT_WITHIN * cell)
                 sampled[id(geometry)] = sum(each.size for each in values), level_set
                 values.append(level_set.values.ravel())
             first[number], level_set = sampled[id(geometry)]

@@ -8,137 +8,112 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
+from sim.cloth.patch_pairs import PairList, PatchPairs
+from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision_kernels import (
-    enclose_elements,
+    enclose_edges,
     find_near_pairs,
-    gather_half_edges,
     pair_edges,
     pair_vertices_with_triangles,
     range_of_vectors,
 )
-from sim.cloth.self_collision_motion import CELL_IN_EDGES, LocalMotion
-from sim.cloth.spatial_hash import SpatialHash
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
 
 REACH_IN_EDGES = 0.6
-LEAST_SKIN_IN_EDGES = 0.2
-"""How far the list of pairs reaches, and at least farther than the thickness, in mean edges, if motion does not ask for
+LEAST_SKIN_IN_EDGES = 0.15
+"""How far lists of pairs reach, and at least farther than the thickness, in mean edges, if motion does not ask for
 more: to last for many substeps at rest, but not list the neighbours in flat cloth, 0.6 mean edges and more off."""
 
-SKIN_IN_MOTIONS = 4.5
-"""Least skin in motions of the substep, of cloth against cloth nearby; so that the list lasts for two."""
+SUBSTEPS_OF_PATCHES = 22.0
+"""How many substeps' motion of the whole cloth the list of pairs of patches allows for."""
 
-SUBSTEPS_OF_LIST = 4.0
-"""How many substeps' motion of the whole cloth the coarse cells allow for."""
-
-GROWTH = 1.5
-MAX_PAIRS = 2**28
-"""Most pairs of a list: 5 GiB on the device; so many mean that the step is far too large."""
-
-
-class PairList:
-    """Pairs of elements; grows when it must.
-
-    Attributes:
-        count: number of pairs.
-        vertices: a vertex and a triangle's corners, or the ends of two edges, (capacity,) of 4-vectors.
-        wanted: distance that they keep [m], (capacity,).
-    """
-
-    def __init__(self, capacity: int) -> None:
-        self.count = 0
-        self._allocate(capacity)
-
-    def fill(self, search, *arguments: object) -> None:
-        """Run a search that appends pairs, again with more room where there was too little."""
-        found = search(*arguments, self.vertices, self.wanted, self._counter, self._capacity)
-        if found < 0 or found > MAX_PAIRS:
-            raise OverflowError(f"more than {MAX_PAIRS} pairs of cloth elements are near each other; lower the step")
-        if found > self._capacity:
-            self._allocate(int(GROWTH * found))
-            search(*arguments, self.vertices, self.wanted, self._counter, self._capacity)
-        self.count = int(found)
-
-    def _allocate(self, capacity: int) -> None:
-        self._capacity = capacity
-        self.vertices = ti.Vector.ndarray(4, ti.i32, capacity)
-        self.wanted = ti.ndarray(ti.f32, capacity)
-        self._counter = ti.ndarray(ti.i32, 1)
+NEGLIGIBLE = 0.01
+"""Part of the thickness that contacts may add to the motion of a substep without it being looked at anew."""
 
 
 class SelfCollision:
     """Finds the pairs of cloth elements, of one cloth or several, that are near each other.
 
     Every crossing of two triangles without a common corner, or with one, begins with a vertex that meets a triangle of
-    which it is no corner, or with two edges without a common vertex that meet; so these are all pairs. They are found
-    by a spatial hash within thickness + skin, and listed until motion, apart from that in common, has used the skin up.
-    What is found in the list does not depend on when it was made.
+    which it is no corner, or with two edges without a common vertex that meet; so these are all pairs. Patches of some
+    twenty triangles that may meet within some substeps are paired first; each pair of patches has a list of its
+    elements within thickness + skin, which holds until their motion, apart from rigid motion in common, has used the
+    skin up. What is found in the lists does not depend on when they were made.
 
     Attributes:
         with_triangles, of_edges: the listed pairs.
         thickness: the largest [m].
         mean_edge: at rest [m].
-        searches: how often pairs were searched for since `forget`.
+        searches: how many pairs of patches were searched since `forget`, over the number of patches.
 
     Args:
         state: the cloths; a triangle without a common corner must not cross another at the start.
     """
 
     def __init__(self, state: ClothState) -> None:
-        self._edge_count, self._triangle_count = len(state.host.edges), len(state.host.triangles)
-        self._edge_hash = SpatialHash(self._edge_count)
-        self._triangle_hash = SpatialHash(self._triangle_count)
-        self._edge_spheres = ti.Vector.ndarray(4, ti.f32, self._edge_count)
-        self._triangle_spheres = ti.Vector.ndarray(4, ti.f32, self._triangle_count)
-        self._half_edges = ti.Vector.ndarray(3, ti.f32, self._edge_count)
+        self._patches = Patches(state.host)
+        self._met = PatchPairs(self._patches)
+        self._added = 0.0
         self._rest = ti.Vector.ndarray(3, ti.f32, state.vertex_count)
         self._rest.from_numpy(state.host.position.astype(np.float32))
-        self._motion = LocalMotion(state.vertex_count)
+        self._half_edges = ti.Vector.ndarray(3, ti.f32, max(state.edge_count, 1))
+        self._edge_spheres = ti.Vector.ndarray(4, ti.f32, max(state.edge_count, 1))
         self._collides = ti.ndarray(ti.i32, len(state.names))
-        self.with_triangles = PairList(4 * state.vertex_count)
-        self.of_edges = PairList(4 * self._edge_count)
+        self.with_triangles = PairList(are_edges=False, capacity=state.vertex_count, pieces=self._met.capacity)
+        self.of_edges = PairList(are_edges=True, capacity=state.edge_count, pieces=self._met.capacity)
         edges = state.host.position[state.host.edges]
         self.mean_edge = float(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).mean())
         self.forget(state)
 
     def forget(self, state: ClothState) -> None:
         """Search anew at the next substep; thicknesses and flags may have changed."""
-        self.searches = 0
-        self._left = self._left_of_whole = -math.inf
+        self._searched = 0
+        self._used, self._reach = 0.0, -math.inf
         self.thickness = float(state.thickness.to_numpy().max())
         self._collides.from_numpy(np.array(state.self_collision, dtype=np.int32))
 
-    def prepare(self, state: ClothState, whole: float) -> None:
+    @property
+    def searches(self) -> float:
+        """How often the elements of a patch were searched since `forget`, on average."""
+        return self._searched / max(self._patches.count, 1)
+
+    def prepare(self, state: ClothState, whole: float, margin: float) -> None:
         """Have all pairs listed that vertices can bring within their thickness, or together, in this substep.
 
         Args:
             state: in a substep.
             whole: how far vertices get apart from their common motion [m].
+            margin: how far each may be displaced beyond its displacement now [m]; pairs that are not listed come no
+                nearer than a thickness without that, and do not meet with it.
         """
-        if self._left > 0.0 and self._motion.of(state.displacement) <= self._left and whole <= self._left_of_whole:
-            return
-        edge = self.mean_edge
-        enclosed = self._enclose(state)
-        # Elements with vertices in cells that are no neighbours are at least a cell less their own sizes apart.
-        between = 2.0 * (enclosed[0] + enclosed[1]) + self.thickness
-        self._motion.place(state.position, max(CELL_IN_EDGES * edge, between + SUBSTEPS_OF_LIST * whole))
-        least = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        skin = max(least, SKIN_IN_MOTIONS * self._motion.of(state.displacement))
-        self._search(state, self.thickness + skin, *enclosed)
-        self._left, self._left_of_whole = 0.5 * skin, 0.5 * (self._motion.cell_size - between)
+        self._met.enclose(state)
+        self._met.fit(state)
+        nearer, more = 2.0 * whole, max(2.0 * margin - self.thickness, 0.0)
+        is_new = self._used + nearer + more >= self._reach
+        if is_new:
+            self._pair_patches(nearer, more)
+        while not self._search(state, nearer, more, is_new=is_new):
+            is_new = True
 
-    def covers(self, state: ClothState, whole: float) -> bool:
-        """Whether all pairs are listed that the displacements, as they are now, can bring together."""
-        allowance = 0.5 * self.thickness
-        return self._motion.of(state.displacement) < self._left + allowance and whole < self._left_of_whole + allowance
+    def follow(self, state: ClothState, whole: float, change: float) -> None:
+        """A substep is over.
 
-    def follow(self, state: ClothState, whole: float) -> None:
-        """Note how far vertices get at most in the substep, apart from their common motion [m]."""
-        self._left -= self._motion.of(state.displacement)
-        self._left_of_whole -= whole
+        Args:
+            state: at the end of its displacements.
+            whole: as in the last `prepare`.
+            change: how far vertices were displaced beyond their displacements there at most [m].
+        """
+        self._added = 2.0 * change
+        if self._added > NEGLIGIBLE * self.thickness:
+            self._met.fit(state)
+            self._met.measure(2.0 * whole + self._added, self._used)
+            self._met.use(0.0)
+        else:
+            self._met.use(self._added)
+        self._used += 2.0 * whole + self._added
 
     def find(self, state: ClothState, contacts: ContactList, margin: float, recovery: float) -> int:
         """Append the listed pairs that are too near, get there, or might cross; the number of contacts then, or needed.
@@ -152,37 +127,38 @@ class SelfCollision:
         found = 0
         for pairs, are_edges in ((self.with_triangles, False), (self.of_edges, True)):
             found = find_near_pairs(
-                pairs.vertices, pairs.wanted, pairs.count, are_edges,
+                pairs.vertices, pairs.wanted, pairs.patches, self._met.approach, pairs.end, are_edges,
                 state.position, state.displacement, state.friction, margin, recovery, *contacts.found_arrays,
             )  # fmt: skip
         return int(found)
 
-    def _enclose(self, state: ClothState) -> tuple[float, float]:
-        """Spheres around edges and triangles where they are now; the largest radius of each [m]."""
-        largest_edge, largest_triangle = enclose_elements(
-            state.position, state.edges, self._edge_count, state.triangles, self._triangle_count,
-            self._edge_spheres, self._triangle_spheres,
-        )  # fmt: skip
-        return float(largest_edge), float(largest_triangle)
+    def _pair_patches(self, nearer: float, more: float) -> None:
+        """List the pairs of patches that can meet within some substeps of this motion."""
+        self._used, self._reach = 0.0, SUBSTEPS_OF_PATCHES * (nearer + self._added) + self.mean_edge + more
+        room = self._met.capacity
+        self._met.meet(self.thickness + self._reach, self._collides)
+        if self._met.capacity > room:
+            for pairs in (self.with_triangles, self.of_edges):
+                pairs.set_pieces(self._met.capacity)
 
-    def _search(self, state: ClothState, radius: float, largest_edge: float, largest_triangle: float) -> None:
-        self.searches += 1
-        about = (state.position, self._rest, state.thickness, state.body, self._collides)
-        cell_size = largest_triangle + radius
-        spheres = self._triangle_hash
-        spheres.sort(self._triangle_spheres, self._triangle_count, cell_size)
-        self.with_triangles.fill(
-            pair_vertices_with_triangles, state.vertex_count, *about, state.triangles,
-            spheres.spheres, spheres.index, spheres.slot_start, spheres.mask, 1.0 / cell_size, radius,
-        )  # fmt: skip
-        cell_size = 2.0 * largest_edge + radius
-        spheres = self._edge_hash
-        spheres.sort(self._edge_spheres, self._edge_count, cell_size)
-        gather_half_edges(state.position, state.edges, spheres.index, self._edge_count, self._half_edges)
-        self.of_edges.fill(
-            pair_edges, self._edge_count, *about, state.edges, self._half_edges,
-            spheres.spheres, spheres.index, spheres.slot_start, spheres.mask, 1.0 / cell_size, radius,
-        )  # fmt: skip
+    def _search(self, state: ClothState, nearer: float, more: float, *, is_new: bool) -> bool:
+        """Search the pairs of patches that have to be; False if that needs more room, and all of them a new search."""
+        met, patches, edge = self._met, self._patches, self.mean_edge
+        if is_new:
+            self.with_triangles.clear()
+            self.of_edges.clear()
+        least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
+        count = met.age(self.thickness, least_skin, nearer, more, self._used, is_new=is_new)
+        if not count:
+            return True
+        self._searched += count
+        where = (met.pairs, met.low, met.high, met.reach)
+        triangles = (state.position, patches.first_vertex, patches.vertices, patches.first_triangle, patches.triangles)
+        edges = (patches.first_edge, patches.edges, self._half_edges, self._edge_spheres)
+        enclose_edges(state.edge_count, state.position, *edges[1:])
+        return self.with_triangles.fill(
+            pair_vertices_with_triangles, state, self._rest, met.expired, count, *where, *triangles
+        ) and self.of_edges.fill(pair_edges, state, self._rest, met.expired, count, *where, *edges)
 
 
 def half_range(vectors: ti.Ndarray, count: int) -> tuple[float, float]:

@@ -11,13 +11,13 @@ from sim.cloth.proximity import (
     unit_or,
 )
 from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, Quadruples, Weights, least_displacement
-from sim.cloth.spatial_hash import Spheres, cell_of, slot_of
 from sim.launch import fast_launch
 
 Pairs = ti.types.ndarray(dtype=ti.types.vector(2, ti.i32), ndim=1)
 Triples = ti.types.ndarray(dtype=ti.types.vector(3, ti.i32), ndim=1)
 Two = ti.types.vector(2, ti.i32)
 Four = ti.types.vector(4, ti.i32)
+Spheres = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 Six = ti.types.vector(6, ti.f32)
 
 OF_REST_DISTANCE = 0.7
@@ -31,35 +31,11 @@ triangles, vertices alone then push."""
 END_OF_EDGE = 1.0e-3
 """Share of an edge that counts as its end."""
 
+LANES = 8
+"""Threads that search a pair of patches: enough to share out the work of a few of them."""
 
-@fast_launch
-@ti.kernel
-def enclose_elements(
-    position: Vectors, edges: Pairs, edge_count: ti.i32, triangles: Triples, triangle_count: ti.i32,
-    edge_spheres: Spheres, triangle_spheres: Spheres,
-) -> ti.math.vec2:  # fmt: skip
-    """Spheres around edges and triangles; returns the largest radius of each [m]."""
-    largest_edge, largest_triangle = 0.0, 0.0
-    for e in range(edge_count):
-        a, b = position[edges[e][0]], position[edges[e][1]]
-        radius = 0.5 * (b - a).norm()
-        edge_spheres[e] = ti.math.vec4(0.5 * (a + b), radius)
-        ti.atomic_max(largest_edge, radius)
-    for t in range(triangle_count):
-        a, b, c = position[triangles[t][0]], position[triangles[t][1]], position[triangles[t][2]]
-        # Twice the area over the longest edge is small for slivers: the box's centre keeps their radius small too.
-        low, high = ti.min(a, b, c), ti.max(a, b, c)
-        centre = 0.5 * (low + high)
-        radius = ti.max((a - centre).norm(), (b - centre).norm(), (c - centre).norm())
-        triangle_spheres[t] = ti.math.vec4(centre, radius)
-        ti.atomic_max(largest_triangle, radius)
-    return ti.math.vec2(largest_edge, largest_triangle)
-
-
-@ti.func
-def may_meet(a: ti.i32, b: ti.i32, cloth: Integers, collides: Integers) -> ti.i32:
-    """Whether elements at two vertices can touch: of different cloths always, of one if it collides with itself."""
-    return ti.cast(cloth[a] != cloth[b] or collides[cloth[a]] == 1, ti.i32)
+NONE = -1
+"""In the place of a vertex: the list has no pair there."""
 
 
 @ti.func
@@ -76,45 +52,52 @@ def pair_thickness(a: ti.i32, b: ti.i32, cloth: Integers, thickness: Floats, at_
     return ti.select(cloth[a] == cloth[b], ti.min(wanted, OF_REST_DISTANCE * at_rest), wanted)
 
 
+@ti.func
+def pair_vertex_with_triangles(
+    v: ti.i32, first: ti.i32, last: ti.i32, position: Vectors, triangles: Triples, reach: ti.f32,
+    p: ti.i32, start: Integers, room: Integers, found: Integers, pairs: Quadruples,
+):  # fmt: skip
+    """List a vertex with those of some triangles within `reach` [m] that it is no corner of."""
+    x = position[v]
+    for t in range(first, last):
+        corners = triangles[t]
+        a, b, c = position[corners[0]] - x, position[corners[1]] - x, position[corners[2]] - x
+        if (ti.min(a, b, c) < reach).all() and (ti.max(a, b, c) > -reach).all():
+            own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
+            if own == 0 and distance_to_triangle(ti.math.vec3(0.0), a, b, c) < reach:
+                place = ti.atomic_add(found[p], 1)
+                if place < room[p]:
+                    pairs[start[p] + place] = Four(v, corners[0], corners[1], corners[2])
+
+
 @fast_launch
 @ti.kernel
 def pair_vertices_with_triangles(
-    vertex_count: ti.i32, position: Vectors, rest: Vectors, thickness: Floats, cloth: Integers, collides: Integers,
-    triangles: Triples, spheres: Spheres, index: Integers, slot_start: Integers, mask: ti.i32,
-    inverse_cell_size: ti.f32, radius: ti.f32, pairs: Quadruples, wanted: Floats, counter: Integers, capacity: ti.i32,
-) -> ti.i32:  # fmt: skip
-    """List each vertex with the triangles within `radius` [m] that it is no corner of; returns how many there are."""
-    counter[0] = 0
-    for v in range(vertex_count):
-        x = position[v]
-        cell = cell_of(ti.math.vec4(x, 0.0), inverse_cell_size)
-        for row in range(9):
-            dy, dz = row % 3 - 1, row // 3 - 1
-            first_slot = slot_of(cell[0] - 1, cell[1] + dy, cell[2] + dz, mask)
-            for part in range(2):
-                # The three slots of the row, the second part of them where the table begins again.
-                begin = ti.select(part == 0, first_slot, 0)
-                end = ti.select(part == 0, ti.min(first_slot + 3, mask + 1), first_slot + 2 - mask)
-                if end > begin:
-                    for place in range(slot_start[begin], slot_start[end]):
-                        sphere = spheres[place]
-                        reach = sphere.w + radius
-                        if (sphere.xyz - x).norm_sqr() < reach * reach:
-                            other = cell_of(sphere, inverse_cell_size)
-                            corners = triangles[index[place]]
-                            own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
-                            in_row = ti.cast(other[1] == cell[1] + dy and other[2] == cell[2] + dz, ti.i32)
-                            if own == 0 and in_row == 1 and may_meet(v, corners[0], cloth, collides) == 1:
-                                a, b, c = position[corners[0]] - x, position[corners[1]] - x, position[corners[2]] - x
-                                if distance_to_triangle(ti.math.vec3(0.0), a, b, c) < radius:
-                                    slot = ti.atomic_add(counter[0], 1)
-                                    if slot < capacity:
-                                        at_rest = distance_to_triangle(
-                                            rest[v], rest[corners[0]], rest[corners[1]], rest[corners[2]]
-                                        )
-                                        pairs[slot] = Four(v, corners[0], corners[1], corners[2])
-                                        wanted[slot] = pair_thickness(v, corners[0], cloth, thickness, at_rest)
-    return counter[0]
+    count: ti.i32, searched: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats, position: Vectors,
+    first_vertex: Integers, vertices: Integers, first_triangle: Integers, triangles: Triples,
+    start: Integers, room: Integers, found: Integers, pairs: Quadruples,
+):  # fmt: skip
+    """List the vertices of each of two patches with the triangles of the other within `reach` [m] of them.
+
+    Args:
+        count: number of pairs of patches that are searched; their numbers are `searched`.
+        start, room: where pairs of elements are listed, and how many fit; `found` gets how many there are.
+    """
+    for item in range(count * LANES):
+        p = searched[item // LANES]
+        for side in range(2):
+            m, other = patches[p][side], patches[p][1 - side]
+            if side == 0 or m != other:
+                least, most = low[other] - reach[p], high[other] + reach[p]
+                place = first_vertex[m] + item % LANES
+                while place < first_vertex[m + 1]:
+                    v = vertices[place]
+                    if (position[v] >= least).all() and (position[v] <= most).all():
+                        pair_vertex_with_triangles(
+                            v, first_triangle[other], first_triangle[other + 1], position, triangles, reach[p],
+                            p, start, room, found, pairs,
+                        )  # fmt: skip
+                    place += LANES
 
 
 @ti.func
@@ -128,68 +111,108 @@ def are_surely_apart(between: ti.math.vec3, half_e: ti.math.vec3, half_f: ti.mat
 
 @fast_launch
 @ti.kernel
-def gather_half_edges(position: Vectors, edges: Pairs, index: Integers, count: ti.i32, half_edges: Vectors):
-    """Half the vector along each sorted edge."""
-    for place in range(count):
-        edge = edges[index[place]]
-        half_edges[place] = 0.5 * (position[edge[1]] - position[edge[0]])
+def enclose_edges(count: ti.i32, position: Vectors, edges: Pairs, half_edges: Vectors, spheres: Spheres):
+    """Half the vector along each edge, and the sphere around it: midpoint and radius [m]."""
+    for e in range(count):
+        a, b = position[edges[e][0]], position[edges[e][1]]
+        half_edges[e] = 0.5 * (b - a)
+        spheres[e] = ti.math.vec4(0.5 * (a + b), half_edges[e].norm())
 
 
 @fast_launch
 @ti.kernel
 def pair_edges(
-    edge_count: ti.i32, position: Vectors, rest: Vectors, thickness: Floats, cloth: Integers, collides: Integers,
-    edges: Pairs, half_edges: Vectors, spheres: Spheres, index: Integers, slot_start: Integers, mask: ti.i32,
-    inverse_cell_size: ti.f32, radius: ti.f32, pairs: Quadruples, wanted: Floats, counter: Integers, capacity: ti.i32,
-) -> ti.i32:  # fmt: skip
-    """List the pairs of edges within `radius` [m] of each other that share no vertex; returns how many there are.
+    count: ti.i32, searched: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats,
+    first_edge: Integers, edges: Pairs, half_edges: Vectors, spheres: Spheres,
+    start: Integers, room: Integers, found: Integers, pairs: Quadruples,
+):  # fmt: skip
+    """List the edges of two patches that are within `reach` [m] of each other and share no vertex; as above."""
+    for item in range(count * LANES):
+        p = searched[item // LANES]
+        m, other = patches[p][0], patches[p][1]
+        least, most = low[other] - reach[p], high[other] + reach[p]
+        place = first_edge[m] + item % LANES
+        while place < first_edge[m + 1]:
+            e, half, sphere = edges[place], half_edges[place], spheres[place]
+            x = sphere.xyz
+            if (x + ti.abs(half) >= least).all() and (x - ti.abs(half) <= most).all():
+                for there in range(ti.select(m == other, place + 1, first_edge[other]), first_edge[other + 1]):
+                    between = spheres[there].xyz - x
+                    within = reach[p] + sphere.w + spheres[there].w
+                    if between.norm_sqr() < within * within:
+                        f, other_half = edges[there], half_edges[there]
+                        is_near = are_surely_apart(between, half, other_half, reach[p]) == 0
+                        is_near = is_near and share_no_vertex(e, f) == 1
+                        slot = room[p]
+                        if (
+                            is_near
+                            and distance_of_edges(-half, half, between - other_half, between + other_half) < reach[p]
+                        ):
+                            slot = ti.atomic_add(found[p], 1)
+                        if slot < room[p]:
+                            # In this order, so that rounding does not depend on that of the patches.
+                            pairs[start[p] + slot] = ti.select(
+                                f[0] < e[0], Four(f[0], f[1], e[0], e[1]), Four(e[0], e[1], f[0], f[1])
+                            )
+            place += LANES
 
-    Each edge looks into the cells after its own alone: of the rows that follow, and of its own row the next.
+
+@fast_launch
+@ti.kernel
+def clear_lists(
+    count: ti.i32, searched: Integers, start: Integers, room: Integers, found: Integers, pairs: Quadruples
+):  # fmt: skip
+    """Empty the lists of the pairs of patches that are searched."""
+    for k in range(count):
+        p = searched[k]
+        for place in range(start[p], start[p] + room[p]):
+            pairs[place] = Four(NONE)
+        found[p] = 0
+
+
+@fast_launch
+@ti.kernel
+def make_room(
+    count: ti.i32, searched: Integers, start: Integers, room: Integers, found: Integers, pairs: Quadruples,
+    end: Integers, again: Integers,
+) -> ti.math.ivec2:  # fmt: skip
+    """Move lists that were too short to the end; returns how many, and where the end is now.
+
+    Their numbers are `again`; `end` has the end, then how many there are.
     """
-    counter[0] = 0
-    for place in range(edge_count):
-        own = spheres[place]
-        cell = cell_of(own, inverse_cell_size)
-        e = edges[index[place]]
-        x, half = own.xyz, half_edges[place]
-        for row in range(5):
-            # (0, 0), (1, 0), (-1, 1), (0, 1), (1, 1): half of the nine rows.
-            dy = ti.select(row < 2, row, row - 3)
-            dz = ti.select(row < 2, 0, 1)
-            back = ti.select(row == 0, 0, 1)
-            first_slot = slot_of(cell[0] - back, cell[1] + dy, cell[2] + dz, mask)
-            last_slot = first_slot + 1 + back
-            for part in range(2):
-                begin = ti.select(part == 0, first_slot, 0)
-                end = ti.select(part == 0, ti.min(last_slot, mask) + 1, last_slot - mask)
-                if end > begin:
-                    for other in range(slot_start[begin], slot_start[end]):
-                        sphere = spheres[other]
-                        between = sphere.xyz - x
-                        if are_surely_apart(between, half, half_edges[other], radius) == 0:
-                            there = cell_of(sphere, inverse_cell_size) - cell
-                            is_meant = there[1] == dy and there[2] == dz and there[0] >= -back
-                            if row == 0 and there[0] == 0:
-                                is_meant = is_meant and other > place
-                            f = edges[index[other]]
-                            if is_meant and share_no_vertex(e, f) * may_meet(e[0], f[0], cloth, collides) == 1:
-                                a, b = position[e[0]] - x, position[e[1]] - x
-                                if distance_of_edges(a, b, position[f[0]] - x, position[f[1]] - x) < radius:
-                                    slot = ti.atomic_add(counter[0], 1)
-                                    if slot < capacity:
-                                        at_rest = distance_of_edges(rest[e[0]], rest[e[1]], rest[f[0]], rest[f[1]])
-                                        # In this order, so that rounding does not depend on the hash.
-                                        pairs[slot] = Four(e[0], e[1], f[0], f[1])
-                                        if f[0] < e[0]:
-                                            pairs[slot] = Four(f[0], f[1], e[0], e[1])
-                                        wanted[slot] = pair_thickness(e[0], f[0], cloth, thickness, at_rest)
-    return counter[0]
+    end[1] = 0
+    for k in range(count):
+        p = searched[k]
+        if found[p] > room[p]:
+            for place in range(start[p], start[p] + room[p]):
+                pairs[place] = Four(NONE)
+            room[p] = found[p] + found[p] // 2
+            start[p] = ti.atomic_add(end[0], room[p])
+            again[ti.atomic_add(end[1], 1)] = p
+    return ti.math.ivec2(end[1], end[0])
+
+
+@fast_launch
+@ti.kernel
+def keep_distances(
+    count: ti.i32, searched: Integers, start: Integers, found: Integers, pairs: Quadruples, are_edges: ti.template(),
+    rest: Vectors, cloth: Integers, thickness: Floats, wanted: Floats, patches: Integers,
+):  # fmt: skip
+    """Distances that the listed elements keep [m], and the number of their pair of patches."""
+    for k in range(count):
+        p = searched[k]
+        for place in range(start[p], start[p] + found[p]):
+            v = pairs[place]
+            a, b, c, d = rest[v[0]], rest[v[1]], rest[v[2]], rest[v[3]]
+            at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
+            patches[place] = p
+            wanted[place] = pair_thickness(v[0], v[2], cloth, thickness, at_rest)
 
 
 @fast_launch
 @ti.kernel
 def find_near_pairs(
-    pairs: Quadruples, wanted: Floats, count: ti.i32, are_edges: ti.template(),
+    pairs: Quadruples, wanted: Floats, patches: Integers, approach: Floats, count: ti.i32, are_edges: ti.template(),
     position: Vectors, displacement: Vectors, vertex_friction: Floats, margin: ti.f32, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
     friction: Floats, counter: Integers, capacity: ti.i32,
@@ -197,11 +220,14 @@ def find_near_pairs(
     """Append the pairs that are nearer than they shall be, or get there, and those that might cross.
 
     The displacement along the line of shortest distance counts. A pair might cross when its vertices, displaced as
-    they are now and by up to `margin` [m] besides, come together: then it is watched, `INACTIVE`. Returns the number of
-    contacts so far.
+    they are now and by up to `margin` [m] besides, come together: then it is watched, `INACTIVE`. They come no nearer
+    than by twice their motion against their mean, nor than by the `approach` [m] of their `patches`. Returns the number
+    of contacts so far.
     """
     for p in range(count):
         v = pairs[p]
+        if v[0] == NONE:
+            continue
         x, u = position[v[0]], displacement[v[0]]
         x1, x2, x3 = position[v[1]] - x, position[v[2]] - x, position[v[3]] - x
         u1, u2, u3 = displacement[v[1]] - u, displacement[v[2]] - u, displacement[v[3]] - u
@@ -223,7 +249,7 @@ def find_near_pairs(
         distance = apart.norm()
         mean = 0.25 * (u1 + u2 + u3)
         motion = ti.max(mean.norm(), (u1 - mean).norm(), (u2 - mean).norm(), (u3 - mean).norm())
-        if distance < ti.max(keeps, 2.0 * (motion + margin)):
+        if distance < ti.max(keeps, ti.min(2.0 * motion, approach[patches[p]]) + 2.0 * margin):
             n = unit_or(apart, across)
             least = least_displacement(distance, keeps, recovery)
             slot = ti.atomic_add(counter[0], 1)

@@ -17,6 +17,9 @@ from sim.shapes.solid import ShapeError
 Vectors = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
+SMALLEST_LENGTH, LARGEST_LENGTH = 1.0e-6, 1.0e6
+"""Of what a sheet measures [m]; single precision ends well within."""
+
 FLAT_TRIANGLE = 1.0e-4
 """A triangle less high than this share of its longest edge is a line: its angles are round-off in a file's float32."""
 
@@ -113,24 +116,32 @@ def sheet_of_triangles(vertices: Vectors, triangles: NDArray[np.integer], *, lab
 
     if not len(triangles):
         raise ShapeError(f'shape.file: "{label}" has no triangles; export it as a mesh')
-    if not np.isfinite(vertices).all():
-        number = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+    used, faces = np.unique(triangles, return_inverse=True)
+    corners = np.asarray(vertices, dtype=np.float64)[used]
+    if not np.isfinite(corners).all():
+        number = int(used[~np.isfinite(corners).all(axis=1)][0])
         raise ShapeError(f'shape.file: vertex {number} of "{label}" is not finite; export it again')
-    merged, faces = merge_vertices(np.asarray(vertices, dtype=np.float64), np.asarray(triangles, dtype=np.int64))
+    if not SMALLEST_LENGTH <= float(np.ptp(corners, axis=0).max()) <= LARGEST_LENGTH:
+        raise ShapeError(
+            f'shape.file: "{label}" is {np.ptp(corners, axis=0).max():.3g} m across, which must be between '
+            f"{SMALLEST_LENGTH:g} m and {LARGEST_LENGTH:g} m; check its export, or give shape.size"
+        )
+    merged, faces = merge_vertices(corners, faces.reshape(-1, 3).astype(np.int64))
     # Once more: corners of triangles that are dropped may be corners of no other.
-    merged, faces = merge_vertices(merged, drop_collapsed_and_repeated_faces(faces))
+    merged, faces = merge_vertices(merged, _drop_second_sides(drop_collapsed_and_repeated_faces(faces)))
     warnings = []
     if len(merged) < len(vertices):
         warnings.append(f'"{label}": merged {len(vertices) - len(merged)} split or unused vertices')
     if len(faces) < len(triangles):
         warnings.append(f'"{label}": dropped {len(triangles) - len(faces)} collapsed or repeated triangles')
-    _refuse_flat_triangles(merged, faces, label)
-    _refuse_branching_edges(merged, faces, label)
+    where = _Places(corners, used, merged)
+    _refuse_flat_triangles(merged, faces, where, label)
+    _refuse_branching_edges(faces, where, label)
     oriented, _ = igl.bfs_orient(faces)
     turned = int(np.count_nonzero((oriented != faces).any(axis=1)))
     if turned:
         warnings.append(f'"{label}": turned {turned} of {len(faces)} triangles, so that the sides of the cloth agree')
-    _refuse_one_sided(merged, oriented, label)
+    _refuse_one_sided(oriented, where, label)
 
     area = triangle_areas(merged, oriented)
     node_area = np.bincount(oriented.ravel(), weights=np.repeat(area / 3.0, 3), minlength=len(merged))
@@ -142,6 +153,12 @@ def sheet_of_triangles(vertices: Vectors, triangles: NDArray[np.integer], *, lab
     )
 
 
+def _drop_second_sides(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Without the second of two triangles that share their corners: models made for games have one for each side."""
+    _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+    return triangles[np.sort(first)]
+
+
 def _sheet_of_file(shape: MeshShape) -> RestSheet:
     vertices, triangles = read_upright_triangles(shape)
     return sheet_of_triangles(vertices, triangles, label=Path(shape.file).name)
@@ -151,9 +168,12 @@ def _nodes_of(vertices: Vectors, nodes: Vectors) -> Indices:
     """Which node each vertex has become; -1 for those that were dropped."""
     from scipy.spatial import cKDTree
 
-    distance, nearest = cKDTree(nodes).query(vertices)
+    numbers = np.full(len(vertices), -1, dtype=np.int32)
+    finite = np.flatnonzero(np.isfinite(vertices).all(axis=1))  # those that no triangle uses may be anything
+    distance, nearest = cKDTree(nodes).query(vertices[finite])
     within = distance <= MERGED * np.linalg.norm(np.ptp(nodes, axis=0))
-    return np.where(within, nearest, -1).astype(np.int32)
+    numbers[finite[within]] = nearest[within]
+    return numbers
 
 
 def triangle_areas(vertices: Vectors, triangles: NDArray[np.integer]) -> NDArray[np.float64]:
@@ -163,18 +183,43 @@ def triangle_areas(vertices: Vectors, triangles: NDArray[np.integer]) -> NDArray
     return areas
 
 
-def _refuse_flat_triangles(vertices: Vectors, triangles: NDArray[np.int64], label: str) -> None:
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """How errors say where in a mesh something is.
+
+    Attributes:
+        corners: vertices that triangles use [m], (c, 3).
+        numbers: theirs in the file, (c,).
+        nodes: [m], (n, 3).
+    """
+
+    corners: Vectors
+    numbers: NDArray[np.int64]
+    nodes: Vectors
+
+    def of(self, nodes: NDArray[np.integer]) -> str:
+        """The middle of some nodes, and the vertices of the file that they were."""
+        from scipy.spatial import cKDTree
+
+        points = self.nodes[nodes]
+        _, nearest = cKDTree(self.corners).query(points)
+        middle = ", ".join(f"{coordinate:.4g}" for coordinate in points.mean(axis=0))
+        *others, last = (str(number) for number in sorted(self.numbers[nearest]))
+        return f"({middle}) m between vertices {', '.join(others)} and {last}, counted from 0"
+
+
+def _refuse_flat_triangles(vertices: Vectors, triangles: NDArray[np.int64], where: _Places, label: str) -> None:
     corners = vertices[triangles]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     flat = np.flatnonzero(2.0 * triangle_areas(vertices, triangles) <= FLAT_TRIANGLE * longest**2)
     if len(flat):
         raise ShapeError(
-            f'shape.file: {len(flat)} triangles of "{label}" have no area, the first at {_place(corners[flat[0]])}; '
-            "remove them (Blender: Mesh > Clean Up > Degenerate Dissolve)"
+            f'shape.file: {len(flat)} triangles of "{label}" have no area, the first at '
+            f"{where.of(triangles[flat[0]])}; remove them (Blender: Mesh > Clean Up > Degenerate Dissolve)"
         )
 
 
-def _refuse_branching_edges(vertices: Vectors, triangles: NDArray[np.int64], label: str) -> None:
+def _refuse_branching_edges(triangles: NDArray[np.int64], where: _Places, label: str) -> None:
     edges, count = np.unique(
         np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
     )
@@ -182,21 +227,16 @@ def _refuse_branching_edges(vertices: Vectors, triangles: NDArray[np.int64], lab
     if len(branching):
         raise ShapeError(
             f'shape.file: {len(branching)} edges of "{label}" have three triangles or more, the first at '
-            f"{_place(vertices[branching[0]])}; a cloth has two sides: split it there"
+            f"{where.of(branching[0])}; a cloth has two sides: split it there"
         )
 
 
-def _refuse_one_sided(vertices: Vectors, triangles: NDArray[np.integer], label: str) -> None:
+def _refuse_one_sided(triangles: NDArray[np.integer], where: _Places, label: str) -> None:
     """After neighbours were made to agree: one edge passed twice the same way makes a Moebius strip."""
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     passed, count = np.unique(edges, axis=0, return_counts=True)
     twice = passed[count > 1]
     if len(twice):
         raise ShapeError(
-            f'shape.file: "{label}" has one side only, like a Moebius strip, seen at {_place(vertices[twice[0]])}; '
-            "cut it open"
+            f'shape.file: "{label}" has one side only, like a Moebius strip, seen at {where.of(twice[0])}; cut it open'
         )
-
-
-def _place(points: Vectors) -> str:
-    return "(" + ", ".join(f"{coordinate:.4g}" for coordinate in points.mean(axis=0)) + ") m"

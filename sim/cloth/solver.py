@@ -6,13 +6,15 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.cloth.air import ClothAir
 from sim.cloth.contacts import ClothContacts
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
-from sim.cloth.motion import blow_on_triangles, finish_step, predict_displacement
-from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters, shared_conflicts
+from sim.cloth.load import NodeLoad
+from sim.cloth.motion import finish_step, predict_displacement
+from sim.cloth.parameters import DEFAULT_SUBSTEPS, RUNAWAY_SPEED, ClothParameters, shared_conflicts
 from sim.cloth.pins import Pins
-from sim.cloth.sheet import build_sheet, triangle_areas
+from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import joined_springs, springs_of
 from sim.cloth.stable_step import too_few_substeps
 from sim.cloth.state import ClothState, HostCloths
@@ -29,9 +31,6 @@ INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
 
 LOST_DISTANCE = 10.0
 """Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
-
-RUNAWAY_SPEED = 1.0e4
-"""No cloth of a film moves at thirty times the speed of sound [m/s]."""
 
 ACCURATE_SHARE = 0.34
 """Share of the longest stable step that explicit springs take if no number of substeps is given: the energy of a sheet
@@ -56,8 +55,8 @@ class ClothSolver:
         parameters: of the cloths, as they are now.
         gravity: [m/s²]; may be changed between frames.
         contacts: resolved in this order in every substep.
-        air_velocity: of the air at each triangle [m/s], (k,) vec3: the wind, unless a coupling writes there.
-        air_force: of the air on each triangle in the last substep [N], (k,) vec3.
+        load: what a coupling lays onto the nodes in every substep, if any does.
+        air: at every triangle, the wind unless a coupling puts other air there.
         warnings: what was repaired in meshes, a sentence each.
 
     Args:
@@ -90,12 +89,14 @@ class ClothSolver:
         self.state = ClothState(host, reach=_reach(domain, host.position))
         self.gravity = gravity
         self.contacts: list[ClothContacts] = []
+        self.load: NodeLoad | None = None
         families = joined_springs([springs_of(sheet) for sheet in sheets], host.first_node.tolist())
         self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
-        self._integrator = INTEGRATORS[self.parameters[0].integrator](self.state, self._springs)
+        shared = self.parameters[0]
+        self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, iterations=shared.iterations)
         self._totals = ClothTotals(self.state, self._springs)
         self._frame_dt = 1.0 / frames_per_second
-        self._allocate_air()
+        self.air = ClothAir(self.state)
         self._pins = Pins(self.parameters, sheets, self.state)
         self._take_parameters()
         self._time_s = 0.0
@@ -122,6 +123,41 @@ class ClothSolver:
             self._adopt(before)  # what explicit springs bear is known once they have their stiffness
             raise
 
+    def hold(
+        self, name: str, nodes: Sequence[int], *, shift: Vector3 = (0.0, 0.0, 0.0), within_s: float | None = None
+    ) -> None:
+        """Hold nodes of a cloth from now on, as a hand would, and lead them straight by a way; between frames.
+
+        Called again for the same nodes, it leads them on. A checkpoint does not know of it.
+
+        Args:
+            name: of the cloth.
+            nodes: their numbers in the cloth, as in its snapshot.
+            shift: the way, from where they are [m].
+            within_s: time that it takes [s]; a frame if omitted.
+
+        Raises:
+            ValueError: there is no such cloth or node, or a pin leads one of them along its own path.
+        """
+        numbers = self._nodes_of(name, nodes)
+        self._pins.grip(numbers, shift, time_s=self._time_s, within_s=within_s or self._frame_dt)
+        self._hold_pins()
+
+    def let_go(self, name: str, nodes: Sequence[int]) -> None:
+        """Let nodes of a cloth go that `hold` or pins hold; they keep their velocity. See `hold`."""
+        self._pins.let_go(self._nodes_of(name, nodes))
+        self._hold_pins()
+
+    def _nodes_of(self, name: str, nodes: Sequence[int]) -> NDArray[np.int64]:
+        """Numbers of a cloth's nodes in the scene."""
+        if name not in self.state.names:
+            raise ValueError(f'no cloth is named "{name}"; cloths are {", ".join(self.state.names)}')
+        first, last = self.state.host.first_node[self.state.names.index(name) :][:2]
+        numbers = np.unique(np.asarray(nodes, dtype=np.int64))
+        if not len(numbers) or numbers[0] < 0 or numbers[-1] >= last - first:
+            raise ValueError(f'nodes of cloth "{name}" are 0 to {last - first - 1}, got {list(nodes)}')
+        return numbers + first
+
     def _adopt(self, parameters: tuple[ClothParameters, ...]) -> None:
         """Step with these parameters from now on."""
         self.parameters = parameters
@@ -138,6 +174,8 @@ class ClothSolver:
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         self._hold_pins()
+        if self.load is not None:
+            self.load.put_on(self.state, self.gravity, dt)
         self._integrator.accelerate(dt)
         self._predict(dt)
         self._pins.displace(self._time_s, dt)
@@ -149,6 +187,8 @@ class ClothSolver:
             state.displacement, state.quantum, state.limit, dt, state.lattice, state.position, state.carry,
             state.velocity,
         )  # fmt: skip
+        if self.load is not None:
+            self.load.take_off(state)
         self._time_s += dt
 
     def begin_frame(self, time_s: float) -> None:
@@ -164,15 +204,11 @@ class ClothSolver:
 
     def _predict(self, dt: float) -> None:
         """Gravity and air."""
-        state, gravity = self.state, ti.math.vec3(*self.gravity)
-        if self._is_windy:
-            blow_on_triangles(
-                state.position, state.velocity, state.triangles, self.air_velocity, self._drag,
-                self._air_share, gravity, dt, self.air_force,
-            )  # fmt: skip
+        state, air, gravity = self.state, self.air, ti.math.vec3(*self.gravity)
+        air.blow(gravity, dt)
         predict_displacement(
-            state.velocity, state.carry, state.inverse_mass, self.air_force, self._air_share, self._triangle_start,
-            self._triangle_list, int(self._is_windy), gravity, dt, state.displacement,
+            state.velocity, state.carry, state.inverse_mass, air.force, air.share, air.triangle_start,
+            air.triangle_list, int(air.acts), gravity, dt, state.displacement,
         )  # fmt: skip
 
     def _hold_pins(self) -> None:
@@ -181,42 +217,13 @@ class ClothSolver:
 
     # --- what it is built from --------------------------------------------------------------------------------------
 
-    def _allocate_air(self) -> None:
-        """Velocities and forces of the air; the triangles of each node in ascending order, and its share of each.
-
-        The share is the node's area over that of its triangles, so that a flat sheet is pushed alike everywhere: 1/3 in
-        meshes; 1/2 or 1/4 in rectangles, whose nodes have four triangles or eight. A triangle's shares sum to 1.
-        """
-        host, count = self.state.host, self.state.triangle_count
-        triangles = host.triangles
-        self.air_velocity = ti.Vector.ndarray(3, ti.f32, count)
-        self.air_force = ti.Vector.ndarray(3, ti.f32, count)
-        self._drag = ti.Vector.ndarray(3, ti.f32, count)
-        order = np.argsort(triangles.ravel(), kind="stable")
-        start = np.searchsorted(triangles.ravel()[order], np.arange(self.state.vertex_count + 1))
-        self._triangle_start = ti.ndarray(ti.i32, len(start))
-        self._triangle_start.from_numpy(start.astype(np.int32))
-        self._triangle_list = ti.ndarray(ti.i32, len(order))
-        self._triangle_list.from_numpy((order // 3).astype(np.int32))
-        around = np.bincount(triangles.ravel(), weights=np.repeat(triangle_areas(host.position, triangles), 3))
-        self._air_share = ti.ndarray(ti.f32, self.state.vertex_count)
-        self._air_share.from_numpy((host.node_area / around).astype(np.float32))
-
     def _take_parameters(self) -> None:
         """Masses, surfaces, stiffness and air as the parameters have them now."""
-        cloths, host = self.parameters, self.state.host
+        cloths = self.parameters
         self.state.set_material(cloths)
         for springs in self._springs:
             springs.set_material(cloths)
-        drag = [
-            [0.5 * cloth.air_density * cloth.drag for cloth in cloths],
-            [0.5 * cloth.air_density * cloth.skin_drag for cloth in cloths],
-            [cloth.mass_per_area for cloth in cloths],
-        ]
-        self._drag.from_numpy(np.stack([host.of_triangles(each) for each in drag], axis=1).astype(np.float32))
-        wind = [host.of_triangles([cloth.wind[axis] for cloth in cloths]) for axis in range(3)]
-        self.air_velocity.from_numpy(np.stack(wind, axis=1).astype(np.float32))
-        self._is_windy = any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 for cloth in cloths)
+        self.air.take_parameters(cloths)
         self._mass = float(self.state.mass.to_numpy().sum(dtype=np.float64))
 
     def _largest_dt(self) -> float:

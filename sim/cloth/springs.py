@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from sim.cloth.colouring import greedy_colours
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet, triangle_areas
+from sim.cloth.strands import strands_of
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
@@ -56,8 +57,9 @@ class Springs:
         share: stiffness over that of the sheet, (m,): [-] of stretch and shear, [1/m²] of bending.
         kind: STRETCH, SHEAR or BEND, (m,).
         colour: (m,).
-        segment: piece of a thread that the spring belongs to, -1 where springs are solved one by one, (m,). Springs of
-            a piece follow one another, each from the last node of the one before, and have one colour.
+        segment: piece of a thread, or strand of a mesh, that the spring belongs to, -1 where springs are solved one by
+            one, (m,). Springs of a piece follow one another, each from the last node of the one before, and have one
+            colour.
     """
 
     nodes: Indices
@@ -173,19 +175,20 @@ def _all(value: int, count: int) -> Indices:
 
 
 def _mesh_edges(sheet: RestSheet) -> Springs:
-    """One along each edge."""
+    """One along each edge, strand by strand."""
     edges, triangle_area = edges_of(sheet.triangles), triangle_areas(sheet.vertices, sheet.triangles)
     area = np.bincount(edges.of_side, weights=np.repeat(triangle_area, 3), minlength=len(edges.nodes))
-    ends = sheet.vertices[edges.nodes]
+    number, nodes, strand, colour = strands_of(edges.nodes, sheet.vertices)
+    ends = sheet.vertices[nodes]
     rest = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
     return Springs(
-        edges.nodes,
+        nodes,
         np.tile([1.0, -1.0], (len(rest), 1)),
         rest,
-        area / rest**2,
+        area[number] / rest**2,
         _all(STRETCH, len(rest)),
-        greedy_colours(edges.nodes, len(sheet.vertices)),
-        _all(-1, len(rest)),
+        colour,
+        strand,
     )
 
 

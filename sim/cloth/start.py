@@ -45,7 +45,8 @@ def pinned_nodes(pin: PinParameters, sheet: RestSheet, position: Floats) -> NDAr
     if pin.index is not None:
         count = len(sheet.node_of_vertex)
         if beyond := [number for number in pin.index if number >= count]:
-            raise ValueError(f"index {beyond[0]} does not exist; the sheet has nodes 0 to {count - 1}")
+            kind = "sheet has nodes" if sheet.grid is not None else "mesh has vertices"
+            raise ValueError(f"index {beyond[0]} does not exist; the {kind} 0 to {count - 1}")
         nodes = sheet.node_of_vertex[list(pin.index)]
         if (nodes < 0).any():
             unused = pin.index[int(np.flatnonzero(nodes < 0)[0])]

@@ -104,6 +104,7 @@ class ClothState:
         edges: (e,) ivec2.
         names: of the cloths.
         self_collision: of each cloth: whether it collides with itself.
+        is_free: of each cloth: whether no pin holds any of its nodes.
         quantum: unit of the lattice [m].
         limit: end of the lattice on each axis, in quanta; nodes that come there are stopped.
     """
@@ -132,6 +133,7 @@ class ClothState:
         self.triangles = ti.Vector.ndarray(3, ti.i32, len(host.triangles))
         self.edges = ti.Vector.ndarray(2, ti.i32, len(host.edges))
         self.self_collision: tuple[bool, ...] = ()
+        self.is_free: tuple[bool, ...] = ()
         self.body.from_numpy(host.body)
         self.triangles.from_numpy(host.triangles)
         self.edges.from_numpy(host.edges)
@@ -185,6 +187,8 @@ class ClothState:
 
     def set_pinned(self, is_pinned: NDArray[np.bool_]) -> None:
         """Hold these nodes, (n,), and no others."""
+        held = np.bincount(self.host.body, weights=is_pinned, minlength=len(self.names))
+        self.is_free = tuple(bool(count == 0) for count in held)
         mass = self.mass.to_numpy()
         self.inverse_mass.from_numpy(np.where(is_pinned, 0.0, 1.0 / mass).astype(np.float32))
 

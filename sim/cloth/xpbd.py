@@ -6,6 +6,7 @@ import taichi as ti
 
 from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.device_springs import COLOURS_AT_ONCE, TINY_LENGTH, DeviceSprings, Laws, coefficient, separation
+from sim.cloth.free_spin import FreeSpin
 from sim.cloth.state import ClothState, Lattice
 from sim.cloth.threads import ThreadSolver
 from sim.launch import fast_launch
@@ -18,16 +19,30 @@ class XPBDSprings:
     """Gauss-Seidel over the springs, colour by colour, each an implicit Euler step of that spring alone.
 
     Nodes that a spring moves in a colour belong to no other spring of it, so the result is the same whatever the number
-    of threads. Momentum of free cloth is kept to rounding. Angular momentum is not quite: springs push along their
-    predicted direction rather than that of the start, as implicit Euler does. Explicit springs keep both.
+    of threads. Momentum of free cloth is kept to rounding. Springs push along their predicted direction rather than
+    that of the start, as implicit Euler does, and so have a torque; `FreeSpin` takes it back from cloths that no pin
+    holds.
 
     Approximate: one sweep a step does not let a stiff spring know of all that hangs on it. A spring alone, of a colour
     that comes early, stretches by 2 n g dt² more than it should if n nodes hang on it, whatever its stiffness; the last
-    spring of a piece of thread by n g dt², and those within a piece by nothing. That falls with the square of the step.
+    spring of a piece of thread by n g dt², and those within a piece by nothing. That falls with the square of the step,
+    and with every further sweep (`iterations`). Bend springs have one sweep always.
+
+    Args:
+        state: what they move.
+        springs: all springs.
+        iterations: sweeps over springs between two nodes in every step.
     """
 
-    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings]) -> None:
-        self._state, self._springs = state, springs
+    def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], *, iterations: int) -> None:
+        self._state, self._springs, self._iterations = state, springs, iterations
+        self._spin = FreeSpin(state)
+        self._bends = [family for family in springs if family.arity > PAIR]
+        self._pairs = [
+            (family, ti.ndarray(ti.f32, family.count))
+            for family in springs
+            if family.arity == PAIR and not family.in_segments
+        ]
         self._threads = [ThreadSolver(family) for family in springs if family.in_segments]
 
     def stable_dt(self) -> float:
@@ -54,28 +69,45 @@ class XPBDSprings:
 
     def displace(self, dt: float) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go."""
-        state = self._state
-        for springs in self._springs:
-            for colour in () if springs.in_segments else springs.first_colours:
-                solve_springs(
-                    springs.nodes, springs.law, springs.coefficients, springs.piece_of_colour, colour, state.lattice,
-                    state.quantum, state.inverse_mass, dt, springs.arity, state.displacement,
-                )  # fmt: skip
+        for springs in self._bends:
+            self._solve_bends(springs, dt)
+        for iteration in range(self._iterations):
+            for springs, multiplier in self._pairs:
+                self._solve_pairs(springs, multiplier, dt, is_first=iteration == 0)
+            for threads in self._threads:
+                threads.displace(self._state, dt, is_first=iteration == 0)
         for threads in self._threads:
-            threads.displace(state, dt)
+            threads.straighten(self._state, dt)
+        self._spin.restore(dt)
+
+    def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
+        state = self._state
+        for colour in springs.first_colours:
+            solve_bends(
+                springs.nodes, springs.law, springs.coefficients, springs.piece_of_colour, colour, state.lattice,
+                state.quantum, state.inverse_mass, dt * dt, 1.0 / dt, springs.arity, state.displacement,
+            )  # fmt: skip
+
+    def _solve_pairs(self, springs: DeviceSprings, multiplier: ti.Ndarray, dt: float, *, is_first: bool) -> None:
+        state = self._state
+        for colour in springs.first_colours:
+            solve_pairs(
+                springs.nodes, springs.law, springs.piece_of_colour, colour, state.lattice, state.quantum,
+                state.inverse_mass, dt * dt, int(is_first), multiplier, state.displacement,
+            )  # fmt: skip
 
 
 @ti.func
-def solve_spring(
+def solve_bend(
     s: ti.i32, nodes: Integers, law: Laws, coefficients: Floats, lattice: Lattice, quantum: ti.f32,
-    inverse_mass: Floats, dt: ti.f32, arity: ti.template(), displacement: Vectors,
+    inverse_mass: Floats, dt_squared: ti.f32, rate: ti.f32, arity: ti.template(), displacement: Vectors,
 ):  # fmt: skip
     """Macklin, Müller & Chentanez 2016, eq. 26, from a multiplier of 0:
 
         Delta lambda = -(C + gamma dC) / ((1 + gamma) sum_a w_a c_a² + 1/(k dt²)),   gamma = tau / dt
 
-    multiplied through by k dt², so that springs without stiffness do nothing; gamma is 0 between two nodes. `law` is
-    (rest, k, tau).
+    multiplied through by k dt² |d|, so that springs without stiffness do nothing, and one division does. `law` is
+    (rest, k, tau); over a node of a rectangle the rest length is 0.
     """
     d = separation(nodes, coefficients, lattice, quantum, s, arity)
     moved = ti.math.vec3(0.0)
@@ -88,15 +120,12 @@ def solve_spring(
     d += moved
     squared = d.dot(d)
     if squared > TINY_LENGTH * TINY_LENGTH:
-        strength = law[s][1] * dt * dt
-        error = 1.0  # over |d|
+        strength = law[s][1] * dt_squared
+        gamma = law[s][2] * rate
+        error = squared + gamma * d.dot(moved)  # times |d|
         if ti.static(arity != BEND_OF_GRID):
-            error -= law[s][0] / ti.sqrt(squared)
-        if ti.static(arity > PAIR):
-            gamma = law[s][2] / dt
-            error += gamma * d.dot(moved) / squared
-            weight *= 1.0 + gamma
-        impulse = -strength * error / (strength * weight + 1.0) * d
+            error -= law[s][0] * ti.sqrt(squared)
+        impulse = -strength * error / (squared * (strength * weight * (1.0 + gamma) + 1.0)) * d
         for a in ti.static(range(arity)):
             i = nodes[arity * s + a]
             displacement[i] += inverse_mass[i] * coefficient(coefficients, s, arity, a) * impulse
@@ -104,14 +133,44 @@ def solve_spring(
 
 @fast_launch
 @ti.kernel
-def solve_springs(
-    nodes: Integers, law: Laws, coefficients: Floats, spring_of_colour: Integers, colour: ti.i32,
-    lattice: Lattice, quantum: ti.f32, inverse_mass: Floats, dt: ti.f32, arity: ti.template(), displacement: Vectors,
+def solve_bends(
+    nodes: Integers, law: Laws, coefficients: Floats, spring_of_colour: Integers, colour: ti.i32, lattice: Lattice,
+    quantum: ti.f32, inverse_mass: Floats, dt_squared: ti.f32, rate: ti.f32, arity: ti.template(),
+    displacement: Vectors,
 ):  # fmt: skip
-    """The springs of some colours, from `colour` on, one colour after the other."""
+    """The bend springs of some colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
     for k in ti.static(range(COLOURS_AT_ONCE)):
         for s in range(spring_of_colour[colour + k], spring_of_colour[colour + k + 1]):
-            solve_spring(s, nodes, law, coefficients, lattice, quantum, inverse_mass, dt, arity, displacement)
+            solve_bend(
+                s, nodes, law, coefficients, lattice, quantum, inverse_mass, dt_squared, rate, arity, displacement
+            )
+
+
+@fast_launch
+@ti.kernel
+def solve_pairs(
+    nodes: Integers, law: Laws, spring_of_colour: Integers, colour: ti.i32, lattice: Lattice, quantum: ti.f32,
+    inverse_mass: Floats, dt_squared: ti.f32, is_first: ti.i32, multiplier: Floats, displacement: Vectors,
+):  # fmt: skip
+    """The springs between two nodes of some colours, one colour after the other.
+
+    Macklin, Müller & Chentanez 2016, eq. 18, Delta lambda = -(C + a lambda) / (w_i + w_j + a) with a = 1/(k dt²),
+    multiplied through by k dt²; multipliers start at 0 in every step.
+    """
+    for m in ti.static(range(COLOURS_AT_ONCE)):
+        for s in range(spring_of_colour[colour + m], spring_of_colour[colour + m + 1]):
+            i, j = nodes[2 * s], nodes[2 * s + 1]
+            w_i, w_j = inverse_mass[i], inverse_mass[j]
+            d = quantum * ti.cast(lattice[i] - lattice[j], ti.f32) + (displacement[i] - displacement[j])
+            length = ti.max(d.norm(), TINY_LENGTH)
+            strength = law[s][1] * dt_squared
+            before = 0.0
+            if not is_first:
+                before = multiplier[s]
+            change = -(strength * (length - law[s][0]) + before) / (length * (strength * (w_i + w_j) + 1.0))  # over |d|
+            multiplier[s] = before + length * change
+            displacement[i] += w_i * change * d
+            displacement[j] -= w_j * change * d
 
 
 @ti.func

@@ -1,4 +1,4 @@
-"""How fast bodies will become, as far as their start and their paths tell."""
+"""How fast bodies and cloths will become, as far as their start and their paths tell."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sim.cloth.parameters import ClothParameters
+from sim.cloth.pin_paths import path_of_pin
 from sim.fluid.expected_speed import square_of_fall_speed
 from sim.parameters import Vector3
 from sim.rigid import rotation
@@ -45,3 +48,20 @@ def expected_body_speed(
         spin = math.hypot(*body.angular_velocity) * geometry.radius
         speeds.append(math.sqrt(math.hypot(*body.velocity) ** 2 + fall) + spin)
     return max(speeds)
+
+
+def expected_cloth_speed(
+    parameters: Sequence[ClothParameters], positions: NDArray[np.floating], domain: DomainParameters, gravity: Vector3
+) -> float:
+    """Largest speed [m/s] to expect of cloths: the initial one with a fall to the domain's deepest corner, or of pins.
+
+    Args:
+        parameters: of the cloths.
+        positions: of points of all of them [m], (n, 3).
+        domain: how deep they can fall.
+        gravity: [m/s²].
+    """
+    fastest = max(math.hypot(*cloth.velocity) for cloth in parameters)
+    extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    pins = [path_of_pin(pin).largest_speed(extent) for cloth in parameters for pin in cloth.pin if pin.keyframe]
+    return max(math.sqrt(fastest**2 + square_of_fall_speed(positions, domain, gravity)), *pins, 0.0)

@@ -1,4 +1,4 @@
-"""The reaction of a particle fluid on the bodies that move in it."""
+"""The reaction of a particle fluid on the bodies and sheets that move in it."""
 
 from typing import Any
 
@@ -12,6 +12,7 @@ from sim.fluid.body_response import BodyResponse, weigh_errors
 from sim.fluid.boundary import Boundary
 from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
 from sim.fluid.kernels import TINY_DISTANCE, spline_slope
+from sim.fluid.sheet_forces import SheetForces
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, viscous_factor
 from sim.launch import fast_launch
 from sim.neighbor_kernels import ROUNDING_MARGIN
@@ -37,6 +38,7 @@ class BodyForces:
 
     Attributes:
         response: lets the bodies' samples answer to forces within the step; None where they wait for its end.
+        sheets: takes the forces on the samples of sheets; None where there are none.
     """
 
     def __init__(self, boundary: Boundary, grid: CellGrid, search_radius: float) -> None:
@@ -55,7 +57,7 @@ class BodyForces:
         ]
         chunk_of_body = np.concatenate([[0], np.cumsum([len(each) for each in chunks])]).astype(np.int32)
         self._chunk_count = int(chunk_of_body[-1])
-        starts = np.concatenate([*chunks, [boundary.moving_count]]).astype(np.int32)
+        starts = np.concatenate([*chunks, [boundary.body_sample_count]]).astype(np.int32)
         self._chunk_start = _integers(starts)
         self._chunk_of_body = _integers(chunk_of_body)
         self._near_start = ti.ndarray(ti.i32, samples + 1)
@@ -66,6 +68,14 @@ class BodyForces:
         self._wrench = ti.ndarray(ti.f32, bodies * WRENCH_WIDTH)
         self._impulse: NDArray[np.float64] = np.zeros((boundary.body_count, WRENCH_WIDTH))
         self.response: BodyResponse | None = None
+        self.sheets: SheetForces | None = None
+
+    @property
+    def answer(self) -> bool:
+        """Whether any moving samples answer to forces within the step."""
+        return (self.response is not None and self.response.is_needed) or (
+            self.sheets is not None and self.sheets.answers
+        )
 
     @property
     def near(self) -> tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray]:
@@ -111,9 +121,12 @@ class BodyForces:
         if self._boundary.moving_count == 0:
             return
         self._gather(self._boundary.velocity if sample_velocity is None else sample_velocity, terms)
-        self._impulse += dt * self._host_wrenches()
+        if self._boundary.body_count:
+            self._impulse += dt * self._host_wrenches()
         if self.response is not None:
             self.response.push_samples(self._wrench, dt)
+        if self.sheets is not None:
+            self.sheets.count_forces(self._force, dt)
 
     def respond(self, *terms: Any) -> ti.Ndarray:
         """Acceleration of each boundary sample by forces that are only tried [m/s²]; their impulses do not count.
@@ -123,7 +136,10 @@ class BodyForces:
         """
         assert self.response is not None
         self._gather(self._boundary.velocity, terms)
-        return self.response.accelerate_samples(self._wrench)
+        acceleration = self.response.accelerate_samples(self._wrench)
+        if self.sheets is not None and self.sheets.answers:
+            self.sheets.accelerate(self._force, acceleration)
+        return acceleration
 
     def measure(self, sample_velocity: ti.Ndarray, *terms: Any) -> NDArray[np.float64]:
         """Forces [N] and torques [N m] on each body that are only tried, (bodies, 6).
@@ -169,7 +185,8 @@ class BodyForces:
         self._sum_over_bodies()
 
     def _host_wrenches(self) -> NDArray[np.float64]:
-        return self._wrench.to_numpy().astype(np.float64).reshape(-1, WRENCH_WIDTH)
+        entries = self._boundary.body_count * WRENCH_WIDTH
+        return self._wrench.to_numpy()[:entries].astype(np.float64).reshape(-1, WRENCH_WIDTH)
 
     def _sum_over_bodies(self) -> None:
         boundary = self._boundary

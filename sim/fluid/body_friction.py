@@ -142,11 +142,11 @@ class BodyFriction:
     def spread(self, twists: NDArray[np.float64]) -> None:
         """Fill `changes` with J_b u for the changes u of the bodies, (bodies, 6)."""
         boundary = self._boundary
-        if boundary.moving_count == 0:
+        if boundary.body_count == 0:
             return
         self._twists.from_numpy(np.ascontiguousarray(twists, dtype=np.float32).ravel())
         spread_twists(
-            boundary.position, boundary.fixed_count, boundary.moving_count, boundary.body, boundary.states,
+            boundary.position, boundary.fixed_count, boundary.body_sample_count, boundary.body, boundary.states,
             self._twists, self.changes,
         )  # fmt: skip
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sim.arrays import Floats, Integers, Vectors
 from sim.fluid.boundary import Boundary
-from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
+from sim.fluid.boundary_kernels import NO_BODY, STATE_WIDTH, WRENCH_WIDTH
 from sim.fluid.kernels import TINY_DISTANCE, spline, spline_slope
 from sim.fluid.pressure_kernels import error_left
 from sim.launch import fast_launch
@@ -24,8 +24,6 @@ PARTICLES_PER_SAMPLE = 8
 
 LARGEST_PUSH = 6.0
 """|sum_b V_b grad W_ib| of a particle that is pressed onto samples, over 1/d; it is 0.9 at rest beside them."""
-
-NO_BODY = 2**31 - 1
 
 
 class BodyResponse:
@@ -103,7 +101,7 @@ class BodyResponse:
         """Accelerations of all boundary samples by forces and torques on the bodies [m/s²]; 0 for the fixed ones."""
         boundary = self._boundary
         accelerate_samples(
-            boundary.position, boundary.fixed_count, boundary.moving_count, boundary.body, boundary.states,
+            boundary.position, boundary.fixed_count, boundary.body_sample_count, boundary.body, boundary.states,
             wrench, self._mobility, self._acceleration,
         )  # fmt: skip
         return self._acceleration
@@ -139,7 +137,7 @@ class BodyResponse:
     def _push(self, wrench: ti.Ndarray, dt: float, gravity_share: float) -> None:
         boundary = self._boundary
         push_samples(
-            boundary.position, boundary.fixed_count, boundary.moving_count, boundary.body, boundary.states,
+            boundary.position, boundary.fixed_count, boundary.body_sample_count, boundary.body, boundary.states,
             wrench, self._mobility, gravity_share * self._gravity, dt, boundary.velocity,
         )  # fmt: skip
 

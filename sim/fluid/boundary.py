@@ -1,4 +1,4 @@
-"""Boundary samples on the device: those of walls and static bodies, then those of bodies that move."""
+"""Boundary samples on the device: of walls and static bodies, then of bodies that move, then of sheets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 
 from sim.cells import CellGrid, CellSort, SortedPoints
-from sim.fluid.boundary_kernels import STATE_WIDTH, order_samples, place_samples, take_samples
+from sim.fluid.boundary_kernels import NO_BODY, STATE_WIDTH, order_samples, place_samples, take_samples
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,19 +24,22 @@ EVERYWHERE = 1.0e30
 class Boundary:
     """Samples of walls and bodies, as the sums over neighbours read them.
 
-    The fixed samples come first, sorted by cell; the moving ones follow in the order they were given, body by body.
+    The fixed samples come first, sorted by cell; the moving ones follow in the order they were given, body by body, and
+    after them those of sheets, which whoever moves the sheets places.
 
     Attributes:
         given_count: number of fixed samples given.
         fixed_count: number of those near enough to the grid to matter.
-        moving_count: number of samples of moving bodies.
+        moving_count: number of samples of moving bodies and of sheets.
+        body_sample_count: number of those of moving bodies.
+        sheet_count: number of those of sheets.
         body_count: number of moving bodies.
         position: (fixed + moving,) of 3-vectors [m].
         velocity: (fixed + moving,) of 3-vectors [m/s], 0 for the fixed ones.
         volume: V_b of each sample [m³], (fixed + moving,).
         index: row in the fixed samples given of each fixed sample here, (fixed,), on the host.
         offset: moving samples relative to the centre of mass of their body, in its axes [m], (moving,) of 3-vectors.
-        body: number of the body of each moving sample, (moving,), int32.
+        body: number of the body of each moving sample, `NO_BODY` for those of sheets, (moving,), int32.
         body_start: first moving sample of each body, (bodies + 1,), on the host.
         reach: largest distance of a sample from the centre of mass of its body [m], (bodies,), on the host.
         states: of the bodies, as `place` takes them: centre of mass, rotation, velocity and angular velocity of the
@@ -48,6 +51,7 @@ class Boundary:
         fixed: BoundarySamples,
         moving: BoundarySamples,
         *,
+        sheets: BoundarySamples,
         body_count: int,
         grid: CellGrid,
         spacing: float,
@@ -58,7 +62,9 @@ class Boundary:
         low = np.array(grid.origin)
         high = low + grid.cell_size * np.array(grid.shape)
         near = np.flatnonzero(((fixed.positions >= low) & (fixed.positions <= high)).all(axis=1))
-        self.given_count, self.fixed_count, self.moving_count = len(fixed.positions), len(near), len(moving.positions)
+        self.given_count, self.fixed_count = len(fixed.positions), len(near)
+        self.body_sample_count, self.sheet_count = len(moving.positions), len(sheets.positions)
+        self.moving_count = self.body_sample_count + self.sheet_count
         self.body_count = body_count
         ids = _device_array(near.astype(np.int32))
         cells = CellSort(grid, self.fixed_count)
@@ -68,13 +74,18 @@ class Boundary:
         self.fixed_points = SortedPoints(_coordinates(fixed_positions), cells.cell_start)
 
         volumes = np.concatenate(
-            [fixed.volumes(spacing, support_in_spacings)[self.index], moving.volumes(spacing, support_in_spacings)]
+            [
+                fixed.volumes(spacing, support_in_spacings)[self.index],
+                *(each.volumes(spacing, support_in_spacings) for each in (moving, sheets)),
+            ]
         )
-        self.position = _device_array(np.concatenate([fixed_positions, moving.positions]))
+        moving_positions = np.concatenate([moving.positions, sheets.positions])
+        self.position = _device_array(np.concatenate([fixed_positions, moving_positions]))
         self.velocity = _device_array(np.zeros((self.fixed_count + self.moving_count, 3), dtype=np.float32))
         self.volume = _device_array(volumes.astype(np.float32))
 
-        self.offset, self.body = _device_array(moving.positions), _device_array(moving.body)
+        no_body = np.full(self.sheet_count, NO_BODY, dtype=np.int32)
+        self.offset, self.body = _device_array(moving.positions), _device_array(np.concatenate([moving.body, no_body]))
         self.body_start: NDArray[np.int64] = np.searchsorted(moving.body, np.arange(body_count + 1))
         distance = np.linalg.norm(moving.positions.astype(np.float64), axis=1)
         self.reach: NDArray[np.float64] = np.array(
@@ -86,14 +97,20 @@ class Boundary:
         self._moving_ids = _device_array(np.arange(self.moving_count, dtype=np.int32))
         self._moving_position = ti.Vector.ndarray(3, ti.f32, max(self.moving_count, 1))
         self._moving_points = (
-            SortedPoints(_coordinates(moving.positions), self._moving_cells.cell_start) if self._moving_cells else None
+            SortedPoints(_coordinates(moving_positions), self._moving_cells.cell_start) if self._moving_cells else None
         )
+        self._reference_sheets = _device_array(sheets.positions)
         self.moving_index = _device_array(np.zeros(self.moving_count, dtype=np.int32))
 
     @property
     def count(self) -> int:
-        """Samples of walls and of all bodies."""
+        """Samples of walls, of all bodies and of sheets."""
         return self.fixed_count + self.moving_count
+
+    @property
+    def first_sheet(self) -> int:
+        """Index of the first sample of sheets among all samples."""
+        return self.fixed_count + self.body_sample_count
 
     def place(
         self,
@@ -125,22 +142,38 @@ class Boundary:
         return float((np.linalg.norm(moved[:, :3], axis=1) + turned * self.reach).max())
 
     def checkpoint(self) -> dict[str, NDArray[np.float32]]:
-        """Where the bodies are, and where they were when the moving samples were sorted last."""
-        return {"body_states": self.states.to_numpy(), "reference_body_states": self._reference_states.copy()}
+        """Where the bodies and sheets are, and where they were when the moving samples were sorted last."""
+        arrays = {"body_states": self.states.to_numpy(), "reference_body_states": self._reference_states.copy()}
+        if self.sheet_count:
+            own = slice(self.first_sheet, self.count)
+            arrays["sheet_position"] = self.position.to_numpy()[own].copy()
+            arrays["sheet_velocity"] = self.velocity.to_numpy()[own].copy()
+            arrays["reference_sheet_position"] = self._reference_sheets.to_numpy()
+        return arrays
 
     def restore_reference(self, arrays: Arrays) -> None:
-        """Put the bodies where they were when the moving samples were sorted before the checkpoint."""
+        """Put bodies and sheets where they were when the moving samples were sorted before the checkpoint."""
         self._place(arrays["reference_body_states"])
+        if self.sheet_count:
+            self._put_sheets(self.position, arrays["reference_sheet_position"])
 
     def restore(self, arrays: Arrays) -> None:
-        """Put the bodies where they were at the checkpoint."""
+        """Put bodies and sheets where they were at the checkpoint."""
         self._place(arrays["body_states"])
+        if self.sheet_count:
+            self._put_sheets(self.position, arrays["sheet_position"])
+            self._put_sheets(self.velocity, arrays["sheet_velocity"])
+
+    def _put_sheets(self, array: ti.Ndarray, rows: NDArray[np.generic]) -> None:
+        values = array.to_numpy()
+        values[self.first_sheet : self.count] = rows
+        array.from_numpy(values)
 
     def _place(self, states: NDArray[np.generic]) -> None:
         self._host_states = np.ascontiguousarray(states)
         self.states.from_numpy(self._host_states)
         place_samples(
-            self.offset, self.body, self.moving_count, self.fixed_count, self.states, self.position, self.velocity
+            self.offset, self.body, self.body_sample_count, self.fixed_count, self.states, self.position, self.velocity
         )
 
     def sort_moving(self) -> SortedPoints | None:
@@ -153,6 +186,7 @@ class Boundary:
         self._reference_states = self.states.to_numpy()
         count, first = self.moving_count, self.fixed_count
         take_samples(self.position, first, count, self._moving_position)
+        take_samples(self.position, self.first_sheet, self.sheet_count, self._reference_sheets)
         self._moving_cells.sort(self._moving_position, self._moving_ids, count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3)
         order_samples(
             self._moving_position, self._moving_cells.order, count, first,

@@ -8,6 +8,9 @@ from sim.launch import fast_launch
 STATE_WIDTH = 18
 """Numbers of a body's state: centre of mass, rotation row by row, velocity, angular velocity."""
 
+NO_BODY = 2**31 - 1
+"""Stands for the number of a body where there is none."""
+
 WRENCH_WIDTH = 6
 """Numbers of a force with its torque."""
 

@@ -8,6 +8,7 @@ import taichi as ti
 from sim.fluid.implicit_fluid import ImplicitFluid
 from sim.fluid.kernels import evaluate, lattice_offsets, particle_volume
 from sim.fluid.pressure_kernels import add_scaled, measure_divergence
+from sim.fluid.sheet_forces import DIVERGENCE
 from sim.fluid.solve_record import SolveRecord
 from sim.solver import Diagnostics
 
@@ -58,6 +59,7 @@ class DFSPHSolver(ImplicitFluid):
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         self._compute_density()
+        self._begin_sheets()
         self._correct_divergence(dt)
         self._compute_acceleration(None)
         self._react_on_bodies(None, dt)
@@ -84,6 +86,7 @@ class DFSPHSolver(ImplicitFluid):
 
     def _correct_divergence(self, dt: float) -> None:
         particles, boundary = self._particles, self.boundary
+        self._recoil_sheets(DIVERGENCE, dt)
         measure_divergence(
             particles.position, particles.velocity, self._density, self._inverse_diagonal, particles.count, *self._list,
             boundary.position, boundary.velocity, boundary.volume, boundary.moving_count > 0,

@@ -11,9 +11,12 @@ from sim.arrays import Floats, Integers, Vectors
 from sim.cells import Cells, cell_of_point, row_of_cell
 from sim.fluid.kernels import inverse_distance, spline_slope
 from sim.fluid.material_fluid import MaterialFluid
+from sim.fluid.sheet_forces import DENSITY, SheetForces
+from sim.fluid.sheet_samples import SheetSamples
 from sim.fluid.surface_tension import cohesion_becker_teschner2007
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING, pair_viscosity, viscous_factor
 from sim.launch import fast_launch
+from sim.solver import Arrays
 
 
 class SPHFluid(MaterialFluid):
@@ -27,10 +30,33 @@ class SPHFluid(MaterialFluid):
     _pressure_slope = 0.0
     """dp/d(rho/rho0) at rest density [Pa], where pressure follows the density."""
 
-    def __init__(self, *args: Any, **keywords: Any) -> None:
-        """Take particles, walls and bodies, as `ParticleFluid` does."""
-        super().__init__(*args, **keywords)
+    sheets_answer = False
+    """Whether sheets answer to pressures that are tried within a step."""
+
+    def __init__(self, *args: Any, sheets: SheetSamples | None = None, **keywords: Any) -> None:
+        """Take particles, walls and bodies, as `ParticleFluid` does, and sheets."""
+        super().__init__(*args, sheets=None if sheets is None else sheets.boundary, **keywords)
         self._acceleration = ti.Vector.ndarray(3, ti.f32, self._particles.capacity)
+        if sheets is not None:
+            self.body_forces.sheets = SheetForces(
+                self.boundary, sheets, gravity=self.gravity, capacity=self.capacity, spacing=self.spacing,
+                support_in_spacings=self.parameters.support_in_spacings, answers=self.sheets_answer,
+            )  # fmt: skip
+
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """As of every particle fluid, with what it expects of sheets."""
+        sheets = self.body_forces.sheets
+        return {**super().checkpoint(), **({} if sheets is None else sheets.checkpoint())}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from a checkpoint bit for bit.
+
+        Raises:
+            ValueError: the arrays are not a checkpoint of this fluid.
+        """
+        super().restore(arrays)
+        if self.body_forces.sheets is not None:
+            self.body_forces.sheets.restore(arrays)
 
     def boundary_forces(self) -> NDArray[np.float32]:
         """Pressure force of the fluid on each fixed boundary sample, in the order they were given [N], (m, 3).
@@ -93,6 +119,42 @@ class SPHFluid(MaterialFluid):
         )  # fmt: skip
         self._add_surface_tension(self._acceleration)
 
+    def _begin_sheets(self) -> None:
+        """Find the fluid that touches sheets at the start of a step, before anything acts between them."""
+        if self.body_forces.sheets is not None:
+            self.body_forces.sheets.begin_step(self.body_forces.near, self._sheet_terms, self._particles.count)
+
+    def _recoil_sheets(self, solve: int, dt: float) -> None:
+        """Push the sheets' samples by the opposite of what acted on them in this solve of the last step."""
+        if self.body_forces.sheets is not None:
+            self.body_forces.sheets.begin_solve(solve)
+            self.body_forces.sheets.recoil(dt)
+
+    def sheets_moved(self, way: float, speed: float, *, elapsed_s: float) -> None:
+        """Take note that the samples of sheets were placed anew.
+
+        Args:
+            way: how far any of them got at most [m].
+            speed: the largest of them [m/s].
+            elapsed_s: time since they were placed last [s]; 0 where they are put there anew.
+        """
+        self._boundary_travelled += way
+        self._sheet_speed = speed
+        self._without_neighbors |= elapsed_s == 0.0
+
+    def take_sheet_motion(self, change: ti.Ndarray, largest_change: float, dt: float) -> None:
+        """Let the fluid that touched sheets in the last step move along with them.
+
+        Args:
+            change: what the velocity of each sample of a sheet differs by from what the last step took it for [m/s].
+            largest_change: norm of the largest of them [m/s].
+            dt: that step [s].
+        """
+        sheets = self.body_forces.sheets
+        assert sheets is not None
+        sheets.take_motion(self._sheet_terms, self._particles.velocity, change, dt)
+        self._travelled += dt * largest_change
+
     def _react_on_bodies(self, pressure_term: ti.Ndarray | None, dt: float, *, with_friction: bool = True) -> None:
         """Count what the particles feel from moving bodies as impulses on these, for a step of dt [s].
 
@@ -100,11 +162,22 @@ class SPHFluid(MaterialFluid):
         friction was counted before, in the first call of the step. There, bodies that answer within the step begin to
         fall, as the particles do by `_compute_acceleration`.
         """
+        sheets = self.body_forces.sheets
+        if with_friction and sheets is not None:
+            sheets.begin_solve(DENSITY)
         if pressure_term is not None or self.parameters.wall_friction > 0.0:
             self.body_forces.gather(*self._body_force_terms(pressure_term, with_friction=with_friction), dt=dt)
-        # After the gathering: the particles felt friction against bodies that had not begun to fall.
+        # After the gathering: the particles felt friction against samples that had not begun to fall or recoil.
         if with_friction and self.body_forces.response is not None:
             self.body_forces.response.fall(dt)
+        if with_friction and sheets is not None:
+            sheets.recoil(dt)
+            sheets.add_missing_weight(self.body_forces.near, self._sheet_terms, dt)
+
+    @property
+    def _sheet_terms(self) -> tuple[Any, ...]:
+        """What `SheetForces` takes of the particles."""
+        return self._particles.position, self._particles.phase, *self._list, self.phases.rest_density
 
     def _body_force_terms(self, pressure_term: ti.Ndarray | None, *, with_friction: bool) -> tuple[Any, ...]:
         """What the forces on bodies by pressure, by friction or by both are made of (`gather_sample_forces`)."""

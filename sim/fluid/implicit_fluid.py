@@ -67,6 +67,7 @@ class ImplicitFluid(SPHFluid):
     cfl_number = CFL_NUMBER
     # A column of 20 layers is stable up to 0.13, and not at 0.18.
     gravity_number = 0.1
+    sheets_answer = True
     _relaxation = 1.0
 
     def __init__(self, *args: Any, **keywords: Any) -> None:
@@ -150,6 +151,14 @@ class ImplicitFluid(SPHFluid):
             response.add_to_diagonal(
                 particles.position, particles.count, self._list, volume=self.particle_volume,
                 gradient_factor=self._sigma / self.support_radius, inverse_support=1.0 / self.support_radius,
+                relaxation=self._relaxation, inverse_diagonal=self._inverse_diagonal,
+            )  # fmt: skip
+
+    def _begin_sheets(self) -> None:
+        super()._begin_sheets()
+        if self.body_forces.sheets is not None:
+            self.body_forces.sheets.add_to_diagonal(
+                self.body_forces.near, self._sheet_terms, self._particles.count,
                 relaxation=self._relaxation, inverse_diagonal=self._inverse_diagonal,
             )  # fmt: skip
 
@@ -237,12 +246,12 @@ class ImplicitFluid(SPHFluid):
         )  # fmt: skip
 
     def _bodies_respond(self, pressure: ti.Ndarray) -> None:
-        """Fill `_boundary_response`, the acceleration of each sample of a free body by this pressure [m/s²]."""
+        """Fill `_boundary_response`, the acceleration of each sample that answers to this pressure [m/s²]."""
         response = self.body_forces.response
         if response is None:
             return
         self._boundary_response = response.no_acceleration
-        if response.is_needed:
+        if self.body_forces.answer:
             self._boundary_response = self.body_forces.respond(*self._body_force_terms(pressure, with_friction=False))
 
     def _mean_error(self, remaining: ti.Ndarray, pressure: ti.Ndarray, dt: float) -> float:

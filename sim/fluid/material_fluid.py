@@ -124,6 +124,11 @@ class MaterialFluid(ParticleFluid):
         return None
 
     @property
+    def _boundary_speed(self) -> float:
+        """Largest speed of a boundary sample [m/s]."""
+        return float(np.maximum(self._body_speed, self._sheet_speed))  # which is NaN where either is
+
+    @property
     def _limiting_viscosity(self) -> float:
         """Viscosity that limits the time step [m²/s]: 0 where it is implicit; without the artificial one."""
         return self._stiffest if self._implicit_viscosity is None else 0.0

@@ -60,6 +60,7 @@ class ParticleFluid(ABC):
         boundary: BoundarySamples,
         phase: NDArray[np.int32] | None = None,
         moving: BoundarySamples | None = None,
+        sheets: BoundarySamples | None = None,
         body_count: int = 0,
         capacity: int | None = None,
     ) -> None:
@@ -74,6 +75,7 @@ class ParticleFluid(ABC):
             boundary: samples of walls and of bodies that never move.
             phase: which of the fluids each particle is of, (n,); all of the first if omitted.
             moving: samples of moving bodies, relative to the centre of mass and in the axes of each.
+            sheets: samples of sheets, which whoever moves these has to place before the first step.
             body_count: number of moving bodies; `move_bodies` has to place them before the first step.
             capacity: most particles that there can ever be; those at the start if omitted.
 
@@ -92,7 +94,7 @@ class ParticleFluid(ABC):
         self._first_bad: str | None = None
         self._frequency_squared: ti.Ndarray | None = None
         self._travelled = self._boundary_travelled = 0.0
-        self._boundary_speed = 0.0
+        self._body_speed = self._sheet_speed = 0.0
 
         box = Box.of_domain(domain)
         self._openings = box.openings
@@ -105,6 +107,7 @@ class ParticleFluid(ABC):
         self.boundary = Boundary(
             boundary,
             BoundarySamples.of_bodies() if moving is None else moving,
+            sheets=BoundarySamples.of_bodies() if sheets is None else sheets,
             body_count=body_count,
             grid=self._grid,
             spacing=self.spacing,
@@ -132,6 +135,11 @@ class ParticleFluid(ABC):
         self._expect_inflow()
         self.begin_frame(0.0)
         self._find_neighbors()
+
+    @property
+    def particles(self) -> ParticleSet:
+        """Where they are, for those that look at them between two substeps."""
+        return self._particles
 
     @property
     def particle_count(self) -> int:
@@ -181,7 +189,7 @@ class ParticleFluid(ABC):
         """
         self._boundary_travelled += self.boundary.place(position, rotation, velocity, angular_velocity)
         speed = np.linalg.norm(velocity, axis=1) + np.linalg.norm(angular_velocity, axis=1) * self.boundary.reach
-        self._boundary_speed = float(speed.max(initial=0.0))
+        self._body_speed = float(speed.max(initial=0.0))
         self._without_neighbors |= elapsed_s == 0.0
 
     def snapshots(self) -> dict[str, Snapshot]:
@@ -216,7 +224,7 @@ class ParticleFluid(ABC):
             "reference_position": np.stack([self._host(axis) for axis in self._particles.reference], axis=1),
             "travelled": np.array([self._travelled], dtype=np.float64),
             "boundary_travelled": np.array([self._boundary_travelled], dtype=np.float64),
-            "boundary_speed": np.array([self._boundary_speed], dtype=np.float64),
+            "boundary_speed": np.array([self._body_speed, self._sheet_speed], dtype=np.float64),
             "max_speed": np.array([self._motion.max_speed], dtype=np.float64),
             "max_acceleration": np.array([self._motion.max_acceleration], dtype=np.float64),
             "max_frequency": np.array([self._motion.max_frequency], dtype=np.float64),
@@ -232,15 +240,16 @@ class ParticleFluid(ABC):
             ValueError: the arrays are not a checkpoint of this fluid.
         """
         check_checkpoint(
-            arrays, self.name, capacity=self.capacity, carried=self.carried, body_states=self.boundary.states.shape
-        )
+            arrays, self.name, capacity=self.capacity, carried=self.carried,
+            body_states=self.boundary.states.shape, sheet_samples=self.boundary.sheet_count,
+        )  # fmt: skip
         # The neighbour list has to be made from the positions it was made from before, then all move on.
         self._particles.load({**arrays, "position": arrays["reference_position"]})
         self.boundary.restore_reference(arrays)
         self._find_neighbors()
         self._particles.load(arrays)
         self.boundary.restore(arrays)
-        self._boundary_speed = float(arrays["boundary_speed"][0])
+        self._body_speed, self._sheet_speed = arrays["boundary_speed"].tolist()
         self._travelled = float(arrays["travelled"][0])
         self._boundary_travelled = float(arrays["boundary_travelled"][0])
         self._motion = MotionSummary(

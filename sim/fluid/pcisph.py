@@ -82,6 +82,7 @@ class PCISPHSolver(ImplicitFluid):
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         self._compute_density()
+        self._begin_sheets()
         self._compute_acceleration(None)
         self._react_on_bodies(None, dt)
         self._apply_implicit_viscosity(self._acceleration, dt)

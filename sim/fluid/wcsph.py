@@ -77,6 +77,7 @@ class WCSPHSolver(SPHFluid):
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         self._compute_density()
+        self._begin_sheets()
         self._compute_acceleration(self._pressure_terms)
         self._react_on_bodies(self._pressure_terms, dt)
         self._apply_implicit_viscosity(self._acceleration, dt)

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.parameters import Vector3
 from sim.rigid import rotation
 from sim.rigid.parameters import RigidBodyParameters
 
@@ -143,6 +144,23 @@ class KeyframePath:
             spin = spin + rotation.rotated(orientation, rate * vector)
             orientation = rotation.product(orientation, rotation.exponential(weight * vector))
         return rotation.normalized(orientation), spin / span
+
+
+def path_onwards(
+    now: Motion, time_s: float, position: Vector3, rotation_deg: Vector3 | None, within_s: float
+) -> KeyframePath:
+    """From a pose at a time [s] straight to another, or the same orientation if omitted, in so many seconds; then rest.
+
+    Args:
+        now: where the path starts.
+        time_s: when [s].
+        position: where it leads [m].
+        rotation_deg: about x, then y, then z [degrees].
+        within_s: how long it takes [s], > 0.
+    """
+    orientation = now.orientation if rotation_deg is None else rotation.from_degrees(rotation_deg)
+    times, orientations = [time_s, time_s + within_s], np.stack([now.orientation, orientation])
+    return KeyframePath(times, np.stack([now.position, np.asarray(position)]), orientations, linear=True)
 
 
 def _speed_bound(motion: Motion, reach: float) -> float:

@@ -15,7 +15,7 @@ from sim.rigid.contact_response import ContactResponse, Surfaces
 from sim.rigid.contacts import Contacts, Poses
 from sim.rigid.free_motion import rotate_freely
 from sim.rigid.geometry import BodyGeometry
-from sim.rigid.keyframes import Path, path_of
+from sim.rigid.keyframes import Path, path_of, path_onwards
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.states import Inertia, MovingBodies
 from sim.rigid.walls import walls_of
@@ -105,10 +105,8 @@ class RigidSolver:
         )
         self._response = ContactResponse(surfaces, self._gravity)
         corners = np.array([domain.min, domain.max])
-        self._domain_centre, self._domain_diagonal = (
-            corners.mean(axis=0),
-            float(np.linalg.norm(np.ptp(corners, axis=0))),
-        )
+        self._domain_centre = corners.mean(axis=0)
+        self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
         self._radius = np.array([geometry.radius for geometry in self._geometries])
         dynamic = np.flatnonzero(self.bodies.is_dynamic)
         smallest = min((self._geometries[number].shortest_edge for number in dynamic), default=math.inf)
@@ -199,6 +197,15 @@ class RigidSolver:
         self._detector.forget()  # so that a run that continues here does the same
         self._contact_count = self._iterations = self._not_converged = 0
         self._max_penetration = 0.0
+
+    def lead(self, name: str, position: Vector3, *, rotation_deg: Vector3 | None = None, within_s: float) -> None:
+        """Lead a kinematic body to another pose, between frames (`path_onwards`); no checkpoint knows of it."""
+        number = self.bodies.names.index(name) if name in self.bodies.names else -1
+        if number not in self._paths:
+            raise ValueError(f'no kinematic body is named "{name}"; only such bodies can be led')
+        now = self._paths[number].at(self._time_s)
+        self._paths[number] = path_onwards(now, self._time_s, position, rotation_deg, within_s)
+        self._place_kinematic_bodies(self._time_s)  # couplings see how it moves from now on
 
     def _find_contacts(self, dt: float) -> Contacts:
         return self._detector.find(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.shapes.mesh_solid import MeshSolid, solid_from_triangles
+from sim.shapes.obj_file import read_obj
 from sim.shapes.parameters import MeshShape
 from sim.shapes.solid import Points, ShapeError
 
@@ -48,28 +49,35 @@ def read_upright_triangles(shape: MeshShape) -> tuple[Points, NDArray[np.int64]]
 
 
 def read_triangles(path: Path) -> tuple[Points, NDArray[np.int64]]:
-    """Vertices (n, 3) and faces (m, 3) of a file, all of its objects in one mesh, as the file has them.
+    """Vertices (n, 3) and faces (m, 3) of a file, all of its objects in one mesh, as the file numbers them.
 
     Raises:
         ShapeError: the file is missing, of an unknown kind, or unreadable.
     """
-    import trimesh
-
     if not path.is_file():
         raise ShapeError(f'shape.file: must be a mesh file, "{path}" does not exist; check the path')
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise ShapeError(f'shape.file: must be an OBJ, PLY, STL or GLB file, got "{path.name}"; export it as GLB')
     try:
-        # Of the bytes alone: given the path, trimesh would follow references to files beside it.
-        mesh = trimesh.load_scene(BytesIO(path.read_bytes()), file_type=kind, process=False).to_mesh()
+        vertices, faces = _read_kind(path.read_bytes(), kind)
     except Exception as error:  # a parser of foreign bytes raises anything: struct.error, IndexError, KeyError...
         raise ShapeError(
             f'shape.file: "{path}" is not a readable {kind.upper()} file '
             f"({type(error).__name__}: {error}); export it again, or convert it to PLY"
         ) from error
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    faces = np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ShapeError(f'shape.file: "{path}" has faces that name vertices it does not have; export it again')
     return vertices, faces
+
+
+def _read_kind(content: bytes, kind: str) -> tuple[Points, NDArray[np.int64]]:
+    if kind == "obj":
+        return read_obj(content.decode("utf-8", errors="replace"))
+    import trimesh
+
+    # Of the bytes alone: given the path, trimesh would follow references to files beside it.
+    # Texture coordinates of a PLY would split its vertices.
+    options = {"fix_texture": False} if kind == "ply" else {}
+    mesh = trimesh.load_scene(BytesIO(content), file_type=kind, process=False, **options).to_mesh()
+    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)

@@ -2,117 +2,143 @@
 
 Each layer of solid cells takes the mean of its neighbours in the layers before (Houston et al. 2003 do the same with
 the nearest fluid value). Velocity on faces between two solid cells continues the flow along the surface, so it slips.
+Cells that a solid leaves start with what was continued into them. Cells deeper inside hold no smoke and no heat.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
-from sim.smoke.grid import SmokeGrid
+from sim.smoke.obstacles import Obstacles
 
-NO_NEIGHBOUR = -1
+KNOWN = 0
+"""Layer of what has a value of its own: cells of air, and faces with air on at least one side."""
 
+NOWHERE, DEEP = 254, 255
+"""Layers of what is not in the grid, and of what lies deeper in a solid than the last layer."""
 
-@dataclass(frozen=True)
-class Band:
-    """Places to fill, layer after layer.
-
-    Attributes:
-        places: flat indices, (n,) int32.
-        neighbours: flat indices of their known neighbours, (n, 6) int32, `NO_NEIGHBOUR` where there is none.
-        layer_ends: where each layer ends in `places`.
-    """
-
-    places: NDArray[np.int32]
-    neighbours: NDArray[np.int32]
-    layer_ends: tuple[int, ...]
-
-
-def build_band(grid: SmokeGrid, known: NDArray[np.bool_], layers: int) -> Band:
-    """The unknown places within some layers of the known ones.
-
-    Args:
-        grid: whose arrays are filled.
-        known: which places have a value, in the shape of cells or of faces across one axis.
-        layers: how many cells deep.
-    """
-    exists = grid.pad(np.ones(known.shape, bool))
-    filled = grid.pad(known)
-    strides = (grid.padded[1] * grid.padded[2], grid.padded[2], 1)
-    shifts = [sign * stride for stride in strides for sign in (-1, 1)]
-    rolls = [(sign, axis) for axis in range(3) for sign in (1, -1)]
-    places: list[NDArray[np.int32]] = [np.empty(0, np.int32)]
-    neighbours: list[NDArray[np.int32]] = [np.empty((0, 6), np.int32)]
-    for _ in range(layers):
-        beside = np.stack([np.roll(filled, sign, axis) for sign, axis in rolls], axis=-1)
-        layer = np.flatnonzero(exists & ~filled & beside.any(axis=-1)).astype(np.int32)
-        usable = beside.reshape(-1, 6)[layer]
-        places.append(layer)
-        neighbours.append(np.where(usable, layer[:, None] + np.array(shifts, np.int32), NO_NEIGHBOUR))
-        filled.reshape(-1)[layer] = True
-    ends = np.cumsum([len(layer) for layer in places])[1:]
-    return Band(np.concatenate(places), np.concatenate(neighbours), tuple(int(end) for end in ends))
+FACES_X, FACES_Y, FACES_Z, CELLS = range(4)
+"""The byte of a place's word that holds the layer of its three faces and of its cell."""
 
 
 @ti.data_oriented
 class Extrapolation:
     """Fills the solid cells next to air in the cell and face fields of one grid.
 
+    Attributes:
+        fields: what it has allocated, four bytes a value.
+
     Args:
-        grid: where the fields live.
+        obstacles: in the grid where the fields live.
         velocity: the three face velocities, flat fields.
         cell_fields: density and temperature excess, flat fields.
         reach: how many cells into a solid a look-up may come.
     """
 
-    def __init__(self, grid: SmokeGrid, *, velocity: tuple, cell_fields: tuple, reach: float) -> None:
-        layers = math.ceil(reach) + 1
-        self._targets = [*velocity, *cell_fields]
-        bands = [build_band(grid, _faces_of_air(grid, axis), layers) for axis in range(3)]
-        bands += [build_band(grid, ~grid.solid, layers)] * len(cell_fields)
+    def __init__(self, obstacles: Obstacles, *, velocity: tuple, cell_fields: tuple, reach: float) -> None:
+        grid = obstacles.grid
+        self._obstacles = obstacles
+        self._nx, self._ny, self._nz = grid.cells
+        self._size = grid.size
+        self._steps = (grid.padded[1] * grid.padded[2], grid.padded[2], 1)
+        self._u, self._v, self._w = velocity
+        self._density, self._excess = cell_fields
+        self._layers = math.ceil(reach) + 1
         # Without solids there is nothing to fill, and no field to allocate.
-        self._bands = bands if grid.solid.any() else []
-        self._places = []
-        self._neighbours = []
-        for band in self._bands:
-            count = max(1, len(band.places))
-            self._places.append(ti.field(ti.i32, shape=count))
-            self._neighbours.append(ti.field(ti.i32, shape=(count, 6)))
-        for band, places, neighbours in zip(self._bands, self._places, self._neighbours, strict=True):
-            if len(band.places):
-                places.from_numpy(band.places)
-                neighbours.from_numpy(band.neighbours)
+        self._has_solids = obstacles.moving or bool(grid.solid.any())
+        self.fields: list[ti.Field] = []
+        if self._has_solids:
+            self._words = ti.field(ti.i32, shape=grid.size)
+            self.fields.append(self._words)
+            self._words.from_numpy(np.full(grid.size, NOWHERE * 0x01010101, np.uint32).view(np.int32))
+            self.update()
+
+    def update(self) -> None:
+        """Follow the obstacles."""
+        if self._has_solids:
+            self._find_known()
+            for layer in range(1, self._layers + 1):
+                self._grow(layer)
 
     def fill(self) -> None:
         """Set the solid cells and faces near air."""
-        for number, band in enumerate(self._bands):
-            start = 0
-            for end in band.layer_ends:
-                self._fill_layer(self._targets[number], self._places[number], self._neighbours[number], start, end)
-                start = end
+        if self._has_solids:
+            for layer in range(1, self._layers + 1):
+                self._fill_layer(layer)
+            self._clear_depths()
+
+    @ti.func
+    def _layer(self, at: ti.i32, kind: ti.template()):
+        return (self._words[at] >> ti.static(8 * kind)) & 255
+
+    @ti.func
+    def _is_air(self, i: ti.i32, j: ti.i32, k: ti.i32):
+        inside = 0 < i <= self._nx and 0 < j <= self._ny and 0 < k <= self._nz
+        at = i * self._steps[0] + j * self._steps[1] + k
+        return int(inside and not self._obstacles.is_solid(at))
 
     @ti.kernel
-    def _fill_layer(
-        self, field: ti.template(), places: ti.template(), neighbours: ti.template(), start: ti.i32, end: ti.i32
-    ):
-        for n in range(start, end):
+    def _find_known(self):
+        for i, j in ti.ndrange((1, self._nx + 2), (1, self._ny + 2)):
+            for k in range(1, self._nz + 2):
+                in_x, in_y, in_z = int(i <= self._nx), int(j <= self._ny), int(k <= self._nz)
+                exists = ti.Vector([in_y * in_z, in_x * in_z, in_x * in_y, in_x * in_y * in_z])
+                here = self._is_air(i, j, k)
+                known = ti.Vector([here, here, here, here])
+                known[0] += self._is_air(i - 1, j, k)
+                known[1] += self._is_air(i, j - 1, k)
+                known[2] += self._is_air(i, j, k - 1)
+                word = 0
+                for kind in ti.static(range(4)):
+                    layer = ti.select(exists[kind] == 0, NOWHERE, ti.select(known[kind] > 0, KNOWN, DEEP))
+                    word |= layer << ti.static(8 * kind)
+                self._words[i * self._steps[0] + j * self._steps[1] + k] = word
+
+    @ti.kernel
+    def _grow(self, layer: ti.i32):
+        """Deep places beside those of the layers before become this layer.
+
+        Other threads may see a word before or after its change: neither is in a layer before.
+        """
+        for i, j in ti.ndrange((1, self._nx + 2), (1, self._ny + 2)):
+            for k in range(1, self._nz + 2):
+                at = i * self._steps[0] + j * self._steps[1] + k
+                word = self._words[at]
+                for kind in ti.static(range(4)):
+                    if self._layer(at, kind) == DEEP:
+                        beside = DEEP
+                        for step in ti.static(self._steps):
+                            beside = ti.min(beside, self._layer(at - step, kind), self._layer(at + step, kind))
+                        if beside < layer:
+                            word += (layer - DEEP) << ti.static(8 * kind)
+                self._words[at] = word
+
+    @ti.kernel
+    def _fill_layer(self, layer: ti.i32):
+        for at in range(self._steps[0], self._size - self._steps[0]):
+            if self._words[at] != KNOWN:
+                self._fill_place(self._u, FACES_X, at, layer)
+                self._fill_place(self._v, FACES_Y, at, layer)
+                self._fill_place(self._w, FACES_Z, at, layer)
+                self._fill_place(self._density, CELLS, at, layer)
+                self._fill_place(self._excess, CELLS, at, layer)
+
+    @ti.func
+    def _fill_place(self, field: ti.template(), kind: ti.template(), at: ti.i32, layer: ti.i32):
+        if self._layer(at, kind) == layer:
             total = 0.0
             count = 0.0
-            for m in ti.static(range(6)):
-                at = neighbours[n, m]
-                if at != ti.static(NO_NEIGHBOUR):
-                    total += field[at]
-                    count += 1.0
-            field[places[n]] = total / count
+            for step in ti.static(self._steps):
+                for neighbour in ti.static((-step, step)):
+                    if self._layer(at + neighbour, kind) < layer:
+                        total += field[at + neighbour]
+                        count += 1.0
+            field[at] = total / count
 
-
-def _faces_of_air(grid: SmokeGrid, axis: int) -> NDArray[np.bool_]:
-    """Faces across an axis with air on at least one side; a side of the box has only one."""
-    solid = np.moveaxis(grid.solid, axis, 0)
-    known = np.ones((solid.shape[0] + 1, *solid.shape[1:]), bool)
-    known[1:-1] = ~(solid[1:] & solid[:-1])
-    known[0], known[-1] = ~solid[0], ~solid[-1]
-    return np.moveaxis(known, 0, axis)
+    @ti.kernel
+    def _clear_depths(self):
+        for at in range(self._size):
+            if self._layer(at, CELLS) == DEEP:
+                self._density[at] = 0.0
+                self._excess[at] = 0.0

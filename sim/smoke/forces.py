@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from sim.parameters import Vector3
-from sim.smoke.grid import SmokeGrid
+from sim.smoke.obstacles import Obstacles
 
 TINY_GRADIENT = 1.0e-6
 """Keeps N = eta / (|eta| + tiny) finite where the vorticity is even [1/(m s)]."""
@@ -27,8 +27,8 @@ class Forces:
     gradient of the vorticity is not made up by the boundary, and averaged onto faces.
 
     Args:
-        grid: where the fields live.
-        openness: by axis, positive on faces that air passes, flat fields; the others are set to velocity 0.
+        obstacles: in the grid where the fields live; closed faces get the velocity of the solid behind them.
+        openness: by axis, positive on faces that air passes, flat fields.
         velocity: the three face velocities [m/s], flat fields.
         cell_fields: density and temperature excess, flat fields.
         work: four flat fields to work in.
@@ -40,7 +40,7 @@ class Forces:
 
     def __init__(
         self,
-        grid: SmokeGrid,
+        obstacles: Obstacles,
         *,
         openness: tuple,
         velocity: tuple,
@@ -51,6 +51,8 @@ class Forces:
         buoyancy_temperature: float,
         confinement: float,
     ) -> None:
+        grid = obstacles.grid
+        self._obstacles = obstacles
         self._nx, self._ny, self._nz = grid.cells
         self._step_x, self._step_y = grid.padded[1] * grid.padded[2], grid.padded[2]
         self._size = grid.size
@@ -65,7 +67,7 @@ class Forces:
         self._strength = confinement * grid.cell_size
 
     def accelerate(self, dt: float) -> None:
-        """Add dt [s] times the acceleration to open faces, and stop the air on closed ones."""
+        """Add dt [s] times the acceleration to open faces; on closed ones air moves as the solid does."""
         self._clear_confinement()
         if self._strength > 0.0:
             self._compute_vorticity()
@@ -138,9 +140,16 @@ class Forces:
                 f_x = self._force(self._f_x, 0, at) + self._force(self._f_x, 0, at - self._step_x)
                 f_y = self._force(self._f_y, 1, at) + self._force(self._f_y, 1, at - self._step_y)
                 f_z = self._force(self._f_z, 2, at) + self._force(self._f_z, 2, at - 1)
-                self._u[at] = ti.select(self._open_x[at] > 0.0, self._u[at] + 0.5 * dt * f_x, 0.0)
-                self._v[at] = ti.select(self._open_y[at] > 0.0, self._v[at] + 0.5 * dt * f_y, 0.0)
-                self._w[at] = ti.select(self._open_z[at] > 0.0, self._w[at] + 0.5 * dt * f_z, 0.0)
+                self._u[at] = self._accelerated(self._open_x, self._u, 0, at, 0.5 * dt * f_x)
+                self._v[at] = self._accelerated(self._open_y, self._v, 1, at, 0.5 * dt * f_y)
+                self._w[at] = self._accelerated(self._open_z, self._w, 2, at, 0.5 * dt * f_z)
+
+    @ti.func
+    def _accelerated(self, openness: ti.template(), face: ti.template(), axis: ti.template(), at: ti.i32, gain: ti.f32):
+        velocity = face[at] + gain
+        if openness[at] == 0.0:
+            velocity = self._obstacles.face_velocity(axis, at)
+        return velocity
 
     @ti.func
     def _force(self, confinement: ti.template(), axis: ti.template(), at: ti.i32):

@@ -16,7 +16,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sim.scene import DomainParameters
 from sim.smoke.parameters import Face, SmokeParameters
@@ -50,7 +49,7 @@ class SmokeGrid:
         cell_size: edge of a cell [m].
         cells: how many cells along x, y, z.
         open_faces: sides of the box that air passes; the others are walls.
-        solid: (nx, ny, nz) bool, which cells are solid.
+        solid: (nx, ny, nz) bool, which cells are in solids that stand still.
     """
 
     origin: tuple[float, float, float]
@@ -154,25 +153,6 @@ class SmokeGrid:
     def open_area(self) -> tuple[NDArray[np.float64], ...]:
         """Part of each face that air passes, 0 or 1, by axis, `face_shape(axis)`."""
         return tuple(self._open_area(axis) for axis in range(3))
-
-    @cached_property
-    def closed_regions(self) -> list[NDArray[np.int32]]:
-        """Connected regions of air without an open side: flat indices of their cells, ascending.
-
-        Pressure is known there up to a constant only. Single cells shut in on all sides have no equation at all and
-        are left out.
-        """
-        labels, count = ndimage.label(~self.solid)
-        touches_outside = set()
-        for axis in range(3):
-            for side in (0, 1):
-                if self.is_open(axis, side):
-                    touches_outside.update(np.unique(np.take(labels, -side, axis=axis)).tolist())
-        flat_labels = self.pad(labels).ravel()
-        order = np.argsort(flat_labels, kind="stable").astype(np.int32)
-        bounds = np.searchsorted(flat_labels[order], np.arange(1, count + 2))
-        regions = [order[bounds[n - 1] : bounds[n]] for n in range(1, count + 1) if n not in touches_outside]
-        return [region for region in regions if len(region) > 1]
 
     def pad(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
         """Cell or face values with their ghosts, `padded`, zero where there were none."""

@@ -11,8 +11,8 @@ import math
 import numpy as np
 import taichi as ti
 
-from sim.smoke.grid import SmokeGrid
-from sim.smoke.multigrid_levels import Level, build_levels
+from sim.smoke.multigrid_levels import Coefficients, operator_matrix
+from sim.smoke.obstacles import Obstacles
 
 SMOOTHED_SPECTRUM = (0.4, 2.0)
 """Eigenvalues of D^-1 A that the smoother has to damp: 2 is the largest that a stencil of this kind has; modes below
@@ -36,32 +36,36 @@ class MultigridVCycle:
         right_hand_side: r, flat, float32; its finest level is set by the caller, 0 in solid cells and ghosts.
         solution: z, flat, float32.
         spare: holds iterates and residuals in between.
-        conductance_x, conductance_y, conductance_z, inverse_diagonal: the levels' coefficients.
-        levels: sizes and offsets.
+        coefficients: of the operator on all levels.
     """
 
-    def __init__(self, grid: SmokeGrid) -> None:
-        levels = build_levels(grid)
+    def __init__(self, obstacles: Obstacles) -> None:
+        self.coefficients = Coefficients(obstacles)
+        levels = self.coefficients.levels
         self._cells = [level.cells for level in levels]
-        sizes = [level.size for level in levels]
-        self._offsets = [sum(sizes[:n]) for n in range(len(levels))]
-        total = sum(sizes)
+        self._offsets = [level.offset for level in levels]
+        total = sum(level.size for level in levels)
         self.right_hand_side = ti.field(ti.f32, shape=total)
         self.solution = ti.field(ti.f32, shape=total)
         self.spare = ti.field(ti.f32, shape=total)
-        self.conductance_x = ti.field(ti.f32, shape=total)
-        self.conductance_y = ti.field(ti.f32, shape=total)
-        self.conductance_z = ti.field(ti.f32, shape=total)
-        self.inverse_diagonal = ti.field(ti.f32, shape=total)
         self._coarsest_count = math.prod(levels[-1].cells)
         self._coarsest_inverse = ti.field(ti.f32, shape=(self._coarsest_count, self._coarsest_count))
-        self._upload(levels)
+        self._coarsest_conductance = self.coefficients.coarsest_conductance()
+        self._invert_coarsest()
         self._first_weight, self._second_weight = chebyshev_weights(2, SMOOTHED_SPECTRUM)
 
     @property
     def level_count(self) -> int:
         """How many grids there are."""
         return len(self._cells)
+
+    def update(self) -> None:
+        """Follow the obstacles."""
+        self.coefficients.update()
+        conductance = self.coefficients.coarsest_conductance()
+        if not np.array_equal(conductance, self._coarsest_conductance):
+            self._coarsest_conductance = conductance
+            self._invert_coarsest()
 
     def apply(self) -> None:
         """Set `solution` to the V-cycle's answer for `right_hand_side`."""
@@ -83,13 +87,10 @@ class MultigridVCycle:
         self._smooth(self.solution, self.spare, *fine, self._second_weight)
         self._smooth(self.spare, self.solution, *fine, self._first_weight)
 
-    def _upload(self, levels: list[Level]) -> None:
-        fields = (self.conductance_x, self.conductance_y, self.conductance_z)
-        for axis, field in enumerate(fields):
-            field.from_numpy(np.concatenate([level.conductance[axis].ravel() for level in levels]))
-        self.inverse_diagonal.from_numpy(np.concatenate([level.inverse_diagonal.ravel() for level in levels]))
+    def _invert_coarsest(self) -> None:
         # The pseudo-inverse also serves regions without an open side, where A has the constants as its null space.
-        inverse = np.linalg.pinv(levels[-1].matrix(), rcond=1.0e-10, hermitian=True)
+        matrix = operator_matrix(tuple(self._coarsest_conductance))
+        inverse = np.linalg.pinv(matrix, rcond=1.0e-10, hermitian=True)
         self._coarsest_inverse.from_numpy(inverse.astype(np.float32))
 
     @ti.func
@@ -97,12 +98,12 @@ class MultigridVCycle:
         """(A x) at a cell; the steps lead to the next cell along x and y."""
         here = x[at]
         return (
-            self.conductance_x[at] * (here - x[at - step_x])
-            + self.conductance_x[at + step_x] * (here - x[at + step_x])
-            + self.conductance_y[at] * (here - x[at - step_y])
-            + self.conductance_y[at + step_y] * (here - x[at + step_y])
-            + self.conductance_z[at] * (here - x[at - 1])
-            + self.conductance_z[at + 1] * (here - x[at + 1])
+            self.coefficients.conductance_x[at] * (here - x[at - step_x])
+            + self.coefficients.conductance_x[at + step_x] * (here - x[at + step_x])
+            + self.coefficients.conductance_y[at] * (here - x[at - step_y])
+            + self.coefficients.conductance_y[at + step_y] * (here - x[at + step_y])
+            + self.coefficients.conductance_z[at] * (here - x[at - 1])
+            + self.coefficients.conductance_z[at + 1] * (here - x[at + 1])
         )
 
     @ti.kernel
@@ -111,7 +112,7 @@ class MultigridVCycle:
             row = offset + (i * (ny + 2) + j) * (nz + 2)
             for k in range(1, nz + 1):
                 at = row + k
-                self.spare[at] = weight * self.inverse_diagonal[at] * self.right_hand_side[at]
+                self.spare[at] = weight * self.coefficients.inverse_diagonal[at] * self.right_hand_side[at]
 
     @ti.kernel
     def _smooth(
@@ -130,7 +131,7 @@ class MultigridVCycle:
             for k in range(1, nz + 1):
                 at = row + k
                 residual = self.right_hand_side[at] - self.laplacian(x, at, step_x, step_y)
-                improved[at] = x[at] + weight * self.inverse_diagonal[at] * residual
+                improved[at] = x[at] + weight * self.coefficients.inverse_diagonal[at] * residual
 
     @ti.kernel
     def _compute_residual(self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
@@ -201,14 +202,14 @@ class MultigridVCycle:
                         + self._value_or_mirror(there + beside_x + beside_y, parent)
                     ) / 16.0
                 child = fine_row + 2 * k - 1
-                if self.inverse_diagonal[at] > 0.0:
+                if self.coefficients.inverse_diagonal[at] > 0.0:
                     self.solution[child] += 0.75 * planes[1] + 0.25 * planes[0]
                     if 2 * k <= fine_nz:
                         self.solution[child + 1] += 0.75 * planes[1] + 0.25 * planes[2]
 
     @ti.func
     def _value_or_mirror(self, at: ti.i32, parent: ti.f32):
-        inverse = self.inverse_diagonal[at]
+        inverse = self.coefficients.inverse_diagonal[at]
         mirrored = ti.select(inverse < 0.0, -parent, parent)
         return ti.select(inverse > 0.0, self.solution[at], mirrored)
 

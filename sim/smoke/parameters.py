@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
 from sim.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
+
+if TYPE_CHECKING:
+    from sim.scene import DomainParameters
 
 Face = Literal["x-", "x+", "y-", "y+", "z-", "z+"]
 
@@ -72,3 +75,13 @@ class SmokeParameters(Parameters):
     )
     projection_max_iterations: int = Field(default=100, ge=1, description="Most iterations of the projection [-].")
     cfl: Positive = Field(default=2.0, le=10.0, description="Most cells that smoke may cross in a substep [-].")
+
+    def corners(self, domain: DomainParameters) -> tuple[Vector3, Vector3]:
+        """Lower and upper corner of its box [m]: its own, or the domain's where it names none."""
+        return self.min or domain.min, self.max or domain.max
+
+
+def boxes_overlap(a: tuple[Vector3, Vector3], b: tuple[Vector3, Vector3]) -> bool:
+    """Whether two boxes, given by their corners [m], have a volume in common."""
+    (a_low, a_high), (b_low, b_high) = a, b
+    return all(max(p, q) < min(r, s) for p, q, r, s in zip(a_low, b_low, a_high, b_high, strict=True))

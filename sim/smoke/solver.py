@@ -11,9 +11,11 @@ from sim.parameters import Vector3
 from sim.reductions import is_finite
 from sim.scene import DomainParameters
 from sim.smoke.advection import Advection
+from sim.smoke.air_force import AirForce
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import Forces, upward
 from sim.smoke.grid import SmokeGrid, SolidRegion
+from sim.smoke.obstacles import Obstacles
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.projection import PressureProjection
 from sim.smoke.reductions import RowReductions
@@ -27,25 +29,36 @@ RUNAWAY_SPEED = 1.0e4
 
 @ti.data_oriented
 class SmokeSolver:
-    """Density, temperature and velocity of smoke in a box of cells, with static solids in it.
+    """Density, temperature and velocity of smoke in a box of cells, with solids in it that stand still or move.
 
-    One substep, by operator splitting as in Stam 1999: advect, accelerate, emit, project, cool. Incompressible air of
-    constant density (Boussinesq): smoke and heat act through buoyancy alone.
+    One substep, by operator splitting as in Stam 1999: advect, let obstacles move on, accelerate, emit, project, cool.
+    Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
 
     Exact: smoke is added by sources only, and what they add is counted. Approximate: advection does not conserve the
     total of density where the flow spreads or closes in, nor at open sides, so `mass` is a measured quantity. Not
-    supported: solids that move, expansion by heat.
+    supported: expansion by heat.
 
-    Closed boxes need no special care: walls let no air through, so the net divergence in a closed region is zero
-    whatever sources do (they drive air, they do not add any), and the pressure equation always has a solution.
+    Solids that move drive air by the velocity of their surface (`Obstacles`), and take whole cells from time to time:
+    in between, air flows through the sides of their cells at the speed of the solid. So the smoke of a cell that they
+    cover is dropped, as look-ups across the moving side have brought in as much ahead of it, and a cell that they
+    leave has the smoke that was continued into it, as much as flowed in behind them. Both are counted.
+
+    In a closed region sources drive air, but do not add any; nor do bodies that are wholly inside. What a piston
+    presses into it is spread evenly (`PressureProjection`): its air is compressed, its smoke is not.
 
     State, float32: face velocities [m/s], density [-], temperature above the air's [K].
+
+    Attributes:
+        grid: the cells, with the solids that stand still.
+        obstacles: all solids, and how others put some in that move.
+        air_forces: what pushes the air from outside, in this order in every substep.
 
     Args:
         parameters: the smoke of a job.
         domain: the box that is used where the smoke names none.
         gravity: [m/s²]; its direction is down.
         solids: static obstacles, voxelized on the grid.
+        moving: whether there will be obstacles that move.
 
     Raises:
         ValueError: the box is empty or full of solids, or a source contains no open cell.
@@ -58,10 +71,12 @@ class SmokeSolver:
         domain: DomainParameters,
         gravity: Vector3,
         solids: Sequence[SolidRegion] = (),
+        moving: bool = False,
     ) -> None:
         self.name = parameters.name
         self.parameters = parameters
         self.grid = SmokeGrid.build(parameters, domain, solids)
+        self.obstacles = Obstacles(self.grid, moving=moving)
         self._nx, self._ny, self._nz = self.grid.cells
         self._size = self.grid.size
         self._step_x, self._step_y = self.grid.padded[1] * self.grid.padded[2], self.grid.padded[2]
@@ -78,12 +93,11 @@ class SmokeSolver:
             "excess_temperature": self.excess_temperature,
         }
         self._projection = PressureProjection(
-            self.grid,
+            self.obstacles,
             velocity,
             tolerance=parameters.projection_tolerance,
             max_iterations=parameters.projection_max_iterations,
         )
-        multigrid = self._projection.multigrid
         work = self._projection.work_fields
         self._advection = Advection(
             self.grid,
@@ -93,8 +107,8 @@ class SmokeSolver:
             maccormack=parameters.advection == "maccormack",
         )
         self._forces = Forces(
-            self.grid,
-            openness=(multigrid.conductance_x, multigrid.conductance_y, multigrid.conductance_z),
+            self.obstacles,
+            openness=self.openness,
             velocity=velocity,
             cell_fields=cell_fields,
             work=work[:4],
@@ -103,25 +117,41 @@ class SmokeSolver:
             buoyancy_temperature=parameters.buoyancy_temperature,
             confinement=parameters.vorticity_confinement,
         )
-        self._extrapolation = Extrapolation(self.grid, velocity=velocity, cell_fields=cell_fields, reach=parameters.cfl)
+        self._extrapolation = Extrapolation(
+            self.obstacles, velocity=velocity, cell_fields=cell_fields, reach=parameters.cfl
+        )
         self._rows = RowReductions(self._nx, self._ny)
-        self._sources = build_sources(parameters, self.grid, velocity=velocity, cell_fields=cell_fields)
+        self._sources = build_sources(
+            parameters, self.obstacles, openness=self.openness, velocity=velocity, cell_fields=cell_fields
+        )
+        self.air_forces: list[AirForce] = []
         self._has_gravity = any(upward(gravity))
         self._time_s = 0.0
-        self._emitted_mass = 0.0
-        self._iterations = self._not_converged = 0
-        self._residual = self._divergence = 0.0
+        self._emitted_mass = self._covered_mass = self._uncovered_mass = 0.0
+        self.begin_frame(0.0)
+
+    @property
+    def openness(self) -> tuple[ti.Field, ti.Field, ti.Field]:
+        """By axis, positive on faces that air passes, flat."""
+        return self._projection.multigrid.coefficients.fields
 
     @property
     def device_bytes(self) -> int:
-        """Memory of the state, the work arrays and the coefficients [bytes]; lists along surfaces are left out."""
-        multigrid = self._projection.multigrid
-        cell_arrays = [*self._state.values(), *self._projection.work_fields]
-        coefficients = [multigrid.conductance_x, multigrid.conductance_y, multigrid.conductance_z]
-        return 4 * sum(math.prod(field.shape) for field in [*cell_arrays, *coefficients, multigrid.inverse_diagonal])
+        """Memory of the state, the work arrays, the coefficients and the obstacles [bytes]."""
+        coefficients = self._projection.multigrid.coefficients
+        arrays = [
+            *self._state.values(),
+            *self._projection.work_fields,
+            *coefficients.fields,
+            coefficients.inverse_diagonal,
+            *self.obstacles.fields,
+            *self._projection.regions.fields,
+            *self._extrapolation.fields,
+        ]
+        return 4 * sum(math.prod(field.shape) for field in arrays)
 
     def stable_dt(self) -> float:
-        """Largest step [s] in which nothing crosses more than `cfl` cells.
+        """Largest step [s] in which no air crosses more than `cfl` cells, and no obstacle more than one.
 
         The speed at the end of the step counts, v + a dt with the largest buoyant acceleration a, so that a start
         from rest is bounded as well: dt solves (v + a dt) dt = cfl h.
@@ -133,7 +163,8 @@ class SmokeSolver:
             if source.parameters.emits_during(self._time_s, self._time_s + without_sources):
                 speed = max(speed, source.speed)
                 acceleration = max(acceleration, self._buoyancy_bound(source.target_excess, source.target_density))
-        return self._largest_step(speed, acceleration)
+        limits = [self.obstacles.stable_dt(), *(force.stable_dt() for force in self.air_forces)]
+        return min(self._largest_step(speed, acceleration), *limits)
 
     def _largest_step(self, speed: float, acceleration: float) -> float:
         distance = self.parameters.cfl * self.grid.cell_size
@@ -142,9 +173,12 @@ class SmokeSolver:
         return 2.0 * distance / (speed + math.sqrt(speed * speed + 4.0 * acceleration * distance))
 
     def substep(self, dt: float) -> None:
-        """Advance by dt [s]."""
+        """Advance by dt [s]; the cells that obstacles fill at its end have been marked."""
         self._advection.advance(dt)
+        self.move_obstacles()
         self._forces.accelerate(dt)
+        for force in self.air_forces:
+            force.accelerate(dt)
         self._emit(dt)
         self._project()
         self._cool(
@@ -154,15 +188,24 @@ class SmokeSolver:
         self._extrapolation.fill()
         self._time_s += dt
 
+    def move_obstacles(self) -> None:
+        """Take the marked cells for the obstacles from now on; each step does so."""
+        change = self.obstacles.commit(self.density)
+        cell_volume = self.grid.cell_size**3
+        self._covered_mass += change.covered * cell_volume
+        self._uncovered_mass += change.uncovered * cell_volume
+        if change.cells:
+            self._follow_obstacles()
+
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
         self._time_s = time_s
         self._iterations = self._not_converged = 0
-        self._residual = self._divergence = 0.0
+        self._residual = self._divergence = self._compression = 0.0
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Density, temperature and velocity at cell centres; solid cells hold no smoke."""
-        air = ~self.grid.solid
+        air = self.obstacles.is_air()
         velocity = np.empty((*self.grid.cells, 3), np.float32)
         for axis, name in enumerate(("u_face_x", "v_face_y", "w_face_z")):
             faces = np.moveaxis(self._faces(name, axis), axis, 0)
@@ -181,9 +224,10 @@ class SmokeSolver:
         return {self.name: Snapshot("smoke", arrays, attributes)}
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """The state with its ghosts, the time and the emitted mass."""
+        """The state with its ghosts, the obstacles that move, the time and the counted masses."""
         arrays = {name: field.to_numpy().reshape(self.grid.padded) for name, field in self._state.items()}
-        return {**arrays, "clock": np.array([self._time_s, self._emitted_mass])}
+        clock = np.array([self._time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass])
+        return {**arrays, **self.obstacles.checkpoint(), "clock": clock}
 
     def restore(self, arrays: Arrays) -> None:
         """Continue from a checkpoint.
@@ -191,35 +235,48 @@ class SmokeSolver:
         Raises:
             ValueError: an array is missing or has another shape.
         """
-        expected = {**dict.fromkeys(self._state, self.grid.padded), "clock": (2,)}
+        moving = ["obstacles"] if self.obstacles.moving else []
+        expected = {**dict.fromkeys([*self._state, *moving], self.grid.padded), "clock": (4,)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
                 raise ValueError(f'checkpoint of smoke "{self.name}": {name} must have shape {shape}, got {found}')
         for name, field in self._state.items():
             field.from_numpy(np.ascontiguousarray(arrays[name], np.float32).ravel())
-        self._time_s, self._emitted_mass = (float(value) for value in arrays["clock"])
+        if moving:
+            self.obstacles.restore(arrays["obstacles"])
+            self._follow_obstacles()
+        self._time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass = (
+            float(value) for value in arrays["clock"]
+        )
 
     def diagnostics(self) -> Diagnostics:
         """Totals of the state, and the projections of the frame.
 
         `mass` and `emitted_mass` are volume integrals of density [m³]; `iterations` is the sum over the frame,
-        `residual` (max|div u| h / max|u|) and `divergence` [1/s] are the worst of the frame.
+        `residual` (max|div u| h / max|u|) and `divergence` [1/s] are the worst of the frame. Where obstacles may move
+        there are also `covered_mass` and `uncovered_mass` [m³], of the cells that they entered and left since the
+        start, and `compression` [1/s], the worst of the frame (`ProjectionReport`).
         """
         self._compute_speed_and_acceleration()
         speed, _ = self._rows.maxima()
-        air = ~self.grid.solid
+        air = self.obstacles.is_air()
         excess = self._cells("excess_temperature")[air]
-        return {
+        numbers = {
             "mass": float(self._cells("density")[air].sum(dtype=np.float64)) * self.grid.cell_size**3,
             "emitted_mass": self._emitted_mass,
-            "max_temperature": self.parameters.ambient_temperature + float(excess.max()),
+            "max_temperature": self.parameters.ambient_temperature + (float(excess.max()) if len(excess) else 0.0),
             "max_speed": speed,
             "iterations": float(self._iterations),
             "residual": self._residual,
             "divergence": self._divergence,
             "not_converged": float(self._not_converged),
         }
+        if self.obstacles.moving:
+            numbers["covered_mass"] = self._covered_mass
+            numbers["uncovered_mass"] = self._uncovered_mass
+            numbers["compression"] = self._compression
+        return numbers
 
     def first_bad_quantity(self) -> str | None:
         """The first field with a value that is no number, or a velocity beyond all reason."""
@@ -242,6 +299,11 @@ class SmokeSolver:
         self._not_converged += not report.converged
         self._residual = max(self._residual, report.residual)
         self._divergence = max(self._divergence, report.divergence)
+        self._compression = max(self._compression, report.compression)
+
+    def _follow_obstacles(self) -> None:
+        self._projection.update()
+        self._extrapolation.update()
 
     def _cells(self, name: str) -> NDArray[np.float32]:
         return self.grid.trim(self._state[name].to_numpy(), self.grid.cells)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sim.shapes import build_solid
 from sim.smoke.grid import SmokeGrid
+from sim.smoke.obstacles import Obstacles
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 
 BLOCK = 256
@@ -32,21 +33,24 @@ def hash_to_unit(key: ti.u32):
 class Source:
     """One source on one grid: the open cells and faces whose centres lie inside it.
 
+    What an obstacle that moves covers just now emits nothing.
+
     Velocity is imposed before the projection, which may change it: a source drives the flow, it is no inlet. So it
     never creates volume, and also blows in a closed box.
 
     Attributes:
         target_density, target_excess: what cells inside are raised to [-], [K above the air].
         speed: largest component of the imposed velocity [m/s].
-        cell_count: how many open cells lie inside.
+        cell_count: how many cells outside of static solids lie inside.
     """
 
     def __init__(
         self,
         parameters: SmokeSourceParameters,
-        grid: SmokeGrid,
+        obstacles: Obstacles,
         *,
         ambient_temperature: float,
+        openness: tuple,
         velocity: tuple,
         cell_fields: tuple,
     ) -> None:
@@ -54,13 +58,15 @@ class Source:
         self.target_density = parameters.density
         self.target_excess = parameters.temperature - ambient_temperature
         self.speed = max(map(abs, parameters.velocity)) if parameters.velocity is not None else 0.0
+        grid = obstacles.grid
+        self._obstacles = obstacles
         self._step_x, self._step_y, self._padded_y = (
             grid.padded[1] * grid.padded[2],
             grid.padded[2],
             grid.padded[1],
         )
         self._density, self._excess = cell_fields
-        self._velocity = velocity
+        self._openness, self._velocity = openness, velocity
         region = build_solid(parameters)
         cells = grid.cells_inside(region) & ~grid.solid
         self.cell_count = int(np.count_nonzero(cells))
@@ -84,7 +90,9 @@ class Source:
         self._raise_cells(int(time_s * FLUCTUATION_RATE_HZ))
         if self.parameters.velocity is not None:
             for axis, speed in enumerate(self.parameters.velocity):
-                self._set_faces(self._faces[axis], self._velocity[axis], self._face_counts[axis], speed)
+                self._set_faces(
+                    self._faces[axis], self._openness[axis], self._velocity[axis], self._face_counts[axis], speed
+                )
         return float(self._emitted.to_numpy().sum(dtype=np.float64))
 
     @ti.kernel
@@ -93,15 +101,16 @@ class Source:
             emitted = 0.0
             for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.cell_count)):
                 at = self._cells[n]
-                before = self._density[at]
-                after = ti.max(before, self.target_density)
-                self._density[at] = after
-                emitted += after - before
-                shortfall = self.parameters.fluctuation * self._fluctuate(at, tick)
-                target = (1.0 - shortfall) * self.target_excess
-                # Heat is raised to the target, and cold lowered.
-                excess = self._excess[at]
-                self._excess[at] = ti.max(excess, target) if self.target_excess >= 0.0 else ti.min(excess, target)
+                if not self._obstacles.is_solid(at):
+                    before = self._density[at]
+                    after = ti.max(before, self.target_density)
+                    self._density[at] = after
+                    emitted += after - before
+                    shortfall = self.parameters.fluctuation * self._fluctuate(at, tick)
+                    target = (1.0 - shortfall) * self.target_excess
+                    # Heat is raised to the target, and cold lowered.
+                    excess = self._excess[at]
+                    self._excess[at] = ti.max(excess, target) if self.target_excess >= 0.0 else ti.min(excess, target)
             self._emitted[block] = emitted
 
     @ti.func
@@ -115,15 +124,25 @@ class Source:
         return hash_to_unit(ti.cast(patch, ti.u32) ^ (ti.cast(tick, ti.u32) * ti.u32(2654435769)))
 
     @ti.kernel
-    def _set_faces(self, faces: ti.template(), field: ti.template(), count: ti.i32, speed: ti.f32):
+    def _set_faces(
+        self, faces: ti.template(), openness: ti.template(), field: ti.template(), count: ti.i32, speed: ti.f32
+    ):
         for n in range(count):
-            field[faces[n]] = speed
+            if openness[faces[n]] > 0.0:
+                field[faces[n]] = speed
 
 
 def build_sources(
-    parameters: SmokeParameters, grid: SmokeGrid, *, velocity: tuple, cell_fields: tuple
+    parameters: SmokeParameters, obstacles: Obstacles, *, openness: tuple, velocity: tuple, cell_fields: tuple
 ) -> Sequence[Source]:
     """The sources of a smoke.
+
+    Args:
+        parameters: of the smoke.
+        obstacles: in its grid.
+        openness: by axis, positive on faces that air passes, flat fields.
+        velocity: the three face velocities [m/s], flat fields.
+        cell_fields: density and temperature excess, flat fields.
 
     Raises:
         ValueError: a source contains no open cell: it lies outside the box, in a solid, or is smaller than a cell.
@@ -131,13 +150,15 @@ def build_sources(
     sources = [
         Source(
             source,
-            grid,
+            obstacles,
             ambient_temperature=parameters.ambient_temperature,
+            openness=openness,
             velocity=velocity,
             cell_fields=cell_fields,
         )
         for source in parameters.source
     ]
+    grid = obstacles.grid
     for number, source in enumerate(sources):
         if source.cell_count == 0:
             raise ValueError(

@@ -19,8 +19,14 @@ TINY = {
     "drop_on_bunny_dfsph": {"fluid.water.particle_radius": 0.05},
     "drop_on_bunny_wcsph": {"fluid.water.particle_radius": 0.05, "fluid.water.dt": 1.0e-3},
     "duck_in_pool_pcisph": {"fluid.water.particle_radius": 0.05},
+    "everything": {
+        "cloth.cloth.shape.counts": [11, 11],
+        "fluid.water.particle_radius": 0.025,
+        "smoke.fog.cell_size": 0.06,
+    },
     "flag_in_wind": {"cloth.flag.shape.counts": [13, 9]},
     "floating_bodies": {"fluid.water.particle_radius": 0.025},
+    "hammock_of_water": {"cloth.sheet.shape.counts": [13, 13], "fluid.water.emitter.0.start_s": 0.0},
     "honey": {"fluid.honey.particle_radius": 0.0014},
     "quickstart": {"fluid.water.particle_radius": 0.02, "smoke.plume.cell_size": 0.06},
 }

@@ -2,35 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import textwrap
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
+from inside_blender import run_inside_blender
 
 from render.system_libraries import missing_libraries
-
-PROJECT = Path(__file__).resolve().parents[2]
 
 pytestmark = pytest.mark.skipif(
     find_spec("bpy") is None or bool(missing_libraries()),
     reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
 )
-
-
-def run_inside_blender(code: str, *arguments: str) -> None:
-    """Run code with its assertions where bpy may be imported: one process, one Blender."""
-    completed = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code), *arguments],
-        cwd=PROJECT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert completed.returncode == 0, completed.stdout + completed.stderr
 
 
 def test_automatic_camera_shows_the_whole_domain_and_no_more_than_needed():

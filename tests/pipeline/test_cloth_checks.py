@@ -6,51 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from cloth_jobs import BALL, SHEET, errors, look_at, warnings
 
-from pipeline.job.checks import check_job
+from pipeline.errors import JobFileError
 from pipeline.job.cloth_checks import BYTES_PER_NODE
-from pipeline.job.loading import LoadedJob, read_job
-from pipeline.job.problems import Findings
 
-SHEET = """\
-name = "drape"
-[domain]
-open_faces = ["x-", "x+", "y-", "y+", "z+"]
-[[cloth]]
-name = "sheet"
-shape = { type = "rectangle", size = [0.4, 0.4], counts = [9, 9] }
-position = [0.0, 0.0, 0.5]
-"""
-BALL = """
-[[rigid]]
-name = "ball"
-shape = { type = "sphere", radius = 0.1 }
-position = [0.0, 0.0, 0.3]
-"""
 SECOND = """
 [[cloth]]
 name = "second"
 shape = { type = "rectangle", size = [0.3, 0.3], counts = [7, 7] }
 position = [0.03, 0.0, 0.5]
 """
-
-
-def look_at(text: str, folder: Path, **options) -> tuple[LoadedJob, Findings]:
-    path = folder / "drape.toml"
-    path.write_text(text)
-    loaded = read_job(path)
-    return loaded, check_job(loaded.job, **options)
-
-
-def errors(text: str, folder: Path, **options) -> list[str]:
-    loaded, findings = look_at(text, folder, **options)
-    return loaded.source.describe_all(findings.errors)
-
-
-def warnings(text: str, folder: Path) -> list[str]:
-    loaded, findings = look_at(text, folder)
-    assert findings.errors == []
-    return loaded.source.describe_all(findings.warnings)
 
 
 def test_a_cloth_over_a_ball_is_fine_and_its_nodes_are_counted(tmp_path):
@@ -151,6 +117,16 @@ def test_cloths_that_fit_one_by_one_but_not_together_are_refused(tmp_path):
     )
 
 
+PLUME = """
+[[smoke]]
+name = "plume"
+cell_size = 0.05
+[[smoke.source]]
+shape = { type = "sphere", radius = 0.2 }
+position = [0.0, 0.0, 0.3]
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -158,15 +134,25 @@ def test_cloths_that_fit_one_by_one_but_not_together_are_refused(tmp_path):
             SHEET + "thickness = 0.06",
             "drape.toml:8 cloth[0].thickness: 0.06 m is more than the 0.05 m between neighbouring nodes",
         ),
-        (SHEET + '[[smoke]]\nname = "plume"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.2 }',
-         "drape.toml: cloth and smoke do not act on each other in this version"),
+        (SHEET + "wind = [1.0, 0.0, 0.0]\n" + PLUME,
+         'drape.toml:8 cloth[0].wind: does not blow in the box of smoke "plume", where the cloth starts'),
         (SHEET + '[material.sheet]\nlook = "plastic"\nthread_spacing = 0.001',
          'drape.toml:10 material.sheet.thread_spacing: has no effect on the look "plastic"'),
     ],
-    ids=["thickness", "smoke", "threads of plastic"],
+    ids=["thickness", "wind in smoke", "threads of plastic"],
 )  # fmt: skip
 def test_what_is_worth_a_look_is_said(text, expected, tmp_path):
     assert any(line.startswith(expected) for line in warnings(text, tmp_path))
+
+
+def test_cloth_beside_smokes_whose_boxes_overlap_is_refused(tmp_path):
+    other = PLUME.replace("plume", "fog").replace("cell_size", "max = [0.5, 0.5, 0.4]\ncell_size")
+    apart = other.replace("max = [0.5, 0.5, 0.4]", "min = [0.5, -0.5, 0.0]\nmax = [1.5, 0.5, 1.0]").replace(
+        "[0.0,", "[0.8,"
+    )
+    with pytest.raises(JobFileError, match='the boxes of smoke "plume" and "fog" overlap'):
+        warnings(SHEET + PLUME + other, tmp_path)
+    assert warnings(SHEET + PLUME + apart, tmp_path) == []
 
 
 def test_cloth_laid_onto_a_box_and_an_edge_pinned_inside_a_pole_are_fine(tmp_path):
@@ -250,12 +236,12 @@ def test_bodies_that_fit_between_the_nodes_are_told(tmp_path):
     )
 
 
-@pytest.mark.parametrize(("wall", "is_told"), [(0.004, True), (0.02, False)])
-def test_bowls_with_thinner_walls_than_cloth_can_feel_are_told(wall, is_told, tmp_path):
+@pytest.mark.parametrize(("wall", "is_told"), [(0.001, True), (0.004, False)])
+def test_shells_with_thinner_walls_than_cloth_can_feel_are_told(wall, is_told, tmp_path):
     shell = trimesh.creation.icosphere(3, 0.2)
     inner = trimesh.creation.icosphere(3, 0.2 - wall)
     inner.invert()
     trimesh.util.concatenate([shell, inner]).export(tmp_path / "shell.ply")
     body = BALL.replace('"sphere", radius = 0.1', '"mesh", file = "shell.ply"').replace("0.3]", "0.25]")
-    told = [line for line in warnings(SHEET + body, tmp_path) if "on walls thinner than 0.00833 m" in line]
+    told = [line for line in warnings(SHEET + body, tmp_path) if "m or thinner; the finest grid that" in line]
     assert len(told) == is_told

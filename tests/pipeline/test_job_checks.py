@@ -152,11 +152,6 @@ def test_job_that_cannot_be_meant_is_refused_with_this_line(text, expected, tmp_
     [
         (HEAD + BALL, "dam.toml: has neither fluid nor smoke nor cloth, so nothing will move"),
         (
-            HEAD + BALL + 'kind = "kinematic"\n' + PLUME,
-            "dam.toml: smoke passes through bodies that move in this version; only static ones are in its way",
-        ),
-        (HEAD + WATER + PLUME, "dam.toml: fluid and smoke do not act on each other in this version"),
-        (
             HEAD + WATER.replace("0.5]", "0.0]"),
             "dam.toml:7 fluid[0].block[0]: 50 % of it are outside the domain and are clipped",
         ),

@@ -41,13 +41,13 @@ def world_of(
 
 
 def cloth_of(world: World) -> ClothSolver:
-    solver = world._solvers["cloth"]
+    solver = world.solvers["cloth"]
     assert isinstance(solver, ClothSolver)
     return solver
 
 
 def rigid_of(world: World) -> RigidSolver:
-    solver = world._solvers["rigid"]
+    solver = world.solvers["rigid"]
     assert isinstance(solver, RigidSolver)
     return solver
 

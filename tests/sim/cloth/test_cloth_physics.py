@@ -75,6 +75,67 @@ def test_xpbd_stretches_long_threads_more_than_they_should_by_what_is_said():
     assert np.abs(np.delete(excess, last)).max() < 0.02 * excess[last]
 
 
+def test_a_mesh_hangs_as_far_down_as_its_stiffness_lets_it(tmp_path):
+    """Equal triangles that hang from an edge get longer by rho g H² / (2 E), 0.18 mm of a metre of cotton."""
+    j, i = (each.ravel() for each in np.mgrid[0:29, 0:25])
+    edge = 1.0 / (28 * math.sqrt(0.75))
+    vertices = np.stack([(i + 0.5 * (j % 2)) * edge, 0.0 * i, 0.5 - j / 28], axis=1)
+    cell = i[(i < 24) & (j < 28)] + 25 * j[(i < 24) & (j < 28)]
+    odd = (cell // 25) % 2
+    triangles = np.concatenate(
+        [np.stack([cell, cell + 1, cell + 25 + odd], axis=1), np.stack([cell + 25, cell + 26, cell + 1 - odd], axis=1)]
+    )
+    path = tmp_path / "sheet.stl"
+    trimesh.Trimesh(vertices, triangles, process=False).export(path)
+    top = {"type": "box", "min": (-1, -1, 0.499), "max": (1, 1, 0.501)}
+    keys = {"bend_stiffness": 0.0, "damping": 2e-3, **VACUUM}
+    solver = solver_of(cloth(shape={"type": "mesh", "file": str(path)}, pin=[{"region": top}], **keys))
+    start = solver.state.positions()
+    settle(solver, 12, 40)
+    x = solver.state.positions()
+    lowest = start[:, 2] < -0.499
+    inner = lowest & (np.abs(start[:, 0]) < 0.25)
+    longer = (start[inner, 2] - x[inner, 2]).mean()
+    # Sheets held along an edge cannot become narrower there, and borders are loose: some 5 % each. Springs that are
+    # solved one by one instead of in strands make it 25 times as much.
+    assert longer == pytest.approx(0.15 * GRAVITY / (2.0 * 4000.0), rel=0.15)
+
+
+def test_a_taut_strip_does_not_jitter_across():
+    """At 20 steps a frame waves run along its upper springs in half a step: directions of the prediction overshoot."""
+    rows = 401
+    keys = {"mass_per_area": 0.15, "stretch_stiffness": 4000.0, **THREADS_ALONE, **VACUUM}
+    strip = rectangle((0.05, 1.0), (2, rows))
+    solver = solver_of(cloth(shape=strip, rotation_deg=(90, 0, 0), pin=[{"edge": "y+"}], **keys))
+    settle(solver, 10, 20)
+    zigzag = np.zeros((2 * rows, 3))
+    zigzag[:, 1] = 1e-3 * (-1.0) ** (np.arange(2 * rows) // 2)
+    zigzag[-2:] = 0.0
+    solver.state.velocity.from_numpy(zigzag.astype(np.float32))
+    for _ in range(60):
+        solver.substep(solver.stable_dt())
+    across = solver.state.velocity.to_numpy()[:, 1]
+    # The strip keeps a little of it as slow waves; without `straighten` nodes move at metres a second.
+    assert np.abs(across).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_iterations_bring_springs_at_a_corner_to_what_short_steps_find():
+    """32 x 32 nodes of cotton hang from two corners; the truth are ten times as many steps."""
+    strains = {}
+    for substeps, iterations in ((20, 1), (20, 4), (200, 1)):
+        pins = [{"corner": "x-y+"}, {"corner": "x+y+"}]
+        keys = {"pin": pins, "rotation_deg": (90, 0, 0), "substeps": substeps, "iterations": iterations}
+        solver = solver_of(cloth(shape=rectangle((1.0, 1.0), (32, 32)), damping=2e-3, **keys, **VACUUM))
+        for _ in range(6):
+            advance(solver, 0.1)
+            solver.state.velocity.fill(0.0)
+        strains[substeps, iterations] = solver.diagnostics()["max_strain"]
+    errors = {key: strain - strains[200, 1] for key, strain in strains.items()}
+    assert 0.0 < errors[20, 1] < 0.05
+    assert abs(errors[20, 4]) < 0.3 * errors[20, 1]
+
+
 @pytest.mark.slow
 def test_energy_of_an_undamped_sheet_that_swings_for_ten_seconds_does_not_drift():
     """Explicit, at its own step: below 1 % of m g L / 2, the energy that is turned over; 0.2 % is what it is."""
@@ -126,8 +187,28 @@ def test_free_cloth_keeps_its_momentum_and_its_angular_momentum(integrator, shee
     parts = mass @ np.linalg.norm(velocity, axis=1)
     levers = mass @ np.linalg.norm(np.cross(solver.state.host.position, velocity), axis=1)
     assert np.abs(momentum(solver) - before[0]).max() < 1e-6 * parts
-    # Velocities of symplectic Euler are half a step behind the positions, and XPBD's springs turn in their step: 1e-4.
-    assert np.abs(angular_momentum(solver) - before[1]).max() < 1e-4 * (levers + parts * 0.1)
+    # In float32, as above; what XPBD's springs take by turning in their step is given back.
+    assert np.abs(angular_momentum(solver) - before[1]).max() < 1e-6 * (levers + parts * 0.1)
+
+
+def test_a_free_cloth_keeps_its_angular_momentum_beside_one_that_is_held():
+    held = cloth("held", position=(0.0, 0.0, 0.5), pin=[{"corner": "x-y-"}], **VACUUM)
+    free = cloth("free", position=(0.3, 0.1, 0.0), **VACUUM)
+    solver = solver_of(held, free, gravity=WEIGHTLESS)
+    assert solver.state.is_free == (False, True)
+    own = slice(*solver.state.host.first_node[1:3])
+    velocity = np.random.default_rng(1).normal(scale=0.5, size=(solver.state.vertex_count, 3))
+    solver.state.velocity.from_numpy(velocity.astype(np.float32))
+    mass = solver.state.mass.to_numpy().astype(np.float64)[own, None]
+
+    def spin():
+        parts = np.cross(solver.state.positions()[own], mass * solver.state.velocity.to_numpy()[own])
+        return parts.sum(axis=0), np.linalg.norm(parts, axis=1).sum()
+
+    (before, size), held_before = spin(), angular_momentum(solver)
+    advance(solver, 0.05)
+    assert np.abs(spin()[0] - before).max() < 1e-6 * size
+    assert np.abs(angular_momentum(solver) - held_before).max() > 1e-3 * size  # the pin takes what it will
 
 
 @pytest.mark.parametrize(("wind", "coefficient", "area_axis"), [((6.0, 0, 0), 0.04, 0), ((0, 0, 6.0), 1.5, 2)])

@@ -136,6 +136,37 @@ def test_springs_of_a_piece_of_thread_follow_one_another():
             np.testing.assert_array_equal(springs.nodes[1:][same, 0], springs.nodes[:-1][same, 1])
 
 
+def test_edges_of_equal_triangles_are_solved_in_straight_strands():
+    sheet = equal_triangles()
+    ((springs, _),) = [each for each in joined_springs([springs_of(sheet)], [0]) if each[0].in_segments]
+    assert len(np.unique(np.sort(springs.nodes, axis=1), axis=0)) == len(springs) == 24 * 27 * 2 + 23 * 28 - 27
+    along = sheet.vertices[springs.nodes[:, 1]] - sheet.vertices[springs.nodes[:, 0]]
+    same = springs.segment[1:] == springs.segment[:-1]
+    np.testing.assert_allclose(along[1:][same], along[:-1][same], atol=1e-12)
+    # Rows are 23 edges long, and both diagonals 27 at most: as few strands as lines, and no more colours than edges.
+    assert len(np.unique(springs.segment)) <= 28 + 2 * (24 + 13)
+    assert springs.colour.max() + 1 <= 11
+
+
+def test_strands_meet_no_node_twice_even_around_a_tube():
+    j, i = (each.ravel() for each in np.mgrid[0:9, 0:12])
+    angle = 2.0 * np.pi * (i + 0.5 * (j % 2)) / 12
+    vertices = np.stack([np.cos(angle), np.sin(angle), 0.45 * j], axis=1)
+    triangles = []
+    for row in range(8):
+        for column in range(12):
+            a, b = row * 12 + column, (row + 1) * 12 + column
+            right_a, right_b = row * 12 + (column + 1) % 12, (row + 1) * 12 + (column + 1) % 12
+            triangles += (
+                [(a, right_a, right_b), (a, right_b, b)] if row % 2 else [(a, right_a, b), (right_a, right_b, b)]
+            )
+    springs = springs_of(sheet_of_triangles(vertices, np.array(triangles), label="tube"))[1]
+    for strand in np.unique(springs.segment):
+        own = springs.nodes[springs.segment == strand]
+        met = np.append(own[0, 0], own[:, 1])
+        assert len(np.unique(met)) == len(met)
+
+
 def test_colours_are_few_and_the_same_every_time():
     sheet = equal_triangles()
     nodes = springs_of(sheet)[1].nodes

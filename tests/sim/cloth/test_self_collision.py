@@ -55,35 +55,41 @@ def test_search_lists_all_pairs_within_reach_once_and_no_others():
     x = np.random.default_rng(1).uniform(-0.06, 0.06, (49, 3))  # crumpled beyond recognition: cells hold many
     state.set_positions(x)
     state.displacement.from_numpy(
-        np.repeat([[[0.0, 0.0, 0.01], [0.0, 0.0, -0.01]]], 25, axis=0).reshape(50, 3)[:49].astype(np.float32)
+        np.repeat([[[0.0, 0.0, 2e-3], [0.0, 0.0, -2e-3]]], 25, axis=0).reshape(50, 3)[:49].astype(np.float32)
     )
     pairs = SelfCollision(state)
-    pairs.prepare(state, 0.01)
-    radius = 0.02 + 4.5 * 0.01  # thickness, and the skin that this motion asks for
-
-    found = pairs.with_triangles.vertices.to_numpy()[: pairs.with_triangles.count].tolist()
+    pairs.prepare(state, 2e-3, 0.01)
+    found = _listed(pairs.with_triangles)
+    # A pair of patches is searched as far as its own motion asks for, to a thickness at least.
+    reach = pairs._met.reach.to_numpy()[: pairs._met.count].max()
+    assert reach < 0.1
     triangles = state.host.triangles
     vertex, triangle = (each.ravel() for each in np.mgrid[0:49, 0 : len(triangles)])
     apart = (triangles[triangle] != vertex[:, None]).all(axis=1)
     vertex, corners = vertex[apart], triangles[triangle[apart]]
     distance = point_triangle_distances(x[vertex], *np.moveaxis(x[corners], 1, 0))
-    _expect_listed(found, np.concatenate([vertex[:, None], corners], axis=1), distance, radius)
+    _expect_listed(found, np.concatenate([vertex[:, None], corners], axis=1), distance, 0.02, reach)
 
-    found = pairs.of_edges.vertices.to_numpy()[: pairs.of_edges.count].tolist()
+    found = _listed(pairs.of_edges)
     edges = edges_of_triangles(triangles)
     first, second = np.triu_indices(len(edges), k=1)
     apart = ~(edges[first][:, :, None] == edges[second][:, None, :]).any(axis=(1, 2))
     both = np.concatenate([edges[first[apart]], edges[second[apart]]], axis=1)
-    _expect_listed(found, both, segment_distances(*np.moveaxis(x[both], 1, 0)), radius)
+    _expect_listed(found, both, segment_distances(*np.moveaxis(x[both], 1, 0)), 0.02, reach)
 
 
-def _expect_listed(found, candidates, distance, radius):
-    assert 0 < np.count_nonzero(distance < radius) < len(distance)
-    listed = {tuple(row) for row in found}
+def _listed(pairs):
+    vertices = pairs.vertices.to_numpy()[: pairs.end]
+    return [tuple(row) for row in vertices[vertices[:, 0] >= 0].tolist()]
+
+
+def _expect_listed(found, candidates, distance, radius, reach):
+    assert 0 < np.count_nonzero(distance < radius) < np.count_nonzero(distance < reach) < len(distance)
+    listed = set(found)
     assert len(listed) == len(found)
-    clear = np.abs(distance - radius) > 1e-6  # float32 cannot tell at the rim
-    expected = {tuple(row) for row in candidates[clear & (distance < radius)].tolist()}
-    unwanted = {tuple(row) for row in candidates[clear & (distance > radius)].tolist()}
+    # Edges are listed from that with the smaller first end on; float32 cannot tell at the rim.
+    expected = {tuple(row) for row in candidates[distance < radius - 1e-6].tolist()}
+    unwanted = {tuple(row) for row in candidates[distance > reach + 1e-6].tolist()}
     assert expected <= listed
     assert not unwanted & listed
 
@@ -322,9 +328,9 @@ def test_contacts_do_not_depend_on_when_pairs_were_searched_for():
     pairs = contacts_of(cloth_of(anew))._pairs
     search = pairs.prepare
 
-    def search_always(state, motion):
+    def search_always(state, motion, margin):
         pairs.forget(state)
-        search(state, motion)
+        search(state, motion, margin)
 
     pairs.prepare = search_always
     for _ in range(12):

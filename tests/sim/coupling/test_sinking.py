@@ -10,6 +10,7 @@ RADIUS = 2.5 * SPACING
 WIDTH, DEPTH = 16 * SPACING, 8 * SPACING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", sorted(SOLVERS))
 def test_a_heavy_sphere_sinks_to_the_floor(taichi_cpu, solver):
     domain = DomainParameters(min=(-WIDTH / 2, -WIDTH / 2, 0.0), max=(WIDTH / 2, WIDTH / 2, 3.0 * DEPTH))

@@ -335,7 +335,7 @@ def test_a_particle_that_is_pressed_against_a_wall_shortens_the_step(taichi_cpu)
 
 def test_the_speed_of_a_body_that_is_not_a_number_is_told(dam_break):
     fluid = dam_break()
-    fluid._boundary_speed = np.nan
+    fluid._body_speed = np.nan
     assert np.isfinite(fluid.stable_dt())  # the larger of two speeds hides it
     fluid.substep(1.0e-5)
     assert "moving body" in fluid.first_bad_quantity()

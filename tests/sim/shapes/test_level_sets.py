@@ -35,6 +35,30 @@ def test_gradient_is_the_normal():
     np.testing.assert_allclose(level_set.gradient(points), normal, atol=0.02)
 
 
+class Counted:
+    """A solid that counts the distances that it is asked for."""
+
+    def __init__(self, solid):
+        self.solid, self.bounds, self.count = solid, solid.bounds, 0
+
+    def signed_distance(self, points):
+        self.count += len(points)
+        return self.solid.signed_distance(points)
+
+
+def test_distances_far_from_the_surface_may_be_coarse_but_have_the_right_sign_and_cost_little():
+    spacing, exact_within = 0.005, 0.01
+    exact = LevelSet.sample(BALL, spacing)
+    counted = Counted(BALL)
+    banded = LevelSet.sample(counted, spacing, exact_within=exact_within)
+    near = np.abs(exact.values) <= exact_within
+    np.testing.assert_array_equal(banded.values[near], exact.values[near])
+    np.testing.assert_array_equal(np.sign(banded.values), np.sign(exact.values))
+    # Coarse cells of 2 and 4 spacings (of 26 cells along an edge), and the ball's centre, where its distance has a tip.
+    assert np.abs(banded.values - exact.values).max() <= 0.87 * 4.0 * spacing
+    assert counted.count < 0.5 * exact.values.size
+
+
 def test_outside_of_the_grid_the_distance_is_an_upper_bound_and_positive():
     level_set = LevelSet.sample(BALL, 0.02)
     points = BALL.position + np.array([[1.0, 0.0, 0.0], [0.0, -2.0, 1.0], [3.0, 3.0, 3.0]])

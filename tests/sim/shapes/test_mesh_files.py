@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from sim.shapes import ShapeError, build_solid
+from sim.shapes.mesh_file import read_triangles
 from sim.shapes.parameters import Placement
 
 
@@ -47,6 +48,52 @@ def test_objects_of_a_scene_are_placed_and_joined(tmp_path):
     )
 
 
+SEAMS = """\
+o left
+v 0 0 0
+v 1 0 0
+v 9 9 9
+v 0 1 0
+v 1 1 0
+vt 0 0
+vt 0.4 0
+vt 0.4 1
+vt 0 1
+vn 0 0 1
+usemtl red
+f 1/1/1 2/2/1 \\
+  5/3/1 4/4/1
+o right
+v 2 0 0
+v 2 1 0
+vt 0.6 0
+vt 0.6 1
+usemtl blue
+f -6//1 -2//1 -1//1
+f 2/5 7/6 5/6
+"""
+"""Two squares that share an edge, where their texture coordinates, materials and objects differ; vertex 2 is unused."""
+
+
+def test_seams_objects_and_materials_leave_the_numbers_of_an_obj_as_they_are(tmp_path):
+    (tmp_path / "seams.obj").write_text(SEAMS)
+    vertices, faces = read_triangles(tmp_path / "seams.obj")
+    expected = [[0, 0, 0], [1, 0, 0], [9, 9, 9], [0, 1, 0], [1, 1, 0], [2, 0, 0], [2, 1, 0]]
+    np.testing.assert_array_equal(vertices, expected)
+    np.testing.assert_array_equal(faces, [[0, 1, 4], [0, 4, 3], [1, 5, 6], [1, 6, 4]])
+
+
+def test_texture_coordinates_of_corners_do_not_renumber_a_ply(tmp_path):
+    (tmp_path / "seam.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 2\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\nend_header\n"
+        "0 0 0\n1 0 0\n0 1 0\n1 1 0\n3 1 3 2 6 0 0 1 0 1 1\n3 0 1 2 6 5 5 6 5 6 6\n"
+    )
+    vertices, faces = read_triangles(tmp_path / "seam.ply")
+    np.testing.assert_array_equal(vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    np.testing.assert_array_equal(faces, [[1, 3, 2], [0, 1, 2]])
+
+
 def test_y_up_turns_the_file_upright(tmp_path):
     trimesh.creation.cone(
         radius=0.5, height=2.0, transform=trimesh.geometry.align_vectors([0, 0, 1], [0, 1, 0])
@@ -85,7 +132,10 @@ def test_missing_file_is_refused(tmp_path):
         ("notes.txt", b"hello", r"must be an OBJ, PLY, STL or GLB file, got \"notes.txt\"; export it as GLB"),
         ("bad.glb", b"garbage", r"is not a readable GLB file \(.+\); export it again"),
         ("bad.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n", "PLY file|has no faces"),
-        ("cut.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", r"is not a readable OBJ file \(IndexError"),
+        ("cut.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cut.obj.* has faces that name vertices it does not have"),
+        ("back.obj", b"v 0 0 0\nv 1 0 0\nf -1 -2 -3\n", r'line 3, "f -1 -2 -3": a face names vertex -3; 2 are there'),
+        ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "a face names vertex 0; 3 are there, numbered from 1"),
+        ("short.obj", b"v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", r'not a readable OBJ file .*line 2, "v 1 0"'),
         ("empty.obj", b"", "empty.obj.* (has no faces|is not a readable OBJ)"),
         ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "points.obj has no faces; a solid needs a surface"),
         ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "nan.obj has 1 vertices that are not finite"),

@@ -5,6 +5,7 @@ import numpy as np
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement, SphereShape
 from sim.smoke.grid import SmokeGrid
+from sim.smoke.obstacles import MOVING, Obstacles
 from sim.smoke.parameters import Face
 
 OPEN_BOX: tuple[Face, ...] = ("x-", "x+", "y-", "y+", "z+")
@@ -42,3 +43,13 @@ def rough_velocity(grid: SmokeGrid) -> list[np.ndarray]:
         jet = np.exp(-((position - 0.5) ** 2).sum(axis=-1) / 0.02)
         values.append(jet + 0.1 * random.standard_normal(shape))
     return values
+
+
+def mark(obstacles: Obstacles, solid: np.ndarray, velocity: tuple[float, float, float]) -> None:
+    """Mark cells, (nx, ny, nz) bool, as solid in the coming step, all with one velocity [m/s]; no solid is static."""
+    state = obstacles.marked.to_numpy()
+    state[obstacles.grid.pad(solid).ravel()] = MOVING
+    obstacles.marked.from_numpy(state)
+    fields = (obstacles.velocity_x, obstacles.velocity_y, obstacles.velocity_z)
+    for field, value in zip(fields, velocity, strict=True):
+        field.from_numpy(np.full(obstacles.grid.size, value, np.float32))

@@ -4,6 +4,7 @@ import taichi as ti
 from smoke_scenes import CLOSED_BOX, OPEN_BOX, get_faces, set_faces, unit_grid
 
 from sim.smoke.forces import Forces, upward
+from sim.smoke.obstacles import Obstacles
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
@@ -14,7 +15,7 @@ def build(grid, *, confinement: float, gravity=(0.0, 0.0, -9.81)):
     for axis, field in enumerate(openness):
         field.from_numpy(grid.pad(grid.open_area[axis].astype(np.float32)).ravel())
     forces = Forces(
-        grid,
+        Obstacles(grid),
         openness=tuple(openness),
         velocity=tuple(velocity),
         cell_fields=tuple(cell_fields),

@@ -1,0 +1,65 @@
+"""Whether the pins of a job do within the film what their times and paths say."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings
+from sim.cloth.parameters import DEFAULT_SUBSTEPS
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+    from sim.cloth.parameters import ClothParameters
+
+
+def check_pin_times(job: Job, findings: Findings) -> None:
+    """Warn of pins whose path or release the film does not reach."""
+    film_s = job.frame_count / job.fps
+    for index, cloth in enumerate(job.cloth):
+        for number, pin in enumerate(cloth.pin):
+            path: KeyPath = ("cloth", index, "pin", number)
+            if pin.release_s is not None and pin.release_s >= film_s:
+                findings.warn(
+                    (*path, "release_s"),
+                    f"lets go at {pin.release_s:g} s, after the film's end at {film_s:g} s, so it holds all through; "
+                    "make it earlier, or remove it",
+                )
+            if pin.keyframe and pin.keyframe[0].time_s >= film_s:
+                findings.warn(
+                    (*path, "keyframe"),
+                    f"starts to move at {pin.keyframe[0].time_s:g} s, after the film's end at {film_s:g} s; "
+                    "make its times earlier",
+                )
+            if pin.keyframe and not any(any((*each.offset, *each.rotation_deg)) for each in pin.keyframe):
+                findings.warn(
+                    (*path, "keyframe"), "never moves: all keyframes are where it starts; give one offset, or remove it"
+                )
+
+
+def check_pin_speed(
+    path: KeyPath, cloth: ClothParameters, *, reach: float, longest_edge: float, fps: int, findings: Findings
+) -> None:
+    """Warn of a pin that pulls its nodes further in a substep than the next node is away.
+
+    Args:
+        path: of the pin's table.
+        cloth: whose pin it is.
+        reach: largest distance of the pinned nodes from their centre [m].
+        longest_edge: longest distance of neighbouring nodes of the cloth [m].
+        fps: frames of the film per second.
+        findings: where warnings go.
+    """
+    from sim.cloth.pin_paths import path_of_pin
+
+    pin = cloth.pin[int(path[-1])]
+    if not pin.keyframe:
+        return
+    speed = path_of_pin(pin).largest_speed(reach)
+    way = speed / (fps * (cloth.substeps or DEFAULT_SUBSTEPS))
+    if way > longest_edge:
+        findings.warn(
+            (*path, "keyframe"),
+            f"moves at up to {speed:.3g} m/s, {way:.3g} m in a substep, further than the {longest_edge:.3g} m between "
+            "neighbouring nodes: the cloth is torn along; give it more time, or the cloth more substeps",
+        )

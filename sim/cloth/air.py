@@ -1,0 +1,163 @@
+"""What air does to cloth, and what it takes from the air: drag on every triangle."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+
+from sim.arrays import Floats, Vectors
+from sim.cloth.parameters import ClothParameters
+from sim.cloth.sheet import triangle_areas
+from sim.cloth.state import ClothState
+from sim.launch import fast_launch
+
+WIND = -1
+"""Source of air that is nothing but the wind of a cloth's parameters."""
+
+Triangles = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
+
+
+class ClothAir:
+    """The air at every triangle, and its force.
+
+    Air is the wind of the parameters, which nothing slows, unless a coupling puts air of its own there: that has a mass
+    per area of cloth, feels the opposite impulse, and is never pushed beyond the cloth's velocity.
+
+    Attributes:
+        velocity: of the air at each triangle [m/s], (k,) vec3.
+        inverse_mass: area of cloth over the mass of the air that it acts on [m²/kg], (k,); 0 for wind.
+        source: number of what the air belongs to, (k,) int32; `WIND` for wind.
+        density: of the air [kg/m³], (k,).
+        force: of the air on each triangle in the last substep [N], (k,) vec3.
+        impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3.
+        wind: of the parameters [m/s], (k,) vec3.
+        share: of each node in the force on any of its triangles [-], (n,).
+        triangle_start: the triangles of node i are `triangle_list[triangle_start[i]:triangle_start[i + 1]]`.
+        triangle_list: in ascending order of the nodes, then of the triangles.
+        acts: whether any cloth has air that drags.
+    """
+
+    def __init__(self, state: ClothState) -> None:
+        """Allocate it; `take_parameters` sets drag and wind.
+
+        The share is the node's area over that of its triangles, so that a flat sheet is pushed alike everywhere: 1/3 in
+        meshes; 1/2 or 1/4 in rectangles, whose nodes have four triangles or eight. A triangle's shares sum to 1.
+        """
+        host, count = state.host, state.triangle_count
+        self._state = state
+        self.velocity, self.force, self.impulse, self._drag = (ti.Vector.ndarray(3, ti.f32, count) for _ in range(4))
+        self.inverse_mass, self.density = (ti.ndarray(ti.f32, count) for _ in range(2))
+        self.source = ti.ndarray(ti.i32, count)
+        self.source.fill(WIND)
+        self.wind = ti.Vector.ndarray(3, ti.f32, count)
+        self.acts = False
+        triangles = host.triangles
+        order = np.argsort(triangles.ravel(), kind="stable")
+        start = np.searchsorted(triangles.ravel()[order], np.arange(state.vertex_count + 1))
+        self.triangle_start = ti.ndarray(ti.i32, len(start))
+        self.triangle_start.from_numpy(start.astype(np.int32))
+        self.triangle_list = ti.ndarray(ti.i32, len(order))
+        self.triangle_list.from_numpy((order // 3).astype(np.int32))
+        around = np.bincount(triangles.ravel(), weights=np.repeat(triangle_areas(host.position, triangles), 3))
+        self.share = ti.ndarray(ti.f32, state.vertex_count)
+        self.share.from_numpy((host.node_area / around).astype(np.float32))
+
+    def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
+        """Drag and wind as the parameters have them now; air that a coupling put there stays."""
+        host = self._state.host
+        drag = [
+            [0.5 * cloth.air_density * cloth.drag for cloth in cloths],
+            [0.5 * cloth.air_density * cloth.skin_drag for cloth in cloths],
+            [cloth.mass_per_area for cloth in cloths],
+        ]
+        self._drag.from_numpy(np.stack([host.of_triangles(each) for each in drag], axis=1).astype(np.float32))
+        self.density.from_numpy(host.of_triangles([cloth.air_density for cloth in cloths]).astype(np.float32))
+        wind = [host.of_triangles([cloth.wind[axis] for cloth in cloths]) for axis in range(3)]
+        wind_of = np.stack(wind, axis=1).astype(np.float32)
+        self.wind.from_numpy(wind_of)
+        is_wind = self.source.to_numpy() == WIND
+        self.velocity.from_numpy(np.where(is_wind[:, None], wind_of, self.velocity.to_numpy()))
+        self.acts = any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 for cloth in cloths)
+
+    def blow(self, gravity: ti.math.vec3, dt: float) -> None:
+        """Compute the force of a step of dt [s], and add to the impulse."""
+        state = self._state
+        if self.acts:
+            blow_on_triangles(
+                state.position, state.velocity, state.inverse_mass, state.triangles, self.velocity, self.inverse_mass,
+                self._drag, self.share, gravity, dt, self.force, self.impulse,
+            )  # fmt: skip
+
+
+@ti.func
+def slowed(speed: ti.f32, rate: ti.f32, dt: ti.f32) -> ti.f32:
+    """s after dt of ds/dt = -rate s² from `speed`, by implicit Euler: never beyond rest, however light the cloth."""
+    return 2.0 * speed / (1.0 + ti.sqrt(1.0 + 4.0 * dt * rate * speed))
+
+
+@ti.func
+def drag_along(
+    past: ti.math.vec3, left: ti.math.vec3, direction: ti.math.vec3, drag: ti.f32, mobility: ti.f32,
+    air_mobility: ti.f32, dt: ti.f32,
+) -> ti.f32:  # fmt: skip
+    """Force per area along a direction, in which the air passes at `past`, and has `left` left after what it gave.
+
+    Quadratic in the passing speed at the end of the step, and at most what brings the air that is left and the cloth
+    to the same velocity.
+    """
+    s = past.dot(direction)
+    end = slowed(s, drag * mobility, dt)
+    force = drag * end * end
+    if air_mobility > 0.0:
+        force = ti.min(force, ti.max(left.dot(direction), 0.0) / (dt * (mobility + air_mobility)))
+    return force
+
+
+@fast_launch
+@ti.kernel
+def blow_on_triangles(
+    position: Vectors, velocity: Vectors, inverse_mass: Floats, triangles: Triangles, air_velocity: Vectors,
+    air_inverse_mass: Floats, drag: Vectors, air_share: Floats, gravity: ti.math.vec3, dt: ti.f32, air_force: Vectors,
+    impulse: Vectors,
+):  # fmt: skip
+    """Force of the air on each triangle [N], normal and tangential, quadratic in the speed of the air past it.
+
+        F = rho A / 2 (C_n |v_n| v_n + C_t |v_t| v_t),   v_n + v_t = air - cloth
+
+    with the cloth's velocity at the end of the step, as far as gravity and the air change it: stable for light cloth in
+    strong wind, and exact at terminal speed. `drag` is (rho C_n / 2, rho C_t / 2, mass per area); a triangle yields by
+    the share of its nodes that are not pinned.
+
+    The air's velocity is what a coupling last found. What the cloth took from it since bounds the force: a part of it
+    with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
+    not gain energy, however little the air weighs, and the quadratic law holds where it leaves that room.
+    """
+    for t in range(triangles.shape[0]):
+        a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
+        x_a = position[a]
+        cross = (position[b] - x_a).cross(position[c] - x_a)
+        squared = cross.dot(cross)
+        force = ti.math.vec3(0.0)
+        if squared > 0.0:
+            inverse = ti.rsqrt(squared)
+            area = 0.5 * squared * inverse
+            normal = inverse * cross
+            mean = air_share[a] * velocity[a] + air_share[b] * velocity[b] + air_share[c] * velocity[c]
+            free = 0.0
+            for k in ti.static(range(3)):
+                i = triangles[t][k]
+                free += ti.select(inverse_mass[i] > 0.0, air_share[i], 0.0)
+            mobility = free / drag[t][2]
+            air_mobility = air_inverse_mass[t]
+            past = air_velocity[t] - mean - dt * free * gravity
+            left = past - air_mobility / area * impulse[t]
+            normal *= ti.math.sign(past.dot(normal))
+            along = past - past.dot(normal) * normal
+            s_t = along.norm()
+            force = drag_along(past, left, normal, drag[t][0], mobility, air_mobility, dt) * normal
+            if s_t > 0.0:
+                along /= s_t
+                force += drag_along(past, left, along, drag[t][1], mobility, air_mobility, dt) * along
+            force *= area
+            impulse[t] += dt * force
+        air_force[t] = force

@@ -1,0 +1,111 @@
+"""Angular momentum of cloth that no pin holds, which its springs must not change."""
+
+import numpy as np
+import taichi as ti
+
+from sim.arrays import Floats, Vectors
+from sim.cloth.state import ClothState, Lattice
+from sim.launch import fast_launch
+from sim.reductions import BRANCHES, device_lanes, reduced
+
+QUANTITIES = 13
+"""Mass, its first moments (3) and second moments (6), and angular momentum that the springs gave (3)."""
+
+LEAST_INERTIA = 1.0e-6
+"""About its long axis a cloth counts as no thinner than this, as a share of the sum of its moments of inertia [-]."""
+
+
+class FreeSpin:
+    """Takes back the angular momentum that springs gave to free cloths.
+
+    With velocities v = (x' - x)/dt, sum m x' x v = sum m x x v: a spring changes the angular momentum unless it pushes
+    along its direction d at the start of the step, as SHAKE does (Ryckaert, Ciccotti & Berendsen 1977). Springs of XPBD
+    push along where the step leads them. That is what lets them hold tension in long steps, and slows whatever spins:
+    by 1e-3 within frames where a ball is caught in cloth. Pushing along d instead is an explicit force across the
+    spring, unstable from the time on in which a wave runs along it; so the loss is returned, to each cloth as a whole:
+    its displacements get the rotation t about its centre of mass X that restores the sum over its nodes,
+
+        I t = -sum m (x - X) x e,   e_i += t x (x_i - X),
+
+    with e the displacements by springs and I the moments of inertia. Linear momentum stays, and no spring is stretched
+    to first order. Where pins hold a cloth, they have a torque of their own, and nothing is returned.
+    """
+
+    def __init__(self, state: ClothState) -> None:
+        self._state = state
+        self._lanes = device_lanes()
+        self._partial = ti.ndarray(ti.f32, QUANTITIES * self._lanes.count)
+        self._totals = ti.ndarray(ti.f32, QUANTITIES * (self._lanes.count // BRANCHES))
+        self._turn = ti.Vector.ndarray(3, ti.f32, 2)
+
+    def restore(self, dt: float) -> None:
+        """Correct the displacements of a step of dt [s], after the springs."""
+        state, lanes = self._state, self._lanes
+        for cloth in np.flatnonzero(state.is_free):
+            first, end = (int(node) for node in state.host.first_node[cloth : cloth + 2])
+            count = end - first
+            return_angular_momentum(
+                state.lattice, state.quantum, state.carry, state.velocity, state.inverse_mass, dt, first, count,
+                lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._partial, lanes.count,
+                self._totals, self._turn, state.displacement,
+            )  # fmt: skip
+
+
+@fast_launch
+@ti.kernel
+def return_angular_momentum(
+    lattice: Lattice, quantum: ti.f32, carry: Vectors, velocity: Vectors, inverse_mass: Floats, dt: ti.f32,
+    first: ti.i32, count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats, lanes: ti.i32,
+    totals: Floats, turn: Vectors, displacement: Vectors,
+):  # fmt: skip
+    """Rotate the nodes of a cloth so that the corrections of its springs have no angular momentum.
+
+    Moments are about the first node; `turn` becomes the rotation, and the centre of mass from there.
+    """
+    for lane in range(lanes):
+        mass = 0.0
+        moment = ti.math.vec3(0.0)
+        squares = ti.math.vec3(0.0)
+        products = ti.math.vec3(0.0)
+        spin = ti.math.vec3(0.0)
+        for k in range(items):
+            n = lane * lane_step + k * item_step
+            if n < count:
+                i = first + n
+                m_i = 1.0 / inverse_mass[i]
+                r_i = quantum * ti.cast(lattice[i] - lattice[first], ti.f32)
+                e_i = displacement[i] - (carry[i] + dt * velocity[i])
+                mass += m_i
+                moment += m_i * r_i
+                squares += m_i * r_i * r_i
+                products += m_i * ti.math.vec3(r_i.y * r_i.z, r_i.z * r_i.x, r_i.x * r_i.y)
+                spin += m_i * r_i.cross(e_i)
+        partial[lane] = mass
+        for axis in ti.static(range(3)):
+            partial[(1 + axis) * lanes + lane] = moment[axis]
+            partial[(4 + axis) * lanes + lane] = squares[axis]
+            partial[(7 + axis) * lanes + lane] = products[axis]
+            partial[(10 + axis) * lanes + lane] = spin[axis]
+    reduced(partial, lanes, QUANTITIES, 0, totals)
+    for _ in range(1):
+        step = lanes // BRANCHES
+        mass = totals[0]
+        centre = ti.math.vec3(totals[step], totals[2 * step], totals[3 * step]) / mass
+        squares = ti.math.vec3(totals[4 * step], totals[5 * step], totals[6 * step]) - mass * centre * centre
+        products = ti.math.vec3(totals[7 * step], totals[8 * step], totals[9 * step])
+        products -= mass * ti.math.vec3(centre.y * centre.z, centre.z * centre.x, centre.x * centre.y)
+        spin = ti.math.vec3(totals[10 * step], totals[11 * step], totals[12 * step])
+        whole = squares.sum()
+        least = LEAST_INERTIA * whole
+        inertia = ti.Matrix(
+            [
+                [whole - squares.x + least, -products.z, -products.y],
+                [-products.z, whole - squares.y + least, -products.x],
+                [-products.y, -products.x, whole - squares.z + least],
+            ]
+        )
+        turn[0] = -(inertia / whole).inverse() @ (spin / whole)
+        turn[1] = centre
+    for i in range(first, first + count):
+        r_i = quantum * ti.cast(lattice[i] - lattice[first], ti.f32) - turn[1]
+        displacement[i] += turn[0].cross(r_i)

@@ -1,0 +1,103 @@
+"""Patches: a cloth's triangles in groups that lie together, with their edges and vertices, and a tree over them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from sim.cloth.state import HostCloths
+
+TRIANGLES_PER_PATCH = 24
+"""Most triangles of a patch: few enough for all of them to move nearly as one, and enough for one pair of patches to
+stand for hundreds of pairs of elements."""
+
+
+class Patches:
+    """Splits cloths into compact patches, by halving each along its longest extent until it is small.
+
+    Every triangle, edge and vertex belongs to one patch. The m patches are in the order of the halvings, so that a
+    binary tree over their numbers is a hierarchy of boxes.
+
+    Attributes:
+        count: number of patches, m.
+        leaves: m rounded up to a power of two.
+        first_triangle, first_edge, first_vertex: of each patch, (m + 1,).
+        triangles: in the order of the patches, (k,) ivec3 of vertices; edges (e,) ivec2; vertices (n,).
+        first_corner, corners: all vertices of a patch's triangles, which its edges end at, its own and others, (c,).
+        cloth: of each patch, (m,).
+
+    Args:
+        host: the cloths where they start; every vertex is one of a triangle.
+    """
+
+    def __init__(self, host: HostCloths) -> None:
+        triangles, edges = host.triangles, host.edges
+        patch = _patch_of_triangles(host)
+        self.count = int(patch.max()) + 1 if len(patch) else 0
+        self.leaves = 1 << max(self.count - 1, 0).bit_length()
+        order = np.argsort(patch, kind="stable")
+        self.first_triangle = _array(_starts(patch, self.count))
+        self.triangles = ti.Vector.ndarray(3, ti.i32, max(len(triangles), 1))
+        self.triangles.from_numpy(triangles[order])
+
+        corner_patch, corner = np.unique(np.stack([np.repeat(patch, 3), triangles.ravel()]), axis=1)
+        self.first_corner, self.corners = _array(_starts(corner_patch, self.count)), _array(corner)
+        # The first patch that a vertex is a corner of owns it, and so an edge: the first with both of its ends in a
+        # triangle, as edges are sides of triangles.
+        owner = np.full(len(host.position), self.count)
+        np.minimum.at(owner, corner, corner_patch)
+        self.first_vertex = _array(_starts(np.sort(owner), self.count))
+        self.vertices = _array(np.argsort(owner, kind="stable"))
+
+        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1).astype(np.int64)
+        number = np.searchsorted(_key(edges, len(owner)), _key(sides, len(owner)))
+        edge_owner = np.full(len(edges), self.count)
+        np.minimum.at(edge_owner, number, np.repeat(patch, 3))
+        self.first_edge = _array(_starts(np.sort(edge_owner), self.count))
+        self.edges = ti.Vector.ndarray(2, ti.i32, max(len(edges), 1))
+        self.edges.from_numpy(edges[np.argsort(edge_owner, kind="stable")])
+        self.cloth = _array(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
+
+
+def _patch_of_triangles(host: HostCloths) -> NDArray[np.int64]:
+    """Number of the patch of each triangle, (k,)."""
+    patch = np.zeros(len(host.triangles), dtype=np.int64)
+    centre = host.position[host.triangles].mean(axis=1)
+    count = 0
+    for first, last in zip(host.first_triangle[:-1], host.first_triangle[1:], strict=True):
+        halvings = max(int(np.ceil(np.log2(max(last - first, 1) / TRIANGLES_PER_PATCH))), 0)
+        order = np.arange(first, last)
+        for level in range(halvings):
+            # All parts of a level at once: each is sorted along its own longest extent, and cut in its middle.
+            bounds = (last - first) * np.arange(2**level + 1) // 2**level
+            part = np.repeat(np.arange(2**level), np.diff(bounds))
+            inner = bounds[:-1]
+            extent = np.maximum.reduceat(centre[order], inner) - np.minimum.reduceat(centre[order], inner)
+            along = centre[order, extent.argmax(axis=1)[part]]
+            order = order[np.lexsort((along, part))]
+        bounds = (last - first) * np.arange(2**halvings + 1) // 2**halvings
+        patch[order] = count + np.repeat(np.arange(2**halvings), np.diff(bounds))
+        count += 2**halvings
+    return patch
+
+
+def _starts(patch: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Where each of the patches begins among values in their order; and the number of all, (count + 1,)."""
+    starts: NDArray[np.int64] = np.concatenate([[0], np.cumsum(np.bincount(patch, minlength=count))])
+    return starts
+
+
+def _key(pairs: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """A number for each pair of vertices, in the order of sorted pairs."""
+    key: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * count + pairs[:, 1]
+    return key
+
+
+def _array(values: NDArray[np.integer]) -> ti.Ndarray:
+    array = ti.ndarray(ti.i32, max(len(values), 1))
+    array.from_numpy(np.ascontiguousarray(values if len(values) else [0], dtype=np.int32))
+    return array

@@ -1,0 +1,267 @@
+"""Bodies that move through smoke."""
+
+import numpy as np
+import pytest
+from thread_counts import outputs_by_threads
+
+from sim.build import build_world
+from sim.coupling.smoke_rigid import SmokeRigidCoupling
+from sim.rigid import rotation
+from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.solver import RigidSolver
+from sim.scene import DomainParameters, SceneParameters
+from sim.smoke.obstacles import AIR, MOVING, STATIC
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
+
+FPS = 60.0
+SOURCE = {"shape": {"type": "sphere", "radius": 0.1}, "position": (0.85, 0.25, 0.25)}
+PISTON = {"name": "piston", "kind": "kinematic", "shape": {"type": "box", "size": (0.5, 0.6, 0.6)}}
+TOLERANCE = 1.0e-5
+"""Of the projection, which is the default."""
+
+
+def build(bodies, *, cells: int = 16, size=(1.0, 0.5, 0.5), open_faces=("x+",), **smoke):
+    """A box of air whose longest side is 1 m and so many cells long, with bodies in it."""
+    scene = {
+        "domain": {"min": (0.0, 0.0, 0.0), "max": size},
+        "gravity": (0.0, 0.0, 0.0),
+        "rigid": bodies,
+        "smoke": [{"name": "air", "source": [SOURCE], "cell_size": 1.0 / cells, "open_faces": open_faces, **smoke}],
+    }
+    return build_world(SceneParameters.model_validate(scene), frames_per_second=FPS)
+
+
+def smoke_of(world):
+    return next(solver for solver in world._solvers.values() if solver.name == "air")
+
+
+def face_velocities(smoke):
+    names = ("u_face_x", "v_face_y", "w_face_z")
+    state = smoke.checkpoint()
+    return [smoke.grid.trim(state[name], smoke.grid.face_shape(axis)) for axis, name in enumerate(names)]
+
+
+@pytest.fixture(scope="module")
+def channel(taichi_cpu):
+    """A channel that is open at one end, and a piston that comes in through the other at 1.2 m/s."""
+    speed = 1.2
+    return build([{**PISTON, "position": (0.005, 0.25, 0.25), "velocity": (speed, 0.0, 0.0)}]), speed
+
+
+def test_a_piston_pushes_air_out_of_a_channel_at_its_own_speed_until_it_has_left_itself(channel):
+    world, speed = channel
+    smoke = smoke_of(world)
+    start = world.checkpoint()
+    for frame in range(1, 7):
+        numbers = world.advance_frame().diagnostics["air"]
+        u, v, w = face_velocities(smoke)
+        # The box ends at 0.255 m + 0.02 m a frame; cells are in it whose centres are.
+        end = np.count_nonzero((np.arange(16) + 0.5) / 16 < 0.255 + 0.02 * frame)
+        assert (~smoke.obstacles.is_air()).sum() == end * 64
+        # Each of up to 12 cells may add its part of the divergence.
+        assert np.abs(u[end:] - speed).max() < 12 * TOLERANCE * speed
+        assert max(np.abs(v[end:]).max(), np.abs(w[end:]).max()) < 12 * TOLERANCE * speed
+        assert numbers["compression"] == 0.0
+    assert numbers["covered_mass"] == 0.0
+    for _ in range(60):
+        numbers = world.advance_frame().diagnostics["air"]
+        assert numbers["not_converged"] == 0.0
+    assert smoke.obstacles.is_air().all()
+    # It has swept the channel, and smoke was in its way.
+    assert numbers["covered_mass"] > 0.0
+    world.restore(0, start)
+
+
+def test_a_run_that_is_killed_and_resumed_has_the_same_bits(channel):
+    world, _ = channel
+    start = world.checkpoint()
+    for _ in range(3):
+        world.advance_frame()
+    half = world.checkpoint()
+    for _ in range(10):
+        world.advance_frame()
+    uninterrupted = world.checkpoint()
+    world.restore(0, start)
+    world.advance_frame()
+    world.restore(3, half)
+    for _ in range(10):
+        world.advance_frame()
+    for name, array in world.checkpoint().items():
+        assert np.array_equal(array, uninterrupted[name]), name
+    world.restore(0, start)
+
+
+@pytest.mark.slow
+def test_a_body_that_rests_acts_as_a_static_one_to_the_bit():
+    ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.13}, "position": (0.52, 0.27, 0.26)}
+    states = []
+    for kind in ("static", "kinematic"):
+        world = build([{**ball, "kind": kind}], source=[{**SOURCE, "velocity": (-1.0, 0.0, 0.0)}])
+        for _ in range(12):
+            world.advance_frame()
+        states.append(world.checkpoint())
+    assert np.abs(states[0]["air/w_face_z"]).max() > 0.01
+    for name in ("u_face_x", "v_face_y", "w_face_z", "density", "excess_temperature"):
+        assert np.array_equal(states[0][f"air/{name}"], states[1][f"air/{name}"]), name
+
+
+SHAPES = (
+    ({"type": "sphere", "radius": 0.12}, (0.2, 0.2, 0.2)),
+    ({"type": "box", "size": (0.3, 0.15, 0.2)}, (0.5, 0.2, 0.25)),
+    ({"type": "cylinder", "radius": 0.1, "height": 0.3}, (0.8, 0.25, 0.25)),
+    ({"type": "capsule", "radius": 0.08, "height": 0.2}, (0.2, 0.6, 0.3)),
+    ({"type": "torus", "major_radius": 0.14, "minor_radius": 0.06}, (0.5, 0.6, 0.4)),
+    ({"type": "cone", "radius": 0.13, "height": 0.3}, (0.8, 0.7, 0.3)),
+    ({"type": "bunny"}, (0.45, 0.5, 0.8)),
+    # Half of it is outside of the smoke's box.
+    ({"type": "sphere", "radius": 0.1}, (1.0, 0.45, 0.8)),
+)
+
+
+def test_cells_whose_centres_are_in_a_body_are_solid_and_have_its_velocity():
+    bodies = [
+        {
+            "name": f"body{number}",
+            # Only kinematic ones may start in a wall.
+            **({"kind": "kinematic"} if position[0] == 1.0 else {"kind": "dynamic", "density": 500.0}),
+            "shape": shape,
+            "scale": 2.0 if shape["type"] == "bunny" else 1.0,
+            "position": position,
+            "rotation_deg": (20.0, -35.0, 50.0 + number),
+            "velocity": (0.1 * number, 0.2, -0.3),
+            "angular_velocity": (1.0, -2.0, 0.5 * number),
+        }
+        for number, (shape, position) in enumerate(SHAPES)
+    ]
+    # A post stands in the way of the ball that sticks out.
+    post = {"name": "post", "shape": {"type": "box", "size": (0.1, 0.1, 0.4)}, "position": (0.95, 0.45, 0.8)}
+    world = build([*bodies, post], cells=40, size=(1.0, 1.0, 1.0))
+    smoke, rigid = smoke_of(world), world._solvers["rigid"]
+    grid, state = smoke.grid, rigid.bodies
+    centres = grid.cell_centres()
+    kind = grid.trim(smoke.obstacles.state.to_numpy(), grid.cells).ravel()
+    assert np.array_equal(kind == STATIC, grid.solid.ravel())
+    solid = kind != AIR
+    velocity = np.stack(
+        [
+            grid.trim(field.to_numpy(), grid.cells).ravel()
+            for field in (smoke.obstacles.velocity_x, smoke.obstacles.velocity_y, smoke.obstacles.velocity_z)
+        ],
+        axis=1,
+    )
+    covered = np.zeros(len(centres), bool)
+    for number, geometry in enumerate(rigid.solids):
+        arm = centres - state.position[number]
+        near = np.linalg.norm(arm, axis=1) < geometry.radius + grid.cell_size
+        distance = np.full(len(centres), np.inf)
+        distance[near] = geometry.signed_distance(arm[near] @ rotation.matrices(state.orientation[number]))
+        # Distances of meshes come from a grid whose cells are a fortieth of the longest edge or so.
+        slack = 0.01 if SHAPES[number][0]["type"] == "bunny" else 1.0e-6
+        inside = distance < -slack
+        assert solid[inside].all()
+        covered |= distance < slack
+        moving = inside & (kind == MOVING)
+        assert moving.sum() > 20
+        expected = state.velocity[number] + np.cross(state.angular_velocity[number], arm[moving])
+        # Single precision of speeds of about 1 m/s.
+        assert np.abs(velocity[moving] - expected).max() < 1.0e-6
+    assert not (kind == MOVING)[~covered].any()
+
+
+def test_a_body_that_is_thinner_than_a_cell_is_refused(channel):
+    world, _ = channel
+    plate = {"name": "plate", "kind": "kinematic", "shape": {"type": "box", "size": (0.05, 0.3, 0.3)}}
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 0.5, 0.5))
+    rigid = RigidSolver([RigidBodyParameters(**plate)], domain=domain, gravity=(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match=r'smoke "air": "plate", a body 0\.05 m thin, would fall between its cells'):
+        SmokeRigidCoupling(rigid, smoke_of(world))
+
+
+def velocity_ahead_of_a_sphere(cells: int) -> np.ndarray:
+    """Along the path of a sphere of 1/8 m that has just started to move in still air, over its own velocity."""
+    speed = 0.3
+    ball = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.125}}
+    ball |= {"position": (0.5 - speed / FPS, 0.5, 0.5), "velocity": (speed, 0.0, 0.0)}
+    world = build(
+        [ball], cells=cells, size=(1.0, 1.0, 1.0), open_faces=(), buoyancy_temperature=0.0, buoyancy_density=0.0,
+        vorticity_confinement=0.0,
+    )  # fmt: skip
+    numbers = world.advance_frame().diagnostics["air"]
+    assert numbers["residual"] <= TOLERANCE
+    u, v, w = (face / speed for face in face_velocities(smoke_of(world)))
+    # The flow is that of a dipole: the same ahead and behind, left and right, and about its axis; the projection's
+    # tolerance, summed over the cells of a side.
+    slack = cells * TOLERANCE
+    assert np.abs(u - u[::-1]).max() < slack
+    assert np.abs(u - u[:, ::-1]).max() < slack
+    assert np.abs(u - u.transpose(0, 2, 1)).max() < slack
+    assert np.abs(v + v[::-1]).max() < slack
+    assert np.abs(v - w.transpose(0, 2, 1)).max() < slack
+    middle = slice(cells // 2 - 1, cells // 2 + 1)
+    mean: np.ndarray = u[:, middle, middle].mean(axis=(1, 2))
+    return mean
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cells", [32, 64])
+def test_air_flows_around_a_sphere_as_around_a_dipole(cells):
+    radius = 0.125
+    ahead = velocity_ahead_of_a_sphere(cells)
+    distance = np.arange(cells + 1) / cells - 0.5
+    near = (distance > 1.4 * radius) & (distance < 2.1 * radius)
+    # u = U (R/r)³ on the axis, with the radius that the air sees. A staircase's is within half a cell of the sphere's;
+    # measured: 0.25 cells more at 32 cells a metre, 0.19 at 64. Images behind the walls add less than 0.1 cells.
+    excess = np.cbrt(ahead[near]) * distance[near] - radius
+    assert np.abs(excess).max() * cells < 0.5
+
+
+THREADS = """
+import hashlib, sys
+from sim.runtime import initialize
+initialize("cpu", threads=int(sys.argv[1]))
+from test_smoke_rigid import PISTON, build
+ball = {"name": "ball", "kind": "dynamic", "density": 300.0, "shape": {"type": "sphere", "radius": 0.1}}
+ball |= {"position": (0.6, 0.25, 0.25), "velocity": (-1.0, 0.3, 0.1), "angular_velocity": (3.0, 1.0, 0.0)}
+piston = {**PISTON, "position": (0.005, 0.25, 0.25), "velocity": (1.2, 0.0, 0.0)}
+world = build([piston, ball], open_faces=())
+for _ in range(6):
+    world.advance_frame()
+digest = hashlib.sha256()
+for name, array in sorted(world.checkpoint().items()):
+    digest.update(array.tobytes())
+print(digest.hexdigest(), world.diagnostics()["air"]["compression"] > 1.0)
+"""
+
+
+@pytest.mark.slow
+def test_smoke_and_bodies_do_not_depend_on_the_number_of_threads():
+    digests = outputs_by_threads(THREADS, beside=__file__)
+    assert digests[0].split()[1] == "True"
+    assert digests[0] == digests[1]
+
+
+@pytest.mark.slow
+def test_a_ball_that_flies_through_a_layer_of_smoke_keeps_its_mass():
+    ball = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.14}}
+    ball |= {"position": (0.2, 0.5, 0.5), "velocity": (1.0, 0.0, 0.0)}
+    world = build(
+        [ball],
+        cells=32,
+        size=(1.0, 1.0, 1.0),
+        open_faces=(),
+        vorticity_confinement=0.0,
+        source=[{**SOURCE, "start_s": 100.0}],
+    )
+    state = world.checkpoint()
+    x = (np.arange(34) - 0.5) / 32
+    state["air/density"][1:-1, 1:-1, 1:-1] = ((x > 0.42) & (x < 0.62))[1:-1, None, None]
+    world.restore(0, state)
+    before = world.diagnostics()["air"]["mass"]
+    for _ in range(34):
+        numbers = world.advance_frame().diagnostics["air"]
+    # It has bored a hole of its own diameter, whose smoke would be 6 % of the layer. Dropping what it covers makes up
+    # for what look-ups across its moving side have brought in: measured, 2.2 % of the mass are missing in the end.
+    bored = np.pi * 0.14**2 * 0.2
+    assert numbers["covered_mass"] - numbers["uncovered_mass"] > 0.8 * bored
+    assert numbers["mass"] == pytest.approx(before, rel=0.03)

@@ -1,0 +1,212 @@
+import numpy as np
+import pytest
+from scipy import ndimage
+from smoke_scenes import OPEN_BOX, mark, unit_grid
+
+from sim.scene import DomainParameters
+from sim.smoke.grid import SmokeGrid
+from sim.smoke.multigrid_levels import Coefficients
+from sim.smoke.obstacles import Obstacles
+from sim.smoke.parameters import SmokeParameters
+from sim.smoke.regions import ClosedRegions
+from sim.smoke.solver import SmokeSolver
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
+
+CELLS = (16, 8, 8)
+CELL_SIZE = 1.0 / 16
+DT = 0.01
+SPEED = 0.3
+TOLERANCE = 1.0e-5
+"""Of the projection, which is the default; a speed that adds up over n cells may be off by n times as much."""
+
+
+@pytest.fixture(scope="module")
+def shared_box(taichi_cpu):
+    parameters = SmokeParameters(
+        name="air",
+        cell_size=CELL_SIZE,
+        source=[{"shape": {"type": "sphere", "radius": 0.07}, "position": (0.9, 0.25, 0.25)}],
+        open_faces=(),
+        buoyancy_density=0.0,
+        buoyancy_temperature=0.0,
+        vorticity_confinement=0.0,
+        cooling=0.0,
+    )
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 0.5, 0.5))
+    return SmokeSolver(parameters, domain=domain, gravity=(0.0, 0.0, -9.81), moving=True)
+
+
+@pytest.fixture
+def box(shared_box):
+    """A closed box of air at rest with nothing in it."""
+    shared_box.restore({name: np.zeros_like(array) for name, array in shared_box.checkpoint().items()})
+    shared_box.begin_frame(0.0)
+    shared_box.obstacles.expect("test", 0.0)
+    return shared_box
+
+
+def block(*ranges: slice) -> np.ndarray:
+    mask = np.zeros(CELLS, bool)
+    mask[ranges] = True
+    return mask
+
+
+def velocity(solver: SmokeSolver, axis: int) -> np.ndarray:
+    name = ("u_face_x", "v_face_y", "w_face_z")[axis]
+    return solver.grid.trim(solver.checkpoint()[name], solver.grid.face_shape(axis))
+
+
+def fill_with_smoke(solver: SmokeSolver) -> None:
+    state = solver.checkpoint()
+    state["density"][1:-1, 1:-1, 1:-1] = 1.0
+    solver.restore(state)
+
+
+def test_a_piston_in_a_closed_box_compresses_the_air_evenly(box):
+    mark(box.obstacles, block(slice(0, 4)), (SPEED, 0.0, 0.0))
+    box.substep(DT)
+    # div u is the same everywhere, so that u falls linearly from the piston, at 4 cells, to the wall at 16.
+    expected = SPEED * (1.0 - (np.arange(4, 17) - 4) / 12)
+    assert np.abs(velocity(box, 0)[4:] - expected[:, None, None]).max() < 12 * TOLERANCE * SPEED
+    assert np.abs(velocity(box, 1)[4:]).max() < 12 * TOLERANCE * SPEED
+    numbers = box.diagnostics()
+    assert numbers["compression"] == pytest.approx(SPEED / (12 * CELL_SIZE), rel=1.0e-6)
+    assert numbers["not_converged"] == 0.0
+    assert numbers["residual"] <= TOLERANCE
+
+
+def test_a_wall_that_moves_through_a_closed_box_stretches_one_side_and_compresses_the_other(box):
+    mark(box.obstacles, block(slice(8, 9)), (SPEED, 0.0, 0.0))
+    box.substep(DT)
+    u = velocity(box, 0)
+    left, right = SPEED * np.arange(9) / 8, SPEED * (1.0 - np.arange(8) / 7)
+    assert np.abs(u[:9] - left[:, None, None]).max() < 8 * TOLERANCE * SPEED
+    assert np.abs(u[9:] - right[:, None, None]).max() < 8 * TOLERANCE * SPEED
+    assert box.diagnostics()["compression"] == pytest.approx(SPEED / (7 * CELL_SIZE), rel=1.0e-6)
+    # Once it is gone the two are one again, and nothing presses on it.
+    box.begin_frame(DT)
+    box.substep(DT)
+    assert box.obstacles.is_air().all()
+    # Rounding alone: speeds of 0.3 m/s in single precision err by 3e-8, over a cell of 1/16 m.
+    assert box.diagnostics()["compression"] < 1.0e-6
+
+
+def test_a_body_inside_closed_walls_compresses_nothing(box):
+    mark(box.obstacles, block(slice(5, 9), slice(2, 5), slice(3, 6)), (SPEED, -0.2, 0.1))
+    box.substep(DT)
+    numbers = box.diagnostics()
+    assert numbers["compression"] < 1.0e-6
+    assert numbers["residual"] <= TOLERANCE
+    u, v, w = (velocity(box, axis) for axis in range(3))
+    assert (u[[5, 9], 2:5, 3:6] == np.float32(SPEED)).all()
+    assert (v[5:9, [2, 5], 3:6] == np.float32(-0.2)).all()
+    assert (w[5:9, 2:5, [3, 6]] == np.float32(0.1)).all()
+    u[5:10, 2:5, 3:6] = SPEED  # what is inside of it, where the flow along it is continued
+    # Air flows back beside it: through every cross-section, with the body's own part, no volume passes.
+    for i in range(17):
+        assert abs(u[i].sum(dtype=np.float64)) < 64 * 16 * TOLERANCE * SPEED
+
+
+def test_a_body_passes_through_even_smoke_and_leaves_it_even(box):
+    fill_with_smoke(box)
+    cell_volume = CELL_SIZE**3
+    for step in range(24):
+        # A third of a cell in each step.
+        first = 2 + step // 3
+        mark(box.obstacles, block(slice(first, first + 3), slice(3, 6), slice(2, 5)), (CELL_SIZE / 3 / DT, 0.0, 0.0))
+        box.substep(DT)
+        density = box.snapshots()["air"].arrays["density"]
+        air = box.obstacles.is_air()
+        assert (~air).sum() == 27
+        assert not density[~air].any()
+        # Means and interpolation of ones are ones, but for a rounding of each of 24 steps.
+        assert np.abs(density[air] - 1.0).max() < 24 * 4 * 6.0e-8
+    numbers = box.diagnostics()
+    # It entered 27 cells at the start, and with each of 7 steps onwards 9 new ones; behind it 9 came free.
+    assert numbers["covered_mass"] == pytest.approx((27 + 7 * 9) * cell_volume, rel=1.0e-5)
+    assert numbers["uncovered_mass"] == pytest.approx(7 * 9 * cell_volume, rel=1.0e-5)
+    assert numbers["mass"] == pytest.approx((16 * 8 * 8 - 27) * cell_volume, rel=1.0e-5)
+
+
+def test_what_is_deep_in_a_body_is_gone_when_it_leaves(box):
+    fill_with_smoke(box)
+    mark(box.obstacles, block(slice(0, 12)), (0.0, 0.0, 0.0))
+    box.substep(DT)
+    box.substep(DT)
+    density = box.snapshots()["air"].arrays["density"]
+    # Three layers of smoke are continued into it, as cfl = 2; a body that moves by cells never leaves more.
+    assert (density[9:] == 1.0).all()
+    assert not density[:9].any()
+
+
+def test_a_source_emits_nothing_where_a_body_stands(box):
+    mark(box.obstacles, block(slice(12, 16)), (0.0, 0.0, 0.0))
+    box.substep(DT)
+    assert box.diagnostics()["emitted_mass"] == 0.0
+    box.substep(DT)
+    assert box.diagnostics()["emitted_mass"] > 0.0
+
+
+def test_obstacles_cross_one_cell_in_a_step_at_most(box):
+    before = box.stable_dt()
+    box.obstacles.expect("test", 1.0e3)
+    assert box.stable_dt() == pytest.approx(CELL_SIZE / 1.0e3, rel=1.0e-12)
+    box.obstacles.expect("test", 0.0)
+    assert box.stable_dt() == before
+
+
+def test_coefficients_that_followed_obstacles_equal_those_of_static_ones(box):
+    random = np.random.default_rng(4)
+    for share in (0.5, 0.1, 0.3):
+        solid = random.random(CELLS) < share
+        mark(box.obstacles, solid, (0.0, 0.0, 0.0))
+        box.move_obstacles()
+    followed = box._projection.multigrid
+    static = Coefficients(Obstacles(SmokeGrid(box.grid.origin, CELL_SIZE, CELLS, frozenset(), solid)))
+    for mine, other in zip(followed.coefficients.fields, static.fields, strict=True):
+        assert np.array_equal(mine.to_numpy(), other.to_numpy())
+    assert np.array_equal(followed.coefficients.inverse_diagonal.to_numpy(), static.inverse_diagonal.to_numpy())
+    assert np.array_equal(followed._coarsest_conductance, static.coarsest_conductance())
+    # Many cells are shut in alone, and have no equation.
+    assert (static.inverse_diagonal.to_numpy()[: box.grid.size] == 0.0).sum() > 0
+
+
+@pytest.mark.parametrize("open_faces", [(), OPEN_BOX, ("z-", "y+")], ids=["closed", "open", "two open sides"])
+def test_closed_regions_are_the_connected_components_that_touch_no_open_side(open_faces):
+    grid = unit_grid((12, 9, 17), open_faces)
+    obstacles = Obstacles(grid, moving=True)
+    regions = ClosedRegions(obstacles)
+    random = np.random.default_rng(7)
+    counts = []
+    # Three quarters of solid leave dozens of pockets, a third one large winding region.
+    for share in (0.75, 0.33, 0.6, 0.0):
+        solid = random.random(grid.cells) < share
+        mark(obstacles, solid, (0.0, 0.0, 0.0))
+        obstacles.commit(obstacles.velocity_x)
+        regions.find()
+        labels, count = ndimage.label(~solid)
+        outside = {0}
+        for axis in range(3):
+            for side in (0, 1):
+                if grid.is_open(axis, side):
+                    outside |= set(np.unique(np.take(labels, -side, axis=axis)))
+        expected = [label for label in range(1, count + 1) if label not in outside]
+        assert regions.count == len(expected)
+        counts.append(regions.count)
+        if regions.count == 0:
+            continue
+        numbers = grid.trim(regions.number.to_numpy(), grid.cells)
+        for label in expected:
+            (number,) = np.unique(numbers[labels == label])
+            assert (numbers == number).sum() == (labels == label).sum()
+        assert (numbers == -1).sum() == np.isin(labels, list(outside)).sum()
+    assert counts[0] > 50
+    assert counts[-1] == (1 if not open_faces else 0)
+
+
+def test_a_checkpoint_without_the_obstacles_is_refused(box):
+    state = box.checkpoint()
+    del state["obstacles"]
+    with pytest.raises(ValueError, match=r"obstacles must have shape \(18, 10, 10\), got nothing"):
+        box.restore(state)
