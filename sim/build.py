@@ -194,10 +194,15 @@ def _couple_smokes(
     """Each smoke with what is in its way, which is put there, and with what hangs in it."""
     from sim.coupling.smoke_cloth import SmokeClothCoupling
     from sim.coupling.smoke_fluid import SmokeFluidCoupling
+    from sim.coupling.smoke_reach import too_thin_bodies
     from sim.coupling.smoke_rigid import SmokeRigidCoupling
 
     couplings: list[Coupling] = []
+    moving = [body for body in scene.rigid if body.kind != "static"]
     for number, smoke in enumerate(smokes):
+        solids = [] if rigid is None else rigid.solids
+        for body, reason in too_thin_bodies(smoke.parameters, moving, solids, scene.domain):
+            raise ValueError(f'"{moving[body].name}" {reason}')
         in_the_way: list[Coupling] = []
         if _meets_fluid(smoke.parameters, scene):
             in_the_way += [SmokeFluidCoupling(fluid, smoke, domain=scene.domain) for fluid in fluids]

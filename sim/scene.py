@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from sim.cloth.parameters import ClothParameters
+from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.fluid.parameters import FluidParameters
 from sim.parameters import Parameters, Vector3
 from sim.rigid.parameters import RigidBodyParameters
@@ -63,6 +63,8 @@ class SceneParameters(Parameters):
 
     @model_validator(mode="after")
     def _has_one_air(self) -> Self:
+        if self.smoke and (conflict := conflict_in_one_air(self.cloth)):
+            raise ValueError(conflict)
         for number, smoke in enumerate(self.smoke):
             for other in self.smoke[:number]:
                 if self.cloth and boxes_overlap(smoke.corners(self.domain), other.corners(self.domain)):

@@ -11,12 +11,18 @@ FAMILIES = {"cloth": "cloth", "coupling": "fluid", "fluid": "fluid", "rigid": "r
 """Folders of tests/sim whose tests share kernels, and a name for those that share them."""
 
 
+def bytecode_folder() -> Path:
+    """Where compiled modules are kept; a relative XDG_CACHE_HOME counts as none, as its specification has it."""
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (named if named.is_absolute() else Path.home() / ".cache") / "physics-pipeline" / "bytecode"
+
+
 def keep_bytecode() -> None:
     """Keep compiled modules where Python is told not to write them beside their sources.
 
     Tests start some hundred processes: compiling the sources of the libraries anew takes each a second.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "physics-pipeline" / "bytecode"
+    cache = bytecode_folder()
     sys.dont_write_bytecode, sys.pycache_prefix = False, str(cache)
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     os.environ["PYTHONPYCACHEPREFIX"] = str(cache)

@@ -19,7 +19,7 @@ from pipeline.job.mesh_checks import mesh_exists
 from pipeline.job.models import Job
 from pipeline.job.placements import placements
 from pipeline.job.positions import KeyPath
-from pipeline.job.problems import Findings
+from pipeline.job.problems import Findings, format_path
 from pipeline.job.rigid_checks import check_ballast, check_rigid_start
 from pipeline.job.step_checks import check_time_steps
 from sim.fluid.parameters import FluidParameters
@@ -37,7 +37,7 @@ NEIGHBOR_BYTES = 240
 """The neighbour list's part of that at a support of two spacings; it grows with the cube of the support."""
 BYTES_PER_CELL = 250
 """Upper bound of what the smoke solver takes, multigrid levels and snapshot included: 92 for itself and what moves in
-it, 28 for fluid, 24 for cloth."""
+it, 32 for fluid, 24 for cloth."""
 BYTES_PER_SEARCH_CELL = 16
 """Starts and counts of fluid and boundary; a cell is as wide as the support radius, two particle spacings."""
 BYTES_PER_WALL_SAMPLE = 150
@@ -62,6 +62,7 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
     budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
     findings.particles = sum(_check_fluid(job, index, solids, budget, findings) for index in range(len(job.fluid)))
     findings.nodes = check_cloths(job, solids, budget, findings)
+    _check_bodies_in_smoke(job, solids, findings)
     findings.cells = sum(_check_smoke(job, index, solids, budget, findings) for index in range(len(job.smoke)))
 
 
@@ -266,7 +267,30 @@ def _check_smoke(
     for path, solid in solids.items():
         if path[:3] == ("smoke", index, "source"):
             _check_source(path, solid, box, smoke.cell_size, findings)
+            _check_what_fills_source(job, path, solid, solids, findings)
     return int(cells)
+
+
+def _check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+    """Note bodies that move and are too thin for the cells of a smoke into whose box they can come."""
+    from sim.coupling.smoke_reach import too_thin_bodies
+    from sim.rigid.geometry import BodyGeometry
+    from sim.shapes import ShapeError
+
+    moving = [index for index, body in enumerate(job.rigid) if body.kind != "static" and ("rigid", index) in solids]
+    if not (moving and job.smoke):
+        return
+    bodies = [job.rigid[index] for index in moving]
+    geometries = []
+    for index, body in zip(moving, bodies, strict=True):
+        try:
+            geometries.append(BodyGeometry(body))
+        except ShapeError as error:
+            findings.error(("rigid", index, "shape"), f"is too thin for a body that moves in smoke: {error}")
+            return
+    for smoke in job.smoke:
+        for number, reason in too_thin_bodies(smoke, bodies, geometries, job.domain):
+            findings.error(("rigid", moving[number]), reason)
 
 
 def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, most_cells: int) -> float:
@@ -277,6 +301,22 @@ def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, most_cel
         # Counts are rounded up: the next size of use is the one that saves a layer of cells.
         size = float(np.min(extent[layers > 1.0] / (layers[layers > 1.0] - 1.0))) * (1.0 + 1.0e-9)
     return size
+
+
+def _check_what_fills_source(
+    job: Job, path: KeyPath, source: Solid, solids: Mapping[KeyPath, Solid], findings: Findings
+) -> None:
+    """Warn of a source wholly within water or a body that moves, as far as the corners of its box tell."""
+    corners = np.array(np.meshgrid(*source.bounds.T)).reshape(3, 8).T
+    for other, solid in solids.items():
+        is_mover = other[0] == "rigid" and job.rigid[int(other[1])].kind != "static"
+        if not (is_mover or other[0] == "fluid") or not touch(solid.bounds, source.bounds, margin=0.0):
+            continue
+        if (solid.signed_distance(corners) < 0.0).all():
+            findings.warn(
+                path,
+                f"lies wholly inside {format_path(other)} at the start, and emits nothing until that has moved off",
+            )
 
 
 def _check_source(path: KeyPath, solid: Solid, grid: Box, cell_size: float, findings: Findings) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import taichi as ti
 
 from sim.arrays import Floats, Vectors
-from sim.cloth.parameters import ClothParameters
+from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
@@ -27,7 +27,7 @@ class ClothAir:
         velocity: of the air at each triangle [m/s], (k,) vec3.
         inverse_mass: area of cloth over the mass of the air that it acts on [m²/kg], (k,); 0 for wind.
         source: number of what the air belongs to, (k,) int32; `WIND` for wind.
-        density: of the air [kg/m³], (k,).
+        density: of the air [kg/m³], (k,); 0 where it drags nothing.
         force: of the air on each triangle in the last substep [N], (k,) vec3.
         impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3.
         wind: of the parameters [m/s], (k,) vec3.
@@ -35,6 +35,7 @@ class ClothAir:
         triangle_start: the triangles of node i are `triangle_list[triangle_start[i]:triangle_start[i + 1]]`.
         triangle_list: in ascending order of the nodes, then of the triangles.
         acts: whether any cloth has air that drags.
+        is_shared: whether a coupling puts air there, of which there is one for all cloths.
     """
 
     def __init__(self, state: ClothState) -> None:
@@ -50,7 +51,7 @@ class ClothAir:
         self.source = ti.ndarray(ti.i32, count)
         self.source.fill(WIND)
         self.wind = ti.Vector.ndarray(3, ti.f32, count)
-        self.acts = False
+        self.acts = self.is_shared = False
         triangles = host.triangles
         order = np.argsort(triangles.ravel(), kind="stable")
         start = np.searchsorted(triangles.ravel()[order], np.arange(state.vertex_count + 1))
@@ -63,15 +64,24 @@ class ClothAir:
         self.share.from_numpy((host.node_area / around).astype(np.float32))
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
-        """Drag and wind as the parameters have them now; air that a coupling put there stays."""
+        """Drag and wind as the parameters have them now; air that a coupling put there stays.
+
+        Raises:
+            ValueError: air of a coupling would have two densities.
+        """
+        if self.is_shared and (conflict := conflict_in_one_air(cloths)):
+            raise ValueError(conflict)
         host = self._state.host
         drag = [
             [0.5 * cloth.air_density * cloth.drag for cloth in cloths],
             [0.5 * cloth.air_density * cloth.skin_drag for cloth in cloths],
             [cloth.mass_per_area for cloth in cloths],
         ]
-        self._drag.from_numpy(np.stack([host.of_triangles(each) for each in drag], axis=1).astype(np.float32))
-        self.density.from_numpy(host.of_triangles([cloth.air_density for cloth in cloths]).astype(np.float32))
+        of_triangles = np.stack([host.of_triangles(each) for each in drag], axis=1)
+        of_triangles[:, 2] *= triangle_areas(host.position, host.triangles)
+        self._drag.from_numpy(of_triangles.astype(np.float32))
+        density = [cloth.air_density if cloth.drag + cloth.skin_drag > 0.0 else 0.0 for cloth in cloths]
+        self.density.from_numpy(host.of_triangles(density).astype(np.float32))
         wind = [host.of_triangles([cloth.wind[axis] for cloth in cloths]) for axis in range(3)]
         wind_of = np.stack(wind, axis=1).astype(np.float32)
         self.wind.from_numpy(wind_of)
@@ -125,8 +135,8 @@ def blow_on_triangles(
         F = rho A / 2 (C_n |v_n| v_n + C_t |v_t| v_t),   v_n + v_t = air - cloth
 
     with the cloth's velocity at the end of the step, as far as gravity and the air change it: stable for light cloth in
-    strong wind, and exact at terminal speed. `drag` is (rho C_n / 2, rho C_t / 2, mass per area); a triangle yields by
-    the share of its nodes that are not pinned.
+    strong wind, and exact at terminal speed. `drag` is (rho C_n / 2, rho C_t / 2, mass of the triangle [kg]), which
+    keeps its mass where it is stretched; it yields by the share of its nodes that are not pinned.
 
     The air's velocity is what a coupling last found. What the cloth took from it since bounds the force: a part of it
     with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
@@ -147,7 +157,7 @@ def blow_on_triangles(
             for k in ti.static(range(3)):
                 i = triangles[t][k]
                 free += ti.select(inverse_mass[i] > 0.0, air_share[i], 0.0)
-            mobility = free / drag[t][2]
+            mobility = free * area / drag[t][2]
             air_mobility = air_inverse_mass[t]
             past = air_velocity[t] - mean - dt * free * gravity
             left = past - air_mobility / area * impulse[t]

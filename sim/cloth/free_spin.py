@@ -28,7 +28,8 @@ class FreeSpin:
         I t = -sum m (x - X) x e,   e_i += t x (x_i - X),
 
     with e the displacements by springs and I the moments of inertia. Linear momentum stays, and no spring is stretched
-    to first order. Where pins hold a cloth, they have a torque of their own, and nothing is returned.
+    to first order. Where pins hold a cloth, they have a torque of their own, and nothing is returned; nor to a mesh of
+    several pieces, as what one has lost is not the others'.
     """
 
     def __init__(self, state: ClothState) -> None:

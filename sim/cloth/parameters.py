@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
@@ -266,6 +267,27 @@ def shared_conflicts(cloths: tuple[ClothParameters, ...]) -> list[tuple[int, str
         for key in SHARED_KEYS
         if getattr(cloth, key) != getattr(cloths[0], key)
     ]
+
+
+THINNEST_AIR = 1.0e-3
+"""Least density of air that cloth and smoke share [kg/m³]: thinner air would be thrown about faster than sums hold."""
+
+
+def conflict_in_one_air(cloths: Sequence[ClothParameters]) -> str | None:
+    """Why cloths cannot hang in the air of a smoke, a sentence; each may have none, air_density = 0."""
+    in_air = [cloth for cloth in cloths if cloth.air_density > 0.0]
+    for cloth in in_air:
+        if cloth.air_density < THINNEST_AIR:
+            return (
+                f'air_density of cloth "{cloth.name}" is {cloth.air_density:g} kg/m³; beside smoke it must be 0, or '
+                f"{THINNEST_AIR:g} kg/m³ at least"
+            )
+        if cloth.air_density != in_air[0].air_density:
+            return (
+                f'air_density of cloth "{cloth.name}" is {cloth.air_density:g} kg/m³, but that of '
+                f'"{in_air[0].name}" {in_air[0].air_density:g} kg/m³; smoke has one air: give them the same, or 0'
+            )
+    return None
 
 
 def _written(value: object) -> str:

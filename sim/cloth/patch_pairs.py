@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
 import taichi as ti
 
 from sim.cloth.patch_motion_kernels import (
@@ -65,10 +66,8 @@ class PairList:
         self._end.fill(0)
 
     def fill(self, search: Callable[..., None], state: ClothState, rest: ti.Ndarray, searched: ti.Ndarray, count: int,
-             *arguments: object) -> bool:  # fmt: skip
-        """Have a search list the elements of some pairs of patches; False if that needs more room than there was.
-
-        Then there is more room, and all pieces have to be filled anew.
+             *arguments: object) -> None:  # fmt: skip
+        """Have a search list the elements of some pairs of patches; the pieces of all others stay as they are.
 
         Raises:
             OverflowError: more pairs than any useful step has.
@@ -80,8 +79,7 @@ class PairList:
         if end < 0 or end > MAX_PAIRS:
             raise OverflowError(TOO_MANY)
         if end > self._capacity:
-            self._allocate(int(GROWTH * end))
-            return False
+            self._grow(int(GROWTH * end))
         self.end = int(end)
         if short:
             self._list(search, self._again, int(short), arguments)
@@ -89,7 +87,6 @@ class PairList:
             count, searched, self._start, self._found, self.vertices, self._are_edges, rest, state.body,
             state.thickness, self.wanted, self.patches,
         )  # fmt: skip
-        return True
 
     def _list(
         self, search: Callable[..., None], searched: ti.Ndarray, count: int, arguments: tuple[object, ...]
@@ -103,6 +100,14 @@ class PairList:
         self.vertices = ti.Vector.ndarray(4, ti.i32, capacity)
         self.wanted = ti.ndarray(ti.f32, capacity)
         self.patches = ti.ndarray(ti.i32, capacity)
+
+    def _grow(self, capacity: int) -> None:
+        """Make room for so many pairs, and keep those that are listed: when lists grow shows in no search after it."""
+        old, before = self._capacity, (self.vertices, self.wanted, self.patches)
+        self._allocate(capacity)
+        for source, target in zip(before, (self.vertices, self.wanted, self.patches), strict=True):
+            values = source.to_numpy()
+            target.from_numpy(np.concatenate([values, np.zeros((capacity - old, *values.shape[1:]), values.dtype)]))
 
 
 class PatchPairs:

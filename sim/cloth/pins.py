@@ -128,10 +128,13 @@ class Pins:
         """Hold more nodes from a time [s] on, and lead them by a way [m] in so many seconds; `hold` does the rest.
 
         Raises:
-            ValueError: a pin leads one of the nodes along its own path.
+            ValueError: a pin leads one of the nodes along its own path; the way is not finite, or takes no time.
         """
+        if not (np.isfinite(shift).all() and 0.0 < within_s < np.inf):
+            raise ValueError(f"a finite way in more than 0 s is needed, got {tuple(shift)} m within {within_s:g} s")
         for pin in self._pins:
-            if pin.path is not None and pin not in self._grips and np.isin(nodes, pin.nodes).any():
+            leads = pin.path is not None and pin not in self._grips and pin.holds(time_s)
+            if leads and np.isin(nodes, pin.nodes).any():
                 raise ValueError("a pin that moves holds one of the nodes; let it go first")
         # Those that were gripped before are led on from where they are.
         self._pins = [pin for pin in self._pins if pin not in self._grips or pin.drop(nodes)]

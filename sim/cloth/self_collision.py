@@ -56,7 +56,6 @@ class SelfCollision:
     def __init__(self, state: ClothState) -> None:
         self._patches = Patches(state.host)
         self._met = PatchPairs(self._patches)
-        self._added = 0.0
         self._rest = ti.Vector.ndarray(3, ti.f32, state.vertex_count)
         self._rest.from_numpy(state.host.position.astype(np.float32))
         self._half_edges = ti.Vector.ndarray(3, ti.f32, max(state.edge_count, 1))
@@ -71,7 +70,7 @@ class SelfCollision:
     def forget(self, state: ClothState) -> None:
         """Search anew at the next substep; thicknesses and flags may have changed."""
         self._searched = 0
-        self._used, self._reach = 0.0, -math.inf
+        self._used, self._added, self._reach = 0.0, 0.0, -math.inf
         self.thickness = float(state.thickness.to_numpy().max())
         self._collides.from_numpy(np.array(state.self_collision, dtype=np.int32))
 
@@ -95,8 +94,7 @@ class SelfCollision:
         is_new = self._used + nearer + more >= self._reach
         if is_new:
             self._pair_patches(nearer, more)
-        while not self._search(state, nearer, more, is_new=is_new):
-            is_new = True
+        self._search(state, nearer, more, is_new=is_new)
 
     def follow(self, state: ClothState, whole: float, change: float) -> None:
         """A substep is over.
@@ -141,8 +139,8 @@ class SelfCollision:
             for pairs in (self.with_triangles, self.of_edges):
                 pairs.set_pieces(self._met.capacity)
 
-    def _search(self, state: ClothState, nearer: float, more: float, *, is_new: bool) -> bool:
-        """Search the pairs of patches that have to be; False if that needs more room, and all of them a new search."""
+    def _search(self, state: ClothState, nearer: float, more: float, *, is_new: bool) -> None:
+        """Search the pairs of patches that have to be."""
         met, patches, edge = self._met, self._patches, self.mean_edge
         if is_new:
             self.with_triangles.clear()
@@ -150,15 +148,16 @@ class SelfCollision:
         least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
         count = met.age(self.thickness, least_skin, nearer, more, self._used, is_new=is_new)
         if not count:
-            return True
+            return
         self._searched += count
         where = (met.pairs, met.low, met.high, met.reach)
         triangles = (state.position, patches.first_vertex, patches.vertices, patches.first_triangle, patches.triangles)
         edges = (patches.first_edge, patches.edges, self._half_edges, self._edge_spheres)
         enclose_edges(state.edge_count, state.position, *edges[1:])
-        return self.with_triangles.fill(
+        self.with_triangles.fill(
             pair_vertices_with_triangles, state, self._rest, met.expired, count, *where, *triangles
-        ) and self.of_edges.fill(pair_edges, state, self._rest, met.expired, count, *where, *edges)
+        )
+        self.of_edges.fill(pair_edges, state, self._rest, met.expired, count, *where, *edges)
 
 
 def half_range(vectors: ti.Ndarray, count: int) -> tuple[float, float]:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from sim.arrays import Vectors
 from sim.cloth.parameters import ClothParameters
@@ -35,6 +37,7 @@ class HostCloths:
         triangles: (k, 3) int32.
         edges: of the triangles, each once, the smaller number first, sorted, (e, 2) int32.
         body: cloth of each node, (n,) int32.
+        is_connected: of each cloth, whether it is one piece.
     """
 
     names: tuple[str, ...]
@@ -47,6 +50,7 @@ class HostCloths:
     triangles: NDArray[np.int32]
     edges: NDArray[np.int32]
     body: NDArray[np.int32]
+    is_connected: tuple[bool, ...]
 
     @classmethod
     def of(cls, cloths: Sequence[ClothParameters], sheets: Sequence[RestSheet]) -> "HostCloths":
@@ -69,6 +73,7 @@ class HostCloths:
             triangles=triangles,
             edges=edges_of(triangles).nodes,
             body=np.repeat(np.arange(len(cloths), dtype=np.int32), counts),
+            is_connected=tuple(_is_connected(sheet) for sheet in sheets),
         )
 
     def of_nodes(self, values: Sequence[float]) -> NDArray[np.float64]:
@@ -78,6 +83,14 @@ class HostCloths:
     def of_triangles(self, values: Sequence[float]) -> NDArray[np.float64]:
         """A number of each cloth for each of its triangles, (k,)."""
         return np.repeat(np.asarray(values, dtype=np.float64), np.diff(self.first_triangle))
+
+
+def _is_connected(sheet: RestSheet) -> bool:
+    """Whether every node of a sheet can be reached from every other one along triangles."""
+    count = len(sheet.vertices)
+    a, b, c = sheet.triangles.T
+    links = coo_matrix((np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c]))), shape=(count, count))
+    return bool(connected_components(links, directed=False, return_labels=False) == 1)
 
 
 class ClothState:
@@ -104,7 +117,7 @@ class ClothState:
         edges: (e,) ivec2.
         names: of the cloths.
         self_collision: of each cloth: whether it collides with itself.
-        is_free: of each cloth: whether no pin holds any of its nodes.
+        is_free: of each cloth: whether it is one piece, and no pin holds any of its nodes.
         quantum: unit of the lattice [m].
         limit: end of the lattice on each axis, in quanta; nodes that come there are stopped.
     """
@@ -188,7 +201,9 @@ class ClothState:
     def set_pinned(self, is_pinned: NDArray[np.bool_]) -> None:
         """Hold these nodes, (n,), and no others."""
         held = np.bincount(self.host.body, weights=is_pinned, minlength=len(self.names))
-        self.is_free = tuple(bool(count == 0) for count in held)
+        self.is_free = tuple(
+            bool(count == 0) and whole for count, whole in zip(held, self.host.is_connected, strict=True)
+        )
         mass = self.mass.to_numpy()
         self.inverse_mass.from_numpy(np.where(is_pinned, 0.0, 1.0 / mass).astype(np.float32))
 

@@ -8,6 +8,7 @@ import taichi as ti
 
 from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.air import WIND, Triangles
+from sim.smoke.obstacles import time_of_travel
 
 if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver
@@ -70,6 +71,7 @@ class SmokeClothCoupling:
         self._fastest_past = 0.0
         self._reaches_cloth = False
         smoke.air_forces.append(self)
+        cloth.air.is_shared = True
         self.follow(0.0)
 
     # --- the coupling -----------------------------------------------------------------------------------------------
@@ -105,9 +107,7 @@ class SmokeClothCoupling:
         """Step [s] in which the air passes a cloth that falls by `MOST_CELLS_PASSED` cells."""
         speed, distance = self._fastest_past, MOST_CELLS_PASSED * self._smoke.grid.cell_size
         fall = float(np.linalg.norm(self._cloth.gravity))
-        if not self._reaches_cloth or (speed == 0.0 and fall == 0.0):
-            return math.inf
-        return 2.0 * distance / (speed + math.sqrt(speed * speed + 4.0 * fall * distance))
+        return time_of_travel(distance, speed, fall) if self._reaches_cloth else math.inf
 
     def accelerate(self, dt: float) -> None:  # noqa: ARG002  (impulses are in place of forces)
         """Give the air what the last `exchange` collected."""
@@ -207,7 +207,7 @@ class SmokeClothCoupling:
         """Changes of the velocity of each face's air [m/s], -sum_t w_tf J_t / (rho h³); impulses start anew."""
         cell_volume = ti.static(self._smoke.grid.cell_size**3)
         for t in range(source.shape[0]):
-            if source[t] == self._number:
+            if source[t] == self._number and density[t] > 0.0:  # the air may have been taken away since, live
                 change = -impulse[t] / (density[t] * cell_volume)
                 for axis, sums in ti.static(enumerate((self._sums_x, self._sums_y, self._sums_z))):
                     self._spread(sums, axis, place[t], change[axis])

@@ -1,12 +1,13 @@
 """Water as an obstacle for smoke and air."""
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
 from sim.arrays import Vectors
+from sim.coupling.water_room import room_for_water
 from sim.scene import DomainParameters
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ holes between it and its neighbours, however small the cells."""
 WATER = 0.5
 """Fraction of water above which a cell is water: where a flat surface cuts the cell's centre."""
 
-BEYOND = 1.0e9
-"""More than any fraction; products of three are still finite."""
+NEVER = 1.0e30
+"""Time in which weightless particles at rest get anywhere [s]."""
 
 FRACTION_QUANTUM = 2.0**-20
 """Unit of the sums of volume fractions [-]; they hold up to 2048."""
@@ -44,10 +45,15 @@ class SmokeFluidCoupling:
 
     with R twice the spacing d of particles, or a cell's edge if that is longer: then it is a mean over the cell and
     half of each of its neighbours. For a lattice of particles it is 1 inside, and 1/2 on a flat surface. What it lacks
-    beside closed faces of the domain is made up for by dividing by the part of the weight that is inside. A lone drop
+    beside closed faces of the domain and static bodies is made up for by dividing by the part of the weight that is
+    free of them, of static bodies as the cells have them. A lone drop
     blocks no air, nor does a sheet of one layer of particles; two layers do where cells are as fine as particles.
 
     Sums are integers, so that their order does not matter.
+
+    Steps are cut so that no particle gets farther than a cell within its reach of the box, with its velocity and
+    gravity. What pressure gives it in a step of the smoke is not foreseen, nor are particles that an emitter has yet to
+    let in: they count from the next step on.
 
     Attributes:
         bodies: names of the fluid's solver and of the smoke.
@@ -73,30 +79,48 @@ class SmokeFluidCoupling:
         self._volume_over_reach = (fluid.spacing / reach) ** 3
         self._fraction = ti.field(ti.i32, shape=grid.size)
         self._momentum_x, self._momentum_y, self._momentum_z = (ti.field(ti.i64, shape=grid.size) for _ in range(3))
-        parts = [parts_inside(grid.origin, grid.cell_size, grid.cells, domain, reach, axis) for axis in range(3)]
-        self._inside_x, self._inside_y, self._inside_z = (ti.field(ti.f32, shape=len(part)) for part in parts)
-        for field, part in zip((self._inside_x, self._inside_y, self._inside_z), parts, strict=True):
-            field.from_numpy(part)
-        self._fastest = ti.field(ti.f32, shape=())
+        self._inside = ti.field(ti.f32, shape=grid.size)
+        self._inside.from_numpy(grid.pad(room_for_water(grid, domain, reach)).astype(np.float32).ravel())
+        self._shortest_time = ti.field(ti.f32, shape=())
+        self._gravity = float(np.linalg.norm(fluid.gravity))
+        smoke.obstacles.movers.append(self)
         self.exchange(0.0)
+
+    def stable_dt(self) -> float:
+        """Largest step [s] in which no particle gets farther than a cell in the box, as far as is foreseen."""
+        particles = self._fluid.particles
+        self._find_shortest_time(particles.position, particles.velocity, particles.count)
+        time_s = float(self._shortest_time[None])
+        return time_s if time_s < NEVER else math.inf
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Mark the cells that hold water now, after the steps of the fluid."""
-        self._find_water(is_marking=True)
+        particles = self._fluid.particles
+        self._clear_sums()
+        self._splat(particles.position, particles.velocity, particles.count)
+        self._mark_water()
 
     def follow(self, dt: float) -> None:
         """Water does not feel the air."""
 
     def resume(self) -> None:
-        """Tell the restored smoke how fast the restored water is; its cells it has saved itself."""
-        self._find_water(is_marking=False)
+        """Which cells were water the smoke has saved itself."""
 
-    def _find_water(self, *, is_marking: bool) -> None:
-        particles = self._fluid.particles
-        self._clear_sums()
-        self._splat(particles.position, particles.velocity, particles.count)
-        self._mark_water(int(is_marking))
-        self._smoke.obstacles.expect(self._fluid.name, float(np.sqrt(self._fastest[None])))
+    @ti.kernel
+    def _find_shortest_time(self, position: Vectors, velocity: Vectors, count: ti.i32):
+        """Least time in which a particle comes to the box and a cell into it, v t + g t² = d (`time_of_travel`)."""
+        size = ti.static(self._smoke.grid.cell_size)
+        low = ti.Vector(ti.static(self._smoke.grid.origin)) - ti.static(self._reach_in_cells) * size
+        high = ti.Vector(ti.static(self._smoke.grid.upper)) + ti.static(self._reach_in_cells) * size
+        gravity = ti.static(self._gravity)
+        self._shortest_time[None] = NEVER
+        for n in range(count):
+            x_n = position[n]
+            distance = ti.max(low - x_n, x_n - high, 0.0).norm() + size
+            speed = velocity[n].norm()
+            root = speed + ti.sqrt(speed * speed + 4.0 * gravity * distance)
+            if root > 0.0:
+                ti.atomic_min(self._shortest_time[None], 2.0 * distance / root)
 
     @ti.kernel
     def _clear_sums(self):
@@ -132,15 +156,13 @@ class SmokeFluidCoupling:
                                 ti.atomic_add(momentum[at], ti.round(share / MOMENTUM_QUANTUM, ti.i64))
 
     @ti.kernel
-    def _mark_water(self, is_marking: ti.i32):
-        """Mark the cells that are water, and find the largest of their squared speeds."""
-        self._fastest[None] = 0.0
+    def _mark_water(self):
+        """Mark the cells that are water."""
         for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
-            inside_xy = self._inside_x[i - 1] * self._inside_y[j - 1]
             for k in range(1, self._nz + 1):
                 at = i * self._step_x + j * self._step_y + k
                 fraction = ti.cast(self._fraction[at], ti.f32) * FRACTION_QUANTUM
-                if fraction > WATER * inside_xy * self._inside_z[k - 1]:
+                if fraction > WATER * self._inside[at]:
                     momentum = ti.Vector(
                         [
                             ti.cast(self._momentum_x[at], ti.f32),
@@ -149,39 +171,4 @@ class SmokeFluidCoupling:
                         ]
                     )
                     velocity = momentum * (MOMENTUM_QUANTUM / fraction)
-                    ti.atomic_max(self._fastest[None], velocity.norm_sqr())
-                    if is_marking:
-                        self._smoke.obstacles.mark(i, j, k, velocity)
-
-
-def parts_inside(
-    origin: tuple[float, float, float],
-    cell_size: float,
-    cells: tuple[int, int, int],
-    domain: DomainParameters,
-    reach: float,
-    axis: int,
-) -> NDArray[np.float32]:
-    """Part of the weight max(0, 1 - |q|) along an axis that lies within the domain's closed faces, by cell, (n,).
-
-    `BEYOND` where a cell's centre is beyond a closed face: no fraction of water makes it water.
-
-    Args:
-        origin: lower corner of the cells [m].
-        cell_size: [m].
-        cells: how many along each axis.
-        domain: whose open faces end nothing.
-        reach: half-width of the weight [m].
-        axis: 0, 1 or 2.
-    """
-    centres = origin[axis] + (np.arange(cells[axis]) + 0.5) * cell_size
-    parts, is_beyond = np.ones(len(centres)), np.zeros(len(centres), bool)
-    for face, distance in (
-        (f"{'xyz'[axis]}-", centres - domain.min[axis]),
-        (f"{'xyz'[axis]}+", domain.max[axis] - centres),
-    ):
-        if face not in domain.open_faces:
-            parts -= 0.5 * (1.0 - np.clip(distance / reach, 0.0, 1.0)) ** 2
-            is_beyond |= distance < 0.0
-    # In a domain narrower than the reach at least half of it is inside: the two halves of the weight overlap.
-    return np.where(is_beyond, BEYOND, np.maximum(parts, 0.5)).astype(np.float32)
+                    self._smoke.obstacles.mark(i, j, k, velocity)

@@ -1,6 +1,7 @@
 """Forces on the particles of every SPH solver: gravity, viscosity, cohesion, and pressure once it is known."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -152,8 +153,9 @@ class SPHFluid(MaterialFluid):
         """
         sheets = self.body_forces.sheets
         assert sheets is not None
-        sheets.take_motion(self._sheet_terms, self._particles.velocity, change, dt)
+        sheets.take_motion(self._sheet_terms, self._particles.velocity, change, dt, walls=self._stepper.box.walls)
         self._travelled += dt * largest_change
+        self._motion = replace(self._motion, max_speed=self._motion.max_speed + largest_change)
 
     def _react_on_bodies(self, pressure_term: ti.Ndarray | None, dt: float, *, with_friction: bool = True) -> None:
         """Count what the particles feel from moving bodies as impulses on these, for a step of dt [s].

@@ -182,17 +182,19 @@ class SheetForces:
             self._inverse_support, dt * self._gravity, self.impulse,
         )  # fmt: skip
 
-    def take_motion(self, particles: tuple[Any, ...], velocity: ti.Ndarray, change: ti.Ndarray, dt: float) -> None:
+    def take_motion(
+        self, particles: tuple[Any, ...], velocity: ti.Ndarray, change: ti.Ndarray, dt: float, *, walls: Any
+    ) -> None:
         """Give the fluid that touched at the start of the step these changes of velocity of the samples [m/s].
 
-        Positions follow as if it had been so during the step of dt [s].
+        Positions follow as if it had been so during the step of dt [s]; `walls`, two corners [m], hold them.
         """
         boundary = self._boundary
         position, phase, *neighbor_list, rest_density = particles
         take_sheet_motion(
             position, velocity, phase, self._start, self._contact, self._count, *neighbor_list,
             boundary.position, boundary.volume, boundary.first_sheet, change, rest_density, self._volume, self._sigma,
-            self._inverse_support, dt,
+            self._inverse_support, dt, *(ti.math.vec3(*corner) for corner in walls),
         )  # fmt: skip
 
     def checkpoint(self) -> dict[str, NDArray[np.float32]]:

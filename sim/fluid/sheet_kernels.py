@@ -174,9 +174,12 @@ def take_sheet_motion(
     position: Vectors, velocity: Vectors, phase: Integers, touched_at: Vectors, contact: Floats, count: ti.i32,
     start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
     sample_position: Vectors, sample_volume: Floats, first_sample: ti.i32, change: Vectors, rest_density: Floats,
-    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt: ti.f32,
+    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, dt: ti.f32, wall_low: ti.math.vec3, wall_high: ti.math.vec3,
 ):  # fmt: skip
-    """v_i += sum_b phi_ib dv_b with m_i phi_ib = contact_i V_b W_ib, as if it had been so during the step."""
+    """v_i += sum_b phi_ib dv_b with m_i phi_ib = contact_i V_b W_ib, as if it had been so during the step.
+
+    Who would pass a wall is put back onto it, as at the end of the fluid's own step.
+    """
     for i in range(count):
         if contact[i] > 0.0:
             x_i = touched_at[i]
@@ -188,5 +191,11 @@ def take_sheet_motion(
                     r = distance((x_i - sample_position[b]).norm_sqr())
                     total += sample_volume[b] * spline(r * inverse_support) * change[b - first_sample]
             dv = sigma * contact[i] / (volume * rest_density[phase[i]]) * total
-            velocity[i] += dv
-            position[i] += dt * dv
+            v_i = velocity[i] + dv
+            free = position[i] + dt * dv
+            x_end = ti.min(ti.max(free, wall_low), wall_high)
+            for axis in ti.static(range(3)):
+                if x_end[axis] != free[axis]:
+                    v_i[axis] = 0.0
+            velocity[i] = v_i
+            position[i] = x_end

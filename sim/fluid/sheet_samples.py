@@ -68,7 +68,7 @@ def resting_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
 
 
 def sheet_standoff(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
-    """Distance from a sheet at which a lattice of fluid is at rest [spacings]: 1.2 at the usual support."""
+    """Distance from a sheet at which a lattice of fluid is at rest [spacings]: 1.3 at the usual support."""
     wall = wall_calibration(support_in_spacings)
     volume = sheet_factor(support_in_spacings) * wall.volume_in_particles * particle_volume(1.0, support_in_spacings)
     lacking = resting_field(support_in_spacings)

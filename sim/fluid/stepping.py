@@ -40,6 +40,7 @@ class ParticleStepper:
     """Advances the particles by symplectic Euler and measures their motion in the same pass."""
 
     def __init__(self, box: Box) -> None:
+        self.box = box
         self._corners = (*box.walls, *box.openings)
         self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim.parameters import Vector3
 from sim.rigid import rotation
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.ways import Way
 
 Array = NDArray[np.float64]
 
@@ -43,6 +44,12 @@ class Path(Protocol):
     def largest_speed(self, reach: float) -> float:
         """The largest speed [m/s] that points up to `reach` [m] from the shape's origin may ever have."""
 
+    def way(self, reach: float) -> Way:
+        """How far such points get, at most."""
+
+    def hull(self) -> tuple[Array, Array]:
+        """Lower and upper corner [m] of a box around all places of the shape's origin; infinite where it goes on."""
+
 
 class SteadyPath:
     """Constant velocity and angular velocity from a starting pose."""
@@ -61,6 +68,15 @@ class SteadyPath:
     def largest_speed(self, reach: float) -> float:
         """The largest speed [m/s] that points up to `reach` [m] from the shape's origin may ever have."""
         return _speed_bound(self._start, reach)
+
+    def way(self, reach: float) -> Way:
+        """How far such points get, at most."""
+        return Way(np.zeros(1), np.zeros(1), self.largest_speed(reach))
+
+    def hull(self) -> tuple[Array, Array]:
+        """Lower and upper corner [m] of a box around all places of the shape's origin; infinite where it goes on."""
+        place, velocity = self._start.position, self._start.velocity
+        return np.where(velocity < 0.0, -np.inf, place), np.where(velocity > 0.0, np.inf, place)
 
 
 class KeyframePath:
@@ -106,11 +122,25 @@ class KeyframePath:
 
     def largest_speed(self, reach: float) -> float:
         """The largest speed [m/s] that points up to `reach` [m] from the shape's origin may ever have."""
-        shares = (
-            np.arange(LOOKUPS_PER_INTERVAL) / LOOKUPS_PER_INTERVAL
-        )  # what ends an interval starts the next, or rests
-        times = (self._times[:-1, None] + shares * np.diff(self._times)[:, None]).ravel()
-        return max((_speed_bound(self.at(float(time)), reach) for time in times), default=0.0)
+        return max((_speed_bound(self.at(float(time)), reach) for time in self._lookups()), default=0.0)
+
+    def way(self, reach: float) -> Way:
+        """How far such points get, at most: the larger speed of two look-ups in a row holds between them."""
+        times = self._lookups()
+        speeds = np.array([_speed_bound(self.at(float(time)), reach) for time in times])
+        lengths = np.cumsum(np.maximum(speeds[1:], speeds[:-1]) * np.diff(times))
+        return Way(times, np.append(0.0, lengths), 0.0)
+
+    def hull(self) -> tuple[Array, Array]:
+        """Lower and upper corner [m] of a box around all places of the shape's origin, as far as look-ups tell."""
+        places = np.stack([self.at(float(time)).position for time in self._lookups()])
+        return places.min(axis=0), places.max(axis=0)
+
+    def _lookups(self) -> Array:
+        """Times in every interval, its start included, and the end [s]."""
+        shares = np.arange(LOOKUPS_PER_INTERVAL) / LOOKUPS_PER_INTERVAL
+        inner = (self._times[:-1, None] + shares * np.diff(self._times)[:, None]).ravel()
+        return np.append(inner, self._times[-1])
 
     def _tangents(self, steps: Array) -> Array:
         """Derivatives at the keyframes, (n, 3), from the steps between them (n - 1, 3)."""
@@ -151,13 +181,24 @@ def path_onwards(
 ) -> KeyframePath:
     """From a pose at a time [s] straight to another, or the same orientation if omitted, in so many seconds; then rest.
 
+    What was sized when the scene was built does not follow a path that is taken later: the speeds that a fluid expects
+    of bodies, and the stiffness that it has from them.
+
     Args:
         now: where the path starts.
         time_s: when [s].
         position: where it leads [m].
         rotation_deg: about x, then y, then z [degrees].
         within_s: how long it takes [s], > 0.
+
+    Raises:
+        ValueError: the pose is not finite, or the way takes no time.
     """
+    if not (np.isfinite([*position, *(rotation_deg or ())]).all() and 0.0 < within_s < np.inf):
+        turn = "" if rotation_deg is None else f", {tuple(rotation_deg)} degrees"
+        raise ValueError(
+            f"a finite pose in more than 0 s is needed, got {tuple(position)} m{turn} within {within_s:g} s"
+        )
     orientation = now.orientation if rotation_deg is None else rotation.from_degrees(rotation_deg)
     times, orientations = [time_s, time_s + within_s], np.stack([now.orientation, orientation])
     return KeyframePath(times, np.stack([now.position, np.asarray(position)]), orientations, linear=True)

@@ -63,6 +63,7 @@ class RigidSolver:
         bodies: state of the moving bodies.
         all_names, all_geometries: of the moving bodies, then of the static ones.
         walls: closed faces of the domain.
+        paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
 
     Args:
         parameters: the moving bodies, in the order of the job.
@@ -83,9 +84,9 @@ class RigidSolver:
         gravity: Vector3,
     ) -> None:
         self.name = SOLVER_NAME
-        self._gravity = np.asarray(gravity, dtype=np.float64)
+        self.gravity = np.asarray(gravity, dtype=np.float64)
         self._geometries = _geometries_of(parameters)
-        self._paths: dict[int, Path] = {
+        self.paths: dict[int, Path] = {
             number: path_of(body) for number, body in enumerate(parameters) if body.kind == "kinematic"
         }
         self.bodies = _starting_bodies(parameters, self._geometries)
@@ -103,7 +104,7 @@ class RigidSolver:
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
         )
-        self._response = ContactResponse(surfaces, self._gravity)
+        self._response = ContactResponse(surfaces, self.gravity)
         corners = np.array([domain.min, domain.max])
         self._domain_centre = corners.mean(axis=0)
         self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
@@ -111,7 +112,7 @@ class RigidSolver:
         dynamic = np.flatnonzero(self.bodies.is_dynamic)
         smallest = min((self._geometries[number].shortest_edge for number in dynamic), default=math.inf)
         self._largest_advance = LARGEST_ADVANCE * 0.5 * smallest
-        self._time_s = 0.0
+        self.time_s = 0.0
         self.begin_frame(0.0)
 
     @property
@@ -154,7 +155,7 @@ class RigidSolver:
         if not math.isfinite(self._largest_advance):
             return dt
         # v dt + g dt² is the largest advance.
-        speed, acceleration = self.max_surface_speed(), float(np.linalg.norm(self._gravity))
+        speed, acceleration = self.max_surface_speed(), float(np.linalg.norm(self.gravity))
         root = speed + math.sqrt(speed**2 + 4.0 * acceleration * self._largest_advance)
         return min(dt, 2.0 * self._largest_advance / root) if root > 0.0 else dt
 
@@ -163,7 +164,7 @@ class RigidSolver:
         bodies = self.bodies
         before = (bodies.position.copy(), bodies.orientation.copy())
         free = bodies.is_free[:, None]
-        bodies.velocity = bodies.velocity + np.where(free, dt * self._gravity, 0.0)
+        bodies.velocity = bodies.velocity + np.where(free, dt * self.gravity, 0.0)
         self._set_mean_velocities_of_kinematic_bodies(dt)
         contacts = self._find_contacts(dt)
         outcome = self._response.resolve(contacts, bodies, dt)
@@ -174,7 +175,7 @@ class RigidSolver:
         # velocity by which the body moves, and a body that it carries has none.
         flying = free & ~(outcome.is_touched | bodies.is_pushed)[:, None]
         bodies.is_pushed[:] = False
-        velocity = bodies.velocity - np.where(flying, 0.5 * dt * self._gravity, 0.0)
+        velocity = bodies.velocity - np.where(flying, 0.5 * dt * self.gravity, 0.0)
         bodies.position = bodies.position + dt * np.where(free, velocity + outcome.extra_velocity, 0.0)
         spin = bodies.angular_momentum()
         if outcome.extra_angular_velocity.any():
@@ -186,26 +187,26 @@ class RigidSolver:
             spin = np.where(outcome.is_held[:, None], rotation.rotated(turn, spin), spin)
         bodies.set_angular_momentum(spin)
         rotate_freely(bodies, dt)
-        self._time_s += dt
-        self._place_kinematic_bodies(self._time_s)
+        self.time_s += dt
+        self._place_kinematic_bodies(self.time_s)
         self._detector.follow(self._with_obstacles(self._surface_motion_since(*before)))
         self._stop_lost_bodies()
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
-        self._time_s = time_s
+        self.time_s = time_s
         self._detector.forget()  # so that a run that continues here does the same
         self._contact_count = self._iterations = self._not_converged = 0
         self._max_penetration = 0.0
 
     def lead(self, name: str, position: Vector3, *, rotation_deg: Vector3 | None = None, within_s: float) -> None:
-        """Lead a kinematic body to another pose, between frames (`path_onwards`); no checkpoint knows of it."""
+        """Lead a kinematic body on, between frames; no checkpoint, nor what `path_onwards` names, knows of it."""
         number = self.bodies.names.index(name) if name in self.bodies.names else -1
-        if number not in self._paths:
+        if number not in self.paths:
             raise ValueError(f'no kinematic body is named "{name}"; only such bodies can be led')
-        now = self._paths[number].at(self._time_s)
-        self._paths[number] = path_onwards(now, self._time_s, position, rotation_deg, within_s)
-        self._place_kinematic_bodies(self._time_s)  # couplings see how it moves from now on
+        now = self.paths[number].at(self.time_s)
+        self.paths[number] = path_onwards(now, self.time_s, position, rotation_deg, within_s)
+        self._place_kinematic_bodies(self.time_s)  # couplings see how it moves from now on
 
     def _find_contacts(self, dt: float) -> Contacts:
         return self._detector.find(
@@ -229,7 +230,7 @@ class RigidSolver:
         return speeds
 
     def _place_kinematic_bodies(self, time_s: float) -> None:
-        for number, path in self._paths.items():
+        for number, path in self.paths.items():
             motion = path.at(time_s)
             arm = rotation.rotated(motion.orientation, self._geometries[number].centre_of_mass)
             self.bodies.position[number] = motion.position + arm
@@ -239,8 +240,8 @@ class RigidSolver:
 
     def _set_mean_velocities_of_kinematic_bodies(self, dt: float) -> None:
         """Contacts see how kinematic bodies will have moved by the end of the step."""
-        for number, path in self._paths.items():
-            end = path.at(self._time_s + dt)
+        for number, path in self.paths.items():
+            end = path.at(self.time_s + dt)
             arm = rotation.rotated(end.orientation, self._geometries[number].centre_of_mass)
             self.bodies.velocity[number] = (end.position + arm - self.bodies.position[number]) / dt
             turn = rotation.product(end.orientation, rotation.conjugate(self.bodies.orientation[number]))
@@ -283,7 +284,7 @@ class RigidSolver:
         return {
             **{name: getattr(self.bodies, name).copy() for name in _STATE},
             **self._response.checkpoint(),
-            "clock": np.array([self._time_s]),
+            "clock": np.array([self.time_s]),
         }
 
     def restore(self, arrays: Arrays) -> None:
@@ -300,7 +301,7 @@ class RigidSolver:
         self._response.restore(arrays)
         for name in _STATE:
             setattr(self.bodies, name, np.array(arrays[name], dtype=getattr(self.bodies, name).dtype))
-        self._time_s = float(arrays["clock"][0])
+        self.time_s = float(arrays["clock"][0])
 
     def diagnostics(self) -> Diagnostics:
         """Totals over the dynamic bodies that are not lost, and the contacts of the frame.
@@ -322,7 +323,7 @@ class RigidSolver:
                 f"angular_momentum_{axis}": float(value) for axis, value in zip("xyz", angular.sum(axis=0), strict=True)
             },
             "kinetic_energy": float(kinetic),
-            "potential_energy": -float(np.sum(mass[:, None] * self._gravity * bodies.position[free])),
+            "potential_energy": -float(np.sum(mass[:, None] * self.gravity * bodies.position[free])),
             "max_speed": self.max_surface_speed(),
             "contacts": float(self._contact_count),
             "max_penetration": self._max_penetration,

@@ -73,7 +73,7 @@ def read_triangles(path: Path) -> tuple[Points, NDArray[np.int64]]:
 
 def _read_kind(content: bytes, kind: str) -> tuple[Points, NDArray[np.int64]]:
     if kind == "obj":
-        return read_obj(content.decode("utf-8", errors="replace"))
+        return read_obj(content.decode("utf-8-sig", errors="replace"))
     import trimesh
 
     # Of the bytes alone: given the path, trimesh would follow references to files beside it.

@@ -13,34 +13,66 @@ from numpy.typing import NDArray
 
 from sim.shapes.solid import Points
 
+ROUND_OFF = 1.0e-2
+"""Part of a polygon's area by which a triangle may lie over others: corners on a line, in files of few digits."""
+
 
 def read_obj(text: str) -> tuple[Points, NDArray[np.int64]]:
     """Vertices (n, 3) in the order of the file, and triangles (m, 3); polygons become fans about their first corner.
 
     Raises:
-        ValueError: a line cannot be read; the message names it.
+        ValueError: a line cannot be read, or has a polygon that such a fan does not fill; the message names it.
     """
     vertices: list[tuple[float, float, float]] = []
     triangles: list[tuple[int, int, int]] = []
+    lines: list[int] = []  # of each triangle
     begun = ""
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.endswith("\\"):  # it goes on in the next one
-            begun += line[:-1] + " "
+    for number, line in enumerate([*text.splitlines(), ""], start=1):  # the empty one ends what the last one began
+        content = line.partition("#")[0].rstrip()  # comments do not go on in the next line
+        if content.endswith("\\"):
+            begun += content[:-1] + " "
             continue
-        (key, *values), begun = (begun + line).split() or [""], ""
+        whole, begun = begun + content, ""
+        key, *values = whole.split() or [""]
         try:
             if key == "v":
                 x, y, z = (float(value) for value in values[:3])
                 vertices.append((x, y, z))
             elif key == "f":
-                corners = [_vertex_number(value, len(vertices)) for value in values if not value.startswith("#")]
+                corners = [_vertex_number(value, len(vertices)) for value in values]
+                if len(corners) < 3:
+                    raise ValueError(f"a face needs three corners or more, got {len(corners)}")
                 triangles.extend((corners[0], after, last) for after, last in pairwise(corners[1:]))
-        except (ValueError, IndexError) as error:
-            raise ValueError(f'line {number}, "{line.strip()[:60]}": {error}') from error
-    return (
-        np.array(vertices, dtype=np.float64).reshape(-1, 3),
-        np.array(triangles, dtype=np.int64).reshape(-1, 3),
-    )
+                lines.extend([number] * (len(corners) - 2))
+        except ValueError as error:
+            raise ValueError(f'line {number}, "{whole.strip()[:60]}": {error}') from error
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    faces = np.array(triangles, dtype=np.int64).reshape(-1, 3)
+    _refuse_overlaps(points, faces, np.array(lines, dtype=np.int64))
+    return points, faces
+
+
+def _refuse_overlaps(vertices: Points, triangles: NDArray[np.int64], lines: NDArray[np.int64]) -> None:
+    """Refuse polygons so concave that triangles of their fan face the other way, and so lie over others.
+
+    Args:
+        vertices: (n, 3).
+        triangles: (m, 3); those of vertices that are not there are left to who knows the file.
+        lines: number of the line, and so of the polygon, that each triangle is from, ascending, (m,).
+    """
+    known = (triangles < len(vertices)).all(axis=1)
+    first, second, third = np.moveaxis(vertices[triangles[known]], 1, 0)
+    with np.errstate(invalid="ignore", over="ignore"):  # vertices that are not finite are told of by who knows the file
+        normal = np.cross(second - first, third - first)
+        own, polygon = np.unique(lines[known], return_inverse=True)
+        total = np.stack([np.bincount(polygon, normal[:, axis], len(own)) for axis in range(3)], axis=1)
+        along = (normal * total[polygon]).sum(axis=1)
+        opposes = along < -ROUND_OFF * np.square(total[polygon]).sum(axis=1)
+    if opposes.any():
+        raise ValueError(
+            f"line {lines[known][opposes.argmax()]}: a concave polygon, which triangles about its first corner do not "
+            "fill; divide polygons into triangles on export"
+        )
 
 
 def _vertex_number(corner: str, count: int) -> int:

@@ -77,11 +77,7 @@ class SmokeGrid:
                     f'smoke "{parameters.name}": max must be above min on every axis, '
                     f"got {axis} from {low:g} to {high:g} m"
                 )
-        # The slack keeps 1 m / 0.02 m at 50 cells where the quotient is 50.00000000000001.
-        nx, ny, nz = (
-            max(1, math.ceil((high - low) / parameters.cell_size - 1.0e-6))
-            for low, high in zip(lower, upper, strict=True)
-        )
+        nx, ny, nz = parameters.cell_counts(domain)
         empty = cls(
             lower, parameters.cell_size, (nx, ny, nz), frozenset(parameters.open_faces), np.zeros((nx, ny, nz), bool)
         )

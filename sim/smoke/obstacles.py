@@ -17,6 +17,7 @@ same cell the later one's velocity counts; static solids are never overridden.
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -47,6 +48,24 @@ class Change:
 NO_CHANGE = Change(0, 0.0, 0.0)
 
 
+class Mover(Protocol):
+    """Somebody who marks cells."""
+
+    def stable_dt(self) -> float:
+        """Largest step [s] in which none of its solids gets farther than a cell in the box, as far as it can tell."""
+
+
+def time_of_travel(distance: float, speed: float, acceleration: float) -> float:
+    """Time t [s] in which nothing gets farther than a distance: v t + a t² = d; infinite at rest.
+
+    The speed at the end of the time counts, v + a t, twice the way of a steady acceleration: one that sets in is no
+    surprise. Distances are positive [m], speeds and accelerations not negative [m/s, m/s²].
+    """
+    if speed <= 0.0 and acceleration <= 0.0:
+        return math.inf
+    return 2.0 * distance / (speed + math.sqrt(speed * speed + 4.0 * acceleration * distance))
+
+
 @ti.data_oriented
 class Obstacles:
     """The solid cells of one grid: static ones, and those that others mark step by step.
@@ -54,6 +73,7 @@ class Obstacles:
     Attributes:
         grid: the cells; its `solid` are the static ones.
         moving: whether anybody marks cells; without, nothing ever changes.
+        movers: who does; steps are cut to follow them.
         state: AIR, MOVING or STATIC of each cell now, flat with ghosts, int32.
         marked: likewise, of the next commit.
         velocity_x, velocity_y, velocity_z: of the solid at the centres of MOVING cells [m/s], flat, float32; without
@@ -66,7 +86,7 @@ class Obstacles:
         self._steps = (grid.padded[1] * grid.padded[2], grid.padded[2], 1)
         self._low, self._cell_size = grid.origin, grid.cell_size
         self._static = _static_state(grid)
-        self._expected_speeds: dict[str, float] = {}
+        self.movers: list[Mover] = []
         self.state = ti.field(ti.i32, shape=grid.size)
         self.state.from_numpy(self._static)
         if moving:
@@ -82,13 +102,11 @@ class Obstacles:
         return [self.state, *moving]
 
     def stable_dt(self) -> float:
-        """Largest step [s] in which no solid crosses more than a cell, so that none leaps over the smoke in its way."""
-        fastest = max(self._expected_speeds.values(), default=0.0)
-        return self._cell_size / fastest if fastest > 0.0 else math.inf
+        """Largest step [s] in which no solid crosses more than a cell, so that none leaps over the smoke in its way.
 
-    def expect(self, name: str, speed: float) -> None:
-        """Say how fast [m/s] the solids of somebody called `name` will be at most; steps are cut to follow them."""
-        self._expected_speeds[name] = speed
+        As far as the movers can tell: what collisions give within the step is unforeseen.
+        """
+        return min((mover.stable_dt() for mover in self.movers), default=math.inf)
 
     def is_air(self) -> NDArray[np.bool_]:
         """Which cells are air now, (nx, ny, nz)."""

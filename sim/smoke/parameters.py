@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
@@ -11,6 +12,9 @@ from sim.shapes.parameters import Placement
 
 if TYPE_CHECKING:
     from sim.scene import DomainParameters
+
+WHOLE = 1.0e-6
+"""Part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001."""
 
 Face = Literal["x-", "x+", "y-", "y+", "z-", "z+"]
 
@@ -77,8 +81,21 @@ class SmokeParameters(Parameters):
     cfl: Positive = Field(default=2.0, le=10.0, description="Most cells that smoke may cross in a substep [-].")
 
     def corners(self, domain: DomainParameters) -> tuple[Vector3, Vector3]:
-        """Lower and upper corner of its box [m]: its own, or the domain's where it names none."""
-        return self.min or domain.min, self.max or domain.max
+        """Lower and upper corner of its box [m]: its own, or the domain's where it names none.
+
+        A box that is no whole number of cells long is rounded up, keeping its lower corner.
+        """
+        low, high = self.min or domain.min, self.max or domain.max
+        ends = [a + n * self.cell_size for a, n in zip(low, self.cell_counts(domain), strict=True)]
+        # What is whole but for rounding ends where it is said to, so that boxes side by side do not overlap.
+        x, y, z = (b if end - b < WHOLE * self.cell_size else end for b, end in zip(high, ends, strict=True))
+        return low, (x, y, z)
+
+    def cell_counts(self, domain: DomainParameters) -> tuple[int, int, int]:
+        """How many cells its box has along x, y, z; 1 where it has no length."""
+        low, high = self.min or domain.min, self.max or domain.max
+        x, y, z = (max(1, math.ceil((b - a) / self.cell_size - WHOLE)) for a, b in zip(low, high, strict=True))
+        return x, y, z
 
 
 def boxes_overlap(a: tuple[Vector3, Vector3], b: tuple[Vector3, Vector3]) -> bool:

@@ -15,7 +15,7 @@ from sim.smoke.air_force import AirForce
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import Forces, upward
 from sim.smoke.grid import SmokeGrid, SolidRegion
-from sim.smoke.obstacles import Obstacles
+from sim.smoke.obstacles import Obstacles, time_of_travel
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.projection import PressureProjection
 from sim.smoke.reductions import RowReductions
@@ -168,9 +168,7 @@ class SmokeSolver:
 
     def _largest_step(self, speed: float, acceleration: float) -> float:
         distance = self.parameters.cfl * self.grid.cell_size
-        if acceleration <= 0.0 and speed <= 0.0:
-            return math.inf
-        return 2.0 * distance / (speed + math.sqrt(speed * speed + 4.0 * acceleration * distance))
+        return time_of_travel(distance, speed, acceleration)
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]; the cells that obstacles fill at its end have been marked."""

@@ -155,6 +155,16 @@ def test_cloth_beside_smokes_whose_boxes_overlap_is_refused(tmp_path):
     assert warnings(SHEET + PLUME + apart, tmp_path) == []
 
 
+def test_cloths_of_two_airs_beside_smoke_are_refused(tmp_path):
+    other = SHEET[SHEET.index("[[cloth]]") :].replace('"sheet"', '"other"')
+    thin, none = "air_density = 0.6\n", "air_density = 0.0\n"
+    apart = other.replace("0.3]", "0.9]")
+    with pytest.raises(JobFileError, match=r'air_density of cloth "other" is 0\.6 kg/m³, but that of "sheet" 1\.2'):
+        warnings(SHEET + apart + thin + PLUME, tmp_path)
+    assert warnings(SHEET + apart + none + PLUME, tmp_path) == []
+    assert warnings(SHEET + apart + thin, tmp_path) == []
+
+
 def test_cloth_laid_onto_a_box_and_an_edge_pinned_inside_a_pole_are_fine(tmp_path):
     table = BALL.replace('"sphere", radius = 0.1', '"box", size = [0.3, 0.3, 0.2]').replace("0.3]\n", "0.4]\n")
     assert errors(SHEET + table, tmp_path) == []

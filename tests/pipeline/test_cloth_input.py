@@ -100,6 +100,13 @@ def test_what_the_film_will_not_show_is_told(text, expected, tmp_path):
     assert expected in warning
 
 
+@pytest.mark.parametrize("substeps", ["", "substeps = 400\n"], ids=["as many as springs need", "given"])
+def test_a_fast_pin_of_explicit_springs_is_judged_by_the_substeps_that_are_given(substeps, tmp_path):
+    """0.3 m in 2 ms are 6 mm in a substep of 1/24000 s; how long steps of explicit springs are is not known here."""
+    path = "keyframe = [{ time_s = 0.0 }, { time_s = 0.002, offset = [0.3, 0.0, 0.0] }]\ninterpolation = 'linear'"
+    assert warnings(f'{FILM}integrator = "explicit"\n{substeps}{EDGE}{path}', tmp_path) == []
+
+
 def test_a_pin_that_rests_moves_and_lets_go_within_the_film_is_fine(tmp_path):
     path = "keyframe = [{ time_s = 0.2 }, { time_s = 0.5, offset = [0.1, 0.0, 0.0] }]\nrelease_s = 0.4"
     assert warnings(FILM + EDGE + path, tmp_path) == []

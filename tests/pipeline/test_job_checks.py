@@ -169,6 +169,16 @@ def test_job_that_cannot_be_meant_is_refused_with_this_line(text, expected, tmp_
             "dam.toml:7 smoke[0].source[0]: is thinner than a cell of 0.05 m and may emit nothing; enlarge it",
         ),
         (
+            HEAD + WATER + PLUME.replace("0.2]", "0.5]"),
+            "dam.toml:14 smoke[0].source[0]: lies wholly inside fluid[0].block[0] at the start, and emits nothing "
+            "until that has moved off",
+        ),
+        (
+            HEAD + PLUME + BALL.replace("0.1 }", "0.3 }") + 'kind = "kinematic"',
+            "dam.toml:7 smoke[0].source[0]: lies wholly inside rigid[0] at the start, and emits nothing "
+            "until that has moved off",
+        ),
+        (
             HEAD + WATER + BALL + '[material.ball]\nlook = "metal"\ndensity = 2.0',
             'dam.toml:17 material.ball.density: has no effect on the look "metal"',
         ),
@@ -178,6 +188,17 @@ def test_job_that_may_be_unintended_is_allowed_with_this_warning(text, expected,
     errors, warnings = errors_and_warnings(text, tmp_path)
     assert errors == []
     assert expected in warnings
+
+
+def test_a_body_too_thin_for_the_cells_of_smoke_is_refused_where_it_can_come_there(tmp_path):
+    plate = BALL.replace('"sphere", radius = 0.1', '"box", size = [0.3, 0.3, 0.02]') + 'kind = "kinematic"\n'
+    errors, _ = errors_and_warnings(HEAD + PLUME + plate, tmp_path)
+    assert errors == [
+        'dam.toml:11 rigid[0]: is 0.02 m thin and would fall between the cells of smoke "plume", 0.05 m, into whose '
+        "box it can come; use a smaller cell_size or a thicker body"
+    ]
+    fog = PLUME.replace("cell_size", "min = [-0.5, -0.5, 0.4]\ncell_size").replace("0.2]", "0.7]")
+    assert errors_and_warnings(HEAD + fog + plate, tmp_path)[0] == []
 
 
 def test_overlap_of_fluid_and_body_is_counted_in_particles(tmp_path):

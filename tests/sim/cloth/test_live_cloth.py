@@ -1,5 +1,7 @@
 """A world that somebody plays with: what may change between frames does, and the cloth goes on without a jump."""
 
+import math
+
 import numpy as np
 import pytest
 from cloth_scenes import FRAMES_PER_SECOND, rectangle
@@ -47,6 +49,35 @@ def test_pins_of_the_job_can_be_let_go_node_by_node():
     after = positions(world)
     np.testing.assert_array_equal(after[6:13], start[6:13])
     assert (after[:4, 2] < start[:4, 2]).all()
+
+
+def test_a_hand_may_hold_what_a_pin_with_a_path_has_let_go():
+    path = [{"time_s": 0.0}, {"time_s": 0.02, "offset": (0.0, 0.0, 0.001)}]
+    world = world_of({**SHEET, "pin": ({"index": (CORNER,), "keyframe": path, "release_s": 0.03},)}, domain=SPACE)
+    solver = cloth_of(world)
+    with pytest.raises(ValueError, match="a pin that moves holds one of the nodes; let it go first"):
+        solver.hold("cloth0", [CORNER])
+    for _ in range(2):
+        world.advance_frame()
+    held = positions(world)[CORNER]
+    solver.hold("cloth0", [CORNER])
+    world.advance_frame()
+    np.testing.assert_array_equal(positions(world)[CORNER], held)
+
+
+@pytest.mark.parametrize(
+    ("way", "within_s"), [(0.1, 0.0), (0.1, -1.0), (0.1, math.nan), (math.nan, 1.0), (math.inf, 1.0), (0.0, 0.0)]
+)
+def test_ways_without_an_end_or_a_time_are_refused(way, within_s):
+    ball = {"kind": "kinematic", "shape": {"type": "sphere", "radius": 0.08}, "position": (0.0, 0.0, -0.5)}
+    world = world_of(SHEET, bodies=[ball], domain=SPACE)
+    with pytest.raises(ValueError, match="a finite way in more than 0 s is needed, got"):
+        cloth_of(world).hold("cloth0", [CORNER], shift=(0.0, way, 0.0), within_s=within_s)
+    with pytest.raises(ValueError, match="a finite pose in more than 0 s is needed, got"):
+        rigid_of(world).lead("body0", (0.0, way, 0.0), within_s=within_s)
+    if way:
+        with pytest.raises(ValueError, match=r"a finite pose in more than 0 s is needed, got .* degrees within"):
+            rigid_of(world).lead("body0", (0.0, 0.0, 0.0), rotation_deg=(0.0, way, 0.0), within_s=within_s)
 
 
 def test_a_ball_that_is_led_about_pushes_the_cloth_and_stiffness_and_wind_change_on_the_way():

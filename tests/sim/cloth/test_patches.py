@@ -106,6 +106,48 @@ def test_a_cloth_of_one_patch_meets_itself():
     assert bound.tolist() == [0.0]
 
 
+def listed(pairs: SelfCollision) -> list[list[tuple[int, ...]]]:
+    """The pairs of elements in both lists, in an order of their own."""
+    lists = (each.vertices.to_numpy()[: each.end].tolist() for each in (pairs.with_triangles, pairs.of_edges))
+    return [sorted(tuple(pair) for pair in each if pair[0] >= 0) for each in lists]
+
+
+def crumple(state, pairs: SelfCollision, count: int) -> None:
+    """Some substeps of a flat sheet whose nodes wander."""
+    generator, x = np.random.default_rng(2), state.host.position.copy()
+    for _ in range(count):
+        step = generator.uniform(-2e-3, 2e-3, x.shape)
+        state.set_positions(x)
+        state.displacement.from_numpy(step.astype(np.float32))
+        pairs.prepare(state, 4e-3, 0.0)  # more than 3^(1/2) times 2 mm
+        pairs.follow(state, 4e-3, 0.0)
+        x += step
+
+
+def test_a_frame_searches_as_it_would_without_the_frames_before_it():
+    """Resumed runs report what whole runs do; lists of patches would last longer after a push of 2 cm just before."""
+    state = state_of(13)
+    whole, resumed = SelfCollision(state), SelfCollision(state)
+    crumple(state, whole, 1)
+    whole.follow(state, 4e-3, 0.02)
+    whole.forget(state)
+    for pairs in (whole, resumed):
+        crumple(state, pairs, 40)
+    assert whole.searches == resumed.searches
+
+
+def test_lists_that_grow_keep_what_they_had_and_need_no_search_more():
+    state = state_of(13)
+    roomy, tight = SelfCollision(state), SelfCollision(state)
+    for pairs, capacity in ((roomy, 10**5), (tight, 1)):
+        pairs.with_triangles._allocate(capacity)
+        pairs.of_edges._allocate(capacity)
+        crumple(state, pairs, 40)
+    assert min(len(each) for each in listed(tight)) > 100
+    assert listed(tight) == listed(roomy)
+    assert tight.searches == roomy.searches
+
+
 def test_patches_are_searched_anew_only_where_cloth_moves():
     """One corner of a sheet is folded to and fro, thirty times: lists of the rest hold."""
     state = state_of(33, size=1.0)

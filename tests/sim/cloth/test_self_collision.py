@@ -353,6 +353,7 @@ def test_a_run_with_contacts_continues_bit_for_bit():
         resumed.advance_frame()
     for name, array in through.checkpoint().items():
         np.testing.assert_array_equal(resumed.checkpoint()[name], array, err_msg=name)
+    assert cloth_of(resumed).diagnostics() == cloth_of(through).diagnostics()
 
 
 STEP_AND_PRINT_DIGEST = """

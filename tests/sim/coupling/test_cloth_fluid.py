@@ -65,6 +65,29 @@ def test_a_taut_sheet_carries_the_weight_of_the_water_on_it(taichi_cpu, solver):
     assert np.linalg.norm(velocities, axis=1).mean() < 0.2
 
 
+def test_a_sheet_that_is_pressed_down_on_water_pushes_no_particle_through_the_walls(taichi_cpu):
+    everywhere = {"type": "box", "min": (-1, -1, -1), "max": (1, 1, 1)}
+    path = [{"time_s": 0.0}, {"time_s": 0.1, "offset": (0, 0, -0.06)}]
+    side = 4 * SPACING
+    tank = ClothTank(
+        cloth={
+            "shape": rectangle(2 * side, 9),
+            "position": (0, 0, 0.14),
+            "mass_per_area": 0.2,
+            "pin": [{"region": everywhere, "keyframe": path}],
+        },
+        water=((-side, -side, 0.0), (side, side, 0.1)),
+        domain={"min": (-side, -side, 0.0), "max": (side, side, 0.5)},
+        solver="dfsph",
+    )
+    time = 0.0
+    while time < 0.1:
+        time += tank.step()
+        positions = tank.particles()[0]
+        assert (np.abs(positions[:, :2]) <= np.float32(side)).all()
+        assert (positions[:, 2] >= 0.0).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", sorted(SOLVERS))
 def test_no_particle_of_a_falling_block_passes_a_taut_sheet(taichi_cpu, solver):

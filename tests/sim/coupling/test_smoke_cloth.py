@@ -140,6 +140,30 @@ def test_cloth_outside_of_the_box_is_in_its_own_wind_and_takes_it_up_again_when_
     assert room.coupling.stable_dt() == np.inf
 
 
+def test_cloths_in_one_air_cannot_take_two_densities_of_it_live(gusty_room):
+    cloth = gusty_room.cloth
+    with pytest.raises(ValueError, match=r'air_density of cloth "layer3" is 0\.6 kg/m³, but that of "layer0" 1\.2'):
+        cloth.change("layer3", air_density=0.6)
+    with pytest.raises(ValueError, match=r"beside smoke it must be 0, or 0\.001 kg/m³ at least"):
+        cloth.change("layer3", air_density=1.0e-4)
+    assert np.unique(cloth.air.density.to_numpy()) == np.float32(AIR_DENSITY)
+
+
+def test_cloth_without_drag_does_not_cut_the_steps_of_the_smoke(pipe):
+    pipe.start_anew()
+    pipe.blow(1.0, 0.0, 0.0)
+    assert pipe.coupling.stable_dt() == pytest.approx(0.02, rel=1.0e-5)
+    skin_drag = pipe.cloth.parameters[0].skin_drag
+    pipe.cloth.change("sheet", drag=0.0, skin_drag=0.0)
+    # Nothing was exchanged, and 0/0 must not get into the air.
+    pipe.coupling.exchange(0.0)
+    pipe.coupling.accelerate(0.0)
+    assert (pipe.velocity(0) == 1.0).all()
+    pipe.coupling.follow(0.0)
+    assert pipe.coupling.stable_dt() == np.inf
+    pipe.cloth.change("sheet", drag=DRAG, skin_drag=skin_drag)
+
+
 @pytest.fixture(scope="module")
 def jet(taichi_cpu) -> WindyRoom:
     """Smoke blown along x at a silken flag that hangs across."""

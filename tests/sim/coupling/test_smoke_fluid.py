@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from half_full_rooms import SILENT_SOURCE, SPACING, HalfFullRoom, lattice
 
+from sim.coupling.water_room import room_for_water
 from sim.scene import DomainParameters
+from sim.smoke.grid import SmokeGrid
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
@@ -49,6 +51,24 @@ def test_single_drops_do_not_block_the_air(room):
     assert not room.is_water().any()
 
 
+@pytest.mark.parametrize("reach_in_cells", [1.0, 1.7, 4.0])
+def test_beside_a_static_body_water_is_made_up_for_as_beside_a_wall(reach_in_cells):
+    size, floor = 0.02, 5
+    solid = np.zeros((12, 12, 12), bool)
+    solid[..., :floor] = True
+    none = np.zeros_like(solid)
+    reach = reach_in_cells * size
+    sides = ("x-", "x+", "y-", "y+", "z-", "z+")
+    open_domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.24, 0.24, 0.24), open_faces=sides)
+    tank = DomainParameters(min=(0.0, 0.0, floor * size), max=(0.24, 0.24, 0.24), open_faces=tuple(set(sides) - {"z-"}))
+    beside_body = room_for_water(SmokeGrid((0.0, 0.0, 0.0), size, solid.shape, frozenset(), solid), open_domain, reach)
+    beside_wall = room_for_water(SmokeGrid((0.0, 0.0, 0.0), size, solid.shape, frozenset(), none), tank, reach)
+    assert beside_wall[5, 5, floor] < 0.9
+    # Cells beside the sides of the box do not know of the body beyond; walls are in single precision.
+    inner = slice(4, -4)
+    np.testing.assert_allclose(beside_body[inner, inner, floor:], beside_wall[inner, inner, floor:], atol=1.0e-6)
+
+
 @pytest.mark.slow
 def test_water_at_rest_is_a_wall_for_rising_and_sinking_smoke_and_holds_none():
     """Cold smoke falls onto the surface from above, and spreads."""
@@ -87,6 +107,8 @@ def test_a_block_of_water_that_comes_in_drives_as_much_air_out():
         open_faces=("z+", "x+"),
         source={**SILENT_SOURCE, "position": (0.16, 0.16, 0.16)},
     )
+    # It moves a cell in a step at most, though none of it is in the box yet.
+    assert room.coupling.stable_dt() == pytest.approx(SPACING / 1.0, rel=1.0e-6)
     time_s = 0.0
     while time_s < 0.12:
         time_s += room.step()
@@ -99,3 +121,9 @@ def test_a_block_of_water_that_comes_in_drives_as_much_air_out():
     came_in = np.count_nonzero(room.fluid.particles.position.to_numpy()[: len(block), 2] < 0.32) * SPACING**3
     assert abs(volume - came_in) < 0.5001 * SPACING * 0.16**2
     assert not room.smoke.snapshots()["air"].arrays["density"][is_water].any()
+    # A particle far above has the way to the box to go first, but for the two spacings that it reaches.
+    room.place(np.array([[0.16, 0.16, 0.7]]))
+    assert room.coupling.stable_dt() == np.inf
+    room.fluid.particles.velocity.fill(2.0)
+    way = 0.7 - (0.32 + 2.0 * SPACING) + SPACING
+    assert room.coupling.stable_dt() == pytest.approx(way / np.hypot(2.0, np.hypot(2.0, 2.0)), rel=1.0e-6)

@@ -5,12 +5,15 @@ import pytest
 from thread_counts import outputs_by_threads
 
 from sim.build import build_world
+from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.rigid import rotation
+from sim.rigid.geometry import BodyGeometry
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
 from sim.scene import DomainParameters, SceneParameters
 from sim.smoke.obstacles import AIR, MOVING, STATIC
+from sim.smoke.parameters import SmokeParameters
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
@@ -169,13 +172,83 @@ def test_cells_whose_centres_are_in_a_body_are_solid_and_have_its_velocity():
     assert not (kind == MOVING)[~covered].any()
 
 
-def test_a_body_that_is_thinner_than_a_cell_is_refused(channel):
-    world, _ = channel
-    plate = {"name": "plate", "kind": "kinematic", "shape": {"type": "box", "size": (0.05, 0.3, 0.3)}}
-    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 0.5, 0.5))
-    rigid = RigidSolver([RigidBodyParameters(**plate)], domain=domain, gravity=(0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match=r'smoke "air": "plate", a body 0\.05 m thin, would fall between its cells'):
-        SmokeRigidCoupling(rigid, smoke_of(world))
+PLATE = {"name": "plate", "kind": "kinematic", "shape": {"type": "box", "size": (0.05, 0.3, 0.3)}}
+DOMAIN = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 0.5, 0.5))
+
+
+def test_a_body_that_is_thinner_than_a_cell_is_refused():
+    with pytest.raises(ValueError, match=r'"plate" is 0\.05 m thin and would fall between the cells of smoke "air"'):
+        build([PLATE])
+
+
+@pytest.mark.parametrize(
+    ("kind", "motion", "reaches"),
+    [
+        ("kinematic", {"position": (0.2, 0.2, 0.2)}, True),
+        ("kinematic", {"position": (2.0, 0.2, 0.2)}, False),
+        ("kinematic", {"position": (2.0, 0.2, 0.2), "velocity": (0.5, 0.0, 0.0)}, False),
+        ("kinematic", {"position": (2.0, 0.2, 0.2), "velocity": (-0.5, 0.0, 0.0)}, True),
+        ("kinematic", {"keyframe": [{"time_s": t, "position": (2.0 - t, 2.0, 0.2)} for t in (0, 1, 2)]}, False),
+        ("kinematic", {"keyframe": [{"time_s": t, "position": (2.0 - t, 0.2, 0.2)} for t in (0, 1, 2)]}, True),
+        ("dynamic", {"position": (0.2, 0.2, 0.2), "density": 500.0}, True),
+    ],
+)
+def test_thin_bodies_are_refused_only_where_they_can_come_into_the_box(kind, motion, reaches):
+    smoke = SmokeParameters(name="air", cell_size=1.0 / 16.0, source=[SOURCE])
+    body = RigidBodyParameters.model_validate({**PLATE, "kind": kind, **motion})
+    assert bool(too_thin_bodies(smoke, [body], [BodyGeometry(body)], DOMAIN)) is reaches
+
+
+def coupled(channel, body, gravity=(0.0, 0.0, 0.0)):
+    """A body that is alone, and what it is to the smoke of the channel."""
+    smoke = smoke_of(channel[0])
+    rigid = RigidSolver([RigidBodyParameters.model_validate(body)], domain=DOMAIN, gravity=gravity)
+    coupling = SmokeRigidCoupling(rigid, smoke)
+    smoke.obstacles.movers.remove(coupling)
+    return rigid, coupling
+
+
+BALL = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.1}}
+RADIUS = 0.1 * np.sqrt(3.0)
+"""Of the sphere around the ball's box, within which it is taken to be."""
+CELL = 1.0 / 16.0
+
+
+@pytest.mark.parametrize("interpolation", ["cubic", "linear"])
+def test_a_body_on_a_path_gets_a_cell_farther_in_a_step_even_if_it_was_at_rest_at_its_start(channel, interpolation):
+    times = {0.0: 0.2, 0.01: 0.2, 0.04: 0.8, 1.0: 0.8}
+    keyframes = [{"time_s": time_s, "position": (x, 0.2, 0.2)} for time_s, x in times.items()]
+    rigid, coupling = coupled(channel, {**BALL, "keyframe": keyframes, "interpolation": interpolation})
+    for time_s in (0.0, 0.012, 0.03):
+        rigid.begin_frame(time_s)
+        dt, path = coupling.stable_dt(), rigid.paths[0]
+        inner = np.linspace(time_s, time_s + dt, 33)
+        places = np.array([path.at(float(time)).position[0] for time in inner])
+        # The larger speed of two look-ups counts between them: at the kink of a linear path 20 m/s for 0.01 s / 32, a
+        # tenth of a cell, too much.
+        assert 0.89 * CELL < np.abs(np.diff(places)).sum() < 1.001 * CELL
+    rigid.begin_frame(1.0)
+    assert coupling.stable_dt() == np.inf
+
+
+def test_a_body_that_is_led_live_is_followed_from_then_on(channel):
+    rigid, coupling = coupled(channel, {**BALL, "position": (0.2, 0.2, 0.2)})
+    assert coupling.stable_dt() == np.inf
+    rigid.lead("ball", (0.6, 0.2, 0.2), within_s=0.1)
+    assert coupling.stable_dt() == pytest.approx(CELL / 4.0, rel=1.0e-12)
+
+
+def test_a_body_falls_a_cell_in_a_step_at_most(channel):
+    body = {**BALL, "kind": "dynamic", "density": 500.0, "position": (0.2, 0.2, 0.2)}
+    _, coupling = coupled(channel, body, gravity=(0.0, 0.0, -9.81))
+    # g dt² is the cell: it comes half that far.
+    assert coupling.stable_dt() == pytest.approx(np.sqrt(CELL / 9.81), rel=1.0e-12)
+
+
+@pytest.mark.parametrize("start", [2.0, 20.0])
+def test_a_body_outside_of_the_box_has_the_way_there_to_go_first(channel, start):
+    _, coupling = coupled(channel, {**BALL, "position": (start, 0.2, 0.2), "velocity": (-3.0, 0.0, 0.0)})
+    assert coupling.stable_dt() == pytest.approx((start - 1.0 - RADIUS + CELL) / 3.0, rel=1.0e-12)
 
 
 def velocity_ahead_of_a_sphere(cells: int) -> np.ndarray:

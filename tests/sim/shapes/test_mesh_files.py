@@ -83,6 +83,51 @@ def test_seams_objects_and_materials_leave_the_numbers_of_an_obj_as_they_are(tmp
     np.testing.assert_array_equal(faces, [[0, 1, 4], [0, 4, 3], [1, 5, 6], [1, 6, 4]])
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{}f 1 2 3 # 4\nf 1 3 4 #left side\n",
+        "# from C:\\models\\\n{}f 1 2 3\nf 1 3 4\n",
+        "{}f 1 2 3\nf 1 3 \\\n4 \\\n",
+        "{}f 1 2 3\nf 1 3 4 \\",
+        "\ufeff{}f 1 2 3\nf 1 3 4\n",
+    ],
+    ids=["comments", "comment with a backslash", "backslash and line end", "backslash at the end", "byte order mark"],
+)
+def test_every_vertex_and_face_of_an_obj_is_read(tmp_path, text):
+    (tmp_path / "square.obj").write_text(text.format("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"), encoding="utf-8")
+    vertices, faces = read_triangles(tmp_path / "square.obj")
+    np.testing.assert_array_equal(vertices, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(faces, [[0, 1, 2], [0, 2, 3]])
+
+
+DART = ((0.0, 0.0), (2.0, 0.0), (1.0, 0.5), (1.0, 2.0))
+"""Its third corner points inwards: triangles about that one, or the first, fill it."""
+
+
+def write_polygon(path, corners, first):
+    turned = corners[first:] + corners[:first]
+    text = "".join(f"v {x} {y} 0\n" for x, y in turned)
+    path.write_text(f"{text}f {' '.join(str(k + 1) for k in range(len(turned)))}\n")
+
+
+def test_polygons_that_a_fan_fills_are_read_though_they_are_concave_or_have_corners_on_a_line(tmp_path):
+    on_a_line = ((0.0, 0.0), (0.5, 1e-6), (1.0, -1e-6), (1.5, 0.0), (1.5, 1.0))
+    for corners, first, area in ((DART, 0, 1.25), (DART, 2, 1.25), (on_a_line, 0, 0.75), (on_a_line, 3, 0.75)):
+        write_polygon(tmp_path / "polygon.obj", corners, first)
+        vertices, faces = read_triangles(tmp_path / "polygon.obj")
+        a, b, c = np.moveaxis(vertices[faces], 1, 0)
+        # Corners that are a millionth off the line make triangles that are as thin.
+        assert 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() == pytest.approx(area, abs=1e-5)
+
+
+@pytest.mark.parametrize("first", [1, 3])
+def test_polygons_that_a_fan_does_not_fill_are_refused(tmp_path, first):
+    write_polygon(tmp_path / "dart.obj", DART, first)
+    with pytest.raises(ShapeError, match=r"dart.obj.*line 5: a concave polygon, which triangles about its first"):
+        read_triangles(tmp_path / "dart.obj")
+
+
 def test_texture_coordinates_of_corners_do_not_renumber_a_ply(tmp_path):
     (tmp_path / "seam.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
@@ -135,6 +180,7 @@ def test_missing_file_is_refused(tmp_path):
         ("cut.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "cut.obj.* has faces that name vertices it does not have"),
         ("back.obj", b"v 0 0 0\nv 1 0 0\nf -1 -2 -3\n", r'line 3, "f -1 -2 -3": a face names vertex -3; 2 are there'),
         ("zero.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "a face names vertex 0; 3 are there, numbered from 1"),
+        ("line.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\nf 1 2 3\n", r'4, "f 1 2": a face needs three corners .* 2'),
         ("short.obj", b"v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", r'not a readable OBJ file .*line 2, "v 1 0"'),
         ("empty.obj", b"", "empty.obj.* (has no faces|is not a readable OBJ)"),
         ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "points.obj has no faces; a solid needs a surface"),

@@ -6,7 +6,7 @@ from smoke_scenes import OPEN_BOX, mark, unit_grid
 from sim.scene import DomainParameters
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.multigrid_levels import Coefficients
-from sim.smoke.obstacles import Obstacles
+from sim.smoke.obstacles import Obstacles, time_of_travel
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.regions import ClosedRegions
 from sim.smoke.solver import SmokeSolver
@@ -42,7 +42,7 @@ def box(shared_box):
     """A closed box of air at rest with nothing in it."""
     shared_box.restore({name: np.zeros_like(array) for name, array in shared_box.checkpoint().items()})
     shared_box.begin_frame(0.0)
-    shared_box.obstacles.expect("test", 0.0)
+    shared_box.obstacles.movers.clear()
     return shared_box
 
 
@@ -148,12 +148,22 @@ def test_a_source_emits_nothing_where_a_body_stands(box):
     assert box.diagnostics()["emitted_mass"] > 0.0
 
 
+class Bullet:
+    def stable_dt(self) -> float:
+        return time_of_travel(CELL_SIZE, speed=1.0e3, acceleration=0.0)
+
+
 def test_obstacles_cross_one_cell_in_a_step_at_most(box):
-    before = box.stable_dt()
-    box.obstacles.expect("test", 1.0e3)
+    box.obstacles.movers.append(Bullet())
     assert box.stable_dt() == pytest.approx(CELL_SIZE / 1.0e3, rel=1.0e-12)
-    box.obstacles.expect("test", 0.0)
-    assert box.stable_dt() == before
+
+
+def test_a_box_of_no_whole_number_of_cells_ends_where_its_last_cell_does():
+    source = [{"shape": {"type": "sphere", "radius": 0.07}}]
+    domain = DomainParameters(min=(0.0, 0.0, -0.3), max=(1.0, 0.95, 0.0))
+    smoke = SmokeParameters(name="air", cell_size=0.1, source=source)
+    # An edge of 0.95 m is ten cells of 0.1 m; what is whole but for rounding, -0.3 + 3 * 0.1 = 5.6e-17, stays.
+    assert smoke.corners(domain) == ((0.0, 0.0, -0.3), (1.0, 1.0, 0.0))
 
 
 def test_coefficients_that_followed_obstacles_equal_those_of_static_ones(box):
