@@ -16,7 +16,7 @@ from pipeline.job.boxes import Box, domain_box, span, touch
 from pipeline.job.cloth_bodies import check_bodies_for_cloth
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.mesh_checks import mesh_exists
-from pipeline.job.pin_checks import check_pin_speed, check_pin_times
+from pipeline.job.pin_checks import check_pin_load, check_pin_speed, check_pin_times
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
 from sim.cloth.parameters import RUNAWAY_SPEED, RectangleSheet, shared_conflicts
@@ -105,6 +105,12 @@ class _Start:
         ends = self.position[self.edges]
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max())
 
+    @cached_property
+    def shortest_edge(self) -> float:
+        """Shortest distance of neighbouring nodes at rest [m]."""
+        rest = self.sheet.vertices[self.edges]
+        return float(np.linalg.norm(rest[:, 1] - rest[:, 0], axis=1).min())
+
     @property
     def box(self) -> Box:
         """What it spans."""
@@ -138,6 +144,10 @@ def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
         _check_size(start, job.domain, findings)
         _check_spacing(start, findings)
         _check_pin_speeds(start, job.fps, findings)
+        check_pin_load(
+            start.path, start.cloth, nodes=len(start.position), pinned=int(start.kept.sum()), edge=start.shortest_edge,
+            gravity=float(np.linalg.norm(job.gravity)), fps=job.fps, findings=findings,
+        )  # fmt: skip
         _check_substeps(start, job.fps, findings)
         for path, solid in solids.items():
             if path[0] == "rigid":
@@ -245,8 +255,7 @@ def _check_size(start: _Start, domain: DomainParameters, findings: Findings) -> 
 
 def _check_spacing(start: _Start, findings: Findings) -> None:
     """Layers keep the thickness where the sheet is folded; it cannot fold more sharply than its nodes allow."""
-    rest = start.sheet.vertices[start.edges]
-    shortest = float(np.linalg.norm(rest[:, 1] - rest[:, 0], axis=1).min())
+    shortest = start.shortest_edge
     if start.cloth.self_collision and start.cloth.thickness > shortest:
         findings.warn(
             (*start.path, "thickness"),

@@ -199,3 +199,36 @@ def test_pins_mean_the_vertices_of_the_file_whatever_its_seams(tmp_path):
     assert problem.endswith("index 2 is a vertex that no triangle of the mesh uses; pin another")
     (problem,) = errors(text.replace("[1, 4, 6]", "[7]"), tmp_path)
     assert problem.endswith("index 7 does not exist; the mesh has vertices 0 to 6")
+
+
+FINE = """
+name = "fine"
+frames = 60
+domain = { min = [-1.0, -1.0, 0.0], max = [1.0, 1.0, 1.0] }
+
+[[cloth]]
+name = "sheet"
+shape = { type = "rectangle", size = [1.0, 1.0], counts = [COUNT, COUNT] }
+position = [0.0, 0.0, 0.5]
+"""
+CORNERS = '[[cloth.pin]]\ncorner = "x-y-"\n[[cloth.pin]]\ncorner = "x+y-"\n'
+
+
+@pytest.mark.parametrize(
+    ("count", "text", "said"),
+    [
+        # 128² / 2 nodes g dt² are 56 mm, at 7.9 mm between them: 7.09 times.
+        (128, CORNERS, "give substeps = 76"),
+        (128, "substeps = 76\n" + CORNERS, None),
+        (128, EDGE, None),
+        (32, CORNERS, None),
+        (128, CORNERS.replace("corner", "release_s = 0.2\ncorner"), None),
+    ],
+    ids=["corners", "short steps", "edge", "coarse", "let go"],
+)
+def test_fine_cloth_on_single_nodes_is_warned_of_with_the_steps_that_do(count, text, said, tmp_path):
+    found = [
+        line for line in warnings(FINE.replace("COUNT", str(count)) + text, tmp_path) if "pinned nodes hold" in line
+    ]
+    assert len(found) == (said is not None)
+    assert said is None or said in found[0]

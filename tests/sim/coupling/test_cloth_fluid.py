@@ -98,7 +98,7 @@ def test_no_particle_of_a_falling_block_passes_a_taut_sheet(taichi_cpu, solver):
 
 
 @pytest.mark.slow
-def test_a_sheet_in_water_is_lifted_by_its_own_volume(taichi_cpu):
+def test_the_water_that_samples_keep_away_does_not_lift_a_sheet(taichi_cpu):
     everywhere = {"region": {"type": "box", "min": (-1.0, -1.0, -1.0), "max": (1.0, 1.0, 1.0)}}
     thickness, side = 0.003, 0.2
     tank = ClothTank(
@@ -112,7 +112,7 @@ def test_a_sheet_in_water_is_lifted_by_its_own_volume(taichi_cpu):
     while elapsed < 0.3:
         elapsed += tank.step()
         lift += tank.coupling.impulse()[2]
-    # What the samples keep away weighs 12 times as much as what the sheet displaces, and is known to some percent.
+    # It weighs 12 times as much as what the sheet displaces and is known to some percent: too few to tell that part.
     kept_away = 1000.0 * GRAVITY * 1.87 * SPACING * side**2
     assert lift / elapsed == pytest.approx(1000.0 * GRAVITY * thickness * side**2, abs=0.08 * kept_away)
 
