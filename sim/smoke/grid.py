@@ -22,9 +22,6 @@ from sim.smoke.parameters import Face, SmokeParameters
 
 Index3 = tuple[int, int, int]
 
-DIRICHLET_CONDUCTANCE = 2.0
-"""Conductance of an open side: pressure is 0 on the face itself, half a cell from the centre."""
-
 
 class SolidRegion(Protocol):
     """A region of space that smoke cannot enter, or that a source fills."""
