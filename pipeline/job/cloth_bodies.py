@@ -29,7 +29,7 @@ def check_bodies_for_cloth(
         longest_edges: longest distance of neighbouring nodes of the cloths, by their numbers [m].
         findings: where warnings go.
     """
-    from sim.cloth.body_grids import CELLS_PER_WALL, THIN_SHARE, grid_spacing, thin_wall
+    from sim.rigid.shape_grids import CELLS_PER_WALL, THIN_SHARE, grid_spacing, thin_wall
     from sim.shapes.placement import PlacedSolid
 
     if not longest_edges:

@@ -12,16 +12,15 @@ from sim.arrays import Floats, Integers, Matrices, Vectors
 from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, Quadruples, Weights, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
-from sim.cloth.rigid_contact_shapes import GRID, Counts, grid_distance, primitive_distance
 from sim.cloth.self_collision_kernels import Four, Pairs, Triples
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
 from sim.rigid.contacts import Poses
 from sim.rigid.geometry import BodyGeometry
+from sim.rigid.shape_distances import CountTriples, distance_at
 from sim.rigid.walls import Wall
 
 Array = NDArray[np.float64]
-CountTriples = ti.types.ndarray(dtype=Counts, ndim=1)
 Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 
 LARGEST_ADVANCE = 0.25
@@ -201,20 +200,6 @@ def find_wall_contacts(
                     normal[slot], floor[slot], kind[slot] = n, least, WALL
                     arm[slot], friction[slot] = ti.math.vec3(0.0), vertex_friction[i]
     return counter[0]
-
-
-@ti.func
-def distance_at(
-    y: ti.math.vec3, b: ti.i32, kind: Integers, size: Vectors, grid_values: Floats, grid_first: Integers,
-    grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
-) -> ti.f32:  # fmt: skip
-    """Distance to body b [m], negative inside, of a point in the frame of its shape."""
-    distance = 0.0
-    if kind[b] == GRID:
-        distance = grid_distance(y, grid_values, grid_first[b], grid_origin[b], grid_spacing[b], grid_shape[b])
-    else:
-        distance = primitive_distance(y, kind[b], size[b])
-    return distance
 
 
 @ti.func

@@ -7,9 +7,9 @@ import numpy as np
 import taichi as ti
 
 from sim.arrays import Floats, Integers, Matrices, Vectors
-from sim.cloth.rigid_contact import CountTriples, distance_at
-from sim.cloth.rigid_contact_bodies import CollisionBodies
+from sim.rigid.device_shapes import DeviceShapes
 from sim.rigid.keyframes import Path
+from sim.rigid.shape_distances import CountTriples, distance_at
 from sim.rigid.ways import Way
 from sim.smoke.obstacles import time_of_travel
 
@@ -43,8 +43,9 @@ class SmokeRigidCoupling:
         """
         self.bodies = (rigid.name, smoke.name)
         self._rigid, self._smoke, self._obstacles = rigid, smoke, smoke.obstacles
-        self._shapes = CollisionBodies(rigid.solids, friction=[0.0] * len(rigid.solids))
-        self._velocity, self._spin = (ti.Vector.ndarray(3, ti.f32, len(rigid.solids)) for _ in range(2))
+        self._shapes = DeviceShapes(rigid.solids)
+        self._position, self._velocity, self._spin = (ti.Vector.ndarray(3, ti.f32, len(rigid.solids)) for _ in range(3))
+        self._rotation = ti.Matrix.ndarray(3, 3, ti.f32, len(rigid.solids))
         self._ways: dict[int, tuple[Path, Way]] = {}
         smoke.obstacles.movers.append(self)
 
@@ -78,10 +79,14 @@ class SmokeRigidCoupling:
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Mark the cells that the bodies fill at the end of a step of the smoke of dt [s]."""
         bodies, shapes = self._rigid.bodies, self._shapes
-        shapes.place(self._rigid.poses(), np.zeros(len(bodies)), np.zeros((len(bodies), 3, 3)))
-        self._velocity.from_numpy(bodies.velocity.astype(np.float32))
-        self._spin.from_numpy(bodies.angular_velocity.astype(np.float32))
         grid, turned = self._smoke.grid, bodies.rotation()
+        for array, values in (
+            (self._position, bodies.position),
+            (self._rotation, turned),
+            (self._velocity, bodies.velocity),
+            (self._spin, bodies.angular_velocity),
+        ):
+            array.from_numpy(values.astype(np.float32))
         for number, geometry in enumerate(self._rigid.solids):
             half, middle = 0.5 * np.ptp(geometry.bounds, axis=0), geometry.bounds.mean(axis=0)
             centre, reach = bodies.position[number] + turned[number] @ middle, np.abs(turned[number]) @ half
@@ -103,8 +108,8 @@ class SmokeRigidCoupling:
                     shapes.grid_origin,
                     shapes.grid_spacing,
                     shapes.grid_shape,
-                    shapes.position,
-                    shapes.rotation,
+                    self._position,
+                    self._rotation,
                     self._velocity,
                     self._spin,
                 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 import pytest
-from inside_blender import run_inside_blender
+from fresh_python import run_python
 
 from render.system_libraries import missing_libraries
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def test_automatic_camera_shows_the_whole_domain_and_no_more_than_needed():
-    run_inside_blender(
+    run_python(
         """
         import itertools
         import numpy as np
@@ -48,7 +48,7 @@ def test_automatic_camera_shows_the_whole_domain_and_no_more_than_needed():
 
 
 def test_ply_of_the_projects_writer_reads_back_and_fills_a_blender_mesh(tmp_path):
-    run_inside_blender(
+    run_python(
         """
         import sys
         from pathlib import Path
@@ -100,7 +100,7 @@ UNFIT_MESHES = {
 def test_unfit_meshes_are_refused_with_the_reason(tmp_path):
     for index, content in enumerate(UNFIT_MESHES.values()):
         (tmp_path / f"{index}.ply").write_bytes(content)
-    run_inside_blender(
+    run_python(
         """
         import sys
         from pathlib import Path

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 import pytest
-from inside_blender import run_inside_blender
+from fresh_python import run_python
 
 from render.system_libraries import missing_libraries
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(
 
 def test_a_weave_of_period_n_shows_one_nth_of_weft_on_average():
     # One crossing in n. A thread is round, so that the other one looks out beside it: 0.240 and 0.185 were measured.
-    run_inside_blender(
+    run_python(
         """
         from blender_scripts.weaves import COTTON, DENIM, SILK, mean_appearance
         for weave in (COTTON, DENIM, SILK):

@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.job.checks import check_job
-from pipeline.job.loading import LoadedJob, read_job
-from pipeline.job.problems import Findings
+from checked_jobs import checked
 
 SHEET = """\
 name = "drape"
@@ -23,19 +21,11 @@ position = [0.0, 0.0, 0.3]
 """
 
 
-def look_at(text: str, folder: Path, **options) -> tuple[LoadedJob, Findings]:
-    path = folder / "drape.toml"
-    path.write_text(text)
-    loaded = read_job(path)
-    return loaded, check_job(loaded.job, **options)
-
-
 def errors(text: str, folder: Path, **options) -> list[str]:
-    loaded, findings = look_at(text, folder, **options)
-    return loaded.source.describe_all(findings.errors)
+    return checked(text, folder / "drape.toml", **options).errors
 
 
 def warnings(text: str, folder: Path) -> list[str]:
-    loaded, findings = look_at(text, folder)
-    assert findings.errors == []
-    return loaded.source.describe_all(findings.warnings)
+    found = checked(text, folder / "drape.toml")
+    assert found.errors == []
+    return found.warnings

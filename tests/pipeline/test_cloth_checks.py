@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from cloth_jobs import BALL, SHEET, errors, look_at, warnings
+from checked_jobs import checked
+from cloth_jobs import BALL, SHEET, errors, warnings
 
 from pipeline.errors import JobFileError
 from pipeline.job.cloth_checks import BYTES_PER_NODE
@@ -20,7 +21,7 @@ position = [0.03, 0.0, 0.5]
 
 
 def test_a_cloth_over_a_ball_is_fine_and_its_nodes_are_counted(tmp_path):
-    _, findings = look_at(SHEET + BALL, tmp_path)
+    findings = checked(SHEET + BALL, tmp_path / "drape.toml").findings
     assert (findings.errors, findings.warnings) == ([], [])
     assert findings.nodes == 81
 

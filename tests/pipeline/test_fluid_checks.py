@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from checked_jobs import checked
 
-from pipeline.job.checks import check_job
 from pipeline.job.fluid_checks import MOST_CELLS, particle_room
 from pipeline.job.jet_checks import _longest_flight, check_jets
 from pipeline.job.loading import read_job
@@ -46,18 +44,9 @@ speed = 1.0
 """
 
 
-def checked(text: str, tmp_path: Path, *, memory_bytes: int | None = None):
-    path = tmp_path / "tank.toml"
-    path.write_text(text)
-    loaded = read_job(path)
-    findings = check_job(loaded.job, memory_bytes=memory_bytes)
-    lines = [loaded.source.describe_all(found) for found in (findings.errors, findings.warnings)]
-    return lines[0], lines[1], findings
-
-
 @pytest.mark.parametrize("text", [HEAD + WATER + OIL, HEAD + JET, HEAD + WATER + JET])
 def test_fluids_that_go_together_pass_without_a_word(text, tmp_path):
-    errors, warnings, findings = checked(text, tmp_path)
+    errors, warnings, findings = checked(text, tmp_path / "tank.toml")
     assert errors == warnings == []
     assert findings.particles > 300
 
@@ -93,7 +82,7 @@ def test_fluids_that_go_together_pass_without_a_word(text, tmp_path):
     ],
 )
 def test_what_cannot_be_is_refused_with_a_remedy(text, expected, tmp_path):
-    errors, _, _ = checked(text, tmp_path, memory_bytes=10**15)
+    errors, _, _ = checked(text, tmp_path / "tank.toml", memory_bytes=10**15)
     assert expected in errors
 
 
@@ -117,28 +106,28 @@ def test_what_cannot_be_is_refused_with_a_remedy(text, expected, tmp_path):
     ],
 )
 def test_what_is_hardly_meant_is_warned_of(text, expected, tmp_path):
-    _, warnings, _ = checked(text, tmp_path)
+    _, warnings, _ = checked(text, tmp_path / "tank.toml")
     assert expected in warnings
 
 
 def test_an_emitter_in_a_solid_body_is_refused(tmp_path):
     ball = '[[rigid]]\nname = "ball"\nshape = { type = "sphere", radius = 0.2 }\nposition = [0.0, 0.0, 0.9]\n'
-    errors, _, _ = checked(HEAD + ball + JET, tmp_path)
+    errors, _, _ = checked(HEAD + ball + JET, tmp_path / "tank.toml")
     assert any("places of its opening are in a solid body; move it out" in error for error in errors)
 
 
 def test_emitters_in_each_others_way_are_refused_at_load(tmp_path):
     again = JET.split("[[fluid.emitter]]")[1]
     same = "[[fluid.emitter]]" + again
-    errors, _, _ = checked(HEAD + JET + same, tmp_path)
+    errors, _, _ = checked(HEAD + JET + same, tmp_path / "tank.toml")
     assert [error.split("emitter[1]")[1] for error in errors] == [
         ": is the same opening as fluid[0].emitter[0], at the same time; let one start when the other has ended"
     ]
     moved = same.replace("[0.0, 0.0, 0.9]", "[0.23, 0.0, 0.9]")
-    errors, _, _ = checked(HEAD + JET + moved, tmp_path)
+    errors, _, _ = checked(HEAD + JET + moved, tmp_path / "tank.toml")
     assert len(errors) == 1
     assert "so near that the pipe around one is in the way of the other" in errors[0]
-    errors, _, _ = checked(HEAD + JET + "end_s = 0.5\n" + same + "start_s = 0.5\n", tmp_path)
+    errors, _, _ = checked(HEAD + JET + "end_s = 0.5\n" + same + "start_s = 0.5\n", tmp_path / "tank.toml")
     assert errors == []
 
 
@@ -173,7 +162,7 @@ FOUNTAIN = emitter("[0.0, 0.0, 0.16]", "[0.17365, 0, 0.98481]", speed=3.0)
     ids=["head-on", "from above", "on a parabola", "fountain"],
 )
 def test_a_jet_that_runs_into_another_nozzle_is_warned_of(text, arrival, tmp_path):
-    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
     assert errors == []
     hits = [warning for warning in warnings if "its jet runs into the nozzle of fluid[0].emitter[0]" in warning]
     assert len(hits) == 1
@@ -197,7 +186,7 @@ def test_a_jet_that_runs_into_another_nozzle_is_warned_of(text, arrival, tmp_pat
     ids=["side by side", "pool between", "post between", "too slow"],
 )  # fmt: skip
 def test_jets_that_meet_something_else_first_pass_without_a_word(text, tmp_path):
-    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
     assert errors == []
     assert not [warning for warning in warnings if "its jet" in warning or "before its opening" in warning]
 
@@ -253,7 +242,7 @@ PLATE = '[[rigid]]\nname = "plate"\nshape = {{ type = "box", size = [0.5, 0.5, 0
     ids=["floor", "plate", "side wall"],
 )
 def test_an_opening_right_before_a_wall_is_warned_of(text, room, tmp_path):
-    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
     assert errors == []
     (warning,) = (each for each in warnings if "before its opening" in each)
     assert float(warning.partition("body is ")[2].partition(" m ")[0]) == pytest.approx(float(room), abs=0.02)
@@ -271,23 +260,25 @@ def test_an_opening_right_before_a_wall_is_warned_of(text, room, tmp_path):
     ids=["high enough", "plate below", "thin", "open"],
 )
 def test_an_opening_with_room_before_it_passes_without_a_word(text, tmp_path):
-    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path)
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
     assert errors == []
     assert not [warning for warning in warnings if "before its opening" in warning]
 
 
 def test_memory_counts_what_emitters_may_add(tmp_path):
     # The domain of 1 m³ holds 15,625 particles of 4 cm, and an endless jet may fill it.
-    endless, _, _ = checked(HEAD + JET, tmp_path, memory_bytes=8_000_000)
+    endless, _, _ = checked(HEAD + JET, tmp_path / "tank.toml", memory_bytes=8_000_000)
     assert any("or give emitters an end_s, or the fluid max_particles" in error for error in endless)
     capped, _, _ = checked(
-        HEAD + JET.replace("[[fluid.e", "max_particles = 3000\n[[fluid.e"), tmp_path, memory_bytes=8_000_000
+        HEAD + JET.replace("[[fluid.e", "max_particles = 3000\n[[fluid.e"),
+        tmp_path / "tank.toml",
+        memory_bytes=8_000_000,
     )
     assert capped == []
 
 
 def test_the_room_is_that_of_the_simulation(tmp_path):
-    _, _, _ = checked(HEAD + JET + "end_s = 0.5", tmp_path)
+    _, _, _ = checked(HEAD + JET + "end_s = 0.5", tmp_path / "tank.toml")
     job = read_job(tmp_path / "tank.toml").job
     # 1 m/s through pi 0.1² m² for half a second, in particles of 0.04³ m³; whole layers of 21.
     assert particle_room(job, job.fluid[0], 0.0) == pytest.approx(np.pi * 0.01 * 0.5 / 0.04**3, abs=21)

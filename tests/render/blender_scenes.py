@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import stat
-import subprocess
 import sys
 import textwrap
 from pathlib import Path
@@ -15,7 +14,6 @@ from render.parameters import CameraParameters, RenderParameters, StageParameter
 from render.spec import RenderSpec
 
 RESOLUTION = (64, 36)
-PROJECT = Path(__file__).resolve().parents[2]
 
 
 def sphere(center: tuple[float, float, float], radius: float, *, rings: int = 24, segments: int = 48):
@@ -75,20 +73,6 @@ def spec_of(*objects, **render) -> RenderSpec:
         objects=objects,
         render=RenderParameters(**settings),
     )
-
-
-def run_python(code: str, *arguments: str) -> str:
-    """Run code in a fresh Python of this environment, from the project's folder; returns what it printed."""
-    completed = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code), *arguments],
-        cwd=PROJECT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert completed.returncode == 0, completed.stdout + completed.stderr
-    return completed.stdout
 
 
 RENDER_FRAMES = """

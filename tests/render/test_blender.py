@@ -16,12 +16,12 @@ from blender_scenes import (
     RESOLUTION,
     read,
     redness,
-    run_python,
     spec_of,
     sphere,
     write_blender_stand_in,
     write_mesh,
 )
+from fresh_python import run_python
 
 from pipeline.executors.base import Assignment, Failed, Finished, TaskEvent
 from pipeline.executors.inline import InlineExecutor
@@ -242,6 +242,10 @@ def test_smoke_is_drawn_where_it_is_and_unfit_volumes_are_refused(tmp_path):
     smoke = VolumeSequenceObject(
         name="smoke",
         file="smoke/{frame}.vdb",
+        box_min=(-0.3, -0.3, 0.2),
+        box_max=(0.3, 0.3, 0.8),
+        open_faces=(),
+        ambient_temperature=293.0,
         material=MaterialParameters(look="smoke", color=(0.02, 0.02, 0.02), density=200.0),
     )
     spec_of(smoke).write(tmp_path / "spec.json")
@@ -288,7 +292,8 @@ def test_every_look_and_stage_builds_and_draws(tmp_path):
         )
         for index, look in enumerate(looks)
     )
-    for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor")):
+    night = StageParameters(name="night", strength=30.0)
+    for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor"), night):
         spec = spec_of(*objects, samples=2).model_copy(update={"stage": stage, "camera": CameraParameters()})
         spec.write(tmp_path / "spec.json")
         run_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, read, redness, run_python, spec_of
+from blender_scenes import RENDER_FRAMES, read, redness, spec_of
+from fresh_python import run_python
 
 from render.meshes import write_ply
 from render.parameters import MaterialParameters

@@ -13,12 +13,12 @@ from blender_scenes import (
     RESOLUTION,
     read,
     redness,
-    run_python,
     spec_of,
     sphere,
     write_blender_stand_in,
     write_mesh,
 )
+from fresh_python import run_python
 
 from pipeline.cache import write_frame
 from pipeline.executors.base import Assignment, Finished

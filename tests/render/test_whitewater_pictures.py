@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, RESOLUTION, read, run_python, spec_of, sphere, write_mesh
+from blender_scenes import RENDER_FRAMES, RESOLUTION, read, spec_of, sphere, write_mesh
+from fresh_python import run_python
 
 from pipeline.job.looks import WHITEWATER
 from render.parameters import MaterialParameters

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.rigid_contact import CountTriples, distance_at
+from sim.rigid.shape_distances import CountTriples, distance_at
 
 
 @ti.kernel

@@ -6,7 +6,7 @@ import trimesh
 from cloth_scenes import EARTH
 from contact_scenes import SPACE, cloth_of, world_of
 
-from sim.cloth import body_grids
+from sim.rigid import shape_grids
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
 
@@ -40,9 +40,9 @@ def nodes_that_left(folder) -> int:
 @pytest.mark.usefixtures("taichi_cpu")
 def test_a_bowl_holds_cloth_as_its_grid_is_as_fine_as_its_walls(tmp_path, monkeypatch):
     # A quarter of the usual cells makes the walls half a cell thick, as those of 2 mm would be of the usual.
-    monkeypatch.setattr(body_grids, "CELLS", 24)
+    monkeypatch.setattr(shape_grids, "CELLS", 24)
     with monkeypatch.context() as coarse:
-        coarse.setattr(body_grids, "CELLS_PER_WALL", 1.0e-6)
+        coarse.setattr(shape_grids, "CELLS_PER_WALL", 1.0e-6)
         assert nodes_that_left(tmp_path) > 0
     assert nodes_that_left(tmp_path) == 0
 
@@ -50,10 +50,10 @@ def test_a_bowl_holds_cloth_as_its_grid_is_as_fine_as_its_walls(tmp_path, monkey
 def test_cells_are_half_a_thin_wall_and_never_more_than_memory_holds(tmp_path):
     write_bowl(tmp_path / "bowl.ply")
     solid = build_solid(Placement(shape={"type": "mesh", "file": str(tmp_path / "bowl.ply")}, scale=0.5))
-    wall = body_grids.thin_wall(solid)
+    wall = shape_grids.thin_wall(solid)
     assert wall == pytest.approx(0.5 * WALL, rel=0.06)  # facets of its 48 sides are up to 2 % nearer than circles
-    assert body_grids.grid_spacing(solid, wall) == pytest.approx(0.5 * wall)
-    assert body_grids.grid_spacing(solid, np.inf) == pytest.approx(RADIUS / 96)
-    finest = body_grids.grid_spacing(solid, 0.0)
+    assert shape_grids.grid_spacing(solid, wall) == pytest.approx(0.5 * wall)
+    assert shape_grids.grid_spacing(solid, np.inf) == pytest.approx(RADIUS / 96)
+    finest = shape_grids.grid_spacing(solid, 0.0)
     nodes = np.prod(np.ceil(np.ptp(solid.bounds, axis=0) / finest + 6.0) + 1.0)
-    assert 0.9 * body_grids.MOST_NODES < nodes <= body_grids.MOST_NODES
+    assert 0.9 * shape_grids.MOST_NODES < nodes <= shape_grids.MOST_NODES

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
+from coupled_steps import CoupledSteps
 from numpy.typing import NDArray
 
 from sim.build import build_world
@@ -14,7 +15,7 @@ EDGES = tuple({"edge": edge} for edge in ("x-", "x+", "y-", "y+"))
 EVERY_FACE = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
-class ClothTank:
+class ClothTank(CoupledSteps):
     """Water and one sheet, as a job describes them, and the world that steps both."""
 
     def __init__(
@@ -41,26 +42,9 @@ class ClothTank:
             "cloth": [{"name": "sheet", "air_density": 0.0, "self_collision": False, **cloth}],
         }
         self.world = build_world(SceneParameters.model_validate(scene), frames_per_second=60.0)
-        self.fluid, self.cloth = (self.world._solvers[name] for name in ("water", "cloth"))
-        self.coupling = next(each for each in self.world._couplings if isinstance(each, ClothFluidCoupling))
-
-    def step(self) -> float:
-        """One coupled substep; returns its length [s]."""
-        dt = min(self.fluid.stable_dt(), self.cloth.stable_dt())
-        self.fluid.substep(dt)
-        self.coupling.exchange(dt)
-        self.cloth.substep(dt)
-        self.coupling.follow(dt)
-        return dt
-
-    def run(self, duration: float) -> float:
-        """Coupled substeps for a time [s], or the little more that they took, which is returned."""
-        time = 0.0
-        while time < duration:
-            time += self.step()
-            assert self.fluid.first_bad_quantity() is None
-            assert self.cloth.first_bad_quantity() is None
-        return time
+        self.cloth = self.world.solvers["cloth"]
+        coupling = next(each for each in self.world._couplings if isinstance(each, ClothFluidCoupling))
+        super().__init__(self.world.solvers["water"], self.cloth, coupling)
 
     def particles(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         """Positions [m], velocities [m/s] and the mass of one [kg]."""

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from coupled_steps import CoupledSteps
 from numpy.typing import NDArray
 
 from sim.coupling.body_samples import samples_of_moving_bodies
@@ -23,7 +24,7 @@ WEIGHTLESS = (0.0, 0.0, 0.0)
 EVERY_FACE = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
-class Tank:
+class Tank(CoupledSteps):
     """A fluid, bodies, and the world that steps both."""
 
     def __init__(
@@ -47,7 +48,7 @@ class Tank:
         points = lattice(*water, self.spacing)
         for body in parameters:
             points = points[build_solid(body).signed_distance(points.astype(np.float64)) >= 0.4995 * self.spacing]
-        self.fluid = SOLVERS[solver](
+        tank = SOLVERS[solver](
             fluid,
             domain=domain,
             gravity=gravity,
@@ -58,26 +59,8 @@ class Tank:
             body_count=len(parameters),
             body_speed=expected_body_speed(parameters, self.rigid.solids, domain, gravity),
         )
-        self.coupling = FluidRigidCoupling(self.fluid, self.rigid)
+        super().__init__(tank, self.rigid, FluidRigidCoupling(tank, self.rigid))
         self.world = World([self.fluid, self.rigid], frames_per_second=frames_per_second, couplings=[self.coupling])
-
-    def step(self) -> float:
-        """One coupled substep; returns its length [s]."""
-        dt = min(self.fluid.stable_dt(), self.rigid.stable_dt())
-        self.fluid.substep(dt)
-        self.coupling.exchange(dt)
-        self.rigid.substep(dt)
-        self.coupling.follow(dt)
-        return dt
-
-    def run(self, duration: float) -> float:
-        """Coupled substeps for a time [s], or the little more that they took, which is returned."""
-        time = 0.0
-        while time < duration:
-            time += self.step()
-            assert self.fluid.first_bad_quantity() is None
-            assert self.rigid.first_bad_quantity() is None
-        return time
 
     def settle(self, duration: float) -> None:
         """Let the fluid come to rest for a time [s] while the bodies are held."""

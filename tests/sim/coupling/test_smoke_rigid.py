@@ -36,7 +36,7 @@ def build(bodies, *, cells: int = 16, size=(1.0, 0.5, 0.5), open_faces=("x+",), 
 
 
 def smoke_of(world):
-    return next(solver for solver in world._solvers.values() if solver.name == "air")
+    return world.solvers["air"]
 
 
 def face_velocities(smoke):
@@ -140,7 +140,7 @@ def test_cells_whose_centres_are_in_a_body_are_solid_and_have_its_velocity():
     # A post stands in the way of the ball that sticks out.
     post = {"name": "post", "shape": {"type": "box", "size": (0.1, 0.1, 0.4)}, "position": (0.95, 0.45, 0.8)}
     world = build([*bodies, post], cells=40, size=(1.0, 1.0, 1.0))
-    smoke, rigid = smoke_of(world), world._solvers["rigid"]
+    smoke, rigid = smoke_of(world), world.solvers["rigid"]
     grid, state = smoke.grid, rigid.bodies
     centres = grid.cell_centres()
     kind = grid.trim(smoke.obstacles.state.to_numpy(), grid.cells).ravel()

@@ -1,10 +1,11 @@
-"""How finely the distances of a mesh are sampled for its contacts with cloth."""
+"""Grids of a mesh's distances, as cloth that touches it and smoke that flows around it read them on the device."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.shapes.level_set import LevelSet
 from sim.shapes.mesh_solid import MeshSolid
 from sim.shapes.placement import PlacedSolid
 from sim.shapes.thickness import wall_thickness
@@ -24,9 +25,20 @@ MOST_NODES = 2**24
 GRID_PADDING = 3.0
 """How far the grid reaches past the mesh, in cells: distances beyond are upper bounds."""
 
+EXACT_NODES = 2**21
+"""A grid of more nodes than this, as thin walls need it, is exact near the surface only; one of `CELLS` has fewer."""
+
 EXACT_WITHIN = 2.0
-"""Distance from the surface, in cells, up to which distances are exact. Others only say that nothing touches, or where
+"""Distance from the surface, in cells, up to which it is. Farther off distances only say that nothing touches, or where
 out is."""
+
+
+def sampled_distances(solid: PlacedSolid) -> LevelSet:
+    """The grid of a mesh, fine enough for its walls."""
+    cell = grid_spacing(solid, thin_wall(solid))
+    is_exact = _node_count(np.ptp(solid.bounds, axis=0), cell) <= EXACT_NODES
+    within = np.inf if is_exact else EXACT_WITHIN * cell
+    return LevelSet.sample(solid, cell, padding=GRID_PADDING * cell, exact_within=within)
 
 
 def thin_wall(solid: PlacedSolid) -> float:
@@ -47,6 +59,10 @@ def _finest_spacing(extent: NDArray[np.float64]) -> float:
     low, high = 0.0, float(extent.max())
     for _ in range(40):
         middle = 0.5 * (low + high)
-        nodes = np.prod(np.ceil(extent / middle + 2.0 * GRID_PADDING) + 1.0)
-        low, high = (middle, high) if nodes > MOST_NODES else (low, middle)
+        low, high = (middle, high) if _node_count(extent, middle) > MOST_NODES else (low, middle)
     return high
+
+
+def _node_count(extent: NDArray[np.float64], spacing: float) -> float:
+    """Nodes of a grid about a box with these edges [m], (3,)."""
+    return float(np.prod(np.ceil(extent / spacing + 2.0 * GRID_PADDING) + 1.0))

@@ -5,10 +5,11 @@ The formulas are those of `sim.shapes.primitives`, exact on both sides of the su
 
 import taichi as ti
 
-from sim.arrays import Floats
+from sim.arrays import Floats, Integers, Vectors
 
 Vector3 = ti.math.vec3
 Counts = ti.types.vector(3, ti.i32)
+CountTriples = ti.types.ndarray(dtype=Counts, ndim=1)
 
 SPHERE, BOX, CYLINDER, CAPSULE, TORUS, CONE, GRID = range(7)
 
@@ -76,4 +77,18 @@ def primitive_distance(p: Vector3, kind: ti.i32, size: Vector3) -> ti.f32:
         distance = rounded(radial - size[0], p[2], size[1])
     elif kind == CONE:
         distance = cone_distance(radial, p[2], size[0], size[1])
+    return distance
+
+
+@ti.func
+def distance_at(
+    y: ti.math.vec3, b: ti.i32, kind: Integers, size: Vectors, grid_values: Floats, grid_first: Integers,
+    grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
+) -> ti.f32:  # fmt: skip
+    """Distance to body b [m], negative inside, of a point in the frame of its shape."""
+    distance = 0.0
+    if kind[b] == GRID:
+        distance = grid_distance(y, grid_values, grid_first[b], grid_origin[b], grid_spacing[b], grid_shape[b])
+    else:
+        distance = primitive_distance(y, kind[b], size[b])
     return distance

@@ -1,0 +1,25 @@
+"""What `check` tells of the text of a job."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline.job.checks import check_job
+from pipeline.job.loading import read_job
+from pipeline.job.problems import Findings
+
+
+class Checked(NamedTuple):
+    """Lines as a user reads them, and what was found beside them."""
+
+    errors: list[str]
+    warnings: list[str]
+    findings: Findings
+
+
+def checked(text: str, path: Path, *, memory_bytes: int | None = None) -> Checked:
+    """Write a job to a file and check it, on a machine with so much memory [bytes]."""
+    path.write_text(text)
+    loaded = read_job(path)
+    findings = check_job(loaded.job, memory_bytes=memory_bytes)
+    describe = loaded.source.describe_all
+    return Checked(describe(findings.errors), describe(findings.warnings), findings)
