@@ -102,7 +102,15 @@ def write_scene(folder: Path, frames: list[int], options: argparse.Namespace) ->
         stage=StageParameters(),
         objects=(
             MeshSequenceObject(name="water", file="water{frame}.ply", material=MaterialParameters(look="water")),
-            VolumeSequenceObject(name="smoke", file="smoke{frame}.vdb", material=MaterialParameters(look="smoke")),
+            VolumeSequenceObject(
+                name="smoke",
+                file="smoke{frame}.vdb",
+                box_min=(-0.5, -0.5, 0.0),
+                box_max=(0.5, 0.5, 1.0),
+                open_faces=(),
+                ambient_temperature=293.0,
+                material=MaterialParameters(look="smoke"),
+            ),
         ),
         render=RenderParameters(resolution=tuple(options.resolution), quality=options.quality, device="cpu"),
     )

@@ -6,6 +6,11 @@ no case distinction.
 
 from __future__ import annotations
 
+import importlib.util
+import sys
+from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import bpy
@@ -23,6 +28,28 @@ def require_supported_version() -> None:
     if tuple(bpy.app.version[:2]) < MINIMUM_VERSION:
         needed = ".".join(str(part) for part in MINIMUM_VERSION)
         raise RuntimeError(f"Blender {blender_version()} is too old; {needed} LTS or newer is needed")
+
+
+def import_openvdb() -> ModuleType:
+    """Blender's own binding of OpenVDB. An executable has it on its path; the bpy wheel brings it and leaves it off.
+
+    Raises:
+        RuntimeError: this build of Blender has none.
+    """
+    if importlib.util.find_spec("openvdb") is None:
+        folders = Path(bpy.utils.resource_path("LOCAL")).glob("python/lib/python3.*/site-packages")
+        files = [folder / f"openvdb{suffix}" for folder in sorted(folders) for suffix in EXTENSION_SUFFIXES]
+        file = next((file for file in files if file.is_file()), None)
+        if file is None:
+            raise RuntimeError(f"Blender {blender_version()} comes without openvdb for Python, which fire needs")
+        spec = importlib.util.spec_from_loader("openvdb", ExtensionFileLoader("openvdb", str(file)))
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        sys.modules["openvdb"] = module
+    import openvdb
+
+    return openvdb
 
 
 def node_tree_of(owner: Any) -> Any:

@@ -90,13 +90,7 @@ def _build_studio(parameters: dict[str, Any], geometry: StageGeometry) -> None:
 
 def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     """Ground to the horizon, a physical sky and a sun from behind the camera's left."""
-    half = 60.0 * geometry.size
-    corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
-    positions = np.array(
-        [(geometry.centre.x + x, geometry.centre.y + y, geometry.floor_z) for x, y in corners], dtype=np.float32
-    )
-    ground = TriangleMesh(positions, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
-    _add_ground(ground, "ground", parameters["color"])
+    _add_ground(_plain(geometry), "ground", parameters["color"])
 
     elevation = math.radians(38.0)
     from_sun = geometry.place(right=-1.0, towards_camera=-0.45, above_floor=0.0) - geometry.place(
@@ -115,11 +109,33 @@ def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     _connect_background(tree, sky.outputs["Color"], 0.14 * parameters["strength"])
 
 
+def _build_night(parameters: dict[str, Any], geometry: StageGeometry) -> None:
+    """Ground to the horizon under a dark sky, for what glows; a moon from behind draws rims on what does not."""
+    _add_ground(_plain(geometry), "ground", parameters["color"])
+    moon = _new_light("moon", "SUN", 0.4 * parameters["strength"], (0.66, 0.80, 1.0))
+    # Wider than the real one, of half a degree: its shadows are soft, as those of a night in a film are.
+    moon.angle = math.radians(4.0)
+    _add_light_object("moon", moon, geometry.place(right=0.8, towards_camera=-1.2, above_floor=1.0), geometry.centre)
+    _set_gradient_world(0.05 * parameters["strength"])
+    bpy.context.scene.world.cycles.sampling_method = "NONE"
+
+
 STAGES: dict[str, Callable[[dict[str, Any], StageGeometry], None]] = {
     "studio": _build_studio,
     "outdoor": _build_outdoor,
+    "night": _build_night,
 }
 """How each stage is built, by the name that a specification uses."""
+
+
+def _plain(geometry: StageGeometry) -> TriangleMesh:
+    """A floor as far as the eye sees."""
+    half = 60.0 * geometry.size
+    corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
+    positions = np.array(
+        [(geometry.centre.x + x, geometry.centre.y + y, geometry.floor_z) for x, y in corners], dtype=np.float32
+    )
+    return TriangleMesh(positions, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
 
 
 def _cyclorama(geometry: StageGeometry) -> TriangleMesh:

@@ -12,6 +12,7 @@ from typing import Any
 import bpy
 
 from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
+from blender_scripts.smoke_looks import build_fire, build_smoke
 from blender_scripts.weaves import build_cotton, build_denim, build_silk
 
 WATER_IOR = 1.333
@@ -19,33 +20,12 @@ WATER_ABSORPTION_PER_M: Color = (0.30, 0.055, 0.009)
 """Absorption of pure water for red, green and blue light [1/m] (Pope & Fry 1997, rounded)."""
 _WATER_ABSORPTION_BY_SIZE = 7.0
 """A domain this many metres across needs no exaggeration to look like deep water."""
-_SMOKE_OPTICAL_SIZE = 22.0
-"""Optical depth of smoke of density 1 across the whole domain."""
 
 
-def new_material(name: str, parameters: dict[str, Any], *, domain_size: float, pixel_angle: float) -> Any:
-    """The material for a body.
-
-    Args:
-        name: of the body.
-        parameters: `look`, `color`, `roughness`, `density` and `thread_spacing` of the specification.
-        domain_size: diagonal of the domain [m].
-        pixel_angle: width of a pixel at a distance of 1 m [m/m].
-
-    Returns:
-        A Blender material.
-    """
-    color = parameters["color"]
-    context = LookContext(
-        domain_size,
-        pixel_angle,
-        None if color is None else tuple(color),
-        parameters["roughness"],
-        parameters["density"],
-        parameters["thread_spacing"],
-    )
+def new_material(name: str, look: str, context: LookContext) -> Any:
+    """A Blender material with a look, for the body of a name."""
     material = bpy.data.materials.new(name)
-    LOOKS[parameters["look"]](NodeBuilder(material), context)
+    LOOKS[look](NodeBuilder(material), context)
     return material
 
 
@@ -74,17 +54,6 @@ def _glass(builder: NodeBuilder, context: LookContext) -> None:
         Transmission_Weight=1.0,
     )
     builder.surface(_with_clear_shadow(builder, shader, tint=or_default(context.color, (0.90, 0.93, 0.92))))
-
-
-def _smoke(builder: NodeBuilder, context: LookContext) -> None:
-    """Light smoke that scatters forwards a little; extinction follows the `density` grid."""
-    shader = builder.node(
-        "ShaderNodeVolumePrincipled",
-        Color=or_default(context.color, (0.86, 0.88, 0.90)),
-        Density=or_default(context.density, _SMOKE_OPTICAL_SIZE / context.domain_size),
-        Anisotropy=0.3,
-    )
-    builder.volume(shader)
 
 
 def _rubber(builder: NodeBuilder, context: LookContext) -> None:
@@ -209,7 +178,8 @@ def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
 
 LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
     "water": _water,
-    "smoke": _smoke,
+    "smoke": build_smoke,
+    "fire": build_fire,
     "rubber": _rubber,
     "ceramic": _ceramic,
     "plastic": _plastic,

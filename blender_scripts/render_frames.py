@@ -28,8 +28,10 @@ import bpy
 from blender_scripts import camera, geometry, lights, looks, png, points, poses, settings, tank, volumes
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.errors import RenderFailedError, RenderInputError
+from blender_scripts.shading import LookContext, SmokeBox
+from blender_scripts.smoke_looks import glow_of
 
-SPEC_VERSION = 1
+SPEC_VERSION = 2
 EXIT_FRAME_FAILED = 1
 
 
@@ -68,6 +70,7 @@ class SceneRenderer:
         if spec["stage"]["tank"]:
             tank.add_tank(spec)
         self._sequences: list[tuple[dict[str, Any], Any]] = []
+        self._fires: dict[str, volumes.FireLight] = {}
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         for description in spec["objects"]:
             self._add_object(description, spec)
@@ -85,6 +88,8 @@ class SceneRenderer:
             path = self._folder / description["file"].replace("{frame}", f"{frame:06d}")
             if description["type"] == "volume_sequence":
                 volumes.load_volume(blender_object.data, path)
+                if fire := self._fires.get(description["name"]):
+                    fire.shine(path)
             elif description["type"] == "point_sequence":
                 points.fill_points(blender_object.data, points.read_points(path, description["kind"]))
             else:
@@ -110,9 +115,14 @@ class SceneRenderer:
 
     def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> None:
         name, kind = description["name"], description["type"]
-        material = looks.new_material(
-            name, description["material"], domain_size=_domain_size(spec), pixel_angle=camera.pixel_angle(spec)
+        look = description["material"]["look"]
+        context = LookContext.of(
+            description["material"],
+            domain_size=_domain_size(spec),
+            pixel_angle=camera.pixel_angle(spec),
+            smoke_box=_smoke_box(description) if kind == "volume_sequence" else None,
         )
+        material = looks.new_material(name, look, context)
         if kind in ("mesh", "moving_mesh"):
             blender_object = geometry.new_mesh_object(name, geometry.read_ply(self._folder / description["file"]))
             blender_object.rotation_mode = "QUATERNION"
@@ -131,11 +141,22 @@ class SceneRenderer:
         else:
             blender_object = volumes.new_volume_object(name)
             self._sequences.append((description, blender_object))
+            if look == "fire":
+                self._fires[name] = volumes.FireLight(name, glow_of(context))
         blender_object.data.materials.append(material)
 
 
 def _domain_size(spec: dict[str, Any]) -> float:
     return sum((high - low) ** 2 for low, high in zip(spec["domain_min"], spec["domain_max"], strict=True)) ** 0.5
+
+
+def _smoke_box(description: dict[str, Any]) -> SmokeBox:
+    return SmokeBox(
+        tuple(description["box_min"]),
+        tuple(description["box_max"]),
+        tuple(description["open_faces"]),
+        description["ambient_temperature"],
+    )
 
 
 def _read_spec(path: Path) -> dict[str, Any]:

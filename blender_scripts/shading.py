@@ -12,24 +12,67 @@ Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
+class SmokeBox:
+    """What a volume says about itself.
+
+    Attributes:
+        box_min: lower corner of the smoke's grid [m].
+        box_max: upper corner [m].
+        open_faces: sides that smoke may leave by, of `x-`, `x+` to `z+`.
+        ambient_temperature: of the air, which the `temperature` grid is counted from [K].
+    """
+
+    box_min: tuple[float, float, float]
+    box_max: tuple[float, float, float]
+    open_faces: tuple[str, ...]
+    ambient_temperature: float
+
+
+@dataclass(frozen=True)
 class LookContext:
-    """What a look may depend on.
+    """What a look may depend on; what comes from the job is None where the job leaves it to the look.
 
     Attributes:
         domain_size: diagonal of the domain [m].
         pixel_angle: width of a pixel at a distance of 1 m [m/m].
-        color: base colour or tint from the job, linear RGB, or None.
-        roughness: from the job [-], or None.
-        density: from the job, or None; see `render.parameters.MaterialParameters`.
-        thread_spacing: of woven cloth, from the job [m], or None.
+        smoke_box: of a volume; None for everything else.
+        color: base colour or tint from the job, linear RGB.
+        roughness: from the job [-].
+        density: from the job; see `render.parameters.MaterialParameters`.
+        thread_spacing: of woven cloth, from the job [m].
+        anisotropy: of smoke, from the job [-].
+        edge_fade: of smoke, from the job [m].
+        emission: of fire, from the job [-].
+        flame_temperature: of fire, from the job [K].
     """
 
     domain_size: float
     pixel_angle: float
+    smoke_box: SmokeBox | None
     color: Color | None
     roughness: float | None
     density: float | None
     thread_spacing: float | None
+    anisotropy: float | None
+    edge_fade: float | None
+    emission: float | None
+    flame_temperature: float | None
+
+    @classmethod
+    def of(
+        cls, parameters: dict[str, Any], *, domain_size: float, pixel_angle: float, smoke_box: SmokeBox | None = None
+    ) -> LookContext:
+        """The context for a material of the specification; keys that it does not have are left to the look."""
+        own = {name: parameters.get(name) for name in _FROM_THE_JOB}
+        if own["color"] is not None:
+            own["color"] = tuple(own["color"])
+        return cls(domain_size=domain_size, pixel_angle=pixel_angle, smoke_box=smoke_box, **own)
+
+
+_FROM_THE_JOB = (
+    *("color", "roughness", "density", "thread_spacing"),
+    *("anisotropy", "edge_fade", "emission", "flame_temperature"),
+)
 
 
 class NodeBuilder:
@@ -57,6 +100,17 @@ class NodeBuilder:
         node.operation = operation
         for operand, socket in zip(operands, node.inputs, strict=False):
             if isinstance(operand, int | float):
+                socket.default_value = operand
+            else:
+                self.link(operand, socket)
+        return node.outputs[0]
+
+    def vector_math(self, operation: str, *operands: Any) -> Any:
+        """The output socket of a calculation with vectors; operands are tuples and output sockets."""
+        node = self.tree.nodes.new("ShaderNodeVectorMath")
+        node.operation = operation
+        for operand, socket in zip(operands, node.inputs, strict=False):
+            if isinstance(operand, tuple):
                 socket.default_value = operand
             else:
                 self.link(operand, socket)

@@ -9,12 +9,12 @@ import numpy as np
 from blender_scripts.camera import pixel_angle
 from blender_scripts.geometry import TriangleMesh, new_mesh_object
 from blender_scripts.looks import new_material
+from blender_scripts.shading import LookContext
 
 _WALL_THICKNESS = 0.008
 """In domain diagonals."""
 _GAP = 0.002
 """Between water and glass, in domain diagonals: coinciding surfaces would shade each other at random."""
-_OWN_MATERIAL = {"color": None, "roughness": None, "density": None, "thread_spacing": None}
 
 
 def add_tank(spec: dict[str, Any]) -> None:
@@ -42,8 +42,8 @@ def add_tank(spec: dict[str, Any]) -> None:
             edges.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2])))
     for name, boxes in (("tank_glass", panes), ("tank_edge", edges)):
         tank = new_mesh_object(name, _boxes(boxes))
-        own = {"look": name, **_OWN_MATERIAL}
-        tank.data.materials.append(new_material(name, own, domain_size=size, pixel_angle=pixel_angle(spec)))
+        context = LookContext.of({}, domain_size=size, pixel_angle=pixel_angle(spec))
+        tank.data.materials.append(new_material(name, name, context))
         tank.data.shade_flat()
 
 

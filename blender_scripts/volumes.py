@@ -1,4 +1,4 @@
-"""Smoke: OpenVDB files into Blender, one a frame."""
+"""Smoke: OpenVDB files into Blender, one a frame, and the lamps of fires."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 
 from blender_scripts.errors import RenderInputError
+from blender_scripts.flames import Glow, Lamp, lamps_of_file
 
 
 def new_volume_object(name: str) -> Any:
@@ -43,3 +44,43 @@ def load_volume(volume: Any, path: Path) -> None:
     if "velocity" in names:
         # Blender checks the name against the loaded grids, so this comes after loading.
         volume.velocity_grid = "velocity"
+
+
+class FireLight:
+    """The lamps of one fire, which shine as its volume glows, frame by frame."""
+
+    def __init__(self, name: str, glow: Glow) -> None:
+        self._name, self._glow = name, glow
+        self._lamps: list[Any] = []
+
+    def shine(self, path: Path) -> None:
+        """Set the lamps to the light of this frame's volume.
+
+        Raises:
+            RenderInputError: the volume lacks a grid.
+        """
+        lamps = lamps_of_file(path, self._glow)
+        while len(self._lamps) < len(lamps):
+            self._lamps.append(self._new_lamp())
+        for index, blender_object in enumerate(self._lamps):
+            blender_object.hide_render = index >= len(lamps)
+            if index < len(lamps):
+                _set_lamp(blender_object, lamps[index])
+
+    def _new_lamp(self) -> Any:
+        light = bpy.data.lights.new(self._name, "POINT")
+        blender_object = bpy.data.objects.new(self._name, light)
+        # The eye and mirrors see the volume itself.
+        blender_object.visible_camera = False
+        blender_object.visible_glossy = False
+        blender_object.visible_transmission = False
+        bpy.context.scene.collection.objects.link(blender_object)
+        return blender_object
+
+
+def _set_lamp(blender_object: Any, lamp: Lamp) -> None:
+    blender_object.location = lamp.position
+    strongest = max(lamp.power)
+    blender_object.data.energy = strongest
+    blender_object.data.color = [channel / strongest for channel in lamp.power]
+    blender_object.data.shadow_soft_size = lamp.radius

@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.cached_smoke import SmokeInBox, read_smoke, slabs, stored_box, write_smoke
 from pipeline.errors import InvalidArtifactError
 from sim.snapshots import Attribute, BodyKind, Snapshot
 from sim.solver import Diagnostics
@@ -73,8 +74,27 @@ class Checkpoint:
     arrays: Mapping[str, NDArray[np.generic]]
 
 
-def write_frame(path: Path, bodies: Mapping[str, Snapshot], report: FrameReport, *, device: str) -> None:
-    """Write one frame, and the device that computed it."""
+def write_frame(
+    path: Path,
+    bodies: Mapping[str, Snapshot],
+    report: FrameReport,
+    *,
+    device: str,
+    longest_shutter_s: float | None = None,
+) -> None:
+    """Write one frame, and the device that computed it.
+
+    Args:
+        path: the file to write.
+        bodies: snapshots by name.
+        report: number, time and diagnostics of the frame.
+        device: what computed it.
+        longest_shutter_s: the longest time that the shutter of any picture is open [s]: what no picture shows of a
+            smoke is left out, and the rest rounded (`cached_smoke`). None keeps smoke as it is.
+
+    Raises:
+        InvalidArtifactError: a value of a smoke is not finite.
+    """
     with _new_file(path) as file:
         file.attrs["format"] = FRAME_FORMAT
         file.attrs["format_version"] = FORMAT_VERSION
@@ -86,6 +106,9 @@ def write_frame(path: Path, bodies: Mapping[str, Snapshot], report: FrameReport,
             group.attrs["kind"] = snapshot.kind
             for key, value in snapshot.attributes.items():
                 group.attrs[key] = value
+            if snapshot.kind == "smoke" and longest_shutter_s is not None:
+                write_smoke(group, name, snapshot, longest_shutter_s=longest_shutter_s, compression=COMPRESSION)
+                continue
             for key, array in snapshot.arrays.items():
                 _write_array(group, key, array)
         for name, diagnostics in report.diagnostics.items():
@@ -103,21 +126,27 @@ def read_frame(path: Path, body: str | None = None, *, kind: BodyKind | None = N
     Raises:
         InvalidArtifactError: the file is truncated, damaged or of another format.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            _require(path, file, FRAME_FORMAT)
-            names = [body] if body is not None else list(file.get("bodies", {}))
-            if kind is not None:
-                names = [name for name in names if file["bodies"][name].attrs["kind"] == kind]
-            return CachedFrame(
-                frame=int(file.attrs["frame"]),
-                time_s=float(file.attrs["time_s"]),
-                device=str(file.attrs["device"]),
-                bodies={name: _read_body(file["bodies"][name]) for name in names},
-                diagnostics=_read_diagnostics(file),
-            )
-    except (OSError, KeyError, RuntimeError) as error:
-        raise InvalidArtifactError(f"{path}: not a readable frame of the cache: {error}") from error
+    with _frame(path) as file:
+        names = [body] if body is not None else list(file.get("bodies", {}))
+        if kind is not None:
+            names = [name for name in names if file["bodies"][name].attrs["kind"] == kind]
+        return CachedFrame(
+            frame=int(file.attrs["frame"]),
+            time_s=float(file.attrs["time_s"]),
+            device=str(file.attrs["device"]),
+            bodies={name: _read_body(file["bodies"][name]) for name in names},
+            diagnostics=_read_diagnostics(file),
+        )
+
+
+def read_smoke_in_box(path: Path, name: str) -> SmokeInBox:
+    """Read a smoke of a frame without the empty space around it, which `read_frame` fills.
+
+    Raises:
+        InvalidArtifactError: the file is truncated, damaged or of another format.
+    """
+    with _frame(path) as file:
+        return read_smoke(file["bodies"][name])
 
 
 def read_numbers(path: Path, only: Collection[str] | None = None) -> FrameNumbers:
@@ -130,16 +159,23 @@ def read_numbers(path: Path, only: Collection[str] | None = None) -> FrameNumber
     Raises:
         InvalidArtifactError: the file is truncated, damaged or of another format.
     """
+    with _frame(path) as file:
+        return FrameNumbers(
+            frame=int(file.attrs["frame"]),
+            time_s=float(file.attrs["time_s"]),
+            device=str(file.attrs["device"]),
+            solvers=_read_diagnostics(file, only),
+            kinds=_read_kinds(file) if only is None else {},
+        )
+
+
+@contextmanager
+def _frame(path: Path) -> Iterator[h5py.File]:
+    """A frame, open for reading; what fails with it is told as an InvalidArtifactError."""
     try:
         with h5py.File(path, "r") as file:
             _require(path, file, FRAME_FORMAT)
-            return FrameNumbers(
-                frame=int(file.attrs["frame"]),
-                time_s=float(file.attrs["time_s"]),
-                device=str(file.attrs["device"]),
-                solvers=_read_diagnostics(file, only),
-                kinds=_read_kinds(file) if only is None else {},
-            )
+            yield file
     except (OSError, KeyError, RuntimeError) as error:
         raise InvalidArtifactError(f"{path}: not a readable frame of the cache: {error}") from error
 
@@ -165,10 +201,15 @@ def _new_file(path: Path) -> Iterator[h5py.File]:
 
 def validate_frame(path: Path) -> None:
     """Decode every array; raises InvalidArtifactError if one is damaged or not finite."""
-    for name, snapshot in read_frame(path).bodies.items():
-        for key, array in snapshot.arrays.items():
-            if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-                raise InvalidArtifactError(f'{path}: {key} of "{name}" holds values that are not finite')
+    with _frame(path) as file:
+        _read_diagnostics(file)
+        for name, group in file.get("bodies", {}).items():
+            is_smoke = group.attrs["kind"] == "smoke"
+            for key, dataset in group.items():
+                for part in slabs(stored_box(dataset)) if is_smoke else [()]:
+                    array = dataset[part]
+                    if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+                        raise InvalidArtifactError(f'{path}: {key} of "{name}" holds values that are not finite')
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:

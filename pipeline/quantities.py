@@ -99,7 +99,6 @@ _KNOWN = {
         Quantity("repaired_crossings", "crossings repaired", "", "Cloth crossings repaired", counted=True),
         Quantity("crossings_left", "crossings left", "", "Cloth crossings left", counted=True),
         Quantity("impact_zone_vertices", "nodes moved as one", "", "Cloth nodes moved as one", counted=True),
-        Quantity("pair_searches", "searches for pairs", "", "Searches for pairs per frame", counted=True),
         Quantity("max_strain", "largest strain", SHARE, "Strain"),
         Quantity("wall_contacts", "wall contacts", "", "Contacts", counted=True),
         Quantity("max_penetration", "deepest penetration", "m", "Penetration"),

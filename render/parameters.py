@@ -60,9 +60,10 @@ class LightParameters(Parameters):
 class StageParameters(Parameters):
     """Ground, background and the lights that come with them."""
 
-    name: Literal["studio", "outdoor"] = Field(
+    name: Literal["studio", "outdoor", "night"] = Field(
         default="studio",
-        description="studio: cyclorama with key, fill and rim lights; outdoor: ground, sky and sun.",
+        description="studio: cyclorama with key, fill and rim lights; outdoor: ground, sky and sun; night: ground, "
+        "a dark sky and a moon behind the domain.",
     )
     strength: Positive = Field(default=1.0, description="Factor on all of its lights [-].")
     color: Color = Field(default=(0.22, 0.25, 0.29), description="Colour of the ground and backdrop, linear RGB.")
@@ -70,8 +71,8 @@ class StageParameters(Parameters):
 
 
 Look = Literal[
-    "water", "smoke", "rubber", "ceramic", "plastic", "metal", "stone", "glass", "spray", "foam", "bubbles", "cotton",
-    "silk", "denim",
+    "water", "smoke", "fire", "rubber", "ceramic", "plastic", "metal", "stone", "glass", "spray", "foam", "bubbles",
+    "cotton", "silk", "denim",
 ]  # fmt: skip
 
 
@@ -83,10 +84,29 @@ class MaterialParameters(Parameters):
     roughness: Fraction | None = Field(default=None, description="Roughness [-]; the look's own if omitted.")
     density: Positive | None = Field(
         default=None,
-        description="Smoke: extinction per metre at density 1 [1/m]. Water: factor on its absorption [-].",
+        description="Smoke and fire: extinction per metre at density 1 [1/m]. Water: factor on its absorption [-].",
     )
     thread_spacing: Positive | None = Field(
         default=None, description="Woven cloth: distance of its threads [m]; the look's own if omitted."
+    )
+    anisotropy: Annotated[float, Field(ge=-0.95, le=0.95)] | None = Field(
+        default=None,
+        description="Smoke and fire: mean cosine of the angle that light is scattered by [-]; 0.3 if omitted.",
+    )
+    edge_fade: NonNegative | None = Field(
+        default=None,
+        description="Smoke and fire: width over which they fade out at the open faces of their box [m]; 0 shows the "
+        "cut, 8 % of the box's shortest edge if omitted.",
+    )
+    emission: NonNegative | None = Field(
+        default=None,
+        description="Fire: radiance of flames so thick that nothing shines through, at flame_temperature [-], where a "
+        "white wall in full light has 1; the look's own if omitted.",
+    )
+    flame_temperature: Annotated[float, Field(ge=800.0, le=4000.0)] | None = Field(
+        default=None,
+        description="Fire: temperature that glows as emission says [K]; 1500 if omitted. What is hotter or colder "
+        "glows more or less as a black body does.",
     )
 
 

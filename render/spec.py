@@ -22,7 +22,7 @@ from render.parameters import (
     Vector3,
 )
 
-SPEC_VERSION: Literal[1] = 1
+SPEC_VERSION: Literal[2] = 2
 
 
 class MeshObject(Parameters):
@@ -79,6 +79,10 @@ class VolumeSequenceObject(Parameters):
     type: Literal["volume_sequence"] = "volume_sequence"
     name: str
     file: str = Field(description="Path with {frame}.")
+    box_min: Vector3 = Field(description="Lower corner of the smoke's grid [m].")
+    box_max: Vector3 = Field(description="Upper corner of the smoke's grid [m].")
+    open_faces: tuple[str, ...] = Field(description="Sides that smoke may leave by: x-, x+, y-, y+, z-, z+.")
+    ambient_temperature: float = Field(description="What the temperature grid is counted from [K].")
     material: MaterialParameters
 
 
@@ -91,7 +95,7 @@ SceneObject = Annotated[
 class RenderSpec(Parameters):
     """Everything in front of the camera, and the camera."""
 
-    version: Literal[1] = SPEC_VERSION
+    version: Literal[2] = SPEC_VERSION
     fps: float = Field(gt=0.0)
     domain_min: Vector3
     domain_max: Vector3

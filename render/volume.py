@@ -1,15 +1,16 @@
 """Smoke volumes as OpenVDB files: `density`, `temperature` and `velocity` on one grid of cells.
 
 The OpenVDB binding is the one inside the bpy wheel; it is loaded by itself, without importing bpy. Equal arrays give
-equal bytes, and a file that was changed is noticed (`vdb_file`). Layout and conventions: docs/formats.md.
+equal bytes, and a file that was changed is noticed (`vdb_file`). Layout and conventions: docs/formats.md. Grids are
+filled column by column: beside the arrays that are written only masks, and what OpenVDB makes of them, take memory.
 """
 
 from __future__ import annotations
 
 import importlib.util
-import math
+import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader, ModuleSpec
 from pathlib import Path
@@ -22,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from render import vdb_file
 from render.errors import InvalidFileError, VolumeUnavailableError
 from render.parameters import VolumeParameters
+from render.smoke_region import Box, blur_reach, bounding_box, grown
 
 Float32Array = NDArray[np.float32]
 
@@ -29,7 +31,14 @@ GRID_TYPES = {"density": "float", "temperature": "float", "velocity": "vec3s"}
 TEMPERATURE_TOLERANCE_K = 0.5
 """Air this close to the ambient temperature [K] is stored as ambient; it emits and lifts nothing visible."""
 
-_SLAB = 64
+CREATOR = "physics-pipeline"
+HALF_MAX = 65504.0
+"""Largest number of 16 bits; OpenVDB would silently make infinity of a larger one."""
+
+_SLAB = 32
+"""Cells along x that are looked at together."""
+_COLUMN = 32
+"""Cells along x and y that are given to OpenVDB together; whole leaves of its tree, which are 8 wide."""
 
 
 @dataclass(frozen=True)
@@ -88,56 +97,61 @@ def write_volume(
     parameters: VolumeParameters,
     fps: float,
     shutter: float,
+    first_cell: tuple[int, int, int] = (0, 0, 0),
 ) -> None:
     """Write one frame of smoke; the same arrays give the same bytes.
 
-    The velocity is kept where there is smoke and as far around it as smoke can travel while the shutter is open,
-    max|v| shutter / (2 fps): a renderer looks the velocity up where the smoke is drawn, not where it came from.
+    The velocity is kept where there is smoke or heat and as far around it as that can travel while the shutter is
+    open, max|v| shutter / (2 fps): a renderer looks the velocity up where the smoke is drawn, not where it came from.
+    Beyond the arrays it goes on as it is in their outermost cells.
 
     Args:
         path: the file to write.
         density: (nx, ny, nz) at cell centres [-].
         temperature: (nx, ny, nz) at cell centres [K]; stored as the difference to the ambient temperature.
         velocity: (nx, ny, nz, 3) at cell centres, world axes [m/s].
-        origin: lower corner of the grid [m]; the centre of cell (i, j, k) is origin + (i + 1/2, ...) cell_size.
+        origin: lower corner of the smoke's box [m]; the centre of cell (i, j, k) is origin + (i + 1/2, ...) cell_size.
         cell_size: edge of a cell [m].
         ambient_temperature: temperature of the air [K].
         parameters: tolerance and precision.
         fps: frames a second of simulated time [1/s].
         shutter: how long the shutter is open [frames].
+        first_cell: which cell of the smoke's box the arrays begin at, where they hold only a part of it: all of its
+            smoke, and the velocity around that.
 
     Raises:
         ValueError: shapes do not fit together, or a value is not finite.
         OSError: the file cannot be written, or the disk is full.
         VolumeUnavailableError: there is no OpenVDB on this machine.
     """
-    smoke = _checked("density", density, 3)
-    heat = _checked("temperature", temperature, 3) - np.float32(ambient_temperature)
-    wind = _checked("velocity", velocity, 4)
+    smoke = _checked("density", density, 3, first_cell)
+    heat = _checked("temperature", temperature, 3, first_cell) - np.float32(ambient_temperature)
+    wind = _checked("velocity", velocity, 4, first_cell)
     if not smoke.shape == heat.shape == wind.shape[:3] or wind.shape[3] != 3:
         raise ValueError(
             f"the fields need one grid of cells: density {smoke.shape}, temperature {heat.shape}, velocity {wind.shape}"
         )
     openvdb = import_openvdb()
-    is_smoke = smoke > parameters.tolerance
-    moving, wind = _around_smoke(is_smoke, wind, travel_cells=shutter / (2.0 * fps * cell_size))
-    padding = (moving.shape[0] - smoke.shape[0]) // 2
-
+    is_smoke, is_hot = smoke > parameters.tolerance, np.abs(heat) > TEMPERATURE_TOLERANCE_K
+    moving, moving_from = _around(is_smoke | is_hot, wind, shutter_s=shutter / fps, cell_size=float(cell_size))
+    half = parameters.half_precision
     grids = [
-        _grid(openvdb.FloatGrid(), "density", np.where(is_smoke, smoke, 0), is_smoke),
-        _grid(openvdb.FloatGrid(), "temperature", heat, np.abs(heat) > TEMPERATURE_TOLERANCE_K),
-        _grid(openvdb.Vec3SGrid(), "velocity", wind, moving, first_cell=-padding),
+        _grid(openvdb.FloatGrid(), "density", smoke, is_smoke, half=half, first_cell=first_cell),
+        _grid(openvdb.FloatGrid(), "temperature", heat, is_hot, half=half, first_cell=first_cell),
+        _grid(openvdb.Vec3SGrid(), "velocity", wind, moving, moving_from, half=half, first_cell=first_cell),
     ]
     transform = openvdb.createLinearTransform(float(cell_size))
     transform.postTranslate(tuple(float(corner) + 0.5 * float(cell_size) for corner in origin))
     for grid in grids:
         grid.transform = transform
-        grid.saveFloatAsHalf = parameters.half_precision
+        grid.creator = CREATOR
     for grid in grids[:2]:
         grid.gridClass = openvdb.GridClass.FOG_VOLUME
     grids[1]["ambient_temperature"] = float(ambient_temperature)
     grids[2].vectorType = openvdb.VectorType.CONTRAVARIANT_RELATIVE
     grids[2]["is_local_space"] = False
+    for grid, unit in zip(grids, ("dimensionless", "K above ambient_temperature", "m/s, at cell centres"), strict=True):
+        grid["unit"] = unit
     path.touch()  # where that is impossible, the system's reason is clearer than OpenVDB's
     openvdb.write(str(path), grids)
     vdb_file.sign(path)
@@ -194,48 +208,100 @@ def _spec_inside_bpy() -> ModuleSpec | None:
     return None
 
 
-def _checked(name: str, values: ArrayLike, dimensions: int) -> Float32Array:
+def _checked(name: str, values: ArrayLike, dimensions: int, first_cell: tuple[int, int, int]) -> Float32Array:
     array = np.asarray(values, np.float32)
     if array.ndim != dimensions:
         raise ValueError(f"{name} must have {dimensions} dimensions, got the shape {array.shape}")
-    if not np.isfinite(array).all():
-        cell = np.argwhere(~np.isfinite(array))[0][:3]
-        raise ValueError(f"{name} of cell {tuple(int(index) for index in cell)} is not finite")
+    for start in range(0, array.shape[0], _SLAB):
+        finite = np.isfinite(array[start : start + _SLAB])
+        if not finite.all():
+            place = np.argwhere(~finite)[0]
+            cell = tuple(int(a + b) for a, b in zip(place[:3], (first_cell[0] + start, *first_cell[1:]), strict=True))
+            raise ValueError(f"{name} of cell {cell} is not finite")
     return array
 
 
-def _around_smoke(
-    is_smoke: NDArray[np.bool_], wind: Float32Array, *, travel_cells: float
-) -> tuple[NDArray[np.bool_], Float32Array]:
-    """Cells that smoke may be drawn in, and their velocity; padded all around, for smoke that leaves the grid.
+def _around(
+    drawn: NDArray[np.bool_], wind: Float32Array, *, shutter_s: float, cell_size: float
+) -> tuple[NDArray[np.bool_], tuple[int, int, int]]:
+    """The cells that smoke may be drawn in: a mask, and the cell of the arrays, maybe outside, that it begins at.
 
     Args:
-        is_smoke: where there is smoke.
+        drawn: where there is smoke or heat.
         wind: velocity [m/s].
-        travel_cells: cells that something of 1 m/s crosses in half the time that the shutter is open.
+        shutter_s: how long the shutter is open [s].
+        cell_size: edge of a cell [m].
     """
-    if not is_smoke.any():
-        return is_smoke, wind
-    from scipy.ndimage import maximum_filter
-
-    fastest = float(np.linalg.norm(wind[is_smoke], axis=-1).max())
-    reach = min(math.ceil(fastest * travel_cells) + 1, max(is_smoke.shape))  # + 1: the renderer interpolates
-    padded = np.pad(is_smoke, reach)
-    moving = maximum_filter(padded, size=2 * reach + 1)
-    return moving, np.pad(wind, [(reach, reach)] * 3 + [(0, 0)], mode="edge")
+    box = bounding_box(drawn)
+    if box is None:
+        return np.zeros((0, 0, 0), np.bool_), (0, 0, 0)
+    reach = blur_reach(wind[box], drawn[box], shutter_s=shutter_s, cell_size=cell_size)
+    x, y, z = (part.start - reach for part in box)
+    return grown(drawn[box], reach), (x, y, z)
 
 
-def _grid(grid: Any, name: str, values: NDArray[np.float32], keep: NDArray[np.bool_], *, first_cell: int = 0) -> Any:
-    """Fill a grid with the values to keep; everything else is its background, zero."""
+def _grid(
+    grid: Any,
+    name: str,
+    values: Float32Array,
+    keep: NDArray[np.bool_],
+    keep_from: tuple[int, int, int] = (0, 0, 0),
+    *,
+    half: bool,
+    first_cell: tuple[int, int, int],
+) -> Any:
+    """Fill a grid with the values to keep; everything else is its background, zero.
+
+    Args:
+        grid: an empty one.
+        name: its name.
+        values: by cell.
+        keep: which to keep.
+        keep_from: cell of the values that `keep` begins at; what it has beyond their sides is as at the sides.
+        half: store 16-bit floats, unless a value is beyond them.
+        first_cell: index that cell (0, 0, 0) of the values gets in the grid.
+    """
     grid.name = name
-    cells = np.argwhere(keep.any(axis=(1, 2))), np.argwhere(keep.any(axis=(0, 2))), np.argwhere(keep.any(axis=(0, 1)))
-    if cells[0].size:
-        low = tuple(int(index[0, 0]) for index in cells)
-        box = tuple(slice(int(index[0, 0]), int(index[-1, 0]) + 1) for index in cells)
-        mask = keep[box] if values.ndim == 3 else keep[box][..., None]
+    largest = 0.0
+    for part in _parts(keep, [a + b for a, b in zip(keep_from, first_cell, strict=True)]):
+        low = tuple(side.start + shift for side, shift in zip(part, keep_from, strict=True))
+        mask = keep[part] if values.ndim == 3 else keep[part][..., None]
+        block = np.where(mask, _continued(values, low, keep[part].shape), np.float32(0.0))
+        largest = max(largest, float(block.max()), -float(block.min()))
         # copyFromArray ignores strides: anything but a C-contiguous array arrives scrambled.
-        grid.copyFromArray(np.ascontiguousarray(values[box] * mask), ijk=tuple(first_cell + index for index in low))
+        grid.copyFromArray(np.ascontiguousarray(block), ijk=tuple(a + b for a, b in zip(low, first_cell, strict=True)))
+    grid.saveFloatAsHalf = half and largest <= HALF_MAX
     return grid
+
+
+def _parts(keep: NDArray[np.bool_], index: Sequence[int]) -> Iterator[Box]:
+    """Boxes that hold all cells to keep: columns along z without the empty space below and above them.
+
+    Args:
+        keep: which cells to keep.
+        index: of cell (0, 0, 0) in the grid. Columns begin where leaves of the tree do, so that none is made twice.
+    """
+    starts = [range(-(first % _COLUMN), length, _COLUMN) for first, length in zip(index, keep.shape, strict=True)]
+    for x, y in itertools.product(*starts[:2]):
+        corner = max(x, 0), max(y, 0)
+        box = bounding_box(keep[corner[0] : x + _COLUMN, corner[1] : y + _COLUMN])
+        if box is not None:
+            i, j = (slice(side.start + low, side.stop + low) for side, low in zip(box[:2], corner, strict=True))
+            yield i, j, box[2]
+
+
+def _continued(values: Float32Array, low: Sequence[int], shape: Sequence[int]) -> Float32Array:
+    """Values of a box of cells that begins at `low`; beyond the array they are as in its outermost cells."""
+    inside, beyond = [], []
+    for start, length, n in zip(low, shape, values.shape, strict=False):
+        first, stop = min(max(start, 0), n - 1), min(max(start + length, 1), n)
+        before = min(max(-start, 0), length - 1)
+        inside.append(slice(first, stop))
+        beyond.append((before, length - before - (stop - first)))
+    part = values[tuple(inside)]
+    if not any(map(any, beyond)):
+        return part
+    return np.pad(part, beyond + [(0, 0)] * (values.ndim - 3), mode="edge")
 
 
 def _dense(grid: Any, start: Sequence[int], stop: Sequence[int]) -> Float32Array:

@@ -170,10 +170,15 @@ def _build_cloths(scene: SceneParameters, frames_per_second: float) -> ClothSolv
 def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> SmokeSolver:
     """The solver of one smoke, with static bodies in it, and room for what will move in it."""
     from sim.smoke.solver import SmokeSolver
+    from sim.smoke.source_motion import with_sources_on
 
     moving = _meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid)
     return SmokeSolver(
-        smoke, domain=scene.domain, gravity=scene.gravity, solids=[body.solid for body in bodies], moving=moving
+        with_sources_on(smoke, scene.rigid),
+        domain=scene.domain,
+        gravity=scene.gravity,
+        solids=[body.solid for body in bodies],
+        moving=moving,
     )
 
 
@@ -196,6 +201,7 @@ def _couple_smokes(
     from sim.coupling.smoke_fluid import SmokeFluidCoupling
     from sim.coupling.smoke_reach import too_thin_bodies
     from sim.coupling.smoke_rigid import SmokeRigidCoupling
+    from sim.coupling.smoke_sources import SmokeSourcesOnBodies
 
     couplings: list[Coupling] = []
     moving = [body for body in scene.rigid if body.kind != "static"]
@@ -210,5 +216,7 @@ def _couple_smokes(
         for coupling in in_the_way:
             coupling.exchange(0.0)
         smoke.move_obstacles()
+        follows = any(source.follow is not None for source in smoke.parameters.source)
+        in_the_way += [SmokeSourcesOnBodies(rigid, smoke)] if rigid is not None and follows else []
         couplings += [*in_the_way, *(SmokeClothCoupling(cloth, smoke, number=number) for cloth in cloths)]
     return couplings

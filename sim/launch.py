@@ -2,20 +2,33 @@
 
 Taichi looks at every argument of every call several times: the launch of a kernel with 17 arguments takes 0.14 ms of
 Python, longer than the kernel itself runs on a GPU for 100 000 particles. `fast_launch` has Taichi check the types of
-a call once, and from then on hands the arguments of calls with the same types straight to the runtime.
-Measurements: docs/performance.md.
+a call once, and from then on hands the arguments of calls with the same types straight to the runtime. On a CPU it also
+keeps what the runtime has of the arrays of a call, as most calls come again with the same ones. Measurements:
+docs/performance.md.
 
 This is the only place that uses Taichi's internals; the lock file pins the release that they belong to.
 """
 
 import functools
-from typing import Any
+import weakref
+from typing import Any, NamedTuple
 
 import taichi as ti
 from taichi.lang import impl
 from taichi.lang.matrix import VectorType
 from taichi.types import primitive_types
 from taichi.types.ndarray_type import NdarrayType
+
+MOST_LAUNCHES = 256
+"""Of so many combinations of arrays at most a kernel remembers the arguments."""
+
+
+class _Launch(NamedTuple):
+    """A call that a kernel remembers; its arrays only as long as somebody else has them."""
+
+    compiled: Any
+    context: Any
+    arrays: tuple[weakref.ref[Any], ...]
 
 
 class FastKernel:
@@ -27,9 +40,11 @@ class FastKernel:
 
     def __init__(self, kernel: Any) -> None:
         functools.update_wrapper(self, kernel)
-        self._kernel, self._primal = kernel, kernel._primal
+        self._primal = kernel._primal
         self._program: Any = None
         self._compiled: dict[tuple[Any, ...], tuple[Any, Any]] = {}
+        self._launches: dict[tuple[Any, ...], _Launch] = {}
+        self._on_cpu = False
         self._templates: list[int] = []
         self._arrays: list[tuple[int, tuple[int]]] = []
         self._floats: list[tuple[int, tuple[int]]] = []
@@ -43,23 +58,67 @@ class FastKernel:
         """Launch; waits for the device only where the kernel returns something."""
         program = impl.get_runtime().prog
         if program is not self._program:
-            self._program, self._compiled = program, {}
-        types = [(args[index].element_type, len(args[index].shape)) for index, _ in self._arrays]
-        key = (*[args[index] for index in self._templates], *types)
-        compiled = self._compiled.get(key)
+            self._program, self._compiled, self._launches = program, {}, {}
+            self._on_cpu = impl.current_cfg().arch in (ti.x64, ti.arm64)
+        if self._on_cpu:
+            return self._call_on_cpu(program, args)
+        compiled = self._compiled.get(self._key(args))
         if compiled is None:
-            # This way Taichi checks the types, compiles, and says what is wrong.
-            result = self._kernel(*args)
-            kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*args)]
-            self._compiled[key] = kernel, program.compile_kernel(program.config(), program.get_device_caps(), kernel)
-            return result
+            return self._first_call(program, args)
         context = compiled[0].make_launch_context()
-        self._pass_arguments(context, args)
-        program.launch_kernel(compiled[1], context)
+        for index, place in self._arrays:
+            context.set_arg_ndarray(place, args[index].arr)
+        return self._launch(program, compiled[1], context, args)
+
+    def _call_on_cpu(self, program: Any, args: tuple[Any, ...]) -> Any:
+        """Launch with what is known of these arrays from an earlier call.
+
+        Arrays are passed by their addresses, as those of other libraries are: Taichi's own it would have to look up in
+        every launch, and what it finds replaces what it was told. On a GPU the arguments do not outlive the launch.
+        """
+        arrays = [args[index] for index, _ in self._arrays]
+        key = (*[args[index] for index in self._templates], *map(id, arrays))
+        launch = self._launches.get(key)
+        if launch is None or not all(known() is array for known, array in zip(launch.arrays, arrays, strict=True)):
+            compiled = self._compiled.get(self._key(args))
+            if compiled is None:
+                return self._first_call(program, args)
+            context = compiled[0].make_launch_context()
+            for (_, place), array in zip(self._arrays, arrays, strict=True):
+                size = array.arr.nelement() * array.arr.element_size()
+                address = program.get_ndarray_data_ptr_as_int(array.arr)
+                context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
+            launch = _Launch(compiled[1], context, tuple(map(weakref.ref, arrays)))
+            if len(self._launches) >= MOST_LAUNCHES:
+                self._launches.clear()
+            self._launches[key] = launch
+        return self._launch(program, launch.compiled, launch.context, args)
+
+    def _key(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
+        """What a kernel is compiled for: compile-time values, and the types of arrays."""
+        types = [(args[index].element_type, len(args[index].shape)) for index, _ in self._arrays]
+        return (*[args[index] for index in self._templates], *types)
+
+    def _first_call(self, program: Any, args: tuple[Any, ...]) -> Any:
+        """Call as Taichi does, which checks the types, compiles, and says what is wrong."""
+        result = self._primal(*args)
+        kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*args)]
+        compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
+        self._compiled[self._key(args)] = kernel, compiled
+        return result
+
+    def _launch(self, program: Any, compiled: Any, context: Any, args: tuple[Any, ...]) -> Any:
+        """Launch with arrays that the context has, and these numbers."""
+        self._pass_numbers(context, args)
+        program.launch_kernel(compiled, context)
         if self._primal.return_type is None:
             return None
         impl.get_runtime().sync()
         return self._primal.construct_kernel_ret(context, self._primal.return_type[0], (0,))
+
+    def __get__(self, owner: Any, kind: type | None = None) -> Any:
+        """As a method of a `ti.data_oriented` class: the owner is its first compile-time value."""
+        return self if owner is None else functools.partial(self, owner)
 
     def _sort_argument(self, index: int, annotation: Any) -> None:
         """Note how argument `index` is passed, and at which place among those that are not compile-time values."""
@@ -79,9 +138,7 @@ class FastKernel:
         else:
             raise TypeError(f"fast_launch cannot pass arguments of type {annotation}")
 
-    def _pass_arguments(self, context: Any, args: tuple[Any, ...]) -> None:
-        for index, place in self._arrays:
-            context.set_arg_ndarray(place, args[index].arr)
+    def _pass_numbers(self, context: Any, args: tuple[Any, ...]) -> None:
         for index, place in self._floats:
             context.set_arg_float(place, args[index])
         for index, place in self._integers:

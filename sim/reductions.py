@@ -17,8 +17,9 @@ CPU_LANES = 256
 GPU_LANES = 32768
 """Few for a CPU, whose threads read best what lies together; enough for a GPU to be busy."""
 
-BRANCHES = 128
-"""Numbers that one node of the tree takes together."""
+BRANCHES, LAST_BRANCHES = 128, 16
+"""Numbers that one node of the tree takes together: of lanes, and at last. A GPU, whose threads wait for every number
+that they add, has 256 nodes in between; a CPU has two."""
 
 MAX_QUANTITIES = 8
 """Most maxima and sums of one reduction: a kernel returns so many at once, which costs less than to read an array."""
@@ -98,12 +99,15 @@ def is_finite(value: ti.f32) -> ti.i32:
 
 @ti.func
 def reduced(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats) -> Results:
-    """Two more levels of the tree: `BRANCHES` lanes to a node, then all nodes, always in the same order.
+    """More levels of the tree: `BRANCHES` lanes to a node, nodes to `LAST_BRANCHES`, these to one, in the same order
+    always.
 
     For the outermost level of a kernel, after the loop over the lanes: its loops then run in parallel.
     """
     node_count = lanes // BRANCHES
-    for n in range(quantities * node_count):
+    last_count = ti.min(node_count, LAST_BRANCHES)
+    first_end, second_end, third_end = quantities * node_count, quantities * last_count, quantities
+    for n in range(first_end):
         q = n // node_count
         first = q * lanes + n % node_count
         value = partial[first]
@@ -111,9 +115,17 @@ def reduced(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, 
             other = partial[first + k * node_count]
             value = ti.select(q < maxima, ti.max(value, other), value + other)
         nodes[n] = value
-    for q in range(quantities):
+    for n in range(second_end):
+        q = n // last_count
+        first = q * node_count + n % last_count
+        value = nodes[first]
+        for k in range(1, node_count // last_count):
+            other = nodes[first + k * last_count]
+            value = ti.select(q < maxima, ti.max(value, other), value + other)
+        nodes[first] = value
+    for q in range(third_end):
         value = nodes[q * node_count]
-        for k in range(1, node_count):
+        for k in range(1, last_count):
             other = nodes[q * node_count + k]
             value = ti.select(q < maxima, ti.max(value, other), value + other)
         nodes[q * node_count] = value

@@ -14,8 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.validation.cases import CASES, compute, load_case
-from benchmarks.validation.fluids import FLUID_SOLVERS
-from benchmarks.validation.page import FOLDER, PAGE, keep_figure, keep_result, load_results, with_tables
+from benchmarks.validation.page import FOLDER, PAGE, TITLES, keep_figure, keep_result, load_results, with_tables
 from sim.runtime import initialize
 
 
@@ -23,7 +22,7 @@ def main() -> int:
     """Run what the command line names; 1 where a number is not as it should be."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("case", nargs="*", metavar="CASE", help=f"{', '.join(CASES)}; all if omitted")
-    parser.add_argument("--solver", action="append", choices=[*FLUID_SOLVERS, "rigid", "cloth"], help="all if omitted")
+    parser.add_argument("--solver", action="append", choices=[*TITLES], help="all if omitted")
     parser.add_argument("--quick", action="store_true", help="small; prints the numbers and keeps nothing")
     parser.add_argument("--redraw", action="store_true", help="computes nothing")
     parser.add_argument("--device", default="cpu")

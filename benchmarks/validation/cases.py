@@ -25,6 +25,8 @@ CASES = {
     "rigid-contacts": "rigid_contacts",
     "inertia": "inertia",
     "cloth": "cloth",
+    "smoke-vortices": "smoke_vortices",
+    "smoke-plume": "smoke_plume",
     "submerged-sphere": "submerged_sphere",
     "buoyancy": "buoyancy",
     "bunny-energy": "bunny_energy",

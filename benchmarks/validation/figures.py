@@ -12,8 +12,24 @@ from matplotlib.figure import Figure
 
 from benchmarks.validation.checks import CaseResult
 
-COLOURS = {"wcsph": "#2a6fbb", "dfsph": "#d1652b", "pcisph": "#2f8f5b", "rigid": "#2a6fbb", "cloth": "#2a6fbb"}
-TITLES = {"wcsph": "WCSPH", "dfsph": "DFSPH", "pcisph": "PCISPH", "rigid": "rigid body", "cloth": "cloth"}
+COLOURS = {
+    "wcsph": "#2a6fbb",
+    "dfsph": "#d1652b",
+    "pcisph": "#2f8f5b",
+    "rigid": "#2a6fbb",
+    "cloth": "#2a6fbb",
+    "maccormack": "#2a6fbb",
+    "semi_lagrangian": "#d1652b",
+}
+TITLES = {
+    "wcsph": "WCSPH",
+    "dfsph": "DFSPH",
+    "pcisph": "PCISPH",
+    "rigid": "rigid body",
+    "cloth": "cloth",
+    "maccormack": "MacCormack",
+    "semi_lagrangian": "semi-Lagrangian",
+}
 MEAN_OF = 20
 """Samples of a running mean."""
 
@@ -325,6 +341,47 @@ def draw_cloth(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
+def draw_smoke_vortices(results: Sequence[CaseResult]) -> Figure:
+    """Refinement of a turning blob and of vortices, energy of a lone vortex with confinement."""
+    figure, (blob, vortices, energy) = _panels(3)
+    for result in results:
+        series, style = result.series, {**_style(result), "markersize": 4}
+        plane = [1.0 / count for count in series["plane_cells"]]
+        space = [1.0 / count for count in series["space_cells"]]
+        blob.loglog(plane, series["rotation_errors"], "o-", **style)
+        vortices.loglog(plane, series["plane_errors"], "o-", **style)
+        vortices.loglog(space, series["space_errors"], "s--", markersize=4, color=COLOURS[result.solver])
+    _order_line(blob, plane, max(results[0].series["rotation_errors"]), 2)
+    _order_line(vortices, plane, max(results[0].series["plane_errors"]), 1)
+    for axes, spacings in ((blob, plane), (vortices, sorted({*plane, *space}))):
+        axes.set_xticks(spacings, [f"1/{round(1 / spacing)}" for spacing in spacings], minor=False)
+        axes.set_xticks([], minor=True)
+    _label(blob, "cell / box", "mean error / mean", "blob, one turn")
+    _label(vortices, "cell / box", "rms error / rms", "vortices: plane (solid), in space (dashed)")
+    shown = results[0]
+    for strength, shade in zip((0.0, *shown.settings["strengths"]), SHADES, strict=False):
+        energy.plot(
+            shown.series["times"], shown.series[f"energy_{strength:g}"], color=shade, label=f"eps = {strength:g}"
+        )
+    _label(energy, "time [s]", "kinetic energy / at first", f"lone vortex, {TITLES[shown.solver]}")
+    return figure
+
+
+def draw_smoke_plume(results: Sequence[CaseResult]) -> Figure:
+    """Front of a plume at several resolutions, and smoke over what was emitted."""
+    figure, (front, kept) = _panels(2, width=4.2)
+    series = results[0].series
+    for count, shade in zip(series["cells"], SHADES, strict=False):
+        front.plot(series["times"], series[f"fronts_{count}"], color=shade, label=f"{count} cells a metre")
+    _label(front, "time [s]", "height with 95 % of the smoke below [m]", "front of the plume")
+    kept.plot(series["times"], series["kept_closed"], color=SHADES[0], label="closed box")
+    kept.plot(series["times"], series["kept_around"], color=SHADES[1], label="open box, past a ball")
+    kept.axhspan(0.99, 1.01, color="#eeeeee", zorder=0)
+    kept.set_ylim(0.97, 1.03)
+    _label(kept, "time [s]", "smoke / emitted smoke", "balance; grey: 1 %")
+    return figure
+
+
 DRAWINGS: dict[str, Callable[[Sequence[CaseResult]], Figure]] = {
     "kernel": draw_kernel,
     "hydrostatic": draw_hydrostatic,
@@ -339,4 +396,6 @@ DRAWINGS: dict[str, Callable[[Sequence[CaseResult]], Figure]] = {
     "rigid-motion": draw_rigid_motion,
     "rigid-contacts": draw_rigid_contacts,
     "cloth": draw_cloth,
+    "smoke-vortices": draw_smoke_vortices,
+    "smoke-plume": draw_smoke_plume,
 }

@@ -13,7 +13,16 @@ from benchmarks.validation.checks import CaseResult, Check
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "validation"
 PAGE = "README.md"
 
-TITLES = {"wcsph": "WCSPH", "dfsph": "DFSPH", "pcisph": "PCISPH", "rigid": "value", "cloth": "value"}
+TITLES = {
+    "wcsph": "WCSPH",
+    "dfsph": "DFSPH",
+    "pcisph": "PCISPH",
+    "rigid": "value",
+    "cloth": "value",
+    "smoke": "value",
+    "maccormack": "MacCormack",
+    "semi_lagrangian": "semi-Lagrangian",
+}
 
 DEVICES = {"cpu": "a CPU", "cuda": "a GPU"}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import JobFileError
 from pipeline.job.loading import LoadedJob, read_job
-from pipeline.job.looks import BODY, WHITEWATER, WOVEN_LOOKS, parts_of
+from pipeline.job.looks import BODY, GLOWING_K, VOLUME_LOOKS, WHITEWATER, WOVEN_LOOKS, parts_of
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
@@ -70,11 +70,11 @@ def _check_wind(job: Job, findings: Findings) -> None:
         for smoke in job.smoke:
             lower, upper = smoke.corners(job.domain)
             starts_inside = all(a <= x <= b for a, x, b in zip(lower, cloth.position, upper, strict=True))
-            if any(cloth.wind) and starts_inside:
+            if any(cloth.wind) and cloth.wind != smoke.wind and starts_inside:
                 findings.warn(
                     ("cloth", index, "wind"),
                     f'does not blow in the box of smoke "{smoke.name}", where the cloth starts: the air of the smoke '
-                    "moves it there; give a source of the smoke a velocity, or the smoke another box",
+                    "moves it there; give the smoke that wind, or another box",
                 )
 
 
@@ -96,18 +96,39 @@ def _check_materials(job: Job, findings: Findings) -> None:
         if name not in kinds:
             hint = suggestion(name, kinds) or (f"; bodies are {', '.join(kinds)}" if kinds else "")
             findings.error(path, f'no body is named "{name}"{hint}')
-        elif kinds[name] == "smoke" and material.look != "smoke":
-            findings.error((*path, "look"), f'smoke can only look like "smoke", got "{material.look}"')
-        elif kinds[name] != "smoke" and material.look == "smoke":
-            findings.error((*path, "look"), f'"smoke" is a look for [[smoke]]; "{name}" is in [[{kinds[name]}]]')
+        elif kinds[name] == "smoke" and material.look not in VOLUME_LOOKS:
+            findings.error((*path, "look"), f'smoke can only look like "smoke" or "fire", got "{material.look}"')
+        elif kinds[name] != "smoke" and material.look in VOLUME_LOOKS:
+            findings.error(
+                (*path, "look"), f'"{material.look}" is a look for [[smoke]]; "{name}" is in [[{kinds[name]}]]'
+            )
         elif kinds[name] != "cloth" and material.look in WOVEN_LOOKS:
             findings.error(
                 (*path, "look"), f'"{material.look}" is a look for [[cloth]]; "{name}" is in [[{kinds[name]}]]'
             )
         if material.thread_spacing is not None and material.look not in WOVEN_LOOKS:
             findings.warn((*path, "thread_spacing"), f'has no effect on the look "{material.look}"')
-        if material.density is not None and material.look not in ("smoke", "water"):
-            findings.warn((*path, "density"), f'has no effect on the look "{material.look}"')
+        for key, looks in (
+            ("density", (*VOLUME_LOOKS, "water")),
+            ("anisotropy", VOLUME_LOOKS),
+            ("edge_fade", VOLUME_LOOKS),
+            ("emission", ("fire",)),
+            ("flame_temperature", ("fire",)),
+        ):
+            if getattr(material, key) is not None and material.look not in looks:
+                findings.warn((*path, key), f'has no effect on the look "{material.look}"')
+        if material.look == "fire":
+            _check_glow(job, name, findings)
+
+
+def _check_glow(job: Job, name: str, findings: Findings) -> None:
+    hottest = [source.temperature for smoke in job.smoke if smoke.name == name for source in smoke.source]
+    if hottest and max(hottest) < GLOWING_K:
+        findings.warn(
+            ("material", name, "look"),
+            f'is "fire", but the hottest source has {max(hottest):g} K, and nothing glows below some {GLOWING_K:g} K; '
+            "flames have 1300 K and more",
+        )
 
 
 def _check_faces(job: Job, findings: Findings) -> None:

@@ -42,6 +42,12 @@ CLOTHS: dict[Material, MaterialParameters] = {
 WOVEN_LOOKS = ("cotton", "silk", "denim")
 """Their threads run along coordinates on the sheet at rest, which only cloths have."""
 
+VOLUME_LOOKS = ("smoke", "fire")
+"""What a volume can look like, and nothing else."""
+
+GLOWING_K = 900.0
+"""From here on the glow of smoke shows beside other light; by day it takes 1200 K and more [K]."""
+
 FLUID = MaterialParameters(look="water")
 SMOKE = MaterialParameters(look="smoke")
 SOLID = MaterialParameters(look="plastic")

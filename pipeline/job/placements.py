@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from sim.shapes.parameters import MeshShape, Placement
+from sim.smoke.parameters import SmokeSourceParameters
 
 
 def placements(job: Job) -> Iterator[tuple[KeyPath, Placement]]:
@@ -17,8 +18,18 @@ def placements(job: Job) -> Iterator[tuple[KeyPath, Placement]]:
         for number, block in enumerate(fluid.block):
             yield ("fluid", index, "block", number), block
     for index, smoke in enumerate(job.smoke):
-        for number, emitter in enumerate(smoke.source):
-            yield ("smoke", index, "source", number), emitter
+        for number, source in enumerate(smoke.source):
+            yield ("smoke", index, "source", number), _at_the_start(job, source)
+
+
+def _at_the_start(job: Job, source: SmokeSourceParameters) -> SmokeSourceParameters:
+    """A source on a body stands where that does."""
+    body = next((body for body in job.rigid if body.name == source.follow), None)
+    if body is None:
+        return source
+    from sim.smoke.source_motion import placed_on
+
+    return placed_on(source, body)
 
 
 def mesh_shapes(job: Job) -> Iterator[tuple[KeyPath, MeshShape]]:

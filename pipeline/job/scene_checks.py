@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.job.amounts import count, gigabytes, rounded_up
 from pipeline.job.boxes import Box, domain_box, overlap, span, touch
@@ -19,12 +18,12 @@ from pipeline.job.mesh_checks import mesh_exists
 from pipeline.job.models import Job
 from pipeline.job.placements import placements
 from pipeline.job.positions import KeyPath
-from pipeline.job.problems import Findings, format_path
+from pipeline.job.problems import Findings
 from pipeline.job.rigid_checks import check_ballast, check_rigid_start
+from pipeline.job.smoke_checks import check_smokes, smoke_box
 from pipeline.job.step_checks import check_time_steps
 from sim.fluid.parameters import FluidParameters
 from sim.scene import DomainParameters
-from sim.smoke.parameters import SmokeParameters
 
 if TYPE_CHECKING:
     from sim.shapes import PlacedSolid, Solid
@@ -35,9 +34,6 @@ BYTES_PER_PARTICLE_ON_GPU = 600
 """The same without the snapshots, which are the host's."""
 NEIGHBOR_BYTES = 240
 """The neighbour list's part of that at a support of two spacings; it grows with the cube of the support."""
-BYTES_PER_CELL = 250
-"""Upper bound of what the smoke solver takes, multigrid levels and snapshot included: 92 for itself and what moves in
-it, 32 for fluid, 24 for cloth."""
 BYTES_PER_SEARCH_CELL = 16
 """Starts and counts of fluid and boundary; a cell is as wide as the support radius, two particle spacings."""
 BYTES_PER_WALL_SAMPLE = 150
@@ -62,8 +58,7 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
     budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
     findings.particles = sum(_check_fluid(job, index, solids, budget, findings) for index in range(len(job.fluid)))
     findings.nodes = check_cloths(job, solids, budget, findings)
-    _check_bodies_in_smoke(job, solids, findings)
-    findings.cells = sum(_check_smoke(job, index, solids, budget, findings) for index in range(len(job.smoke)))
+    findings.cells = check_smokes(job, solids, budget, findings)
 
 
 # --- shapes --------------------------------------------------------------------------------------------------------
@@ -91,13 +86,9 @@ def _build_solids(job: Job, findings: Findings) -> Mapping[KeyPath, PlacedSolid]
 # --- places --------------------------------------------------------------------------------------------------------
 
 
-def _smoke_box(smoke: SmokeParameters, domain: DomainParameters) -> Box:
-    return np.array([smoke.min or domain.min, smoke.max or domain.max])
-
-
 def _check_rigid_bodies(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
     domain = domain_box(job.domain)
-    regions = [domain, *(_smoke_box(smoke, job.domain) for smoke in job.smoke)]
+    regions = [domain, *(smoke_box(smoke, job.domain) for smoke in job.smoke)]
     for path, solid in solids.items():
         if path[0] == "rigid" and not any(overlap(solid.bounds, region) for region in regions):
             findings.error(path, f"is wholly outside the domain: it spans {span(solid.bounds)}, not {span(domain)}")
@@ -232,98 +223,3 @@ def _check_block(path: KeyPath, solid: Solid, lattice: _Lattice, findings: Findi
             "enlarge it or use a smaller particle_radius",
         )
     return left
-
-
-# --- smoke ---------------------------------------------------------------------------------------------------------
-
-
-def _check_smoke(
-    job: Job, index: int, solids: Mapping[KeyPath, Solid], budget: MemoryBudget, findings: Findings
-) -> int:
-    """Cells of the smoke's grid."""
-    smoke = job.smoke[index]
-    box = _smoke_box(smoke, job.domain)
-    extent = box[1] - box[0]
-    if np.any(extent <= 0.0):
-        corner = "max" if smoke.max is not None else "min"
-        findings.error(("smoke", index, corner), f"max must be above min on every axis, got {span(box)}")
-        return 0
-    if np.any(extent < 4.0 * smoke.cell_size):
-        findings.error(
-            ("smoke", index, "cell_size"),
-            f"{smoke.cell_size:g} m leaves fewer than 4 cells along an edge of {extent.min():.3g} m; "
-            f"use {extent.min() / 4.0:.3g} m or less",
-        )
-    cells = float(np.prod(np.ceil(extent / smoke.cell_size)))
-    if cells * BYTES_PER_CELL > budget.bytes:
-        possible = budget.bytes // BYTES_PER_CELL
-        size = _cell_size_that_fits(extent, smoke.cell_size, possible)
-        findings.error(
-            ("smoke", index, "cell_size"),
-            f"{count(cells)} cells need {gigabytes(cells * BYTES_PER_CELL)}, "
-            f"{budget.owner} has {gigabytes(budget.bytes)}; "
-            f"at most {count(possible)} fit: use {rounded_up(size):g} m or more",
-        )
-    for path, solid in solids.items():
-        if path[:3] == ("smoke", index, "source"):
-            _check_source(path, solid, box, smoke.cell_size, findings)
-            _check_what_fills_source(job, path, solid, solids, findings)
-    return int(cells)
-
-
-def _check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    """Note bodies that move and are too thin for the cells of a smoke into whose box they can come."""
-    from sim.coupling.smoke_reach import too_thin_bodies
-    from sim.rigid.geometry import BodyGeometry
-    from sim.shapes import ShapeError
-
-    moving = [index for index, body in enumerate(job.rigid) if body.kind != "static" and ("rigid", index) in solids]
-    if not (moving and job.smoke):
-        return
-    bodies = [job.rigid[index] for index in moving]
-    geometries = []
-    for index, body in zip(moving, bodies, strict=True):
-        try:
-            geometries.append(BodyGeometry(body))
-        except ShapeError as error:
-            findings.error(("rigid", index, "shape"), f"is too thin for a body that moves in smoke: {error}")
-            return
-    for smoke in job.smoke:
-        for number, reason in too_thin_bodies(smoke, bodies, geometries, job.domain):
-            findings.error(("rigid", moving[number]), reason)
-
-
-def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, most_cells: int) -> float:
-    """The smallest cell size [m], not below a given one, that cuts a box into at most so many cells, or one."""
-    most = max(1, most_cells)
-    size = max(cell_size, float(np.cbrt(np.prod(extent) / most)))
-    while np.prod(layers := np.ceil(extent / size)) > most:
-        # Counts are rounded up: the next size of use is the one that saves a layer of cells.
-        size = float(np.min(extent[layers > 1.0] / (layers[layers > 1.0] - 1.0))) * (1.0 + 1.0e-9)
-    return size
-
-
-def _check_what_fills_source(
-    job: Job, path: KeyPath, source: Solid, solids: Mapping[KeyPath, Solid], findings: Findings
-) -> None:
-    """Warn of a source wholly within water or a body that moves, as far as the corners of its box tell."""
-    corners = np.array(np.meshgrid(*source.bounds.T)).reshape(3, 8).T
-    for other, solid in solids.items():
-        is_mover = other[0] == "rigid" and job.rigid[int(other[1])].kind != "static"
-        if not (is_mover or other[0] == "fluid") or not touch(solid.bounds, source.bounds, margin=0.0):
-            continue
-        if (solid.signed_distance(corners) < 0.0).all():
-            findings.warn(
-                path,
-                f"lies wholly inside {format_path(other)} at the start, and emits nothing until that has moved off",
-            )
-
-
-def _check_source(path: KeyPath, solid: Solid, grid: Box, cell_size: float, findings: Findings) -> None:
-    inside = overlap(solid.bounds, grid)
-    if inside == 0.0:
-        findings.error(path, f"is wholly outside the smoke's grid: it spans {span(solid.bounds)}, not {span(grid)}")
-    elif inside < ALL:
-        findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the smoke's grid and emit nothing")
-    if np.min(solid.bounds[1] - solid.bounds[0]) < cell_size:
-        findings.warn(path, f"is thinner than a cell of {cell_size:g} m and may emit nothing; enlarge it")

@@ -143,9 +143,16 @@ def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
     ]
     objects += [
         VolumeSequenceObject(
-            name=smoke.name, file=f"volumes/{smoke.name}/{{frame}}.vdb", material=job.material_of(smoke.name)
+            name=smoke.name,
+            file=f"volumes/{smoke.name}/{{frame}}.vdb",
+            box_min=corners[0],
+            box_max=corners[1],
+            open_faces=smoke.open_faces,
+            ambient_temperature=smoke.ambient_temperature,
+            material=job.material_of(smoke.name),
         )
         for smoke in job.smoke
+        for corners in (smoke.corners(job.domain),)
     ]
     return RenderSpec(
         fps=job.fps,

@@ -14,7 +14,7 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.cache import Checkpoint, read_checkpoint, read_frame, validate_frame, write_checkpoint, write_frame
+from pipeline.cache import Checkpoint, read_checkpoint, read_numbers, validate_frame, write_checkpoint, write_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
 from pipeline.files import sync
 from pipeline.job.models import Job
@@ -56,7 +56,7 @@ class SimulateStage:
     """One task for the whole job: it commits a frame at a time and continues where it stopped."""
 
     name = "simulate"
-    version = 3
+    version = 4
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""
@@ -142,14 +142,14 @@ class _Simulation:
             _saying(f"while frame {report.frame} was written"),
             self._context.committing(self._context.task.outputs[report.frame], validate_frame) as path,
         ):
-            write_frame(path, bodies, report, device=self._device)
+            write_frame(path, bodies, report, device=self._device, longest_shutter_s=1.0 / self._context.job.fps)
 
     def _require_device_of_committed_frames(self, missing: Collection[int]) -> None:
         """Devices differ in their rounding, and the flow amplifies that: their frames do not fit together."""
         outputs = self._context.task.outputs
         first = next((output for frame, output in enumerate(outputs) if frame not in missing), None)
         if first is not None:
-            device = read_frame(self._context.layout.path(first)).device
+            device = read_numbers(self._context.layout.path(first), only=()).device
             if device != self._device:
                 raise self._another_device(device)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from math import ceil, prod
 
-from pipeline.cache import read_frame
+from pipeline.cache import read_smoke_in_box
+from pipeline.errors import InvalidArtifactError
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
@@ -16,16 +17,16 @@ from sim.scene import DomainParameters
 from sim.smoke.parameters import SmokeParameters
 
 WORKER_BYTES = 130_000_000
-BYTES_PER_CELL = 100
-"""Measured: 136 MB at 379,000 cells in the quickstart's workers, and 66 bytes a cell from 64³ to 128³ cells all full of
-smoke, to which the arrays as read from the cache add 20."""
+BYTES_PER_CELL = 80
+"""Measured by `benchmarks/smoke_files.py`: 70 bytes a cell at 128³ cells all full of smoke, what is read from the cache
+included; 41 at 256³ cells of which 18 % hold smoke."""
 
 
 class VolumeStage:
     """One VDB a smoke and frame, with density, temperature and velocity."""
 
     name = "volume"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a smoke and frame."""
@@ -57,24 +58,33 @@ class VolumeStage:
         return []
 
     def run(self, context: TaskContext) -> None:
-        """Write one frame of one smoke."""
+        """Write one frame of one smoke.
+
+        Raises:
+            InvalidArtifactError: the cached frame is damaged, or holds what is no smoke.
+        """
         from render.volume import validate_volume, write_volume
 
         task, job = context.task, context.job
-        smoke = read_frame(context.layout.path(task.inputs[0]), task.subject).bodies[task.subject]
+        cached = context.layout.path(task.inputs[0])
+        smoke = read_smoke_in_box(cached, task.subject)
         with context.committing(task.outputs[0], validate_volume) as path:
-            write_volume(
-                path,
-                density=smoke.arrays["density"],
-                temperature=smoke.arrays["temperature"],
-                velocity=smoke.arrays["velocity"],
-                origin=smoke.vector("origin"),
-                cell_size=smoke.number("cell_size"),
-                ambient_temperature=smoke.number("ambient_temperature"),
-                parameters=job.volume,
-                fps=job.fps,
-                shutter=job.render.shutter,
-            )
+            try:
+                write_volume(
+                    path,
+                    density=smoke.density,
+                    temperature=smoke.temperature,
+                    velocity=smoke.velocity,
+                    origin=smoke.origin,
+                    cell_size=smoke.cell_size,
+                    ambient_temperature=smoke.ambient_temperature,
+                    parameters=job.volume,
+                    fps=job.fps,
+                    shutter=job.render.shutter,
+                    first_cell=smoke.first_cell,
+                )
+            except ValueError as error:
+                raise InvalidArtifactError(f'{cached}: smoke "{task.subject}": {error}') from error
         context.progress(1, 1)
 
 

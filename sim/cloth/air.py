@@ -28,7 +28,7 @@ class ClothAir:
         inverse_mass: area of cloth over the mass of the air that it acts on [m²/kg], (k,); 0 for wind.
         source: number of what the air belongs to, (k,) int32; `WIND` for wind.
         density: of the air [kg/m³], (k,); 0 where it drags nothing.
-        force: of the air on each triangle in the last substep [N], (k,) vec3.
+        force: of the air on each triangle in the last substep [N], (k,) vec3; of those that `blow` was called for.
         impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3.
         wind: of the parameters [m/s], (k,) vec3.
         share: of each node in the force on any of its triangles [-], (n,).
@@ -89,13 +89,14 @@ class ClothAir:
         self.velocity.from_numpy(np.where(is_wind[:, None], wind_of, self.velocity.to_numpy()))
         self.acts = any(cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0 for cloth in cloths)
 
-    def blow(self, gravity: ti.math.vec3, dt: float) -> None:
-        """Compute the force of a step of dt [s], and add to the impulse."""
+    def blow(self, cloths: range, gravity: ti.math.vec3, dt: float) -> None:
+        """Compute the force of a step of dt [s] on some cloths, and add to the impulse."""
         state = self._state
         if self.acts:
+            first, end = (int(state.host.first_triangle[number]) for number in (cloths.start, cloths.stop))
             blow_on_triangles(
-                state.position, state.velocity, state.inverse_mass, state.triangles, self.velocity, self.inverse_mass,
-                self._drag, self.share, gravity, dt, self.force, self.impulse,
+                state.position, state.velocity, state.inverse_mass, state.triangles, first, end, self.velocity,
+                self.inverse_mass, self._drag, self.share, gravity, dt, self.force, self.impulse,
             )  # fmt: skip
 
 
@@ -107,16 +108,15 @@ def slowed(speed: ti.f32, rate: ti.f32, dt: ti.f32) -> ti.f32:
 
 @ti.func
 def drag_along(
-    past: ti.math.vec3, left: ti.math.vec3, direction: ti.math.vec3, drag: ti.f32, mobility: ti.f32,
-    air_mobility: ti.f32, dt: ti.f32,
+    speed: ti.f32, left: ti.math.vec3, direction: ti.math.vec3, drag: ti.f32, mobility: ti.f32, air_mobility: ti.f32,
+    dt: ti.f32,
 ) -> ti.f32:  # fmt: skip
-    """Force per area along a direction, in which the air passes at `past`, and has `left` left after what it gave.
+    """Force per area along a direction, in which the air passes at `speed`, and has `left` left after what it gave.
 
     Quadratic in the passing speed at the end of the step, and at most what brings the air that is left and the cloth
     to the same velocity.
     """
-    s = past.dot(direction)
-    end = slowed(s, drag * mobility, dt)
+    end = slowed(speed, drag * mobility, dt)
     force = drag * end * end
     if air_mobility > 0.0:
         force = ti.min(force, ti.max(left.dot(direction), 0.0) / (dt * (mobility + air_mobility)))
@@ -126,9 +126,9 @@ def drag_along(
 @fast_launch
 @ti.kernel
 def blow_on_triangles(
-    position: Vectors, velocity: Vectors, inverse_mass: Floats, triangles: Triangles, air_velocity: Vectors,
-    air_inverse_mass: Floats, drag: Vectors, air_share: Floats, gravity: ti.math.vec3, dt: ti.f32, air_force: Vectors,
-    impulse: Vectors,
+    position: Vectors, velocity: Vectors, inverse_mass: Floats, triangles: Triangles, first: ti.i32, end: ti.i32,
+    air_velocity: Vectors, air_inverse_mass: Floats, drag: Vectors, air_share: Floats, gravity: ti.math.vec3,
+    dt: ti.f32, air_force: Vectors, impulse: Vectors,
 ):  # fmt: skip
     """Force of the air on each triangle [N], normal and tangential, quadratic in the speed of the air past it.
 
@@ -142,7 +142,7 @@ def blow_on_triangles(
     with the mass that is within reach must not be pushed beyond the cloth's velocity. So air and cloth together do
     not gain energy, however little the air weighs, and the quadratic law holds where it leaves that room.
     """
-    for t in range(triangles.shape[0]):
+    for t in range(first, end):
         a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
         x_a = position[a]
         cross = (position[b] - x_a).cross(position[c] - x_a)
@@ -161,13 +161,16 @@ def blow_on_triangles(
             air_mobility = air_inverse_mass[t]
             past = air_velocity[t] - mean - dt * free * gravity
             left = past - air_mobility / area * impulse[t]
-            normal *= ti.math.sign(past.dot(normal))
-            along = past - past.dot(normal) * normal
+            s_n = past.dot(normal)
+            along = past - s_n * normal
             s_t = along.norm()
-            force = drag_along(past, left, normal, drag[t][0], mobility, air_mobility, dt) * normal
+            normal *= ti.math.sign(s_n)
+            force = drag_along(ti.abs(s_n), left, normal, drag[t][0], mobility, air_mobility, dt) * normal
             if s_t > 0.0:
+                # With that speed, not that of the air in this direction: of air that blows straight onto the triangle,
+                # rounding leaves a trace along the normal, where the air passes much faster.
                 along /= s_t
-                force += drag_along(past, left, along, drag[t][1], mobility, air_mobility, dt) * along
+                force += drag_along(s_t, left, along, drag[t][1], mobility, air_mobility, dt) * along
             force *= area
-            impulse[t] += dt * force
+            impulse[t] = impulse[t] + dt * force  # += is an atomic operation
         air_force[t] = force

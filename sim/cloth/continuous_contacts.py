@@ -10,28 +10,33 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.continuous_response import begin_push, finish_push, push_apart, repair_crossings, weigh_contacts
+from sim.cloth.continuous_response import (
+    STEPS,
+    begin_push,
+    finish_push,
+    push_apart,
+    repair_crossings,
+    weigh_contacts,
+)
 from sim.cloth.continuous_zones import ImpactZones
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import SelfCollision, half_range
-from sim.cloth.self_collision_kernels import copy_vectors, largest_change
+from sim.cloth.self_collision_kernels import copy_vectors
+from sim.reductions import LaneReduction
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
 
 ITERATIONS = (8, 16)
-"""Steps of the contact iteration, and of those that follow where it is not there yet: two layers under their weight
-need one, stacks and impacts more."""
+"""Steps of the contact iteration, multiples of `STEPS`, and of those that follow where it is not there yet: two layers
+under their weight need one, stacks and impacts more."""
 
 TOLERANCE = 0.02
 """Part of their thickness by which contacts may miss what they should keep."""
 
 REPAIRS = 4
 """Rounds in which crossing pairs are pushed before they become impact zones."""
-
-MARGIN = 0.5
-"""How far contacts are expected to push, in thicknesses; where they push farther, pairs are looked at again."""
 
 LEAST_GAP = 0.02
 """Layers are never let nearer than this, in their thickness, as far as contacts and impact zones decide it."""
@@ -73,11 +78,11 @@ class ContinuousContacts:
         n = state.vertex_count
         self._contacts = ContactList(4 * n)
         self._shares, self._touched = ti.ndarray(ti.i32, n), ti.ndarray(ti.i32, n)
-        self._counter = ti.ndarray(ti.i32, 2)
-        self._gathered = ti.ndarray(ti.i64, 3 * n)
-        self._gathered.fill(0)
+        self._counter = ti.ndarray(ti.i32, 3)
+        self._uses = ti.ndarray(ti.i32, 2 * n)
         self._predicted, self._start, self._reached = (ti.Vector.ndarray(3, ti.f32, n) for _ in range(3))
-        self._crossing = ti.ndarray(ti.i32, 4 * n)
+        self._crossing, self._crossing_count = ti.ndarray(ti.i32, 4 * n), ti.ndarray(ti.i32, 1)
+        self._missing, self._ends = LaneReduction(maxima=1, sums=0), LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
         self.begin_frame()
@@ -86,21 +91,20 @@ class ContinuousContacts:
 
     def stable_dt(self, state: ClothState) -> float:
         """Largest step [s] in which cloth moves little against itself and against bodies."""
-        deviation, speed = half_range(state.velocity, state.vertex_count)
+        deviation, speed = half_range(state.velocity, state.vertex_count, self._ends)
         own = LARGEST_MOTION * self._pairs.mean_edge / deviation if deviation > 0.0 else math.inf
         return min(own, self.rigid.stable_dt(speed))
 
     def begin_frame(self) -> None:
-        """Count anew, and find pairs anew, so that a run that continues here does the same."""
-        self._pairs.forget(self._state)
-        self._change = 0.0
+        """Count anew, and expect of contacts what a run does that continues here."""
+        self._pairs.begin_frame(self._state)
+        self.rigid.set_thickness(self._pairs.thickness)
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
         self._mean_mass = float(self._state.mass.to_numpy().mean())
 
     def diagnostics(self) -> Mapping[str, float]:
         """Numbers of the frame: contacts, with watched pairs, and iterations a substep.
 
-        `pair_searches` is how many pairs of patches were searched for near elements, over the number of patches;
         `repaired_crossings` counts pairs that contacts alone would have let cross, `impact_zone_vertices` the vertices
         that had to move with others, `crossings_left` pairs that even so may have crossed, as where pins are led
         through each other; all summed over the substeps.
@@ -108,7 +112,6 @@ class ContinuousContacts:
         return {
             "contacts": self._found / max(self._substeps, 1),
             "contact_iterations": self._iterations / max(self._substeps, 1),
-            "pair_searches": float(self._pairs.searches),
             "repaired_crossings": float(self._repaired),
             "impact_zone_vertices": float(self._zone_vertices),
             "crossings_left": float(self._left),
@@ -123,40 +126,39 @@ class ContinuousContacts:
 
     def resolve(self, state: ClothState, dt: float) -> None:
         """Change the displacements of a substep of dt [s] so that nothing crosses."""
-        motion, _ = half_range(state.displacement, state.vertex_count)
+        motion = self._pairs.look(state)
         if not math.isfinite(motion) or motion > 1.0e6:
             return  # the solver says which quantity is not finite, or ran away
         self.rigid.begin_substep(dt)
         self._impulse_unit = IMPULSE_UNIT * self._mean_mass * dt**2
-        n = state.vertex_count
-        margin = max(MARGIN * self._pairs.thickness, 1.25 * self._change)
         while True:
-            self._pairs.prepare(state, motion, margin)
-            found = self._find(state, margin, dt)
-            left, change = 0, 0.0
-            if found:
-                copy_vectors(state.displacement, n, self._predicted)
-                self._push(state, found, is_first=True)
-                left = self._keep_apart(state, found)
-                self._change = change = float(largest_change(state.displacement, self._predicted, n))
-                if not math.isfinite(change):
-                    return  # as above
-            # What was pushed farther than foreseen may have met what was not looked at.
-            if change <= margin:
+            self._pairs.prepare(state)
+            found = self._find(state, dt)
+            if not found:
+                left = 0
                 break
-            margin = 1.5 * change
-            motion, _ = half_range(state.displacement, n)
-        self._pairs.follow(state, motion, change)
+            copy_vectors(state.displacement, state.vertex_count, self._predicted)
+            self._push(state, found, is_first=True)
+            left = self._keep_apart(state, found)
+            change, beyond = self._pairs.measure_changes(state, self._predicted)
+            if not math.isfinite(change):
+                return  # as above
+            # What was pushed farther than foreseen may have met what was not looked at.
+            if not beyond:
+                break
+            self._pairs.look(state)
+        self._pairs.follow(state, is_changed=found > 0)
         self._substeps += 1
         self._found += found
         self._left += left
 
-    def _find(self, state: ClothState, margin: float, dt: float) -> int:
+    def _find(self, state: ClothState, dt: float) -> int:
         recovery = min(1.0, dt / RECOVERY_TIME_S)
         while True:
             self._contacts.counter.fill(0)
-            found = self._pairs.find(state, self._contacts, margin, recovery)
-            found = self.rigid.find(state, self._contacts, recovery, found)
+            self._pairs.find(state, self._contacts, recovery)
+            self.rigid.find(state, self._pairs.patches, self._contacts, recovery)
+            found = self._contacts.found
             if not self._contacts.make_room_for(found):
                 return found
 
@@ -164,9 +166,9 @@ class ContinuousContacts:
         contacts, bodies, n = self._contacts, self.rigid.bodies, state.vertex_count
         pushing, touched = weigh_contacts(
             count, contacts.vertices, contacts.weights, contacts.floor, contacts.kind, contacts.arm, contacts.mobility,
-            contacts.impulse, contacts.pushing, self._counter, n, state.inverse_mass, self._shares,
-            self._touched, bodies.count, bodies.inverse_mass, bodies.inverse_inertia, bodies.load, bodies.load_unit,
-            is_first,
+            contacts.impulse, contacts.pushing, self._counter, n, state.inverse_mass, self._shares, self._touched,
+            *self._uses_of(contacts), bodies.count, bodies.inverse_mass, bodies.inverse_inertia, bodies.load,
+            bodies.load_unit, is_first,
         )[:2]  # fmt: skip
         if not pushing:
             return
@@ -177,30 +179,37 @@ class ContinuousContacts:
     def _iterate(self, state: ClothState, count: int, touched: int, iterations: int) -> float:
         """Some steps of the contact iteration; the most that a contact misses then, in its thickness."""
         contacts, bodies = self._contacts, self.rigid.bodies
-        vertices = (touched, self._touched)
+        vertices, lanes = (touched, self._touched), self._missing.lanes
         begin_push(
             count, contacts.pushing, contacts.impulse, contacts.impulse_before, contacts.impulse_given, *vertices,
             state.displacement, self._start, self._reached, bodies.count, bodies.motion, bodies.motion_start,
             bodies.motion_reached,
         )  # fmt: skip
-        for k in range(iterations):
+        uses = self._uses_of(contacts)
+        for first in range(0, iterations, STEPS):
             push_apart(
-                k / (k + 3.0), (k + 1.0) / (k + 4.0), count, contacts.pushing, contacts.vertices, contacts.weights,
-                contacts.normal, contacts.floor, contacts.kind, contacts.arm, contacts.friction, contacts.mobility,
-                contacts.impulse, contacts.impulse_before, *vertices, state.displacement, self._reached,
-                state.inverse_mass, self._gathered, bodies.count, bodies.motion, bodies.motion_reached,
-                bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, self._impulse_unit,
+                tuple(k / (k + 3.0) for k in range(first, first + STEPS + 1)), count, contacts.pushing,
+                contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind, contacts.arm,
+                contacts.friction, contacts.mobility, contacts.impulse, contacts.impulse_before, contacts.push,
+                *vertices, state.displacement, self._reached, state.inverse_mass, *uses, bodies.count, bodies.motion,
+                bodies.motion_reached, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered,
+                self._impulse_unit,
             )  # fmt: skip
         self._iterations += iterations
         return float(
             finish_push(
                 count, contacts.pushing, contacts.vertices, contacts.weights, contacts.normal, contacts.floor,
-                contacts.kind, contacts.arm, contacts.impulse, contacts.impulse_given, *vertices,
-                state.displacement, self._start, state.inverse_mass, state.thickness, self._gathered, bodies.count,
+                contacts.kind, contacts.arm, contacts.impulse, contacts.impulse_given, contacts.push, *vertices,
+                state.displacement, self._start, state.inverse_mass, state.thickness, *uses, bodies.count,
                 bodies.motion, bodies.motion_start, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered,
-                bodies.impulse, self._impulse_unit,
+                bodies.impulse, self._impulse_unit, lanes.items(count), lanes.lane_step(count), lanes.item_step(),
+                *self._missing.tree,
             )
         )  # fmt: skip
+
+    def _uses_of(self, contacts: ContactList) -> tuple[ti.Ndarray, ...]:
+        """Which contacts push each vertex."""
+        return self._uses, contacts.used_by, contacts.use_weight
 
     def _keep_apart(self, state: ClothState, count: int) -> int:
         """Push, and at last tie together, until no pair can have crossed; how many pairs still may have."""
@@ -227,7 +236,7 @@ class ContinuousContacts:
             repair_crossings(
                 count, contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind,
                 contacts.impulse, state.position, state.displacement, state.inverse_mass, state.thickness, LEAST_GAP,
-                self._crossing,
+                self._crossing, self._crossing_count,
             )
         )  # fmt: skip
 

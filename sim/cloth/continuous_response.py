@@ -17,8 +17,9 @@ and threads.
 import taichi as ti
 
 from sim.arrays import Floats, Integers, LongIntegers, Matrices, Vectors
-from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, WALL, Quadruples, Weights
+from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, Quadruples, Weights
 from sim.launch import fast_launch
+from sim.reductions import reduced
 
 SHARES_PER_UNIT = 65536.0
 """Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
@@ -33,6 +34,11 @@ LARGEST_SHARE = 0.9
 KEPT_BY_REPAIR = 0.3
 """Share of its separation that a pair keeps which would have crossed: above 1 - `LARGEST_SHARE`."""
 
+STEPS = 4
+"""Steps of the iteration in one launch."""
+
+Momenta = ti.types.vector(STEPS + 1, ti.f32)
+
 ROUNDING = 1.0e-6
 """Relative rounding of a separation in float32, in lengths of the elements."""
 
@@ -43,6 +49,7 @@ def weigh_contacts(
     count: ti.i32, vertices: Quadruples, weights: Weights, floor: Floats, kind: Integers, arm: Vectors,
     mobility: Floats, impulse: Vectors, pushing: Integers, counter: Integers,
     vertex_count: ti.i32, inverse_mass: Floats, shares: Integers, touched: Integers,
+    uses: Integers, used_by: Integers, use_weight: Floats,
     body_count: ti.i32, body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_load: LongIntegers,
     load_unit: ti.f32, is_first: ti.template(),
 ) -> ti.math.ivec2:  # fmt: skip
@@ -50,19 +57,26 @@ def weigh_contacts(
 
     Returns how many there are, and how many vertices they push, which are listed too. Contacts whose free vertices
     weigh less than `LEAST_FREE_WEIGHT` do not push.
+
+    Which of them push a vertex, by their places in `pushing`, and with what weights, is listed in `used_by` and
+    `use_weight`, between `uses[2 i]` and `uses[2 i + 1]` of vertex i: then a step sums over the contacts of a vertex,
+    without the twelve atomic sums that each contact would otherwise take.
     """
-    for i in range(vertex_count):
-        shares[i] = 0
-    for b in range(body_count):
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts_end, vertices_end, bodies_end = count, vertex_count, body_count
+    counter[0], counter[1], counter[2] = 0, 0, 0
+    for i in range(vertices_end):
+        shares[i], uses[2 * i], uses[2 * i + 1] = 0, 0, 0
+    for b in range(bodies_end):
         body_load[b] = ti.cast(0, ti.i64)
-    counter[0], counter[1] = 0, 0
-    for c in range(count):
+    for c in range(contacts_end):
         if floor[c] > 0.5 * INACTIVE:
             free = 0.0
             for k in ti.static(range(4)):
                 if weights[c][k] != 0.0:
                     share = ti.cast(ti.ceil(ti.abs(weights[c][k]) * SHARES_PER_UNIT), ti.i32)
                     ti.atomic_add(shares[vertices[c][k]], share)
+                    ti.atomic_add(uses[2 * vertices[c][k] + 1], 1)
                     if inverse_mass[vertices[c][k]] > 0.0:
                         free += ti.abs(weights[c][k])
             b = kind[c]
@@ -73,6 +87,11 @@ def weigh_contacts(
                     free = 1.0
             if free >= LEAST_FREE_WEIGHT:
                 pushing[ti.atomic_add(counter[0], 1)] = c
+    for i in range(vertices_end):
+        if shares[i] > 0:
+            touched[ti.atomic_add(counter[1], 1)] = i
+            first = ti.atomic_add(counter[2], uses[2 * i + 1])
+            uses[2 * i], uses[2 * i + 1] = first, first
     for place in range(counter[0]):
         c = pushing[place]
         if ti.static(is_first):
@@ -83,14 +102,13 @@ def weigh_contacts(
             if weight > 0.0:
                 v = vertices[c][k]
                 total += weight * inverse_mass[v] * (ti.cast(shares[v], ti.f32) / SHARES_PER_UNIT)
+                use = ti.atomic_add(uses[2 * v + 1], 1)
+                used_by[use], use_weight[use] = place, weights[c][k]
         b = kind[c]
         if b >= 0:
             most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
             total += ti.sqrt(most) * ti.cast(body_load[b], ti.f32) * load_unit
         mobility[c] = total
-    for i in range(vertex_count):
-        if shares[i] > 0:
-            touched[ti.atomic_add(counter[1], 1)] = i
     return ti.math.ivec2(counter[0], counter[1])
 
 
@@ -117,20 +135,22 @@ def relative_displacement(
 
 
 @ti.func
-def give(
-    push: ti.math.vec3, vertices: ti.types.vector(4, ti.i32), weights: ti.math.vec4, kind: ti.i32, arm: ti.math.vec3,
-    gathered: LongIntegers, body_gathered: LongIntegers,
-):  # fmt: skip
-    """Add an impulse, in units, to what the vertices and the body of a contact get, to the nearest unit."""
-    for k in ti.static(range(4)):
-        if weights[k] != 0.0:
-            for axis in ti.static(range(3)):
-                ti.atomic_add(gathered[3 * vertices[k] + axis], ti.round(weights[k] * push[axis], ti.i64))
-    if kind >= 0:
-        twist = arm.cross(push)
-        for axis in ti.static(range(3)):
-            ti.atomic_add(body_gathered[6 * kind + axis], -ti.round(push[axis], ti.i64))
-            ti.atomic_add(body_gathered[6 * kind + 3 + axis], -ti.round(twist[axis], ti.i64))
+def give_body(push: ti.math.vec3, body: ti.i32, arm: ti.math.vec3, body_gathered: LongIntegers):
+    """Add the opposite of an impulse, in units, to what a body gets, to the nearest unit."""
+    twist = arm.cross(push)
+    for axis in ti.static(range(3)):
+        ti.atomic_add(body_gathered[6 * body + axis], -ti.round(push[axis], ti.i64))
+        ti.atomic_add(body_gathered[6 * body + 3 + axis], -ti.round(twist[axis], ti.i64))
+
+
+@ti.func
+def given_to(i: ti.i32, uses: Integers, used_by: Integers, use_weight: Floats, push: Vectors) -> ti.math.vec3:
+    """Sum of what the contacts of a vertex give it, in units, each to the nearest unit."""
+    x, y, z = ti.cast(0, ti.i64), ti.cast(0, ti.i64), ti.cast(0, ti.i64)
+    for use in range(uses[2 * i], uses[2 * i + 1]):
+        part = use_weight[use] * push[used_by[use]]
+        x, y, z = x + ti.round(part[0], ti.i64), y + ti.round(part[1], ti.i64), z + ti.round(part[2], ti.i64)
+    return ti.math.vec3(ti.cast(x, ti.f32), ti.cast(y, ti.f32), ti.cast(z, ti.f32))
 
 
 @ti.func
@@ -157,14 +177,16 @@ def begin_push(
     body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors,
 ):  # fmt: skip
     """Note where the iteration starts."""
-    for place in range(touched_count):
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts_end, touched_end, bodies_end = count, touched_count, 2 * body_count
+    for place in range(touched_end):
         i = touched[place]
         start[i] = displacement[i]
         reached[i] = displacement[i]
-    for m in range(2 * body_count):
+    for m in range(bodies_end):
         body_start[m] = body_motion[m]
         body_reached[m] = body_motion[m]
-    for place in range(count):
+    for place in range(contacts_end):
         c = pushing[place]
         impulse_before[c] = impulse[c]
         impulse_given[c] = impulse[c]
@@ -173,84 +195,100 @@ def begin_push(
 @fast_launch
 @ti.kernel
 def push_apart(
-    momentum: ti.f32, next_momentum: ti.f32, count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights,
+    momenta: Momenta, count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights,
     normal: Vectors, floor: Floats, kind: Integers, arm: Vectors, friction: Floats, mobility: Floats,
-    impulse: Vectors, impulse_before: Vectors,
+    impulse: Vectors, impulse_before: Vectors, push: Vectors,
     touched_count: ti.i32, touched: Integers, displacement: Vectors, reached: Vectors, inverse_mass: Floats,
-    gathered: LongIntegers,
+    uses: Integers, used_by: Integers, use_weight: Floats,
     body_count: ti.i32, body_motion: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
     body_inverse_inertia: Matrices, body_gathered: LongIntegers, unit: ti.f32,
 ):  # fmt: skip
-    """A step of the iteration, from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them.
+    """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
 
-    Leaves the displacements of the next step, ahead by beta_{k+1} of those that it has `reached`.
+    A step starts from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them. It leaves the
+    displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
     """
-    for place in range(count):
-        c = pushing[place]
-        n = normal[c]
-        w = relative_displacement(c, vertices, weights, displacement, kind, arm, body_motion)
-        ahead = impulse[c] + momentum * (impulse[c] - impulse_before[c])
-        along = ti.max(ahead.dot(n) + (floor[c] - w.dot(n)) / mobility[c], 0.0)
-        sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / mobility[c]
-        most, length = friction[c] * along, sideways.norm()
-        if length > most:
-            sideways *= most / length
-        after = along * n + sideways
-        impulse_before[c] = impulse[c]
-        impulse[c] = after
-        if (after - ahead).norm_sqr() > 0.0:
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts_end, touched_end, bodies_end = count, touched_count, body_count
+    for step in ti.static(range(STEPS)):
+        for place in range(contacts_end):
+            c = pushing[place]
+            n = normal[c]
+            w = relative_displacement(c, vertices, weights, displacement, kind, arm, body_motion)
+            ahead = impulse[c] + momenta[step] * (impulse[c] - impulse_before[c])
+            along = ti.max(ahead.dot(n) + (floor[c] - w.dot(n)) / mobility[c], 0.0)
+            sideways = ahead - ahead.dot(n) * n - (w - w.dot(n) * n) / mobility[c]
+            held, length = friction[c] * along, sideways.norm()
+            if length > held:
+                sideways *= held / length
+            after = along * n + sideways
+            impulse_before[c] = impulse[c]
+            impulse[c] = after
+            push[place] = (after - ahead) / unit
             # What nothing moves need not hear of it before the end: its sums are in the way of all threads.
-            mobile = kind[c]
-            if mobile >= 0 and body_mobility(arm[c], body_inverse_mass[mobile], body_inverse_inertia[mobile]) == 0.0:
-                mobile = WALL
-            give((after - ahead) / unit, vertices[c], weights[c], mobile, arm[c], gathered, body_gathered)
-    for place in range(touched_count):
-        i = touched[place]
-        u = displacement[i] + (inverse_mass[i] * unit) * take(gathered, 3 * i)
-        displacement[i] = u + next_momentum * (u - reached[i])
-        reached[i] = u
-    for b in range(body_count):
-        shift = body_motion[2 * b] + (body_inverse_mass[b] * unit) * take(body_gathered, 6 * b)
-        turn = body_motion[2 * b + 1] + unit * (body_inverse_inertia[b] @ take(body_gathered, 6 * b + 3))
-        body_motion[2 * b] = shift + next_momentum * (shift - body_reached[2 * b])
-        body_motion[2 * b + 1] = turn + next_momentum * (turn - body_reached[2 * b + 1])
-        body_reached[2 * b] = shift
-        body_reached[2 * b + 1] = turn
+            b = kind[c]
+            most = 0.0
+            if b >= 0 and (after - ahead).norm_sqr() > 0.0:
+                most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
+            if most > 0.0:
+                give_body(push[place], b, arm[c], body_gathered)
+        for place in range(touched_end):
+            i = touched[place]
+            u = displacement[i] + (inverse_mass[i] * unit) * given_to(i, uses, used_by, use_weight, push)
+            displacement[i] = u + momenta[step + 1] * (u - reached[i])
+            reached[i] = u
+        for b in range(bodies_end):
+            shift = body_motion[2 * b] + (body_inverse_mass[b] * unit) * take(body_gathered, 6 * b)
+            turn = body_motion[2 * b + 1] + unit * (body_inverse_inertia[b] @ take(body_gathered, 6 * b + 3))
+            body_motion[2 * b] = shift + momenta[step + 1] * (shift - body_reached[2 * b])
+            body_motion[2 * b + 1] = turn + momenta[step + 1] * (turn - body_reached[2 * b + 1])
+            body_reached[2 * b] = shift
+            body_reached[2 * b + 1] = turn
 
 
 @fast_launch
 @ti.kernel
 def finish_push(
     count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats,
-    kind: Integers, arm: Vectors, impulse: Vectors, impulse_given: Vectors,
+    kind: Integers, arm: Vectors, impulse: Vectors, impulse_given: Vectors, push: Vectors,
     touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, inverse_mass: Floats,
-    thickness: Floats, gathered: LongIntegers, body_count: ti.i32, body_motion: Vectors, body_start: Vectors,
+    thickness: Floats, uses: Integers, used_by: Integers, use_weight: Floats,
+    body_count: ti.i32, body_motion: Vectors, body_start: Vectors,
     body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_gathered: LongIntegers,
-    body_impulse: LongIntegers, unit: ti.f32,
+    body_impulse: LongIntegers, unit: ti.f32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
+    lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
 ) -> ti.f32:  # fmt: skip
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
     Returns the most that a contact's displacement is below its floor, in thicknesses of what touches.
     """
-    for place in range(count):
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    contacts_end, touched_end, bodies_end, lanes_end = count, touched_count, body_count, lanes
+    for place in range(contacts_end):
         c = pushing[place]
-        push = (impulse[c] - impulse_given[c]) / unit
-        give(push, vertices[c], weights[c], kind[c], arm[c], gathered, body_gathered)
-    for place in range(touched_count):
+        push[place] = (impulse[c] - impulse_given[c]) / unit
+        if kind[c] >= 0:
+            give_body(push[place], kind[c], arm[c], body_gathered)
+    for place in range(touched_end):
         i = touched[place]
-        displacement[i] = start[i] + (inverse_mass[i] * unit) * take(gathered, 3 * i)
-    for b in range(body_count):
+        displacement[i] = start[i] + (inverse_mass[i] * unit) * given_to(i, uses, used_by, use_weight, push)
+    for b in range(bodies_end):
         for axis in ti.static(range(6)):
             body_impulse[6 * b + axis] += body_gathered[6 * b + axis]
         body_motion[2 * b] = body_start[2 * b] + (body_inverse_mass[b] * unit) * take(body_gathered, 6 * b)
         twist = unit * take(body_gathered, 6 * b + 3)
         body_motion[2 * b + 1] = body_start[2 * b + 1] + body_inverse_inertia[b] @ twist
-    missing = 0.0
-    for place in range(count):
-        c = pushing[place]
-        w = relative_displacement(c, vertices, weights, displacement, kind, arm, body_motion)
-        ti.atomic_max(missing, (floor[c] - w.dot(normal[c])) / thickness_between(vertices[c], thickness))
-    return missing
+    for lane in range(lanes_end):
+        missing = 0.0
+        for k in range(items):
+            place = lane * lane_step + k * item_step
+            if place < count:
+                c = pushing[place]
+                w = relative_displacement(c, vertices, weights, displacement, kind, arm, body_motion)
+                least = floor[c] - w.dot(normal[c])
+                missing = ti.max(missing, least / thickness_between(vertices[c], thickness))
+        partial[lane] = missing
+    return reduced(partial, lanes, quantities, maxima, nodes)[0]
 
 
 @fast_launch
@@ -258,7 +296,7 @@ def finish_push(
 def repair_crossings(
     count: ti.i32, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers,
     impulse: Vectors, position: Vectors, displacement: Vectors, inverse_mass: Floats, thickness: Floats,
-    least_gap_in_thicknesses: ti.f32, crossing: Integers,
+    least_gap_in_thicknesses: ti.f32, crossing: Integers, counter: Integers,
 ) -> ti.i32:  # fmt: skip
     """Count the pairs that are not certainly apart all through the substep, and have their worst vertices pushed.
 
@@ -267,7 +305,7 @@ def repair_crossings(
     of the nearest two vertices, keeps 1 - `LARGEST_SHARE` of what it was; or all of it where it was none.
     `crossing` gets 1 for pairs that fail, else 0. Pairs whose vertices are all pinned are not looked at.
     """
-    failed = 0
+    counter[0] = 0
     for c in range(count):
         crossing[c] = 0
         mobile = 0.0
@@ -299,7 +337,7 @@ def repair_crossings(
             least_gap = least_gap_in_thicknesses * thickness_between(v, thickness)
             least = ti.min(ti.max((1.0 - LARGEST_SHARE) * apart, least_gap), apart - ROUNDING * size)
             if low - high < least:
-                failed += 1
+                ti.atomic_add(counter[0], 1)
                 crossing[c] = 1
                 pair = ti.math.vec4(0.0)
                 between = 0.0
@@ -311,4 +349,4 @@ def repair_crossings(
                 weights[c] = pair
                 floor[c] = ti.min(ti.max(KEPT_BY_REPAIR * apart, 2.0 * least_gap), apart) - between
                 impulse[c] = ti.math.vec3(0.0)
-    return failed
+    return counter[0]

@@ -16,6 +16,8 @@ Laws = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
 COLOURS_AT_ONCE = 4
 """Colours that are loops of one kernel: a launch costs 20 us of the host, and every loop its time to compile."""
 
+Bounds = ti.types.vector(COLOURS_AT_ONCE + 1, ti.i32)
+
 TINY_LENGTH = 1.0e-12
 """Springs shorter than this [m] have no direction: bend springs of flat cloth are at rest there."""
 
@@ -36,10 +38,12 @@ class DeviceSprings:
         in_segments: whether these are threads.
         segment_start: first spring of each piece, and number of springs, (pieces + 1,).
         host: the springs on the host.
+        cloths: numbers of the cloths that they belong to.
     """
 
     def __init__(self, springs: Springs, cloth_of: NDArray[np.int32]) -> None:
         self.host, self._cloth_of = springs, cloth_of
+        self.cloths = frozenset(np.unique(cloth_of).tolist())
         self.arity, self.count = springs.arity, len(springs)
         self.nodes = ti.ndarray(ti.i32, self.count * self.arity)
         self.nodes.from_numpy(np.ascontiguousarray(springs.nodes).ravel())
@@ -91,6 +95,15 @@ def coefficient(coefficients: Floats, s: ti.i32, arity: ti.template(), a: ti.tem
     else:
         value = ti.static([1.0, -2.0, 1.0] if arity == 3 else [1.0, -1.0])[a]
     return value
+
+
+@ti.func
+def colour_bounds(piece_of_colour: Integers, first: ti.i32) -> Bounds:
+    """Where each of `COLOURS_AT_ONCE` colours begins, from `first` on, and where the last one ends."""
+    return Bounds(
+        piece_of_colour[first], piece_of_colour[first + 1], piece_of_colour[first + 2], piece_of_colour[first + 3],
+        piece_of_colour[first + 4],
+    )  # fmt: skip
 
 
 @ti.func

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, coefficient, separation
+from sim.cloth.parameters import ClothParameters
 from sim.cloth.stable_step import longest_explicit_step
 from sim.cloth.state import ClothState, Lattice
 from sim.launch import fast_launch
@@ -43,6 +44,9 @@ class ExplicitSprings:
         self._coefficient = ti.ndarray(ti.f32, len(order))
         self._coefficient.from_numpy(coefficients[order].astype(np.float32))
         self._force = ti.Vector.ndarray(3, ti.f32, int(self._first[-1]))
+
+    def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
+        """Springs hold their own stiffness."""
 
     def stable_dt(self) -> float:
         """Longest stable step [s]."""

@@ -109,4 +109,4 @@ def return_angular_momentum(
         turn[1] = centre
     for i in range(first, first + count):
         r_i = quantum * ti.cast(lattice[i] - lattice[first], ti.f32) - turn[1]
-        displacement[i] += turn[0].cross(r_i)
+        displacement[i] = displacement[i] + turn[0].cross(r_i)

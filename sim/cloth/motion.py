@@ -15,11 +15,14 @@ LARGEST_MOVE = 2.0**29
 @ti.kernel
 def predict_displacement(
     velocity: Vectors, carry: Vectors, inverse_mass: Floats, air_force: Vectors, air_share: Floats,
-    triangle_start: Integers, triangle_list: Integers, is_windy: ti.i32, gravity: ti.math.vec3, dt: ti.f32,
-    displacement: Vectors,
+    triangle_start: Integers, triangle_list: Integers, is_windy: ti.i32, first: ti.i32, end: ti.i32,
+    gravity: ti.math.vec3, dt: ti.f32, displacement: Vectors,
 ):  # fmt: skip
-    """Accelerate by gravity and by the node's share of the force on each of its triangles; where that leads in dt."""
-    for i in range(velocity.shape[0]):
+    """Accelerate by gravity and by the node's share of the force on each of its triangles; where that leads in dt.
+
+    Nodes from `first` to before `end`.
+    """
+    for i in range(first, end):
         w_i = inverse_mass[i]
         if w_i > 0.0:
             v_i = velocity[i] + dt * gravity

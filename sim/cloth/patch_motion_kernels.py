@@ -5,17 +5,16 @@ import taichi as ti
 from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.self_collision_kernels import Pairs
 from sim.launch import fast_launch
+from sim.reductions import Results, reduced
 
 FAR = 1.0e30
 
 SAFETY = 1.0e-5
 """Part of the motion of two patches against each other that is added to it: norms and sums of float32 lose some 1e-7.
 
-Other rounding is not in proportion to that motion: residuals of the fit lose some 2e-7 of the whole displacement, and
-what positions take differs from displacements by half a quantum an axis, 1e-9 of the domain. In a frame, after which
-lists are forgotten, that is about a micrometre where cloth moves at metres a second in a hundred substeps. It needs no
-term: what is not listed is still a whole thickness apart when a list runs out, so that contacts begin later by that, a
-hundredth of a thin cloth's thickness at most, and nothing has met unseen.
+Residuals of the fit lose some 2e-7 of the whole displacement besides, nanometres in a substep. That needs no term: what
+is not listed is still a whole thickness apart when a list runs out, so that contacts begin later by that, and nothing
+has met unseen. What positions do besides their displacements, as they are rounded, is measured.
 """
 
 REGULARIZATION = 1.0e-5
@@ -27,66 +26,119 @@ SKIN_IN_MOTIONS = 2.0
 
 @fast_launch
 @ti.kernel
-def enclose_patches(
-    count: ti.i32, first_corner: Integers, corners: Integers, position: Vectors, low: Vectors, high: Vectors
-):  # fmt: skip
-    """Boxes around patches where they are now."""
-    for m in range(count):
-        least, most = ti.math.vec3(FAR), ti.math.vec3(-FAR)
-        for place in range(first_corner[m], first_corner[m + 1]):
-            x = position[corners[place]]
-            least, most = ti.min(least, x), ti.max(most, x)
-        low[m], high[m] = least, most
+def look_at_patches(
+    vertex_count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, still: ti.f32,
+    position: Vectors, displacement: Vectors, expected: Vectors,
+    count: ti.i32, patch_items: ti.i32, patch_step: ti.i32, first_corner: Integers, corners: Integers,
+    low: Vectors, high: Vectors, centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
+    motion: Floats, more: Floats, spent: Floats, reach: Floats, way: Floats, partial: Floats, lanes: ti.i32,
+    nodes: Floats,
+) -> Results:  # fmt: skip
+    """Where patches are, and how they move in this substep.
 
+    A rigid motion c + w x (x - centre) is fitted to the displacements of each patch, by least squares. `rest` gets the
+    largest displacement that is left of it [m], `radius` the largest distance from the centre [m]. The fit decides how
+    small the rest is, not whether it is a bound. `motion` gets how far vertices get from the middle of all
+    displacements at most [m], `way` that with what it has spent and what contacts may add.
 
-@fast_launch
-@ti.kernel
-def fit_motions(
-    count: ti.i32, first_corner: Integers, corners: Integers, position: Vectors, displacement: Vectors,
-    centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
-):  # fmt: skip
-    """Fit a rigid motion c + w x (x - centre) to the displacements of each patch, by least squares.
-
-    `rest` gets the largest displacement that is left of it [m], and `radius` the largest distance from the centre [m].
-    The fit decides how small the rest is, not whether it is a bound.
+    Returns the largest components of displacements [m], then those of their negatives; how far a vertex is at most from
+    where its last displacement should have led it; and how far the motion of a patch, with what was spent before
+    and may come besides, passes the reach of the list of pairs of patches at most.
     """
-    for m in range(count):
-        first, last = first_corner[m], first_corner[m + 1]
+    for lane in range(lanes):
+        most, least, off = ti.math.vec3(-FAR), ti.math.vec3(FAR), 0.0
+        for k in range(items):
+            i = lane * lane_step + k * item_step
+            if i < vertex_count:
+                u = displacement[i]
+                most, least = ti.max(most, u), ti.min(least, u)
+                off = ti.max(off, (position[i] - expected[i]).norm_sqr())
+        for axis in ti.static(range(3)):
+            partial[axis * lanes + lane], partial[(3 + axis) * lanes + lane] = most[axis], -least[axis]
+        partial[6 * lanes + lane] = off
+    ends = reduced(partial, lanes, 7, 7, nodes)
+    middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
+    astray = ti.sqrt(ends[6])
+    for lane in range(lanes):
+        beyond = -FAR
+        for k in range(patch_items):
+            m = lane * patch_step + k * item_step
+            if m < count:
+                fit_motion(
+                    m, still, first_corner, corners, position, displacement, low, high, centre, shift, turn, radius,
+                    rest,
+                )  # fmt: skip
+                motion[m] = (1.0 + SAFETY) * ((shift[m] - middle).norm() + turn[m].norm() * radius[m] + rest[m])
+                way[m] = spent[m] + astray + motion[m] + more[m]
+                beyond = ti.max(beyond, way[m] - reach[m])
+        partial[lane] = beyond
+    worst = reduced(partial, lanes, 1, 1, nodes)
+    return Results(ends[0], ends[1], ends[2], ends[3], ends[4], ends[5], astray, worst[0])
+
+
+@ti.func
+def fit_motion(
+    m: ti.i32, still: ti.f32, first_corner: Integers, corners: Integers, position: Vectors, displacement: Vectors,
+    low: Vectors, high: Vectors, centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
+):  # fmt: skip
+    """The box and the motion of a patch; displacements within `still` [m] of each other are not fitted any closer."""
+    first, last = first_corner[m], first_corner[m + 1]
+    origin, u_first = position[corners[first]], displacement[corners[first]]
+    least, most, u_least, u_most = origin, origin, u_first, u_first
+    # Sums about the first corner: what is subtracted for the mean is of their own size.
+    r_sum, u_sum, moment = ti.math.vec3(0.0), ti.math.vec3(0.0), ti.math.vec3(0.0)
+    squares, products = ti.math.vec3(0.0), ti.math.vec3(0.0)
+    for place in range(first, last):
+        i = corners[place]
+        x, u = position[i], displacement[i]
+        least, most = ti.min(least, x), ti.max(most, x)
+        u_least, u_most = ti.min(u_least, u), ti.max(u_most, u)
+        r, v = x - origin, u - u_first
+        r_sum, u_sum, moment = r_sum + r, u_sum + v, moment + r.cross(v)
+        squares, products = squares + r * r, products + r * r.yzx
+    low[m], high[m] = least, most
+    x_0, u_0, w = 0.5 * (least + most), 0.5 * (u_least + u_most), ti.math.vec3(0.0)
+    left, largest = (0.5 * (u_most - u_least)).norm_sqr(), (0.5 * (most - least)).norm_sqr()
+    if left > still * still:
         share = 1.0 / ti.cast(last - first, ti.f32)
-        origin = position[corners[first]]
-        x_0, u_0 = ti.math.vec3(0.0), ti.math.vec3(0.0)
-        for place in range(first, last):
-            x_0 += position[corners[place]] - origin
-            u_0 += displacement[corners[place]]
-        x_0, u_0 = origin + share * x_0, share * u_0
-        xx, yy, zz, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        moment = ti.math.vec3(0.0)
-        for place in range(first, last):
-            r = position[corners[place]] - x_0
-            moment += r.cross(displacement[corners[place]] - u_0)
-            xx, yy, zz = xx + r.x * r.x, yy + r.y * r.y, zz + r.z * r.z
-            xy, xz, yz = xy + r.x * r.y, xz + r.x * r.z, yz + r.y * r.z
+        x_0, u_0 = origin + share * r_sum, u_first + share * u_sum
+        moment -= share * r_sum.cross(u_sum)
+        squares, products = squares - share * r_sum * r_sum, products - share * r_sum * r_sum.yzx
         # Regularized: corners on a line say nothing about turns around it.
-        more = (1.0 + REGULARIZATION) * (xx + yy + zz) + 1.0e-30
+        more = (1.0 + REGULARIZATION) * squares.sum() + 1.0e-30
+        xx, yy, zz, xy, yz, xz = squares.x, squares.y, squares.z, products.x, products.y, products.z
         inertia = ti.math.mat3(more - xx, -xy, -xz, -xy, more - yy, -yz, -xz, -yz, more - zz)
         w = inertia.inverse() @ moment
         left, largest = 0.0, 0.0
         for place in range(first, last):
-            r = position[corners[place]] - x_0
-            left = ti.max(left, (displacement[corners[place]] - u_0 - w.cross(r)).norm())
-            largest = ti.max(largest, r.norm())
-        centre[m], shift[m], turn[m], radius[m], rest[m] = x_0, u_0, w, largest, left
+            i = corners[place]
+            r = position[i] - x_0
+            left = ti.max(left, (displacement[i] - u_0 - w.cross(r)).norm_sqr())
+            largest = ti.max(largest, r.norm_sqr())
+    centre[m], shift[m], turn[m], radius[m], rest[m] = x_0, u_0, w, ti.sqrt(largest), ti.sqrt(left)
 
 
 @fast_launch
 @ti.kernel
-def place_leaves(count: ti.i32, leaves: ti.i32, low: Vectors, high: Vectors, tree_low: Vectors, tree_high: Vectors):
-    """Leaves of a complete binary tree: the boxes of the patches, then empty ones; leaf k is node `leaves` + k."""
+def place_leaves(
+    count: ti.i32, leaves: ti.i32, low: Vectors, high: Vectors, motion: Floats, change: Floats, more: Floats,
+    fewest: ti.f32, most: ti.f32, enough: ti.f32, least: ti.f32, half_thickness: ti.f32, reach: Floats, spent: Floats,
+    tree_low: Vectors, tree_high: Vectors,
+):  # fmt: skip
+    """Leaves of a complete binary tree: boxes around the patches, then empty ones; leaf k is node `leaves` + k.
+
+    Boxes are larger than the patches by half a thickness and by as much as these may move, their `reach`: in `fewest`
+    to `most` substeps like this one, as many as take them `enough` [m], and by `least` [m] besides.
+    """
     for leaf in range(leaves):
-        least, most = ti.math.vec3(FAR), ti.math.vec3(-FAR)
+        lowest, highest = ti.math.vec3(FAR), ti.math.vec3(-FAR)
         if leaf < count:
-            least, most = low[leaf], high[leaf]
-        tree_low[leaves + leaf], tree_high[leaves + leaf] = least, most
+            spent[leaf] = 0.0
+            moves = motion[leaf] + change[leaf]
+            reach[leaf] = ti.math.clamp(enough, fewest * moves, most * moves) + least + more[leaf]
+            lowest = low[leaf] - reach[leaf] - half_thickness
+            highest = high[leaf] + reach[leaf] + half_thickness
+        tree_low[leaves + leaf], tree_high[leaves + leaf] = lowest, highest
 
 
 @fast_launch
@@ -101,14 +153,14 @@ def merge_boxes(first: ti.i32, tree_low: Vectors, tree_high: Vectors):
 @fast_launch
 @ti.kernel
 def pair_patches(
-    count: ti.i32, leaves: ti.i32, low: Vectors, high: Vectors, tree_low: Vectors, tree_high: Vectors,
-    cloth: Integers, collides: Integers, reach: ti.f32, pairs: Pairs, counter: Integers, capacity: ti.i32,
+    count: ti.i32, leaves: ti.i32, tree_low: Vectors, tree_high: Vectors,
+    cloth: Integers, collides: Integers, pairs: Pairs, counter: Integers, capacity: ti.i32,
 ) -> ti.i32:  # fmt: skip
-    """List the patches whose boxes are within `reach` [m] of each other along every axis, each pair once, and each
-    patch with itself; returns how many there are."""
+    """List the patches whose boxes in the tree meet, each pair once, and each patch with itself; returns how many
+    there are."""
     counter[0] = 0
     for m in range(count):
-        least, most = low[m] - reach, high[m] + reach
+        least, most = tree_low[leaves + m], tree_high[leaves + m]
         node = 1
         while node > 0:
             # The last leaf below a node: pairs are listed by the smaller of their numbers.
@@ -157,61 +209,118 @@ def approach_of(
 @ti.kernel
 def age_pairs(
     count: ti.i32, pairs: Pairs, low: Vectors, high: Vectors, centre: Vectors, shift: Vectors, turn: Vectors,
-    radius: Floats, rest: Floats, thickness: ti.f32, least_skin: ti.f32, whole: ti.f32, more: ti.f32,
-    used: ti.f32, is_new: ti.i32, wake: Floats, slack: Floats, approach: Floats, reach: Floats, expired: Integers,
-    counter: Integers,
+    radius: Floats, rest: Floats, motion: Floats, margin: Floats, more: Floats, spent: Floats, way: Floats,
+    thickness: ti.f32, least_skin: ti.f32, astray: ti.f32, is_new: ti.i32, wake: Floats, slack: Floats,
+    approach: Floats, allowed: Floats, reach: Floats, expired: Integers, needed: Integers, counter: Integers,
 ) -> ti.i32:  # fmt: skip
     """List the pairs of patches whose elements have to be searched before this substep; returns how many there are.
 
-    Pairs far apart sleep until the motion of the whole cloth can have closed the gap between their boxes.
+    Pairs far apart sleep until their patches' motion can have closed the gap between their boxes.
 
     Args:
+        motion: how far vertices of a patch get from the middle of all displacements at most [m]; `spent` is the sum of
+            the substeps before, `way` all that with `more`.
+        margin: how far contacts may displace them beyond that [m]; `more` what of it is beyond half a thickness.
         thickness: the largest [m].
         least_skin: how far beyond to search at least [m].
-        whole: how much nearer any two points come at most [m]; `more` by which contacts may add to that, `used` by
-            the substeps before.
+        astray: how far vertices are from where they were left at most [m].
         is_new: whether nothing is known about the pairs yet.
-        wake: value of `used` until which a pair sleeps.
+        wake: what their patches spend until a pair wakes [m].
         slack: how much nearer the elements of a pair may come, that are not listed, and be a thickness apart [m].
-        approach: what this substep uses of it; 0 where a pair sleeps.
+        approach: what this substep uses of it; 0 where a pair sleeps; `allowed` the margins of both, likewise.
+        needed: gets 1 for patches of pairs that are searched.
         reach: how far to search for elements, so that the list lasts for some substeps [m].
     """
     counter[0] = 0
     for p in range(count):
-        approach[p] = 0.0
         if is_new == 1:
-            wake[p], slack[p] = -1.0, -1.0
-        if used + whole + more > wake[p]:
-            m, other = pairs[p][0], pairs[p][1]
-            nearer = approach_of(m, other, centre, shift, turn, radius, rest)
-            approach[p] = nearer
-            if slack[p] < nearer + more:
+            wake[p], slack[p], approach[p], allowed[p] = -1.0, -1.0, 0.0, 0.0
+        m, other = pairs[p][0], pairs[p][1]
+        if way[m] + way[other] > wake[p]:
+            whole, besides = motion[m] + motion[other], more[m] + more[other]
+            nearer = ti.min(approach_of(m, other, centre, shift, turn, radius, rest), whole)
+            approach[p], allowed[p] = nearer, margin[m] + margin[other]
+            slack[p] -= 2.0 * astray
+            if slack[p] < nearer + besides:
                 gap = gap_of_boxes(m, other, low, high) - thickness
-                if gap > whole + more:
-                    wake[p], slack[p], approach[p] = used + gap, -1.0, 0.0
+                if gap > whole + besides:
+                    wake[p], slack[p] = spent[m] + spent[other] + 2.0 * astray + gap, -1.0
+                    approach[p], allowed[p] = 0.0, 0.0
                 else:
-                    skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * more
+                    skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides
                     wake[p], slack[p], reach[p] = -1.0, skin, thickness + skin
                     expired[ti.atomic_add(counter[0], 1)] = p
+                    needed[m], needed[other] = 1, 1
     return counter[0]
 
 
 @fast_launch
 @ti.kernel
-def use_slack(count: ti.i32, more: ti.f32, approach: Floats, slack: Floats):
-    """Subtract what the substep used, and what contacts added to it at most [m]."""
-    for p in range(count):
-        if slack[p] > 0.0:
-            slack[p] -= approach[p] + more
+def measure_changes(
+    count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, first_corner: Integers, corners: Integers,
+    displacement: Vectors, predicted: Vectors, half_thickness: ti.f32, change: Floats, margin: Floats, more: Floats,
+    partial: Floats, lanes: ti.i32, nodes: Floats,
+) -> ti.math.vec2:  # fmt: skip
+    """How far contacts displaced the vertices of each patch, `change` [m]; where that is beyond the `margin` that was
+    allowed for, half as much again is from now on.
+
+    Returns the largest change, and the largest that is beyond its margin, or 0.
+    """
+    for lane in range(lanes):
+        largest, largest_beyond = 0.0, 0.0
+        for k in range(items):
+            m = lane * lane_step + k * item_step
+            if m < count:
+                squared = 0.0
+                for place in range(first_corner[m], first_corner[m + 1]):
+                    i = corners[place]
+                    squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
+                change[m] = ti.sqrt(squared)
+                largest = ti.max(largest, change[m])
+                if change[m] > margin[m]:
+                    largest_beyond = ti.max(largest_beyond, change[m])
+                    margin[m] = 1.5 * change[m]
+                    more[m] = margin[m] - half_thickness
+        partial[lane], partial[lanes + lane] = largest, largest_beyond
+    results = reduced(partial, lanes, 2, 2, nodes)
+    return ti.math.vec2(results[0], results[1])
 
 
 @fast_launch
 @ti.kernel
-def measure_approach(
-    count: ti.i32, pairs: Pairs, centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
-    whole: ti.f32, used: ti.f32, wake: Floats, approach: Floats,
+def finish_patches(
+    vertex_count: ti.i32, still: ti.f32, position: Vectors, displacement: Vectors, expected: Vectors,
+    count: ti.i32, first_corner: Integers, corners: Integers, low: Vectors, high: Vectors,
+    centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
+    motion: Floats, change: Floats, is_changed: ti.i32, astray: ti.f32, negligible: ti.f32, least_margin: ti.f32,
+    half_thickness: ti.f32, margin: Floats, more: Floats, spent: Floats,
+    pair_count: ti.i32, pairs: Pairs, approach: Floats, slack: Floats,
 ):  # fmt: skip
-    """Note how much nearer the elements of pairs of patches come that do not sleep."""
-    for p in range(count):
-        if used + whole > wake[p]:
-            approach[p] = approach_of(pairs[p][0], pairs[p][1], centre, shift, turn, radius, rest)
+    """The displacements of a substep are final: note where they lead, and what of the lists they use up.
+
+    Patches that contacts changed by more than `negligible` [m] are fitted anew. Margins for the next substep are a
+    quarter more than what contacts did in this one, and `least_margin` at least [m].
+    """
+    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
+    vertices_end, patches_end, pairs_end = vertex_count, count, pair_count
+    for i in range(vertices_end):
+        expected[i] = position[i] + displacement[i]
+    for m in range(patches_end):
+        change[m] = ti.select(is_changed == 1, change[m], 0.0)
+        spent[m] += motion[m] + change[m] + astray
+        margin[m] = ti.max(least_margin, 1.25 * change[m])
+        more[m] = ti.max(margin[m] - half_thickness, 0.0)
+        if change[m] > negligible:
+            fit_motion(
+                m, still, first_corner, corners, position, displacement, low, high, centre, shift, turn, radius, rest
+            )  # fmt: skip
+    for p in range(pairs_end):
+        if slack[p] > 0.0:
+            m, other = pairs[p][0], pairs[p][1]
+            nearer = approach[p] + change[m] + change[other]
+            if ti.max(change[m], change[other]) > negligible:
+                nearer = approach_of(m, other, centre, shift, turn, radius, rest)
+                # A patch that was not fitted anew moves as noted, but for its change.
+                nearer += ti.select(change[m] > negligible, 0.0, change[m])
+                nearer += ti.select(change[other] > negligible, 0.0, change[other])
+            slack[p] -= nearer

@@ -7,19 +7,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from sim.cloth.patch_motion_kernels import (
     age_pairs,
-    enclose_patches,
-    fit_motions,
-    measure_approach,
+    finish_patches,
+    look_at_patches,
+    measure_changes,
     merge_boxes,
     pair_patches,
     place_leaves,
-    use_slack,
 )
 from sim.cloth.patches import Patches
-from sim.cloth.self_collision_kernels import clear_lists, keep_distances, make_room
+from sim.cloth.self_collision_kernels import LANES, keep_distances, make_room
+from sim.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -27,6 +28,18 @@ if TYPE_CHECKING:
 GROWTH = 1.5
 MAX_PAIRS = 2**28
 """Most pairs of a list: 5 GiB on the device; so many mean that the step is far too large."""
+
+SUBSTEPS_OF_PATCHES = (12.0, 60.0)
+PATCH_REACH_IN_EDGES = 3.0
+"""How many substeps' motion of the patches the list of their pairs allows for: as many as take them so many mean edges,
+but in this range. All pairs are searched when the list is made anew, and each costs a little in every substep."""
+
+MARGIN = 0.5
+"""How far contacts are expected to push, in thicknesses; where they push farther, pairs are looked at again."""
+
+STILL = 1.0e-3
+"""Part of the thickness by which displacements of a patch may differ without a turn being fitted to them: a list lasts
+for a hundred substeps even so, and cloth that falls or lies is looked at once instead of twice."""
 
 TOO_MANY = f"more than {MAX_PAIRS} pairs of cloth elements are near each other; lower the step"
 
@@ -40,6 +53,7 @@ class PairList:
             is not full.
         patches: number of the pair of patches, (capacity,).
         wanted: distance that they keep [m], (capacity,).
+        found: number of elements in each piece.
 
     Args:
         are_edges: whether the elements are edges.
@@ -49,13 +63,14 @@ class PairList:
 
     def __init__(self, *, are_edges: bool, capacity: int, pieces: int) -> None:
         self._are_edges = are_edges
+        self._lanes = LANES if runs_on_gpu() else 1
         self._end = ti.ndarray(ti.i32, 2)
         self._allocate(capacity)
         self.set_pieces(pieces)
 
     def set_pieces(self, capacity: int) -> None:
         """Make room for the pieces of so many pairs of patches, all empty."""
-        self._start, self._room, self._found, self._again = (ti.ndarray(ti.i32, capacity) for _ in range(4))
+        self._start, self._room, self.found, self._again = (ti.ndarray(ti.i32, capacity) for _ in range(4))
         self.clear()
 
     def clear(self) -> None:
@@ -67,14 +82,15 @@ class PairList:
 
     def fill(self, search: Callable[..., None], state: ClothState, rest: ti.Ndarray, searched: ti.Ndarray, count: int,
              *arguments: object) -> None:  # fmt: skip
-        """Have a search list the elements of some pairs of patches; the pieces of all others stay as they are.
+        """Have a search list the elements of some pairs of patches, `found` being 0; the pieces of all others stay.
 
         Raises:
             OverflowError: more pairs than any useful step has.
         """
-        self._list(search, searched, count, arguments)
+        pieces = (self._start, self._room, self.found)
+        search(count, self._lanes, searched, *arguments, *pieces, self.vertices)
         short, end = make_room(
-            count, searched, self._start, self._room, self._found, self.vertices, self._end, self._again
+            count, searched, *pieces, self.vertices, self._end, self._again
         )[:2]  # fmt: skip
         if end < 0 or end > MAX_PAIRS:
             raise OverflowError(TOO_MANY)
@@ -82,18 +98,11 @@ class PairList:
             self._grow(int(GROWTH * end))
         self.end = int(end)
         if short:
-            self._list(search, self._again, int(short), arguments)
+            search(int(short), self._lanes, self._again, *arguments, *pieces, self.vertices)
         keep_distances(
-            count, searched, self._start, self._found, self.vertices, self._are_edges, rest, state.body,
+            count, searched, *pieces, self.vertices, self._are_edges, rest, state.body,
             state.thickness, self.wanted, self.patches,
         )  # fmt: skip
-
-    def _list(
-        self, search: Callable[..., None], searched: ti.Ndarray, count: int, arguments: tuple[object, ...]
-    ) -> None:
-        pieces = (self._start, self._room, self._found, self.vertices)
-        clear_lists(count, searched, *pieces)
-        search(count, searched, *arguments, *pieces)
 
     def _allocate(self, capacity: int) -> None:
         self._capacity = capacity
@@ -116,9 +125,12 @@ class PatchPairs:
     Attributes:
         count: number of pairs of patches.
         pairs: their numbers, the smaller first, (count,) ivec2.
-        low, high: boxes around patches at the last `prepare` [m], (m,) vec3.
-        expired: numbers of the pairs to be searched.
-        approach: how much nearer points of a pair come at most in this substep [m], (count,).
+        low, high: boxes around patches at the last `look` [m], (m,) vec3.
+        motion_arrays: the rigid motion of each patch in the substep: centre [m], shift [m], turn [rad], (m,) vec3;
+            distance of its corners from the centre, and of their displacements from that motion, at most [m], (m,).
+        expired: numbers of the pairs to be searched; `needed` is 1 for their patches, (m,).
+        approach: how much nearer points of a pair come at most in this substep [m], (count,); `allowed` how much
+            contacts may add to it.
         reach: how far to search for the elements of each pair [m], (count,).
 
     Args:
@@ -129,9 +141,24 @@ class PatchPairs:
         self.patches = patches
         m = max(patches.count, 1)
         self.low, self.high, self._centre, self._shift, self._turn = (ti.Vector.ndarray(3, ti.f32, m) for _ in range(5))
-        self._radius, self._rest = ti.ndarray(ti.f32, m), ti.ndarray(ti.f32, m)
+        (
+            self._radius,
+            self._rest,
+            self._motion,
+            self._change,
+            self._margin,
+            self._more,
+            self._spent,
+            self._reach,
+            self._way,
+        ) = (ti.ndarray(ti.f32, m) for _ in range(9))
+        self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
         self._tree_low, self._tree_high = (ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2))
         self._counter = ti.ndarray(ti.i32, 1)
+        self.needed = ti.ndarray(ti.i32, m)
+        self.needed.fill(0)
+        self._maxima = LaneReduction(maxima=MAX_QUANTITIES, sums=0)
+        self._astray, self._half_thickness, self._still = 0.0, 0.0, 0.0
         self.count = 0
         self._allocate(8 * m)
 
@@ -139,34 +166,64 @@ class PatchPairs:
         self.capacity = capacity
         self.pairs = ti.Vector.ndarray(2, ti.i32, capacity)
         self.expired = ti.ndarray(ti.i32, capacity)
-        self.reach, self._wake, self._slack, self.approach = (ti.ndarray(ti.f32, capacity) for _ in range(4))
-
-    def enclose(self, state: ClothState) -> None:
-        """Note where patches are."""
-        enclose_patches(
-            self.patches.count, self.patches.first_corner, self.patches.corners, state.position, self.low, self.high
+        self.reach, self._wake, self._slack, self.approach, self.allowed = (
+            ti.ndarray(ti.f32, capacity) for _ in range(5)
         )
 
-    def fit(self, state: ClothState) -> None:
-        """Note how patches move in this substep."""
-        fit_motions(
-            self.patches.count, self.patches.first_corner, self.patches.corners, state.position, state.displacement,
-            *self._motion,
-        )  # fmt: skip
+    @property
+    def motion_arrays(self) -> tuple[ti.Ndarray, ...]:
+        """See above."""
+        return self._centre, self._shift, self._turn, self._radius, self._rest
 
-    def meet(self, reach: float, collides: ti.Ndarray) -> None:
-        """List the pairs of patches within reach [m], of cloths that may meet; nothing is known about them yet."""
+    @property
+    def _fitted(self) -> tuple[ti.Ndarray, ...]:
+        return self.low, self.high, *self.motion_arrays
+
+    def set_margin(self, thickness: float) -> None:
+        """Allow contacts to displace vertices by half a thickness [m], whatever they did before."""
+        self._half_thickness, self._still = 0.5 * thickness, STILL * thickness
+        self._margin.fill(MARGIN * thickness)
+        self._more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
+
+    def look(self, state: ClothState) -> tuple[NDArray[np.float64], bool]:
+        """Note where patches are and how they move in this substep.
+
+        Returns the largest components of the displacements [m], then those of their negatives, (6,); and whether the
+        pairs of patches hold for this substep, if they held before.
+        """
+        patches, lanes, n = self.patches, self._maxima.lanes, self.patches.vertex_count
+        partial, lane_count, *_, nodes = self._maxima.tree
+        *ends, self._astray, beyond = look_at_patches(
+            n, lanes.items(n), lanes.lane_step(n), lanes.item_step(), self._still, state.position,
+            state.displacement, self._expected, patches.count, lanes.items(patches.count),
+            lanes.lane_step(patches.count), patches.first_corner, patches.corners, *self._fitted, self._motion,
+            self._more, self._spent, self._reach, self._way, partial, lane_count, nodes,
+        )  # fmt: skip
+        return np.array(ends, dtype=np.float64), beyond <= 0.0
+
+    def meet(self, thickness: float, edge: float, collides: ti.Ndarray) -> None:
+        """List the pairs of patches that may get within a thickness [m]; nothing is known about them yet.
+
+        Args:
+            thickness: the largest [m].
+            edge: the mean one [m].
+            collides: which cloths do with themselves, (b,).
+        """
         patches = self.patches
-        tree = (self.low, self.high, self._tree_low, self._tree_high)
-        place_leaves(patches.count, patches.leaves, *tree)
+        self._astray = 0.0
+        tree = self._tree_low, self._tree_high
+        place_leaves(
+            patches.count, patches.leaves, self.low, self.high, self._motion, self._change, self._more,
+            *SUBSTEPS_OF_PATCHES, PATCH_REACH_IN_EDGES * edge, 0.5 * edge, 0.5 * thickness, self._reach, self._spent,
+            *tree,
+        )  # fmt: skip
         first = patches.leaves
         while first := first // 2:
-            merge_boxes(first, self._tree_low, self._tree_high)
+            merge_boxes(first, *tree)
         while True:
             found = pair_patches(
-                patches.count, patches.leaves, *tree, patches.cloth, collides, reach, self.pairs, self._counter,
-                self.capacity,
-            )  # fmt: skip
+                patches.count, patches.leaves, *tree, patches.cloth, collides, self.pairs, self._counter, self.capacity
+            )
             if found < 0 or found > MAX_PAIRS:
                 raise OverflowError(TOO_MANY)
             if found <= self.capacity:
@@ -174,32 +231,48 @@ class PatchPairs:
             self._allocate(int(GROWTH * found))
         self.count = int(found)
 
-    def age(self, thickness: float, least_skin: float, whole: float, more: float, used: float, *, is_new: bool) -> int:
+    def age(self, thickness: float, least_skin: float, *, is_new: bool) -> int:
         """Find which pairs have to be searched in this substep, and how far each; returns how many there are.
 
         Args:
             thickness: distance within which all elements have to be listed [m].
             least_skin: how far beyond to search at least [m].
-            whole: how much nearer any two points of the cloths come at most [m].
-            more: how much nearer they may come besides [m].
-            used: sum of what `whole` was since the pairs of patches were listed [m].
             is_new: whether elements of all pairs have to be looked at anew.
         """
         return int(
             age_pairs(
-                self.count, self.pairs, self.low, self.high, *self._motion, thickness, least_skin, whole, more, used,
-                int(is_new), self._wake, self._slack, self.approach, self.reach, self.expired, self._counter,
+                self.count, self.pairs, *self._fitted, self._motion, self._margin, self._more, self._spent, self._way,
+                thickness, least_skin, self._astray, int(is_new), self._wake, self._slack, self.approach, self.allowed,
+                self.reach, self.expired, self.needed, self._counter,
             )
         )  # fmt: skip
 
-    def measure(self, whole: float, used: float) -> None:
-        """Note how much nearer pairs come by the motion that was fitted last, of those that it can bring together."""
-        measure_approach(self.count, self.pairs, *self._motion, whole, used, self._wake, self.approach)
+    def measure_changes(self, state: ClothState, predicted: ti.Ndarray) -> tuple[float, float]:
+        """How far contacts displaced vertices at most [m]; and those that they displaced farther than allowed for.
 
-    def use(self, more: float) -> None:
-        """A substep is over: its motion, and `more` [m] that was added to it at most, are used up."""
-        use_slack(self.count, more, self.approach, self._slack)
+        Where they did, they may displace half as much again from now on.
+        """
+        patches, lanes = self.patches, self._maxima.lanes
+        partial, lane_count, *_, nodes = self._maxima.tree
+        largest, beyond = measure_changes(
+            patches.count, lanes.items(patches.count), lanes.lane_step(patches.count), lanes.item_step(),
+            patches.first_corner, patches.corners, state.displacement, predicted, self._half_thickness, self._change,
+            self._margin, self._more, partial, lane_count, nodes,
+        )  # fmt: skip
+        return float(largest), float(beyond)
 
-    @property
-    def _motion(self) -> tuple[ti.Ndarray, ...]:
-        return self._centre, self._shift, self._turn, self._radius, self._rest
+    def finish(self, state: ClothState, negligible: float, *, is_changed: bool) -> None:
+        """A substep is over: its motion is used up, and what contacts added to it, if they did.
+
+        Args:
+            state: at the end of its displacements.
+            negligible: what they may add without the motion of patches being looked at anew [m].
+            is_changed: whether `measure_changes` was asked in this substep.
+        """
+        patches = self.patches
+        finish_patches(
+            patches.vertex_count, self._still, state.position, state.displacement, self._expected,
+            patches.count, patches.first_corner, patches.corners, *self._fitted, self._motion, self._change,
+            int(is_changed), self._astray, negligible, MARGIN * 2.0 * self._half_thickness, self._half_thickness,
+            self._margin, self._more, self._spent, self.count, self.pairs, self.approach, self._slack,
+        )  # fmt: skip

@@ -2,6 +2,9 @@
 
 import taichi as ti
 
+from sim.arrays import Integers
+from sim.launch import fast_launch
+
 Quadruples = ti.types.ndarray(dtype=ti.types.vector(4, ti.i32), ndim=1)
 Weights = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 
@@ -31,13 +34,20 @@ class ContactList:
         mobility: what the relative displacement grows by per impulse, all contacts pushing alike [1/kg], (capacity,).
         impulse: on the first, minus that on the second, times the step [kg m], (capacity,) of 3-vectors.
         impulse_before, impulse_given: that of an iteration earlier, and that which displacements contain already.
-        pushing: numbers of the contacts that push, (capacity,).
+        pushing: numbers of the contacts that push, (capacity,); `push` is what they give in a step of the iteration, in
+            its units, in the same order.
+        used_by, use_weight: places of contacts in that order, and weights, vertex by vertex, (4 capacity,).
         counter: number of contacts found, also those beyond the capacity, (1,).
     """
 
     def __init__(self, capacity: int) -> None:
         self.counter = ti.ndarray(ti.i32, 1)
         self._allocate(capacity)
+
+    @property
+    def found(self) -> int:
+        """Number of contacts found, also those beyond the capacity; waits for the device."""
+        return int(read_count(self.counter))
 
     def make_room_for(self, found: int) -> bool:
         """Whether so many contacts did not fit, so that they have to be found again; now there is room."""
@@ -68,6 +78,15 @@ class ContactList:
             ti.Vector.ndarray(3, ti.f32, self.capacity) for _ in range(3)
         )
         self.pushing = ti.ndarray(ti.i32, self.capacity)
+        self.push = ti.Vector.ndarray(3, ti.f32, self.capacity)
+        self.used_by, self.use_weight = ti.ndarray(ti.i32, 4 * self.capacity), ti.ndarray(ti.f32, 4 * self.capacity)
+
+
+@fast_launch
+@ti.kernel
+def read_count(counter: Integers) -> ti.i32:
+    """The first of some integers."""
+    return counter[0]
 
 
 @ti.func

@@ -9,12 +9,14 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.arrays import Floats, Integers, Matrices, Vectors
+from sim.cloth.patch_pairs import PatchPairs
 from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, Quadruples, Weights, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
-from sim.cloth.self_collision_kernels import Four, Pairs, Triples
+from sim.cloth.self_collision_kernels import LANES, Four, Pairs, Triples
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
+from sim.reductions import runs_on_gpu
 from sim.rigid.contacts import Poses
 from sim.rigid.geometry import BodyGeometry
 from sim.rigid.shape_distances import CountTriples, distance_at
@@ -33,6 +35,10 @@ step, if that is more: what left through an open face falls on outside."""
 SMALL_BODY = 4.0
 """Round bodies with a shorter edge, in mean edges of the cloth, are looked at between its vertices, too: larger ones
 show by an eighth of an edge at most where vertices alone meet them."""
+
+
+WITH_ROUNDING = 1.00001
+"""Bounds of how far patches reach and move are so much larger than computed: float32 loses some 1e-7 of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +80,7 @@ class RigidContact:
         self._motion: BodyMotion | None = None
         self._surface_speed = 0.0
         self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
-        self._spacing = 0.0
+        self._spacing, self._largest_half = 0.0, 0.0
         self._wall_count = len(walls)
         room = max(len(walls), 1)
         self._wall_plane = ti.Vector.ndarray(4, ti.f32, room)
@@ -102,6 +108,10 @@ class RigidContact:
         self._spacing = mean_edge
         self.bodies.look_between_vertices(SMALL_BODY * mean_edge)
         self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
+
+    def set_thickness(self, largest: float) -> None:
+        """Say how thick the cloth is at most [m]."""
+        self._largest_half = 0.5 * largest
 
     def place(self, poses: Poses, motion: BodyMotion | None = None) -> None:
         """Say where the bodies are at the start of a substep, and how they move; without motion they stand still."""
@@ -134,72 +144,112 @@ class RigidContact:
             return math.inf
         return LARGEST_ADVANCE * 0.5 * self.bodies.shortest_edge / relative
 
-    def find(self, state: ClothState, contacts: ContactList, recovery: float, found: int) -> int:
-        """Append what touches in this substep; the number of contacts then, or needed.
+    def find(self, state: ClothState, moved: PatchPairs, contacts: ContactList, recovery: float) -> None:
+        """Append what touches in this substep.
 
         Args:
             state: at the start of a substep.
+            moved: where the cloths' patches are, and how they move in it.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
-            found: number of contacts before.
         """
+        patches, lanes = moved.patches, LANES if runs_on_gpu() else 1
+        own = (patches.count, lanes, patches.first_vertex, patches.vertices, *moved.motion_arrays)
         cloth = (state.position, state.displacement, state.thickness, state.friction)
         if self._wall_count:
-            found = find_wall_contacts(
-                state.vertex_count, *cloth, self._wall_count, self._wall_plane, self._wall_low, self._wall_high,
+            find_wall_contacts(
+                *own, self._largest_half, *cloth, self._wall_count, self._wall_plane, self._wall_low, self._wall_high,
                 self._joined_low, self._joined_high, self._spacing, recovery, *contacts.found_arrays,
             )  # fmt: skip
         if not self.bodies.count:
-            return int(found)
+            return
         each = self.bodies
         bodies = (
             each.count, each.kind, each.size, each.has_edges, each.centre_of_mass, each.radius, each.step,
             each.friction, each.grid_values, each.grid_first, each.grid_origin, each.grid_spacing, each.grid_shape,
             each.position, each.rotation, each.motion,
         )  # fmt: skip
-        found = find_body_contacts_of_vertices(
-            state.vertex_count, *cloth, *bodies, recovery, *contacts.found_arrays
-        )  # fmt: skip
+        find_body_contacts_of_vertices(*own, self._largest_half, *cloth, *bodies, recovery, *contacts.found_arrays)
         if self._has_edges:
-            found = find_body_contacts_between_vertices(
-                state.edges, state.edge_count, state.triangles, state.triangle_count, *cloth, *bodies, recovery,
-                *contacts.found_arrays,
+            find_body_contacts_between_vertices(
+                patches.count, lanes, patches.first_edge, patches.edges, patches.first_triangle, patches.triangles,
+                *moved.motion_arrays, self._largest_half, *cloth, *bodies, recovery, *contacts.found_arrays,
             )  # fmt: skip
-        return int(found)
 
 
 @fast_launch
 @ti.kernel
 def find_wall_contacts(
-    vertex_count: ti.i32, position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
+    patch_count: ti.i32, lanes: ti.i32, first_vertex: Integers, patch_vertices: Integers,
+    centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats, largest_half: ti.f32,
+    position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
     wall_count: ti.i32, plane: Planes, low: Vectors, high: Vectors, joined_low: Vectors, joined_high: Vectors,
     spacing: ti.f32, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
     friction: Floats, counter: Integers, capacity: ti.i32,
-) -> ti.i32:  # fmt: skip
-    """Append the vertices that reach a wall; walls are flat, so that vertices are enough.
+):  # fmt: skip
+    """Append the vertices that reach a wall, of the patches that may; walls are flat, so that vertices are enough.
 
     Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
     both.
     """
-    for i in range(vertex_count):
-        x, half = position[i], 0.5 * thickness[i]
+    for item in range(patch_count * lanes):
+        m = item // lanes
+        reach = shift[m].norm() + (1.0 + turn[m].norm()) * patch_radius[m] + rest[m] + largest_half
         for w in range(wall_count):
-            n = plane[w].xyz
-            distance = n.dot(x) - plane[w].w
-            least = least_displacement(distance, half, recovery)
-            if distance < half or n.dot(displacement[i]) < least:
-                depth = ti.max(2.0 * WALL_DEPTH * half, spacing, displacement[i].norm())
-                is_above = (x >= low[w] - depth * joined_low[w]).all()
-                is_below = (x <= high[w] + depth * joined_high[w]).all()
-                slot = capacity
-                if is_above and is_below and distance > -depth:
-                    slot = ti.atomic_add(counter[0], 1)
-                if slot < capacity:
-                    vertices[slot], weights[slot] = Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0)
-                    normal[slot], floor[slot], kind[slot] = n, least, WALL
-                    arm[slot], friction[slot] = ti.math.vec3(0.0), vertex_friction[i]
-    return counter[0]
+            is_near = plane[w].xyz.dot(centre[m]) - plane[w].w < WITH_ROUNDING * reach
+            place = ti.select(is_near, first_vertex[m], first_vertex[m + 1])
+            place += item % lanes
+            while place < first_vertex[m + 1]:
+                touch_wall(
+                    patch_vertices[place], w, position, displacement, thickness, vertex_friction, plane, low, high,
+                    joined_low, joined_high, spacing, recovery, vertices, weights, normal, floor, kind, arm, friction,
+                    counter, capacity,
+                )  # fmt: skip
+                place += lanes
+
+
+@ti.func
+def touch_wall(
+    i: ti.i32, w: ti.i32, position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
+    plane: Planes, low: Vectors, high: Vectors, joined_low: Vectors, joined_high: Vectors,
+    spacing: ti.f32, recovery: ti.f32,
+    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
+    friction: Floats, counter: Integers, capacity: ti.i32,
+):  # fmt: skip
+    """Append a vertex if it reaches a wall."""
+    x, half, n = position[i], 0.5 * thickness[i], plane[w].xyz
+    distance = n.dot(x) - plane[w].w
+    least = least_displacement(distance, half, recovery)
+    if distance < half or n.dot(displacement[i]) < least:
+        depth = ti.max(2.0 * WALL_DEPTH * half, spacing, displacement[i].norm())
+        is_above = (x >= low[w] - depth * joined_low[w]).all()
+        is_below = (x <= high[w] + depth * joined_high[w]).all()
+        slot = capacity
+        if is_above and is_below and distance > -depth:
+            slot = ti.atomic_add(counter[0], 1)
+        if slot < capacity:
+            vertices[slot], weights[slot] = Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0)
+            normal[slot], floor[slot], kind[slot] = n, least, WALL
+            arm[slot], friction[slot] = ti.math.vec3(0.0), vertex_friction[i]
+
+
+@ti.func
+def may_touch_bodies(
+    m: ti.i32, centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats,
+    largest_half: ti.f32, body_count: ti.i32, radius: Floats, body_position: Vectors, motion: Vectors,
+) -> ti.i32:  # fmt: skip
+    """Whether points of a patch may come as near to a body's sphere as `touch_bodies` asks for."""
+    may = 0
+    for b in range(body_count):
+        r = centre[m] - body_position[b]
+        spin = motion[2 * b + 1]
+        relative = (shift[m] - motion[2 * b] - spin.cross(r)).norm()
+        relative += (turn[m].norm() + spin.norm()) * patch_radius[m] + rest[m]
+        reach = WITH_ROUNDING * (radius[b] + patch_radius[m] + largest_half + relative)
+        if r.norm_sqr() < reach * reach:
+            may = 1
+    return may
 
 
 @ti.func
@@ -248,30 +298,8 @@ def touch_bodies(
 @fast_launch
 @ti.kernel
 def find_body_contacts_of_vertices(
-    vertex_count: ti.i32, position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
-    body_count: ti.i32, shape_kind: Integers, size: Vectors, has_edges: Integers, centre_of_mass: Vectors,
-    radius: Floats, step: Floats, body_friction: Floats, grid_values: Floats, grid_first: Integers,
-    grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
-    body_position: Vectors, rotation: Matrices, motion: Vectors, recovery: ti.f32,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
-) -> ti.i32:  # fmt: skip
-    """Append the contacts of vertices with bodies; returns the number of contacts so far."""
-    for i in range(vertex_count):
-        touch_bodies(
-            position[i], displacement[i], 0.5 * thickness[i], vertex_friction[i],
-            Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0), False, recovery,
-            body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-            grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-            vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-        )  # fmt: skip
-    return counter[0]
-
-
-@fast_launch
-@ti.kernel
-def find_body_contacts_between_vertices(
-    edges: Pairs, edge_count: ti.i32, triangles: Triples, triangle_count: ti.i32,
+    patch_count: ti.i32, lanes: ti.i32, first_vertex: Integers, patch_vertices: Integers,
+    centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats, largest_half: ti.f32,
     position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
     body_count: ti.i32, shape_kind: Integers, size: Vectors, has_edges: Integers, centre_of_mass: Vectors,
     radius: Floats, step: Floats, body_friction: Floats, grid_values: Floats, grid_first: Integers,
@@ -279,26 +307,67 @@ def find_body_contacts_between_vertices(
     body_position: Vectors, rotation: Matrices, motion: Vectors, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
     friction: Floats, counter: Integers, capacity: ti.i32,
-) -> ti.i32:  # fmt: skip
+):  # fmt: skip
+    """Append the contacts of vertices with bodies."""
+    for item in range(patch_count * lanes):
+        m = item // lanes
+        may_touch = may_touch_bodies(
+            m, centre, shift, turn, patch_radius, rest, largest_half, body_count, radius, body_position, motion
+        )
+        place = ti.select(may_touch == 1, first_vertex[m], first_vertex[m + 1]) + item % lanes
+        while place < first_vertex[m + 1]:
+            i = patch_vertices[place]
+            touch_bodies(
+                position[i], displacement[i], 0.5 * thickness[i], vertex_friction[i],
+                Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0), False, recovery,
+                body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
+                grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
+                vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
+            )  # fmt: skip
+            place += lanes
+
+
+@fast_launch
+@ti.kernel
+def find_body_contacts_between_vertices(
+    patch_count: ti.i32, lanes: ti.i32, first_edge: Integers, edges: Pairs, first_triangle: Integers,
+    triangles: Triples,
+    centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats, largest_half: ti.f32,
+    position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
+    body_count: ti.i32, shape_kind: Integers, size: Vectors, has_edges: Integers, centre_of_mass: Vectors,
+    radius: Floats, step: Floats, body_friction: Floats, grid_values: Floats, grid_first: Integers,
+    grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
+    body_position: Vectors, rotation: Matrices, motion: Vectors, recovery: ti.f32,
+    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
+    friction: Floats, counter: Integers, capacity: ti.i32,
+):  # fmt: skip
     """Append the contacts of midpoints of edges and triangles with bodies that have edges of their own."""
-    for e in range(edge_count):
-        a, b = edges[e][0], edges[e][1]
-        touch_bodies(
-            0.5 * (position[a] + position[b]), 0.5 * (displacement[a] + displacement[b]), 0.5 * thickness[a],
-            vertex_friction[a], Four(a, b, a, a), ti.math.vec4(0.5, 0.5, 0.0, 0.0), True, recovery,
-            body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-            grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-            vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-        )  # fmt: skip
-    for t in range(triangle_count):
-        a, b, c = triangles[t][0], triangles[t][1], triangles[t][2]
-        third = 1.0 / 3.0
-        touch_bodies(
-            third * (position[a] + position[b] + position[c]),
-            third * (displacement[a] + displacement[b] + displacement[c]), 0.5 * thickness[a],
-            vertex_friction[a], Four(a, b, c, a), ti.math.vec4(third, third, third, 0.0), True, recovery,
-            body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-            grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-            vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-        )  # fmt: skip
-    return counter[0]
+    for item in range(patch_count * lanes):
+        m = item // lanes
+        may_touch = may_touch_bodies(
+            m, centre, shift, turn, patch_radius, rest, largest_half, body_count, radius, body_position, motion
+        )
+        place = ti.select(may_touch == 1, first_edge[m], first_edge[m + 1]) + item % lanes
+        while place < first_edge[m + 1]:
+            a, b = edges[place][0], edges[place][1]
+            touch_bodies(
+                0.5 * (position[a] + position[b]), 0.5 * (displacement[a] + displacement[b]), 0.5 * thickness[a],
+                vertex_friction[a], Four(a, b, a, a), ti.math.vec4(0.5, 0.5, 0.0, 0.0), True, recovery,
+                body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
+                grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
+                vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
+            )  # fmt: skip
+            place += lanes
+        place = ti.select(may_touch == 1, first_triangle[m], first_triangle[m + 1]) + item % lanes
+        while place < first_triangle[m + 1]:
+            a, b, c = triangles[place][0], triangles[place][1], triangles[place][2]
+            third = 1.0 / 3.0
+            touch_bodies(
+                third * (position[a] + position[b] + position[c]),
+                third * (displacement[a] + displacement[b] + displacement[c]), 0.5 * thickness[a],
+                vertex_friction[a], Four(a, b, c, a), ti.math.vec4(third, third, third, 0.0), True, recovery,
+                body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
+                grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
+                vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
+            )  # fmt: skip
+            place += lanes

@@ -12,13 +12,12 @@ from sim.cloth.proximity import (
 )
 from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, Quadruples, Weights, least_displacement
 from sim.launch import fast_launch
+from sim.reductions import Results, reduced
 
 Pairs = ti.types.ndarray(dtype=ti.types.vector(2, ti.i32), ndim=1)
 Triples = ti.types.ndarray(dtype=ti.types.vector(3, ti.i32), ndim=1)
 Two = ti.types.vector(2, ti.i32)
 Four = ti.types.vector(4, ti.i32)
-Spheres = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
-Six = ti.types.vector(6, ti.f32)
 
 OF_REST_DISTANCE = 0.7
 """Elements that are nearer than their thickness when the cloth is flat keep this part of their distance there."""
@@ -32,7 +31,13 @@ END_OF_EDGE = 1.0e-3
 """Share of an edge that counts as its end."""
 
 LANES = 8
-"""Threads that search a pair of patches: enough to share out the work of a few of them."""
+"""Threads of a GPU that search a pair of patches: enough to share out the work of a few of them."""
+
+BLOCK = 16
+"""Elements that are compared with one at a time: two instructions of eight lanes, and few places that only fill up."""
+
+FAR = 1.0e9
+"""Coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32."""
 
 NONE = -1
 """In the place of a vertex: the list has no pair there."""
@@ -53,121 +58,115 @@ def pair_thickness(a: ti.i32, b: ti.i32, cloth: Integers, thickness: Floats, at_
 
 
 @ti.func
-def pair_vertex_with_triangles(
-    v: ti.i32, first: ti.i32, last: ti.i32, position: Vectors, triangles: Triples, reach: ti.f32,
-    p: ti.i32, start: Integers, room: Integers, found: Integers, pairs: Quadruples,
-):  # fmt: skip
-    """List a vertex with those of some triangles within `reach` [m] that it is no corner of."""
-    x = position[v]
-    for t in range(first, last):
-        corners = triangles[t]
-        a, b, c = position[corners[0]] - x, position[corners[1]] - x, position[corners[2]] - x
-        if (ti.min(a, b, c) < reach).all() and (ti.max(a, b, c) > -reach).all():
-            own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
-            if own == 0 and distance_to_triangle(ti.math.vec3(0.0), a, b, c) < reach:
-                place = ti.atomic_add(found[p], 1)
-                if place < room[p]:
-                    pairs[start[p] + place] = Four(v, corners[0], corners[1], corners[2])
+def lowest_bit(bits: ti.i32) -> ti.i32:
+    """Number of the lowest bit that is set, of less than 2^24: a float32 has it in its exponent."""
+    return (ti.bit_cast(ti.cast(bits & -bits, ti.f32), ti.i32) >> 23) - 127
 
 
 @fast_launch
 @ti.kernel
 def pair_vertices_with_triangles(
-    count: ti.i32, searched: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats, position: Vectors,
-    first_vertex: Integers, vertices: Integers, first_triangle: Integers, triangles: Triples,
+    count: ti.i32, lanes: ti.i32, searched: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats,
+    position: Vectors, first_vertex: Integers, vertices: Integers, first_block: Integers, triangles: Triples,
+    low_x: Floats, low_y: Floats, low_z: Floats, high_x: Floats, high_y: Floats, high_z: Floats,
     start: Integers, room: Integers, found: Integers, pairs: Quadruples,
 ):  # fmt: skip
     """List the vertices of each of two patches with the triangles of the other within `reach` [m] of them.
 
     Args:
         count: number of pairs of patches that are searched; their numbers are `searched`.
+        lanes: threads that share a pair.
+        first_block, triangles, low_x to high_z: see `ElementBlocks.triangles`.
         start, room: where pairs of elements are listed, and how many fit; `found` gets how many there are.
     """
-    for item in range(count * LANES):
-        p = searched[item // LANES]
+    for item in range(count * lanes):
+        p = searched[item // lanes]
         for side in range(2):
             m, other = patches[p][side], patches[p][1 - side]
-            if side == 0 or m != other:
-                least, most = low[other] - reach[p], high[other] + reach[p]
-                place = first_vertex[m] + item % LANES
-                while place < first_vertex[m + 1]:
-                    v = vertices[place]
-                    if (position[v] >= least).all() and (position[v] <= most).all():
-                        pair_vertex_with_triangles(
-                            v, first_triangle[other], first_triangle[other + 1], position, triangles, reach[p],
-                            p, start, room, found, pairs,
-                        )  # fmt: skip
-                    place += LANES
-
-
-@ti.func
-def are_surely_apart(between: ti.math.vec3, half_e: ti.math.vec3, half_f: ti.math.vec3, radius: ti.f32) -> ti.i32:
-    """Whether edges are apart in their shadows on the line through their midpoints; true of most neighbours in flat
-    cloth, which the spheres around them do not tell apart."""
-    squared = between.norm_sqr()
-    beyond = ti.max(squared - ti.abs(half_e.dot(between)) - ti.abs(half_f.dot(between)), 0.0)
-    return ti.cast(beyond * beyond > radius * radius * squared, ti.i32)
-
-
-@fast_launch
-@ti.kernel
-def enclose_edges(count: ti.i32, position: Vectors, edges: Pairs, half_edges: Vectors, spheres: Spheres):
-    """Half the vector along each edge, and the sphere around it: midpoint and radius [m]."""
-    for e in range(count):
-        a, b = position[edges[e][0]], position[edges[e][1]]
-        half_edges[e] = 0.5 * (b - a)
-        spheres[e] = ti.math.vec4(0.5 * (a + b), half_edges[e].norm())
+            place = first_vertex[m] + item % lanes
+            least, most = low[other] - reach[p], high[other] + reach[p]
+            if side == 1 and m == other:
+                place = first_vertex[m + 1]
+            while place < first_vertex[m + 1]:
+                v = vertices[place]
+                place += lanes
+                x = position[v]
+                if (x >= least).all() and (x <= most).all():
+                    below, above = x - reach[p], x + reach[p]
+                    for block in range(first_block[other], first_block[other + 1]):
+                        near = 0
+                        for k in range(BLOCK):
+                            t = block * BLOCK + k
+                            is_beside = low_x[t] < above[0] and high_x[t] > below[0]
+                            is_beside = is_beside and low_y[t] < above[1] and high_y[t] > below[1]
+                            is_beside = is_beside and low_z[t] < above[2] and high_z[t] > below[2]
+                            near |= ti.cast(is_beside, ti.i32) << k
+                        while near != 0:
+                            t = block * BLOCK + lowest_bit(near)
+                            near &= near - 1
+                            corners = triangles[t]
+                            own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
+                            if own == 0:
+                                a, b, c = position[corners[0]] - x, position[corners[1]] - x, position[corners[2]] - x
+                                if distance_to_triangle(ti.math.vec3(0.0), a, b, c) < reach[p]:
+                                    slot = ti.atomic_add(found[p], 1)
+                                    if slot < room[p]:
+                                        pairs[start[p] + slot] = Four(v, corners[0], corners[1], corners[2])
 
 
 @fast_launch
 @ti.kernel
 def pair_edges(
-    count: ti.i32, searched: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats,
-    first_edge: Integers, edges: Pairs, half_edges: Vectors, spheres: Spheres,
+    count: ti.i32, lanes: ti.i32, searched: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats,
+    first_block: Integers, edges: Pairs,
+    mid_x: Floats, mid_y: Floats, mid_z: Floats, half_x: Floats, half_y: Floats, half_z: Floats,
     start: Integers, room: Integers, found: Integers, pairs: Quadruples,
 ):  # fmt: skip
-    """List the edges of two patches that are within `reach` [m] of each other and share no vertex; as above."""
-    for item in range(count * LANES):
-        p = searched[item // LANES]
+    """List the edges of two patches that are within `reach` [m] of each other and share no vertex; as above.
+
+    Edges are first told apart by their shadows on the line through their midpoints, which are disjoint for most
+    neighbours in flat cloth; spheres around them do not.
+    """
+    for item in range(count * lanes):
+        p = searched[item // lanes]
         m, other = patches[p][0], patches[p][1]
+        within = reach[p] * reach[p]
         least, most = low[other] - reach[p], high[other] + reach[p]
-        place = first_edge[m] + item % LANES
-        while place < first_edge[m + 1]:
-            e, half, sphere = edges[place], half_edges[place], spheres[place]
-            x = sphere.xyz
-            if (x + ti.abs(half) >= least).all() and (x - ti.abs(half) <= most).all():
-                for there in range(ti.select(m == other, place + 1, first_edge[other]), first_edge[other + 1]):
-                    between = spheres[there].xyz - x
-                    within = reach[p] + sphere.w + spheres[there].w
-                    if between.norm_sqr() < within * within:
-                        f, other_half = edges[there], half_edges[there]
-                        is_near = are_surely_apart(between, half, other_half, reach[p]) == 0
-                        is_near = is_near and share_no_vertex(e, f) == 1
-                        slot = room[p]
-                        if (
-                            is_near
-                            and distance_of_edges(-half, half, between - other_half, between + other_half) < reach[p]
-                        ):
-                            slot = ti.atomic_add(found[p], 1)
-                        if slot < room[p]:
-                            # In this order, so that rounding does not depend on that of the patches.
-                            pairs[start[p] + slot] = ti.select(
-                                f[0] < e[0], Four(f[0], f[1], e[0], e[1]), Four(e[0], e[1], f[0], f[1])
-                            )
-            place += LANES
-
-
-@fast_launch
-@ti.kernel
-def clear_lists(
-    count: ti.i32, searched: Integers, start: Integers, room: Integers, found: Integers, pairs: Quadruples
-):  # fmt: skip
-    """Empty the lists of the pairs of patches that are searched."""
-    for k in range(count):
-        p = searched[k]
-        for place in range(start[p], start[p] + room[p]):
-            pairs[place] = Four(NONE)
-        found[p] = 0
+        place = first_block[m] * BLOCK + item % lanes
+        while place < first_block[m + 1] * BLOCK:
+            e, own = edges[place], place
+            x, y, z = mid_x[place], mid_y[place], mid_z[place]
+            g, h, i = half_x[place], half_y[place], half_z[place]
+            place += lanes
+            middle, half = ti.math.vec3(x, y, z), ti.math.vec3(g, h, i)
+            if (middle + ti.abs(half) >= least).all() and (middle - ti.abs(half) <= most).all():
+                for block in range(ti.select(m == other, own // BLOCK, first_block[other]), first_block[other + 1]):
+                    near = 0
+                    for k in range(BLOCK):
+                        f = block * BLOCK + k
+                        dx, dy, dz = mid_x[f] - x, mid_y[f] - y, mid_z[f] - z
+                        squared = dx * dx + dy * dy + dz * dz
+                        shadows = ti.abs(g * dx + h * dy + i * dz)
+                        shadows += ti.abs(half_x[f] * dx + half_y[f] * dy + half_z[f] * dz)
+                        beyond = ti.max(squared - shadows, 0.0)
+                        near |= ti.select(beyond * beyond <= within * squared, 1, 0) << k
+                    if m == other and block == own // BLOCK:
+                        # Each pair once: only edges after this one.
+                        near &= -2 << (own % BLOCK)
+                    while near != 0:
+                        there = block * BLOCK + lowest_bit(near)
+                        near &= near - 1
+                        f = edges[there]
+                        if share_no_vertex(e, f) == 1:
+                            between = ti.math.vec3(mid_x[there], mid_y[there], mid_z[there]) - middle
+                            far_half = ti.math.vec3(half_x[there], half_y[there], half_z[there])
+                            if distance_of_edges(-half, half, between - far_half, between + far_half) < reach[p]:
+                                slot = ti.atomic_add(found[p], 1)
+                                if slot < room[p]:
+                                    # In this order, so that rounding does not depend on that of the patches.
+                                    pairs[start[p] + slot] = ti.select(
+                                        f[0] < e[0], Four(f[0], f[1], e[0], e[1]), Four(e[0], e[1], f[0], f[1])
+                                    )
 
 
 @fast_launch
@@ -188,6 +187,7 @@ def make_room(
                 pairs[place] = Four(NONE)
             room[p] = found[p] + found[p] // 2
             start[p] = ti.atomic_add(end[0], room[p])
+            found[p] = 0
             again[ti.atomic_add(end[1], 1)] = p
     return ti.math.ivec2(end[1], end[0])
 
@@ -195,10 +195,10 @@ def make_room(
 @fast_launch
 @ti.kernel
 def keep_distances(
-    count: ti.i32, searched: Integers, start: Integers, found: Integers, pairs: Quadruples, are_edges: ti.template(),
-    rest: Vectors, cloth: Integers, thickness: Floats, wanted: Floats, patches: Integers,
+    count: ti.i32, searched: Integers, start: Integers, room: Integers, found: Integers, pairs: Quadruples,
+    are_edges: ti.template(), rest: Vectors, cloth: Integers, thickness: Floats, wanted: Floats, patches: Integers,
 ):  # fmt: skip
-    """Distances that the listed elements keep [m], and the number of their pair of patches."""
+    """Distances that the listed elements keep [m], and the number of their pair of patches; nothing is after them."""
     for k in range(count):
         p = searched[k]
         for place in range(start[p], start[p] + found[p]):
@@ -207,22 +207,24 @@ def keep_distances(
             at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
             patches[place] = p
             wanted[place] = pair_thickness(v[0], v[2], cloth, thickness, at_rest)
+        for place in range(start[p] + found[p], start[p] + room[p]):
+            pairs[place] = Four(NONE)
 
 
 @fast_launch
 @ti.kernel
 def find_near_pairs(
-    pairs: Quadruples, wanted: Floats, patches: Integers, approach: Floats, count: ti.i32, are_edges: ti.template(),
-    position: Vectors, displacement: Vectors, vertex_friction: Floats, margin: ti.f32, recovery: ti.f32,
+    pairs: Quadruples, wanted: Floats, patches: Integers, approach: Floats, allowed: Floats, count: ti.i32,
+    are_edges: ti.template(), position: Vectors, displacement: Vectors, vertex_friction: Floats, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
     friction: Floats, counter: Integers, capacity: ti.i32,
-) -> ti.i32:  # fmt: skip
+):  # fmt: skip
     """Append the pairs that are nearer than they shall be, or get there, and those that might cross.
 
     The displacement along the line of shortest distance counts. A pair might cross when its vertices, displaced as
-    they are now and by up to `margin` [m] besides, come together: then it is watched, `INACTIVE`. They come no nearer
-    than by twice their motion against their mean, nor than by the `approach` [m] of their `patches`. Returns the number
-    of contacts so far.
+    they are now and by contacts besides, come together: then it is watched, `INACTIVE`. They come no nearer than by
+    twice their motion against their mean, nor than by the `approach` [m] of their `patches`; contacts are `allowed` so
+    much more [m].
     """
     for p in range(count):
         v = pairs[p]
@@ -249,7 +251,7 @@ def find_near_pairs(
         distance = apart.norm()
         mean = 0.25 * (u1 + u2 + u3)
         motion = ti.max(mean.norm(), (u1 - mean).norm(), (u2 - mean).norm(), (u3 - mean).norm())
-        if distance < ti.max(keeps, ti.min(2.0 * motion, approach[patches[p]]) + 2.0 * margin):
+        if distance < ti.max(keeps, ti.min(2.0 * motion, approach[patches[p]]) + allowed[patches[p]]):
             n = unit_or(apart, across)
             least = least_displacement(distance, keeps, recovery)
             slot = ti.atomic_add(counter[0], 1)
@@ -260,17 +262,6 @@ def find_near_pairs(
                 kind[slot] = EDGE_EDGE if ti.static(are_edges) else VERTEX_TRIANGLE
                 arm[slot] = zero
                 friction[slot] = ti.sqrt(vertex_friction[v[0]] * vertex_friction[v[2]])
-    return counter[0]
-
-
-@fast_launch
-@ti.kernel
-def largest_change(vectors: Vectors, before: Vectors, count: ti.i32) -> ti.f32:
-    """Largest distance of vectors from what they were."""
-    largest = 0.0
-    for i in range(count):
-        ti.atomic_max(largest, (vectors[i] - before[i]).norm())
-    return largest
 
 
 @fast_launch
@@ -283,15 +274,17 @@ def copy_vectors(vectors: Vectors, count: ti.i32, copy: Vectors):
 
 @fast_launch
 @ti.kernel
-def range_of_vectors(vectors: Vectors, count: ti.i32) -> Six:
-    """Largest components, then those of the negative vectors; exact in any order."""
-    large_x, large_y, large_z = -1.0e30, -1.0e30, -1.0e30
-    small_x, small_y, small_z = -1.0e30, -1.0e30, -1.0e30
-    for i in range(count):
-        ti.atomic_max(large_x, vectors[i][0])
-        ti.atomic_max(large_y, vectors[i][1])
-        ti.atomic_max(large_z, vectors[i][2])
-        ti.atomic_max(small_x, -vectors[i][0])
-        ti.atomic_max(small_y, -vectors[i][1])
-        ti.atomic_max(small_z, -vectors[i][2])
-    return Six(large_x, large_y, large_z, small_x, small_y, small_z)
+def range_of_vectors(
+    vectors: Vectors, count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
+    lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
+) -> Results:  # fmt: skip
+    """Largest components, then those of the negative vectors, six maxima."""
+    for lane in range(lanes):
+        most, least = ti.math.vec3(-FAR), ti.math.vec3(FAR)
+        for k in range(items):
+            i = lane * lane_step + k * item_step
+            if i < count:
+                most, least = ti.max(most, vectors[i]), ti.min(least, vectors[i])
+        for axis in ti.static(range(3)):
+            partial[axis * lanes + lane], partial[(3 + axis) * lanes + lane] = most[axis], -least[axis]
+    return reduced(partial, lanes, quantities, maxima, nodes)

@@ -1,6 +1,7 @@
 """Cloths: nodes with mass on springs, in air, held by pins."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from itertools import pairwise
 
 import numpy as np
 import taichi as ti
@@ -14,6 +15,8 @@ from sim.cloth.load import NodeLoad
 from sim.cloth.motion import finish_step, predict_displacement
 from sim.cloth.parameters import DEFAULT_SUBSTEPS, RUNAWAY_SPEED, ClothParameters, shared_conflicts
 from sim.cloth.pins import Pins
+from sim.cloth.rectangles import rectangles_in_rows
+from sim.cloth.row_air import RectangleAir
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import joined_springs, springs_of
 from sim.cloth.stable_step import too_few_substeps
@@ -90,13 +93,18 @@ class ClothSolver:
         self.gravity = gravity
         self.contacts: list[ClothContacts] = []
         self.load: NodeLoad | None = None
-        families = joined_springs([springs_of(sheet) for sheet in sheets], host.first_node.tolist())
-        self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
         shared = self.parameters[0]
+        apart = rectangles_in_rows(host) if shared.integrator == "xpbd" else ()
+        families = joined_springs([springs_of(sheet) for sheet in sheets], host.first_node.tolist(), apart=apart)
+        self._springs = [DeviceSprings(springs, cloth_of) for springs, cloth_of in families]
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, iterations=shared.iterations)
         self._totals = ClothTotals(self.state, self._springs)
         self._frame_dt = 1.0 / frames_per_second
         self.air = ClothAir(self.state)
+        self._rectangles_in_wind = {
+            number: RectangleAir(self.state, grid, int(host.first_node[number]), self.air.share)
+            for number, grid in rectangles_in_rows(host).items()
+        }
         self._pins = Pins(self.parameters, sheets, self.state)
         self._take_parameters()
         self._time_s = 0.0
@@ -206,13 +214,18 @@ class ClothSolver:
         ti.sync()
 
     def _predict(self, dt: float) -> None:
-        """Gravity and air."""
+        """Gravity and air: of rectangles in nothing but wind by rows, of all others by lists of triangles."""
         state, air, gravity = self.state, self.air, ti.math.vec3(*self.gravity)
-        air.blow(gravity, dt)
-        predict_displacement(
-            state.velocity, state.carry, state.inverse_mass, air.force, air.share, air.triangle_start,
-            air.triangle_list, int(air.acts), gravity, dt, state.displacement,
-        )  # fmt: skip
+        in_rows = self._rectangles_in_wind if air.acts and not air.is_shared else {}
+        for rectangle in in_rows.values():
+            rectangle.predict(gravity, dt)
+        for cloths in _runs_without(in_rows, len(self.parameters)):
+            air.blow(cloths, gravity, dt)
+            first, end = (int(state.host.first_node[number]) for number in (cloths.start, cloths.stop))
+            predict_displacement(
+                state.velocity, state.carry, state.inverse_mass, air.force, air.share, air.triangle_start,
+                air.triangle_list, int(air.acts), first, end, gravity, dt, state.displacement,
+            )  # fmt: skip
 
     def _hold_pins(self) -> None:
         if self._pins.hold(self._time_s):
@@ -226,7 +239,10 @@ class ClothSolver:
         self.state.set_material(cloths)
         for springs in self._springs:
             springs.set_material(cloths)
+        self._integrator.take_parameters(cloths)
         self.air.take_parameters(cloths)
+        for number, rectangle in self._rectangles_in_wind.items():
+            rectangle.take_parameters(cloths[number])
         self._mass = float(self.state.mass.to_numpy().sum(dtype=np.float64))
 
     def _largest_dt(self) -> float:
@@ -314,6 +330,12 @@ class ClothSolver:
 
 _STATE = {"lattice": np.int32, "carry": np.float32, "velocity": np.float32}
 """Arrays of the state that a restart needs, each (n, 3)."""
+
+
+def _runs_without(left_out: Collection[int], count: int) -> list[range]:
+    """The numbers 0 ... count - 1 but some, in runs of neighbours."""
+    ends = [-1, *sorted(left_out), count]
+    return [range(a + 1, b) for a, b in pairwise(ends) if b > a + 1]
 
 
 def _reach(domain: DomainParameters, positions: NDArray[np.float64]) -> float:

@@ -24,7 +24,7 @@ A sheet of square cells has the stretch stiffness E + G and half of G across, be
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -104,17 +104,17 @@ def springs_of(sheet: RestSheet) -> list[Springs]:
 
 
 def _grid_diagonals(grid: Grid) -> Springs:
-    """Both of each cell; the colours alternate along each direction."""
+    """Both of each cell, those of every second row of cells first."""
     number = _numbers(grid)
     length = float(np.hypot(grid.step_x, grid.step_y))
     row = np.broadcast_to(np.arange(grid.rows - 1)[:, None], (grid.rows - 1, grid.columns - 1)) % 2
-    share = length**2 / (2.0 * grid.step_x * grid.step_y)
+    share = diagonal_share(grid)
     ends = [(number[:-1, :-1], number[1:, 1:]), (number[:-1, 1:], number[1:, :-1])]
     nodes = np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in ends])
     count = len(nodes)
     return Springs(
         nodes, np.tile([1.0, -1.0], (count, 1)), np.full(count, length), np.full(count, share), _all(SHEAR, count),
-        np.concatenate([row.ravel(), 2 + row.ravel()]).astype(np.int32), _all(-1, count),
+        np.concatenate([2 * row.ravel(), 2 * row.ravel() + 1]).astype(np.int32), _all(-1, count),
     )  # fmt: skip
 
 
@@ -122,8 +122,7 @@ def _grid_threads(grid: Grid) -> Springs:
     """Along x, then along y, thread by thread; colours alternate along each thread from piece to piece."""
     groups, pieces = [], 0
     for axis, along, step, other in _directions(grid):
-        width = np.full((len(along), along.shape[1] - 1), other)
-        width[[0, -1]] *= 0.5
+        width = np.broadcast_to(line_widths(len(along), other)[:, None], (len(along), along.shape[1] - 1))
         piece = np.arange(along.shape[1] - 1) // SEGMENT_LENGTH
         nodes = np.stack([along[:, :-1], along[:, 1:]], axis=-1).reshape(-1, 2)
         count = len(nodes)
@@ -143,18 +142,35 @@ def _grid_bends(grid: Grid) -> Springs:
     """Over each inner node along x, then along y."""
     groups = []
     for axis, along, step, other in _directions(grid):
-        width = np.full((len(along), max(along.shape[1] - 2, 0)), other)
-        width[[0, -1]] *= 0.5
+        width = np.broadcast_to(line_widths(len(along), other)[:, None], (len(along), max(along.shape[1] - 2, 0)))
         nodes = np.stack([along[:, :-2], along[:, 1:-1], along[:, 2:]], axis=-1).reshape(-1, 3)
         count = len(nodes)
         colour = np.broadcast_to(3 * axis + np.arange(width.shape[1]) % 3, width.shape)
         groups.append(
             Springs(
-                nodes, np.tile([1.0, -2.0, 1.0], (count, 1)), np.zeros(count), (width / step**3).ravel(),
+                nodes, np.tile([1.0, -2.0, 1.0], (count, 1)), np.zeros(count), bend_share(width, step).ravel(),
                 _all(BEND, count), colour.ravel().astype(np.int32), _all(-1, count),
             )
         )  # fmt: skip
     return _joined(groups)
+
+
+def line_widths(lines: int, spacing: float) -> Floats:
+    """Width that each thread of so many, side by side at a spacing [m], stands for [m], (lines,)."""
+    width = np.full(lines, spacing)
+    width[[0, -1]] *= 0.5
+    return width
+
+
+def bend_share(width: Floats, step: float) -> Floats:
+    """Stiffness of bend springs along threads of a width [m] and with nodes at a step [m], over the sheet's [1/m²]."""
+    share: Floats = width / step**3
+    return share
+
+
+def diagonal_share(grid: Grid) -> float:
+    """Stiffness of a diagonal over that of the sheet against shear [-]."""
+    return (grid.step_x**2 + grid.step_y**2) / (2.0 * grid.step_x * grid.step_y)
 
 
 def _directions(grid: Grid) -> list[tuple[int, Indices, float, float]]:
@@ -244,18 +260,22 @@ def edges_of(triangles: Indices) -> Edges:
     return Edges(nodes.astype(np.int32), of_side.reshape(-1))
 
 
-def joined_springs(parts: list[list[Springs]], node_offsets: list[int]) -> list[tuple[Springs, Indices]]:
+def joined_springs(
+    parts: list[list[Springs]], node_offsets: list[int], *, apart: Collection[int] = ()
+) -> list[tuple[Springs, Indices]]:
     """Springs of several cloths, those that are solved alike together and sorted by colour, and the cloth of each.
 
     Args:
         parts: the springs of each cloth.
         node_offsets: number of its first node.
+        apart: cloths whose springs are not joined with those of the others.
     """
-    families: dict[tuple[int, bool], list[tuple[int, Springs]]] = {}
+    families: dict[tuple[bool, int, bool], list[tuple[int, Springs]]] = {}
     for number, cloth in enumerate(parts):
         for springs in cloth:
             if len(springs):
-                families.setdefault((-springs.arity, springs.in_segments), []).append((number, springs))
+                key = (number in apart, -springs.arity, springs.in_segments)
+                families.setdefault(key, []).append((number, springs))
     joined = []
     for key in sorted(families):
         moved, pieces = [], 0

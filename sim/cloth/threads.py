@@ -4,7 +4,7 @@ import numpy as np
 import taichi as ti
 
 from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.device_springs import COLOURS_AT_ONCE, TINY_LENGTH, DeviceSprings, Laws
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, colour_bounds
 from sim.cloth.state import ClothState, Lattice
 from sim.launch import fast_launch
 
@@ -25,7 +25,8 @@ class ThreadSolver:
     cloth that hangs from its corner would jitter there. `straighten` therefore lets tension turn with its springs.
 
     What can be done spring by spring is; the passes along the pieces read nothing but a few numbers that lie together.
-    On a GPU following the nodes there would take most of the step's time, as memory answers late.
+    On a GPU following the nodes there would take most of the step's time, as memory answers late. Kernels here and in
+    `xpbd` write x = x + y: what stands at an index from memory Taichi would add to by an atomic operation for +=.
     """
 
     def __init__(self, springs: DeviceSprings) -> None:
@@ -83,9 +84,13 @@ def solve_threads(
     Spring s leads from node s to node s + 1 of the piece, n_s is its direction, l_s its multiplier and D_s the change
     of that. `tension` becomes what is too much of -l_s / |d|, `is_taut` whether a piece has any.
     """
-    for k in ti.static(range(COLOURS_AT_ONCE)):
-        colour = first + k
-        for s in range(spring_of_colour[colour], spring_of_colour[colour + 1]):
+    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
+    s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, first)
+    p0, p1, p2, p3, p4 = colour_bounds(piece_of_colour, first)
+    for first_spring, end_spring, first_piece, end_piece in ti.static(
+        ((s0, s1, p0, p1), (s1, s2, p1, p2), (s2, s3, p2, p3), (s3, s4, p3, p4))
+    ):
+        for s in range(first_spring, end_spring):
             i, j = nodes[2 * s], nodes[2 * s + 1]
             d = quantum * ti.cast(lattice[i] - lattice[j], ti.f32) + (displacement[i] - displacement[j])
             length = ti.max(d.norm(), TINY_LENGTH)
@@ -97,7 +102,7 @@ def solve_threads(
             change[s] = law[s][0] - length - compliance * multiplier[s]
             lower[s] = -inverse_mass[i]
             diagonal[s] = inverse_mass[i] + inverse_mass[j] + compliance
-        for p in range(piece_of_colour[colour], piece_of_colour[colour + 1]):
+        for p in range(first_piece, end_piece):
             start, stop = segment_start[p], segment_start[p + 1]
             inverse_pivot = 0.0
             solved = 0.0
@@ -118,16 +123,16 @@ def solve_threads(
                 change[s] = solved
                 factor = lower[s]
             is_taut[p] = 0
-        for s in range(spring_of_colour[colour], spring_of_colour[colour + 1]):
+        for s in range(first_spring, end_spring):
             i, j = nodes[2 * s], nodes[2 * s + 1]
             push = change[s] * direction[s]
             moved = -push  # of the node that the spring leads to, which the next one leads from
             if s + 1 < piece.shape[0] and piece[s + 1] == piece[s]:
                 moved += change[s + 1] * direction[s + 1]
-            displacement[j] += inverse_mass[j] * moved
+            displacement[j] = displacement[j] + inverse_mass[j] * moved
             if s == 0 or piece[s - 1] != piece[s]:
-                displacement[i] += inverse_mass[i] * push
-            multiplier[s] += change[s]
+                displacement[i] = displacement[i] + inverse_mass[i] * push
+            multiplier[s] = multiplier[s] + change[s]
             stress = -multiplier[s] * tension[s]
             weight = inverse_mass[i] + inverse_mass[j]
             excess = 0.0
@@ -160,14 +165,18 @@ def straighten_threads(
     e~ is by how much springs have changed the displacements, e by how much they shall have; t_i is the tension of the
     spring from node i on. What is stored for a spring is of the node that it leads to.
     """
-    for k in ti.static(range(COLOURS_AT_ONCE)):
-        colour = first + k
-        for s in range(spring_of_colour[colour], spring_of_colour[colour + 1]):
+    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
+    s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, first)
+    p0, p1, p2, p3, p4 = colour_bounds(piece_of_colour, first)
+    for first_spring, end_spring, first_piece, end_piece in ti.static(
+        ((s0, s1, p0, p1), (s1, s2, p1, p2), (s2, s3, p2, p3), (s3, s4, p3, p4))
+    ):
+        for s in range(first_spring, end_spring):
             if is_taut[piece[s]]:
                 j = nodes[2 * s + 1]
                 weight[s] = inverse_mass[j]
                 solved[s] = corrected(j, inverse_mass, carry, velocity, dt, displacement)
-        for p in range(piece_of_colour[colour], piece_of_colour[colour + 1]):
+        for p in range(first_piece, end_piece):
             if is_taut[p]:
                 start, stop = segment_start[p], segment_start[p + 1]
                 head = nodes[2 * start]
@@ -193,8 +202,9 @@ def straighten_threads(
                     s = stop - 1 - m
                     e_i = solved[s] + factor[s] * e_i
                     solved[s] = e_i
-                displacement[head] += e_head + share_of_head * e_i - change
-        for s in range(spring_of_colour[colour], spring_of_colour[colour + 1]):
+                displacement[head] = displacement[head] + (e_head + share_of_head * e_i - change)
+        for s in range(first_spring, end_spring):
             if is_taut[piece[s]]:
                 j = nodes[2 * s + 1]
-                displacement[j] += solved[s] - corrected(j, inverse_mass, carry, velocity, dt, displacement)
+                change_j = solved[s] - corrected(j, inverse_mass, carry, velocity, dt, displacement)
+                displacement[j] = displacement[j] + change_j

@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import taichi as ti
 
 from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.device_springs import COLOURS_AT_ONCE, TINY_LENGTH, DeviceSprings, Laws, coefficient, separation
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, coefficient, colour_bounds, separation
 from sim.cloth.free_spin import FreeSpin
+from sim.cloth.parameters import ClothParameters
+from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
 from sim.cloth.state import ClothState, Lattice
 from sim.cloth.threads import ThreadSolver
 from sim.launch import fast_launch
@@ -37,13 +39,23 @@ class XPBDSprings:
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], *, iterations: int) -> None:
         self._state, self._springs, self._iterations = state, springs, iterations
         self._spin = FreeSpin(state)
-        self._bends = [family for family in springs if family.arity > PAIR]
+        self._rectangles = {
+            number: RectangleSprings(state, grid, int(state.host.first_node[number]))
+            for number, grid in rectangles_in_rows(state.host).items()
+        }
+        listed = [family for family in springs if not family.cloths & self._rectangles.keys()]
+        self._bends = [family for family in listed if family.arity > PAIR]
         self._pairs = [
             (family, ti.ndarray(ti.f32, family.count))
-            for family in springs
+            for family in listed
             if family.arity == PAIR and not family.in_segments
         ]
-        self._threads = [ThreadSolver(family) for family in springs if family.in_segments]
+        self._threads = [ThreadSolver(family) for family in listed if family.in_segments]
+
+    def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
+        """Stiffness of the rectangles as it is now; lists of springs hold theirs."""
+        for number, rectangle in self._rectangles.items():
+            rectangle.take_parameters(cloths[number])
 
     def stable_dt(self) -> float:
         """Any step is stable [s]."""
@@ -78,6 +90,8 @@ class XPBDSprings:
                 threads.displace(self._state, dt, is_first=iteration == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
+        for rectangle in self._rectangles.values():
+            rectangle.displace(dt, self._iterations)
         self._spin.restore(dt)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
@@ -128,7 +142,7 @@ def solve_bend(
         impulse = -strength * error / (squared * (strength * weight * (1.0 + gamma) + 1.0)) * d
         for a in ti.static(range(arity)):
             i = nodes[arity * s + a]
-            displacement[i] += inverse_mass[i] * coefficient(coefficients, s, arity, a) * impulse
+            displacement[i] = displacement[i] + inverse_mass[i] * coefficient(coefficients, s, arity, a) * impulse
 
 
 @fast_launch
@@ -139,8 +153,10 @@ def solve_bends(
     displacement: Vectors,
 ):  # fmt: skip
     """The bend springs of some colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
-    for k in ti.static(range(COLOURS_AT_ONCE)):
-        for s in range(spring_of_colour[colour + k], spring_of_colour[colour + k + 1]):
+    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
+    s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, colour)
+    for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
+        for s in range(start, stop):
             solve_bend(
                 s, nodes, law, coefficients, lattice, quantum, inverse_mass, dt_squared, rate, arity, displacement
             )
@@ -157,8 +173,10 @@ def solve_pairs(
     Macklin, Müller & Chentanez 2016, eq. 18, Delta lambda = -(C + a lambda) / (w_i + w_j + a) with a = 1/(k dt²),
     multiplied through by k dt²; multipliers start at 0 in every step.
     """
-    for m in ti.static(range(COLOURS_AT_ONCE)):
-        for s in range(spring_of_colour[colour + m], spring_of_colour[colour + m + 1]):
+    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
+    s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, colour)
+    for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
+        for s in range(start, stop):
             i, j = nodes[2 * s], nodes[2 * s + 1]
             w_i, w_j = inverse_mass[i], inverse_mass[j]
             d = quantum * ti.cast(lattice[i] - lattice[j], ti.f32) + (displacement[i] - displacement[j])
@@ -169,8 +187,8 @@ def solve_pairs(
                 before = multiplier[s]
             change = -(strength * (length - law[s][0]) + before) / (length * (strength * (w_i + w_j) + 1.0))  # over |d|
             multiplier[s] = before + length * change
-            displacement[i] += w_i * change * d
-            displacement[j] -= w_j * change * d
+            displacement[i] = displacement[i] + w_i * change * d
+            displacement[j] = displacement[j] - w_j * change * d
 
 
 @ti.func
@@ -194,7 +212,7 @@ def damp_spring(
         impulse = -strength / (strength * weight + 1.0) * d.dot(rate) / squared * d
         for a in ti.static(range(arity)):
             i = nodes[arity * s + a]
-            velocity[i] += inverse_mass[i] * coefficient(coefficients, s, arity, a) * impulse
+            velocity[i] = velocity[i] + inverse_mass[i] * coefficient(coefficients, s, arity, a) * impulse
 
 
 @fast_launch
@@ -205,7 +223,9 @@ def damp_springs(
     arity: ti.template(), velocity: Vectors,
 ):  # fmt: skip
     """The springs of some colours, one colour after the other, and one by one within a piece."""
-    for k in ti.static(range(COLOURS_AT_ONCE)):
-        for piece in range(piece_of_colour[colour + k], piece_of_colour[colour + k + 1]):
+    # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
+    p0, p1, p2, p3, p4 = colour_bounds(piece_of_colour, colour)
+    for start, stop in ti.static(((p0, p1), (p1, p2), (p2, p3), (p3, p4))):
+        for piece in range(start, stop):
             for s in range(segment_start[piece], segment_start[piece + 1]):
                 damp_spring(s, nodes, law, coefficients, lattice, quantum, carry, inverse_mass, dt, arity, velocity)

@@ -37,7 +37,7 @@ class DeviceShapes:
         kind: of the shape, (b,).
         size: of a primitive, (b,) vec3, scaled.
         centre_of_mass: in the frame of the shape [m], (b,) vec3.
-        radius: largest distance from the centre of mass [m], (b,).
+        radius: that of a sphere around the centre of mass that holds the body [m], (b,).
         step: half width of differences for normals [m], (b,).
         grid_first, grid_origin, grid_spacing, grid_shape: where in `grid_values` a mesh's distances are.
 
@@ -61,6 +61,7 @@ class DeviceShapes:
         kind, first, shape = np.empty(b, np.int32), np.zeros(b, np.int32), np.zeros((b, 3), np.int32)
         size, origin, spacing = np.zeros((b, 3)), np.zeros((b, 3)), np.ones(b)
         step = np.empty(b)
+        radius = np.array([geometry.radius for geometry in self.geometries])
         sampled: dict[int, tuple[int, LevelSet]] = {}
         values: list[NDArray[np.float32]] = []
         for number, geometry in enumerate(self.geometries):
@@ -69,6 +70,8 @@ class DeviceShapes:
                 kind[number], size_of = _SIZES[type(solid.shape)]
                 size[number] = solid.scale * np.asarray(size_of(solid.shape))
                 step[number] = GRADIENT_STEP * geometry.shortest_edge
+                if isinstance(solid.shape, Sphere):  # `geometry` goes by the corners of its box
+                    radius[number] = size[number, 0] + np.linalg.norm(geometry.centre_of_mass)
                 continue
             if id(geometry) not in sampled:
                 level_set = sampled_distances(solid)
@@ -91,7 +94,7 @@ class DeviceShapes:
             (self.grid_origin, origin),
             (self.grid_spacing, spacing),
             (self.step, step),
-            (self.radius, np.array([geometry.radius for geometry in self.geometries])),
+            (self.radius, radius),
             (self.centre_of_mass, np.array([geometry.centre_of_mass for geometry in self.geometries])),
         ):
             floats.from_numpy(numbers.astype(np.float32))

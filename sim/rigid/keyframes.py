@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim.parameters import Vector3
 from sim.rigid import rotation
-from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.parameters import RigidBodyParameters, RigidKeyframeParameters
 from sim.rigid.ways import Way
 
 Array = NDArray[np.float64]
@@ -218,9 +218,14 @@ def path_of(parameters: RigidBodyParameters) -> Path:
             np.asarray(parameters.velocity, dtype=np.float64),
             np.asarray(parameters.angular_velocity, dtype=np.float64),
         )
+    return path_through(parameters.keyframe, linear=parameters.interpolation == "linear")
+
+
+def path_through(keyframes: Sequence[RigidKeyframeParameters], *, linear: bool) -> KeyframePath:
+    """The path through keyframes as a job file names them."""
     return KeyframePath(
-        [keyframe.time_s for keyframe in parameters.keyframe],
-        np.array([keyframe.position for keyframe in parameters.keyframe], dtype=np.float64),
-        np.stack([rotation.from_degrees(keyframe.rotation_deg) for keyframe in parameters.keyframe]),
-        linear=parameters.interpolation == "linear",
+        [keyframe.time_s for keyframe in keyframes],
+        np.array([keyframe.position for keyframe in keyframes], dtype=np.float64),
+        np.stack([rotation.from_degrees(keyframe.rotation_deg) for keyframe in keyframes]),
+        linear=linear,
     )

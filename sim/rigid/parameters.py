@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, Literal, Self
 
@@ -12,7 +13,7 @@ from sim.shapes.parameters import Placement
 
 
 class RigidKeyframeParameters(Parameters):
-    """Where a kinematic body is at one time."""
+    """Where something on a path is at one time."""
 
     time_s: NonNegative = Field(description="Time [s]; later than that of the keyframe before.")
     position: Vector3 = Field(description="World position of the shape's centre [m].")
@@ -21,6 +22,43 @@ class RigidKeyframeParameters(Parameters):
         description="Rotation about x, then y, then z (world axes) [degrees]; "
         "the way from one keyframe to the next is the shortest, below 180 degrees.",
     )
+
+
+def placed_at_first_keyframe(data: Any, what: str) -> Any:
+    """What a job file says of something with keyframes, with the pose of the first as its place.
+
+    So everybody who asks where it starts gets that pose.
+
+    Args:
+        data: as it comes to a validator, before anything is known about it.
+        what: how to call the thing in messages.
+
+    Raises:
+        ValueError: it is placed elsewhere as well.
+    """
+    if not isinstance(data, dict) or not isinstance(data.get("keyframe"), list | tuple) or not data["keyframe"]:
+        return data
+    first = data["keyframe"][0]
+    placed = [key for key in ("position", "rotation_deg") if key in data]
+    if isinstance(first, RigidKeyframeParameters):
+        first = first.model_dump()
+    if not isinstance(first, dict) or "position" not in first:
+        return data  # the keyframe's own validation says what is wrong with it
+    start = {key: first[key] for key in ("position", "rotation_deg") if key in first}
+    for key in placed:
+        if tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
+            raise ValueError(f"{key} differs from that of the first keyframe, which places the {what}; remove {key}")
+    return {**data, **start}
+
+
+def require_ascending_times(keyframes: Sequence[RigidKeyframeParameters]) -> None:
+    """Raises ValueError unless each keyframe is later than the one before."""
+    for number, (before, after) in enumerate(pairwise(keyframes), start=1):
+        if after.time_s <= before.time_s:
+            raise ValueError(
+                f"keyframe[{number}].time_s must be after {before.time_s:g} s, that of the keyframe before, "
+                f"got {after.time_s:g} s"
+            )
 
 
 class BallastParameters(Parameters):
@@ -76,20 +114,7 @@ class RigidBodyParameters(Placement):
     @model_validator(mode="before")
     @classmethod
     def _start_at_first_keyframe(cls, data: Any) -> Any:
-        """Everybody who asks where the body starts gets the pose of its first keyframe."""
-        if not isinstance(data, dict) or not isinstance(data.get("keyframe"), list | tuple) or not data["keyframe"]:
-            return data
-        first = data["keyframe"][0]
-        placed = [key for key in ("position", "rotation_deg") if key in data]
-        if isinstance(first, RigidKeyframeParameters):
-            first = first.model_dump()
-        if not isinstance(first, dict) or "position" not in first:
-            return data  # the keyframe's own validation says what is wrong with it
-        start = {key: first[key] for key in ("position", "rotation_deg") if key in first}
-        for key in placed:
-            if tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
-                raise ValueError(f"{key} differs from that of the first keyframe, which places the body; remove {key}")
-        return {**data, **start}
+        return placed_at_first_keyframe(data, "body")
 
     @model_validator(mode="after")
     def _has_only_what_its_kind_means(self) -> Self:
@@ -116,10 +141,5 @@ class RigidBodyParameters(Placement):
 
     @model_validator(mode="after")
     def _keyframes_are_in_order(self) -> Self:
-        for number, (before, after) in enumerate(pairwise(self.keyframe), start=1):
-            if after.time_s <= before.time_s:
-                raise ValueError(
-                    f"keyframe[{number}].time_s must be after {before.time_s:g} s, that of the keyframe before, "
-                    f"got {after.time_s:g} s"
-                )
+        require_ascending_times(self.keyframe)
         return self

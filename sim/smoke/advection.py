@@ -7,7 +7,9 @@ is first-order in time by itself; MacCormack's second pass corrects the error of
 
 import taichi as ti
 
+from sim.smoke.balance import CorrectionBalance
 from sim.smoke.grid import SmokeGrid
+from sim.smoke.lanes import lane_count, lane_items, lane_place
 
 
 @ti.data_oriented
@@ -23,9 +25,19 @@ class Advection:
         cell_fields: density and temperature excess, flat fields.
         work: six flat fields to work in.
         maccormack: whether to correct the semi-Lagrangian result.
+        balance: keeps the totals of the cell fields in spite of the limiter, if given.
     """
 
-    def __init__(self, grid: SmokeGrid, *, velocity: tuple, cell_fields: tuple, work: tuple, maccormack: bool) -> None:
+    def __init__(
+        self,
+        grid: SmokeGrid,
+        *,
+        velocity: tuple,
+        cell_fields: tuple,
+        work: tuple,
+        maccormack: bool,
+        balance: CorrectionBalance | None = None,
+    ) -> None:
         self._nx, self._ny, self._nz = grid.cells
         self._step_x, self._step_y = grid.padded[1] * grid.padded[2], grid.padded[2]
         self._size = grid.size
@@ -33,11 +45,12 @@ class Advection:
         self._density, self._excess = cell_fields
         self._predicted_x, self._predicted_y, self._predicted_z, self._result_x, self._result_y, self._result_z = work
         self._cells_per_metre = 1.0 / grid.cell_size
-        self._maccormack = maccormack
+        self._maccormack, self._balance = maccormack, balance
+        self._lanes = lane_count()
         # Beyond these indices lies outside air; walls keep smoke in, so theirs are out of reach.
         far = 1.0e9
-        self._low = tuple(0.5 if grid.is_open(axis, 0) else -far for axis in range(3))
-        self._high = tuple(n + 0.5 if grid.is_open(axis, 1) else far for axis, n in enumerate(grid.cells))
+        self._low = tuple(0.5 if grid.lets_in(axis, 0) else -far for axis in range(3))
+        self._high = tuple(n + 0.5 if grid.lets_in(axis, 1) else far for axis, n in enumerate(grid.cells))
 
     def advance(self, dt: float) -> None:
         """Advect all fields by dt [s] with the present velocity."""
@@ -45,6 +58,9 @@ class Advection:
         self._predict_cells(step)
         if self._maccormack:
             self._correct_cells(step)
+            if self._balance is not None:
+                self._balance.restore(self._density, self._predicted_x, self._result_x, step)
+                self._balance.restore(self._excess, self._predicted_y, self._result_y, step)
             self._store_cells(self._result_x, self._result_y)
         else:
             self._store_cells(self._predicted_x, self._predicted_y)
@@ -148,8 +164,9 @@ class Advection:
 
     @ti.kernel
     def _predict_cells(self, step: ti.f32):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
-            for k in range(1, self._nz + 1):
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
+            for n in range(lane_items(self._nz, lane)):
+                k = lane_place(n, lane)
                 at = self._row(i, j, k)
                 departure = ti.Vector([float(i), float(j), float(k)]) - step * self._velocity_at_cell(at)
                 density, excess = 0.0, 0.0
@@ -163,8 +180,9 @@ class Advection:
     @ti.kernel
     def _correct_cells(self, step: ti.f32):
         """phi = phi^ + (phi_n - phi_) / 2, where phi_ is phi^ carried back (Selle et al. 2008, eq. 5)."""
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
-            for k in range(1, self._nz + 1):
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
+            for n in range(lane_items(self._nz, lane)):
+                k = lane_place(n, lane)
                 at = self._row(i, j, k)
                 here = ti.Vector([float(i), float(j), float(k)])
                 shift = step * self._velocity_at_cell(at)
@@ -182,8 +200,9 @@ class Advection:
 
     @ti.kernel
     def _predict_faces(self, axis: ti.template(), field: ti.template(), predicted: ti.template(), step: ti.f32):
-        for i, j in ti.ndrange((1, self._nx + 1 + (axis == 0)), (1, self._ny + 1 + (axis == 1))):
-            for k in range(1, self._nz + 1 + (axis == 2)):
+        for i, j, lane in ti.ndrange((1, self._nx + 1 + (axis == 0)), (1, self._ny + 1 + (axis == 1)), self._lanes):
+            for n in range(lane_items(self._nz + (axis == 2), lane)):
+                k = lane_place(n, lane)
                 velocity = self._velocity_at_face(axis, i, j, k)
                 there, offset = self._locate(ti.Vector([float(i), float(j), float(k)]) - step * velocity, axis)
                 predicted[self._row(i, j, k)] = self._interpolate(field, there, offset)
@@ -197,8 +216,9 @@ class Advection:
         result: ti.template(),
         step: ti.f32,
     ):
-        for i, j in ti.ndrange((1, self._nx + 1 + (axis == 0)), (1, self._ny + 1 + (axis == 1))):
-            for k in range(1, self._nz + 1 + (axis == 2)):
+        for i, j, lane in ti.ndrange((1, self._nx + 1 + (axis == 0)), (1, self._ny + 1 + (axis == 1)), self._lanes):
+            for n in range(lane_items(self._nz + (axis == 2), lane)):
+                k = lane_place(n, lane)
                 at = self._row(i, j, k)
                 here = ti.Vector([float(i), float(j), float(k)])
                 shift = step * self._velocity_at_face(axis, i, j, k)
@@ -209,8 +229,9 @@ class Advection:
 
     @ti.kernel
     def _store_cells(self, density: ti.template(), excess: ti.template()):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
-            for k in range(1, self._nz + 1):
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
+            for n in range(lane_items(self._nz, lane)):
+                k = lane_place(n, lane)
                 at = self._row(i, j, k)
                 self._density[at] = density[at]
                 self._excess[at] = excess[at]
@@ -218,8 +239,9 @@ class Advection:
     @ti.kernel
     def _store_faces(self, u: ti.template(), v: ti.template(), w: ti.template()):
         """Copy the faces; beyond the last cells, only those across the axis exist."""
-        for i, j in ti.ndrange((1, self._nx + 2), (1, self._ny + 2)):
-            for k in range(1, self._nz + 2):
+        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
+            for n in range(lane_items(self._nz + 1, lane)):
+                k = lane_place(n, lane)
                 at = self._row(i, j, k)
                 if j <= self._ny and k <= self._nz:
                     self._u[at] = u[at]

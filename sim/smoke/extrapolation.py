@@ -10,6 +10,7 @@ import math
 import numpy as np
 import taichi as ti
 
+from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import Obstacles
 
 KNOWN = 0
@@ -39,6 +40,7 @@ class Extrapolation:
     def __init__(self, obstacles: Obstacles, *, velocity: tuple, cell_fields: tuple, reach: float) -> None:
         grid = obstacles.grid
         self._obstacles = obstacles
+        self._lanes = lane_count()
         self._nx, self._ny, self._nz = grid.cells
         self._size = grid.size
         self._steps = (grid.padded[1] * grid.padded[2], grid.padded[2], 1)
@@ -80,8 +82,9 @@ class Extrapolation:
 
     @ti.kernel
     def _find_known(self):
-        for i, j in ti.ndrange((1, self._nx + 2), (1, self._ny + 2)):
-            for k in range(1, self._nz + 2):
+        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
+            for n in range(lane_items(self._nz + 1, lane)):
+                k = lane_place(n, lane)
                 in_x, in_y, in_z = int(i <= self._nx), int(j <= self._ny), int(k <= self._nz)
                 exists = ti.Vector([in_y * in_z, in_x * in_z, in_x * in_y, in_x * in_y * in_z])
                 here = self._is_air(i, j, k)
@@ -101,8 +104,9 @@ class Extrapolation:
 
         Other threads may see a word before or after its change: neither is in a layer before.
         """
-        for i, j in ti.ndrange((1, self._nx + 2), (1, self._ny + 2)):
-            for k in range(1, self._nz + 2):
+        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
+            for n in range(lane_items(self._nz + 1, lane)):
+                k = lane_place(n, lane)
                 at = i * self._steps[0] + j * self._steps[1] + k
                 word = self._words[at]
                 for kind in ti.static(range(4)):

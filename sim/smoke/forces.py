@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 
 from sim.parameters import Vector3
+from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import Obstacles
 
 TINY_GRADIENT = 1.0e-6
@@ -53,6 +54,7 @@ class Forces:
     ) -> None:
         grid = obstacles.grid
         self._obstacles = obstacles
+        self._lanes = lane_count()
         self._nx, self._ny, self._nz = grid.cells
         self._step_x, self._step_y = grid.padded[1] * grid.padded[2], grid.padded[2]
         self._size = grid.size
@@ -89,10 +91,10 @@ class Forces:
     @ti.kernel
     def _compute_vorticity(self):
         """omega = curl u by central differences of cell-centred velocities [1/s]."""
-        for i, j in ti.ndrange((2, self._nx), (2, self._ny)):
+        for i, j, lane in ti.ndrange((2, self._nx), (2, self._ny), self._lanes):
             row = i * self._step_x + j * self._step_y
-            for k in range(2, self._nz):
-                at = row + k
+            for n in range(lane_items(self._nz - 2, lane)):
+                at = row + 1 + lane_place(n, lane)
                 x, y, z = ti.static(self._step_x, self._step_y, 1)
                 omega_x = (self._centre(self._w, z, at + y) - self._centre(self._w, z, at - y)) - (
                     self._centre(self._v, y, at + z) - self._centre(self._v, y, at - z)
@@ -114,10 +116,11 @@ class Forces:
     @ti.kernel
     def _compute_confinement(self):
         """Replace omega by epsilon h (N x omega), N = eta / |eta|, eta = grad |omega| [m/s²]."""
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
             inner_row = 2 < i < self._nx - 1 and 2 < j < self._ny - 1
-            for k in range(1, self._nz + 1):
+            for n in range(lane_items(self._nz, lane)):
+                k = lane_place(n, lane)
                 at = row + k
                 x, y, z = ti.static(self._step_x, self._step_y, 1)
                 eta_x = self._half_per_cell * (self._vorticity[at + x] - self._vorticity[at - x])
@@ -133,10 +136,10 @@ class Forces:
     @ti.kernel
     def _apply(self, dt: ti.f32):
         # Ghost cells have no density, no excess and no confinement: half of what the cell inside has acts on a side.
-        for i, j in ti.ndrange((1, self._nx + 2), (1, self._ny + 2)):
+        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
             row = i * self._step_x + j * self._step_y
-            for k in range(1, self._nz + 2):
-                at = row + k
+            for n in range(lane_items(self._nz + 1, lane)):
+                at = row + lane_place(n, lane)
                 f_x = self._force(self._f_x, 0, at) + self._force(self._f_x, 0, at - self._step_x)
                 f_y = self._force(self._f_y, 1, at) + self._force(self._f_y, 1, at - self._step_y)
                 f_z = self._force(self._f_z, 2, at) + self._force(self._f_z, 2, at - 1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -21,6 +21,9 @@ from sim.scene import DomainParameters
 from sim.smoke.parameters import Face, SmokeParameters
 
 Index3 = tuple[int, int, int]
+
+CENTRE = (0.5, 0.5, 0.5)
+"""Of a cell, in cells off its lower corner."""
 
 
 class SolidRegion(Protocol):
@@ -45,8 +48,9 @@ class SmokeGrid:
         origin: lower corner [m].
         cell_size: edge of a cell [m].
         cells: how many cells along x, y, z.
-        open_faces: sides of the box that air passes; the others are walls.
+        open_faces: sides of the box that air passes freely; the others are walls.
         solid: (nx, ny, nz) bool, which cells are in solids that stand still.
+        inflow_faces: sides through which wind comes in at a given speed; walls to the pressure.
     """
 
     origin: tuple[float, float, float]
@@ -54,6 +58,7 @@ class SmokeGrid:
     cells: Index3
     open_faces: frozenset[Face]
     solid: NDArray[np.bool_]
+    inflow_faces: frozenset[Face] = frozenset()
 
     @classmethod
     def build(
@@ -64,7 +69,7 @@ class SmokeGrid:
         A box that is no whole number of cells long is rounded up, keeping its lower corner.
 
         Raises:
-            ValueError: the box is empty, or solids fill it.
+            ValueError: the box is empty, solids fill it, or its sides cannot take the wind.
         """
         lower = parameters.min if parameters.min is not None else domain.min
         upper = parameters.max if parameters.max is not None else domain.max
@@ -74,9 +79,17 @@ class SmokeGrid:
                     f'smoke "{parameters.name}": max must be above min on every axis, '
                     f"got {axis} from {low:g} to {high:g} m"
                 )
+        if problem := parameters.wind_problem():
+            raise ValueError(f'smoke "{parameters.name}": wind {problem}')
         nx, ny, nz = parameters.cell_counts(domain)
+        inflow = frozenset(parameters.windward_faces)
         empty = cls(
-            lower, parameters.cell_size, (nx, ny, nz), frozenset(parameters.open_faces), np.zeros((nx, ny, nz), bool)
+            lower,
+            parameters.cell_size,
+            (nx, ny, nz),
+            frozenset(parameters.open_faces) - inflow,
+            np.zeros((nx, ny, nz), bool),
+            inflow,
         )
         if not solids:
             return empty
@@ -91,7 +104,7 @@ class SmokeGrid:
         solid = np.any(masks, axis=0)
         if solid.all():
             raise ValueError(f'smoke "{parameters.name}": solids fill its whole box; there is no air to move')
-        return cls(empty.origin, empty.cell_size, empty.cells, empty.open_faces, solid)
+        return replace(empty, solid=solid)
 
     def touches(self, region: SolidRegion) -> bool:
         """Whether the bounds of a region overlap the box."""
@@ -116,18 +129,20 @@ class SmokeGrid:
         return x, y, z
 
     def is_open(self, axis: int, side: int) -> bool:
-        """Whether air passes the lower (side 0) or upper (side 1) side of the box along an axis."""
+        """Whether air passes the lower (side 0) or upper (side 1) side of the box along an axis as it likes."""
         return f"{'xyz'[axis]}{'-+'[side]}" in self.open_faces
+
+    def lets_in(self, axis: int, side: int) -> bool:
+        """Whether air from outside may come in through a side: one that is open, or that wind blows in through."""
+        return self.is_open(axis, side) or f"{'xyz'[axis]}{'-+'[side]}" in self.inflow_faces
 
     def cell_centres(self) -> NDArray[np.float64]:
         """Positions [m], (nx * ny * nz, 3)."""
-        return self._positions(self.cells, (0.5, 0.5, 0.5))
+        return _points(self._axes(self.cells, CENTRE))
 
     def face_centres(self, axis: int) -> NDArray[np.float64]:
         """Positions [m] of the faces across an axis, (n, 3), in the order of `face_shape`."""
-        offset = [0.5, 0.5, 0.5]
-        offset[axis] = 0.0
-        return self._positions(self.face_shape(axis), offset)
+        return _points(self._axes(self.face_shape(axis), _face_offset(axis)))
 
     def face_shape(self, axis: int) -> Index3:
         """How many faces across an axis there are along x, y, z."""
@@ -136,15 +151,15 @@ class SmokeGrid:
 
     def cells_inside(self, region: SolidRegion) -> NDArray[np.bool_]:
         """Cells whose centre lies in a region, (nx, ny, nz)."""
-        return _inside(region, self.cell_centres()).reshape(self.cells)
+        return self._inside(region, self.cells, CENTRE)
 
     def faces_inside(self, region: SolidRegion, axis: int) -> NDArray[np.bool_]:
         """Faces whose centre lies in a region, `face_shape(axis)`."""
-        return _inside(region, self.face_centres(axis)).reshape(self.face_shape(axis))
+        return self._inside(region, self.face_shape(axis), _face_offset(axis))
 
     @cached_property
-    def open_area(self) -> tuple[NDArray[np.float64], ...]:
-        """Part of each face that air passes, 0 or 1, by axis, `face_shape(axis)`."""
+    def open_area(self) -> tuple[NDArray[np.bool_], ...]:
+        """Which faces air passes, by axis, `face_shape(axis)`."""
         return tuple(self._open_area(axis) for axis in range(3))
 
     def pad(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -157,26 +172,42 @@ class SmokeGrid:
         """The inner part, of a given shape, of a flat or padded array."""
         return values.reshape(self.padded)[tuple(slice(1, 1 + n) for n in shape)]
 
-    def _positions(self, shape: Index3, offset: Sequence[float]) -> NDArray[np.float64]:
-        axes = [
+    def _axes(self, shape: Index3, offset: Sequence[float]) -> list[NDArray[np.float64]]:
+        """Positions [m] along x, y and z of places that are `offset` cells off the lower corners."""
+        return [
             low + (np.arange(n) + shift) * self.cell_size
             for low, n, shift in zip(self.origin, shape, offset, strict=True)
         ]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
-    def _open_area(self, axis: int) -> NDArray[np.float64]:
+    def _inside(self, region: SolidRegion, shape: Index3, offset: Sequence[float]) -> NDArray[np.bool_]:
+        """Which places lie inside a region; distances, which are dear for meshes, are asked for near it only."""
+        axes = self._axes(shape, offset)
+        lower, upper = region.bounds
+        spans = tuple(
+            slice(int(np.searchsorted(axis, low)), int(np.searchsorted(axis, high, "right")))
+            for axis, low, high in zip(axes, lower, upper, strict=True)
+        )
+        inside = np.zeros(shape, bool)
+        near = inside[spans]
+        if near.size:
+            points = _points([axis[span] for axis, span in zip(axes, spans, strict=True)])
+            near[...] = (region.signed_distance(points) < 0.0).reshape(near.shape)
+        return inside
+
+    def _open_area(self, axis: int) -> NDArray[np.bool_]:
         air = np.moveaxis(~self.solid, axis, 0)
-        area = np.zeros((air.shape[0] + 1, *air.shape[1:]))
+        area = np.zeros((air.shape[0] + 1, *air.shape[1:]), bool)
         area[1:-1] = air[1:] & air[:-1]
         area[0] = air[0] & self.is_open(axis, 0)
         area[-1] = air[-1] & self.is_open(axis, 1)
         return np.moveaxis(area, 0, axis)
 
 
-def _inside(region: SolidRegion, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points lie inside a region; distances, which are dear for meshes, are asked for near it only."""
-    lower, upper = region.bounds
-    inside = ((points >= lower) & (points <= upper)).all(axis=1)
-    if inside.any():
-        inside[inside] = region.signed_distance(points[inside]) < 0.0
-    return inside
+def _face_offset(axis: int) -> tuple[float, ...]:
+    """Where the centres of the faces across an axis lie, in cells off the lower corners of their cells."""
+    return tuple(0.0 if a == axis else 0.5 for a in range(3))
+
+
+def _points(axes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Every combination of positions along x, y and z, (n, 3), in C order."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -11,6 +11,8 @@ import math
 import numpy as np
 import taichi as ti
 
+from sim.launch import fast_launch
+from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.multigrid_levels import Coefficients, operator_matrix
 from sim.smoke.obstacles import Obstacles
 
@@ -52,6 +54,7 @@ class MultigridVCycle:
         self._coarsest_inverse = ti.field(ti.f32, shape=(self._coarsest_count, self._coarsest_count))
         self._coarsest_conductance = self.coefficients.coarsest_conductance()
         self._invert_coarsest()
+        self._lanes = lane_count()
         self._first_weight, self._second_weight = chebyshev_weights(2, SMOOTHED_SPECTRUM)
 
     @property
@@ -69,23 +72,13 @@ class MultigridVCycle:
 
     def apply(self) -> None:
         """Set `solution` to the V-cycle's answer for `right_hand_side`."""
-        self._descend(0)
-
-    def _descend(self, number: int) -> None:
-        offset, (nx, ny, nz) = self._offsets[number], self._cells[number]
-        if number == self.level_count - 1:
-            self._solve_coarsest(offset, ny, nz)
-            return
-        fine = (offset, nx, ny, nz)
-        coarse_offset, (coarse_nx, coarse_ny, coarse_nz) = self._offsets[number + 1], self._cells[number + 1]
-        self._smooth_from_zero(*fine, self._first_weight)
-        self._smooth(self.spare, self.solution, *fine, self._second_weight)
-        self._compute_residual(*fine)
-        self._restrict_residual(offset, ny, nz, coarse_offset, coarse_nx, coarse_ny, coarse_nz)
-        self._descend(number + 1)
-        self._prolong_correction(*fine, coarse_offset, coarse_ny, coarse_nz)
-        self._smooth(self.solution, self.spare, *fine, self._second_weight)
-        self._smooth(self.spare, self.solution, *fine, self._first_weight)
+        descents = list(zip(self._offsets, self._cells, self._offsets[1:], self._cells[1:], strict=False))
+        for offset, cells, coarse_offset, coarse_cells in descents:
+            self._descend(offset, *cells, coarse_offset, *coarse_cells, self._first_weight, self._second_weight)
+        _, coarsest_ny, coarsest_nz = self._cells[-1]
+        self._solve_coarsest(self._offsets[-1], coarsest_ny, coarsest_nz)
+        for offset, cells, coarse_offset, coarse_cells in reversed(descents):
+            self._ascend(offset, *cells, coarse_offset, *coarse_cells[1:], self._first_weight, self._second_weight)
 
     def _invert_coarsest(self) -> None:
         # The pseudo-inverse also serves regions without an open side, where A has the constants as its null space.
@@ -106,90 +99,76 @@ class MultigridVCycle:
             + self.coefficients.conductance_z[at + 1] * (here - x[at + 1])
         )
 
-    @ti.kernel
-    def _smooth_from_zero(self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32, weight: ti.f32):
-        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
-            row = offset + (i * (ny + 2) + j) * (nz + 2)
-            for k in range(1, nz + 1):
-                at = row + k
-                self.spare[at] = weight * self.coefficients.inverse_diagonal[at] * self.right_hand_side[at]
+    @ti.func
+    def _laplacian_of_jacobi(self, at: ti.i32, step_x: ti.i32, step_y: ti.i32):
+        """(A D^-1 r) at a cell."""
+        here = self._jacobi(at)
+        return (
+            self.coefficients.conductance_x[at] * (here - self._jacobi(at - step_x))
+            + self.coefficients.conductance_x[at + step_x] * (here - self._jacobi(at + step_x))
+            + self.coefficients.conductance_y[at] * (here - self._jacobi(at - step_y))
+            + self.coefficients.conductance_y[at + step_y] * (here - self._jacobi(at + step_y))
+            + self.coefficients.conductance_z[at] * (here - self._jacobi(at - 1))
+            + self.coefficients.conductance_z[at + 1] * (here - self._jacobi(at + 1))
+        )
 
+    @fast_launch
     @ti.kernel
-    def _smooth(
-        self,
-        x: ti.template(),
-        improved: ti.template(),
-        offset: ti.i32,
-        nx: ti.i32,
-        ny: ti.i32,
-        nz: ti.i32,
-        weight: ti.f32,
-    ):
+    def _descend(
+        self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32,
+        coarse_offset: ti.i32, coarse_nx: ti.i32, coarse_ny: ti.i32, coarse_nz: ti.i32,
+        first_weight: ti.f32, second_weight: ti.f32,
+    ):  # fmt: skip
+        """Smooth twice from zero, and leave the sum of the children's residuals to the coarser level."""
         step_x, step_y = (ny + 2) * (nz + 2), nz + 2
-        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
+        for i, j, lane in ti.ndrange((1, nx + 1), (1, ny + 1), self._lanes):
             row = offset + i * step_x + j * step_y
-            for k in range(1, nz + 1):
-                at = row + k
-                residual = self.right_hand_side[at] - self.laplacian(x, at, step_x, step_y)
-                improved[at] = x[at] + weight * self.coefficients.inverse_diagonal[at] * residual
-
-    @ti.kernel
-    def _compute_residual(self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
-        step_x, step_y = (ny + 2) * (nz + 2), nz + 2
-        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
+            for n in range(lane_items(nz, lane)):
+                at = row + lane_place(n, lane)
+                # From zero the first sweep gives w r / D, which the second one finds where it needs it.
+                residual = self.right_hand_side[at] - first_weight * self._laplacian_of_jacobi(at, step_x, step_y)
+                change = second_weight * self.coefficients.inverse_diagonal[at] * residual
+                self.solution[at] = first_weight * self._jacobi(at) + change
+        for i, j, lane in ti.ndrange((1, nx + 1), (1, ny + 1), self._lanes):
             row = offset + i * step_x + j * step_y
-            for k in range(1, nz + 1):
-                at = row + k
+            for n in range(lane_items(nz, lane)):
+                at = row + lane_place(n, lane)
                 self.spare[at] = self.right_hand_side[at] - self.laplacian(self.solution, at, step_x, step_y)
-
-    @ti.kernel
-    def _restrict_residual(
-        self,
-        fine_offset: ti.i32,
-        fine_ny: ti.i32,
-        fine_nz: ti.i32,
-        offset: ti.i32,
-        nx: ti.i32,
-        ny: ti.i32,
-        nz: ti.i32,
-    ):
-        step_x, step_y = (fine_ny + 2) * (fine_nz + 2), fine_nz + 2
-        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
-            row = offset + (i * (ny + 2) + j) * (nz + 2)
-            fine_row = fine_offset + (2 * i - 1) * step_x + (2 * j - 1) * step_y
+        for i, j, lane in ti.ndrange((1, coarse_nx + 1), (1, coarse_ny + 1), self._lanes):
+            row = coarse_offset + (i * (coarse_ny + 2) + j) * (coarse_nz + 2)
+            fine_row = offset + (2 * i - 1) * step_x + (2 * j - 1) * step_y
             # Children beyond an odd end are ghosts, which hold 0 in `spare`.
-            for k in range(1, nz + 1):
+            for n in range(lane_items(coarse_nz, lane)):
+                k = lane_place(n, lane)
                 child = fine_row + 2 * k - 1
                 total = 0.0
                 for di, dj, dk in ti.static(ti.ndrange(2, 2, 2)):
                     total += self.spare[child + di * step_x + dj * step_y + dk]
                 self.right_hand_side[row + k] = total
 
+    @fast_launch
     @ti.kernel
-    def _prolong_correction(
-        self,
-        fine_offset: ti.i32,
-        fine_nx: ti.i32,
-        fine_ny: ti.i32,
-        fine_nz: ti.i32,
-        offset: ti.i32,
-        ny: ti.i32,
-        nz: ti.i32,
-    ):
-        """Add the coarse solution, interpolated between cell centres: per axis 3/4 parent + 1/4 its neighbour.
+    def _ascend(
+        self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32,
+        coarse_offset: ti.i32, coarse_ny: ti.i32, coarse_nz: ti.i32,
+        first_weight: ti.f32, second_weight: ti.f32,
+    ):  # fmt: skip
+        """Add the coarser level's solution, interpolated between cell centres, and smooth twice.
 
-        Where the neighbour is a wall or a solid it counts as equal to the parent (no flux), beyond an open side as its
-        opposite (zero pressure on the face).
+        Per axis 3/4 parent + 1/4 its neighbour. Where that is a wall or a solid it counts as equal to the parent (no
+        flux), beyond an open side as its opposite (zero pressure on the face).
         """
         step_x, step_y = (ny + 2) * (nz + 2), nz + 2
-        for fine_i, fine_j in ti.ndrange((1, fine_nx + 1), (1, fine_ny + 1)):
+        for fine_i, fine_j, lane in ti.ndrange((1, nx + 1), (1, ny + 1), self._lanes):
             i, j = (fine_i + 1) // 2, (fine_j + 1) // 2
-            row = offset + i * step_x + j * step_y
+            coarse_step_x, coarse_step_y = (coarse_ny + 2) * (coarse_nz + 2), coarse_nz + 2
+            row = coarse_offset + i * coarse_step_x + j * coarse_step_y
             # An odd index is the lower child, whose neighbour lies below.
-            beside_x = ti.select(fine_i % 2 == 1, -step_x, step_x)
-            beside_y = ti.select(fine_j % 2 == 1, -step_y, step_y)
-            fine_row = fine_offset + (fine_i * (fine_ny + 2) + fine_j) * (fine_nz + 2)
-            for k in range(1, nz + 1):
+            beside_x = ti.select(fine_i % 2 == 1, -coarse_step_x, coarse_step_x)
+            beside_y = ti.select(fine_j % 2 == 1, -coarse_step_y, coarse_step_y)
+            fine_row = offset + fine_i * step_x + fine_j * step_y
+            for n in range(lane_items(coarse_nz, lane)):
+                k = lane_place(n, lane)
                 at = row + k
                 parent = self.solution[at]
                 planes = ti.Vector([0.0, 0.0, 0.0])
@@ -201,11 +180,32 @@ class MultigridVCycle:
                         + 3.0 * self._value_or_mirror(there + beside_y, parent)
                         + self._value_or_mirror(there + beside_x + beside_y, parent)
                     ) / 16.0
+                # Selected, not branched over, so that the loop can be vectorized; the ghost beyond an odd end gets 0.
+                is_air = self.coefficients.inverse_diagonal[at] > 0.0
                 child = fine_row + 2 * k - 1
-                if self.coefficients.inverse_diagonal[at] > 0.0:
-                    self.solution[child] += 0.75 * planes[1] + 0.25 * planes[0]
-                    if 2 * k <= fine_nz:
-                        self.solution[child + 1] += 0.75 * planes[1] + 0.25 * planes[2]
+                lower = self.solution[child] + ti.select(is_air, 0.75 * planes[1] + 0.25 * planes[0], 0.0)
+                upper = ti.select(is_air and 2 * k <= nz, 0.75 * planes[1] + 0.25 * planes[2], 0.0)
+                upper += self.solution[child + 1]
+                self.solution[child] = lower
+                self.solution[child + 1] = upper
+        for i, j, lane in ti.ndrange((1, nx + 1), (1, ny + 1), self._lanes):
+            row = offset + i * step_x + j * step_y
+            for n in range(lane_items(nz, lane)):
+                self._smooth(self.solution, self.spare, row + lane_place(n, lane), step_x, step_y, second_weight)
+        for i, j, lane in ti.ndrange((1, nx + 1), (1, ny + 1), self._lanes):
+            row = offset + i * step_x + j * step_y
+            for n in range(lane_items(nz, lane)):
+                self._smooth(self.spare, self.solution, row + lane_place(n, lane), step_x, step_y, first_weight)
+
+    @ti.func
+    def _smooth(self, x: ti.template(), improved: ti.template(), at: ti.i32, step_x: ti.i32, step_y: ti.i32, weight):
+        residual = self.right_hand_side[at] - self.laplacian(x, at, step_x, step_y)
+        improved[at] = x[at] + weight * self.coefficients.inverse_diagonal[at] * residual
+
+    @ti.func
+    def _jacobi(self, at: ti.i32):
+        """r / D; 0 in ghosts, where r is 0."""
+        return self.coefficients.inverse_diagonal[at] * self.right_hand_side[at]
 
     @ti.func
     def _value_or_mirror(self, at: ti.i32, parent: ti.f32):
@@ -213,6 +213,7 @@ class MultigridVCycle:
         mirrored = ti.select(inverse < 0.0, -parent, parent)
         return ti.select(inverse > 0.0, self.solution[at], mirrored)
 
+    @fast_launch
     @ti.kernel
     def _solve_coarsest(self, offset: ti.i32, ny: ti.i32, nz: ti.i32):
         for cell in range(self._coarsest_count):

@@ -16,10 +16,14 @@ from numpy.typing import NDArray
 
 from sim.arrays import Floats
 from sim.smoke.grid import Index3, SmokeGrid
+from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import Obstacles
 
 COARSEST_CELLS = 64
 """At most this many cells are solved directly, by a dense inverse."""
+
+LARGEST_INDEX = 2**31 - 1
+"""Flat indices in kernels are 32 bits wide."""
 
 DIRICHLET_GHOST = -1.0
 """Mark in the ghosts of `inverse_diagonal`: beyond this side pressure changes sign."""
@@ -62,7 +66,11 @@ class Level:
 
 
 def plan_levels(cells: Index3) -> list[Level]:
-    """The levels of a grid, finest first; the last has at most `COARSEST_CELLS` cells."""
+    """The levels of a grid, finest first; the last has at most `COARSEST_CELLS` cells.
+
+    Raises:
+        ValueError: there are more values on all levels together than indices of 32 bits can tell apart.
+    """
     levels: list[Level] = []
     widths = tuple(np.ones(n) for n in cells)
     offset, distances = 0, 0
@@ -74,6 +82,11 @@ def plan_levels(cells: Index3) -> list[Level]:
         levels.append(Level((nx, ny, nz), offset, widths, begins))
         offset += levels[-1].size
         distances += nx + ny + nz + 6
+    if offset > LARGEST_INDEX:
+        raise ValueError(
+            f"a smoke of {cells[0]} x {cells[1]} x {cells[2]} cells is too large: with its coarser grids and the layer "
+            f"around each it has {offset} values a field, and at most {LARGEST_INDEX} can be counted"
+        )
     return levels
 
 
@@ -116,6 +129,7 @@ class Coefficients:
     def __init__(self, obstacles: Obstacles) -> None:
         self.levels = plan_levels(obstacles.grid.cells)
         self._obstacles = obstacles
+        self._lanes = lane_count()
         total = sum(level.size for level in self.levels)
         self.conductance_x, self.conductance_y, self.conductance_z, self.inverse_diagonal = (
             ti.field(ti.f32, shape=total) for _ in range(4)
@@ -163,10 +177,11 @@ class Coefficients:
     def _open_faces(
         self, axis: ti.template(), conductance: ti.template(), nx: ti.i32, ny: ti.i32, nz: ti.i32, distances: ti.i32
     ):
-        for i, j in ti.ndrange((1, nx + 1 + (axis == 0)), (1, ny + 1 + (axis == 1))):
+        for i, j, lane in ti.ndrange((1, nx + 1 + (axis == 0)), (1, ny + 1 + (axis == 1)), self._lanes):
             step_x, step_y = (ny + 2) * (nz + 2), nz + 2
             step = ti.static(axis == 0) * step_x + ti.static(axis == 1) * step_y + ti.static(axis == 2)
-            for k in range(1, nz + 1 + (axis == 2)):
+            for n in range(lane_items(nz + (axis == 2), lane)):
+                k = lane_place(n, lane)
                 at = i * step_x + j * step_y + k
                 distance = self._distance[distances + ti.Vector([i, j, k])[axis]]
                 is_closed = self._obstacles.is_solid(at - step) or self._obstacles.is_solid(at)
@@ -189,9 +204,10 @@ class Coefficients:
         distances: ti.i32,
     ):
         """A coarse face takes the open area of its four fine ones; those beyond an odd end are ghosts, and closed."""
-        for i, j in ti.ndrange((1, nx + 1 + (axis == 0)), (1, ny + 1 + (axis == 1))):
+        for i, j, lane in ti.ndrange((1, nx + 1 + (axis == 0)), (1, ny + 1 + (axis == 1)), self._lanes):
             fine_step_x, fine_step_y = (fine_ny + 2) * (fine_nz + 2), fine_nz + 2
-            for k in range(1, nz + 1 + (axis == 2)):
+            for n in range(lane_items(nz + (axis == 2), lane)):
+                k = lane_place(n, lane)
                 fine_i, fine_j, fine_k = 2 * i - 1, 2 * j - 1, 2 * k - 1
                 fine_face, face = 0, 0
                 first, second = fine_step_x, fine_step_y
@@ -215,9 +231,10 @@ class Coefficients:
 
     @ti.kernel
     def _invert_diagonal(self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
-        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
+        for i, j, lane in ti.ndrange((1, nx + 1), (1, ny + 1), self._lanes):
             step_x, step_y = (ny + 2) * (nz + 2), nz + 2
-            for k in range(1, nz + 1):
+            for n in range(lane_items(nz, lane)):
+                k = lane_place(n, lane)
                 at = offset + i * step_x + j * step_y + k
                 diagonal = self.conductance_x[at] + self.conductance_x[at + step_x]
                 diagonal += self.conductance_y[at] + self.conductance_y[at + step_y]

@@ -24,7 +24,8 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.reductions import RowReductions
+from sim.smoke.lanes import lane_count, lane_items, lane_place
+from sim.smoke.reductions import Pair, RowReductions
 
 AIR, MOVING, STATIC = range(3)
 """What a cell is. Beyond closed sides of the box all is static, beyond open ones air."""
@@ -86,6 +87,7 @@ class Obstacles:
         self._steps = (grid.padded[1] * grid.padded[2], grid.padded[2], 1)
         self._low, self._cell_size = grid.origin, grid.cell_size
         self._static = _static_state(grid)
+        self._lanes = lane_count()
         self.movers: list[Mover] = []
         self.state = ti.field(ti.i32, shape=grid.size)
         self.state.from_numpy(self._static)
@@ -122,8 +124,7 @@ class Obstacles:
         if not self.moving:
             return NO_CHANGE
         cells = self._swap(density)
-        covered, uncovered = self._rows.sums() if cells else (0.0, 0.0)
-        return Change(cells, covered, uncovered)
+        return Change(cells, *map(float, self._sum_changes())) if cells else NO_CHANGE
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Which cells are moving solids, if any may be; their velocities have gone into the faces."""
@@ -181,12 +182,12 @@ class Obstacles:
     @ti.kernel
     def _swap(self, density: ti.template()) -> ti.i32:
         changed = 0
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._steps[0] + j * self._steps[1]
             covered, uncovered = 0.0, 0.0
             in_row = 0
-            for k in range(1, self._nz + 1):
-                at = row + k
+            for n in range(lane_items(self._nz, lane)):
+                at = row + lane_place(n, lane)
                 before, after = self.state[at], self.marked[at]
                 if before != after:
                     in_row += 1
@@ -197,9 +198,14 @@ class Obstacles:
                         covered += density[at]
                 if after == MOVING:
                     self.marked[at] = AIR
-            self._rows.row[i - 1, j - 1] = ti.Vector([covered, uncovered])
+            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([covered, uncovered])
             changed += in_row
         return changed
+
+    @ti.kernel
+    def _sum_changes(self) -> Pair:
+        self._rows.sum_up()
+        return self._rows.result[None]
 
 
 def _static_state(grid: SmokeGrid) -> NDArray[np.int32]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal, Self
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from sim.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
+from sim.rigid.parameters import RigidKeyframeParameters, placed_at_first_keyframe, require_ascending_times
 from sim.shapes.parameters import Placement
 
 if TYPE_CHECKING:
@@ -18,9 +20,21 @@ WHOLE = 1.0e-6
 
 Face = Literal["x-", "x+", "y-", "y+", "z-", "z+"]
 
+Seed = Annotated[int, Field(ge=0, le=1_000_000_000)]
+
+
+class RampPointParameters(Parameters):
+    """How strong a source is at one time."""
+
+    time_s: NonNegative = Field(description="Time [s]; later than that of the point before.")
+    strength: Fraction = Field(description="Part of its density and of its heat that it has then [-].")
+
 
 class SmokeSourceParameters(Placement):
-    """A region that emits: inside it, each step brings the fields at least to these values, from the air's."""
+    """A region that emits: inside it, each step brings the fields at least to these values, from the air's.
+
+    It drives air and creates none. One that moves emits all along its way, whatever the steps.
+    """
 
     density: Fraction = Field(default=1.0, description="Smoke density inside the source [-].")
     temperature: Positive = Field(default=450.0, description="Temperature inside the source [K].")
@@ -29,11 +43,45 @@ class SmokeSourceParameters(Placement):
         description="How far its heat falls short of that, at random in space and time [-]; "
         "0 makes a plume as symmetric as its source.",
     )
+    flicker: Fraction = Field(
+        default=0.0, description="How far all of it falls short of its strength now and then, as a fire does [-]."
+    )
+    flicker_rate: Positive = Field(default=8.0, description="How often it flickers [1/s].")
+    seed: Seed = Field(default=0, description="Of the random numbers of fluctuation and flicker.")
     velocity: Vector3 | None = Field(
-        default=None, description="Velocity inside the source [m/s]; left to the flow if omitted."
+        default=None,
+        description="Velocity inside the source [m/s]; left to the flow if omitted. Of a source that moves: relative "
+        "to it and turned with it; its own motion comes on top.",
     )
     start_s: NonNegative = Field(default=0.0, description="When it starts to emit [s].")
     end_s: Positive | None = Field(default=None, description="When it stops [s]; never if omitted.")
+    ramp: tuple[RampPointParameters, ...] = Field(
+        default=(),
+        description="Its strength over time: linear between these points, and constant before and after them; "
+        "1 if omitted.",
+    )
+    keyframe: tuple[RigidKeyframeParameters, ...] = Field(
+        default=(), description="Path of the source; it rests before the first and after the last keyframe."
+    )
+    interpolation: Literal["cubic", "linear"] = Field(
+        default="cubic",
+        description="Between keyframes. cubic: velocities are continuous; linear: they are constant and jump.",
+    )
+    follow: str | None = Field(
+        default=None,
+        description="Name of the rigid body that it is fixed to: position, rotation_deg and velocity are then along "
+        "the body's own axes, from its shape's centre.",
+    )
+
+    @property
+    def moves(self) -> bool:
+        """Whether it may be elsewhere later."""
+        return bool(self.keyframe) or self.follow is not None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _start_at_first_keyframe(cls, data: Any) -> Any:
+        return placed_at_first_keyframe(data, "source")
 
     @model_validator(mode="after")
     def _ends_after_start(self) -> Self:
@@ -41,9 +89,54 @@ class SmokeSourceParameters(Placement):
             raise ValueError(f"end_s must be after start_s = {self.start_s:g} s, got {self.end_s:g} s")
         return self
 
+    @model_validator(mode="after")
+    def _moves_in_one_way(self) -> Self:
+        require_ascending_times(self.keyframe)
+        if self.keyframe and self.follow is not None:
+            raise ValueError(f'it follows "{self.follow}" and has keyframes; remove one of them')
+        if "interpolation" in self.model_fields_set and not self.keyframe:
+            raise ValueError(
+                "interpolation has no meaning without keyframes; remove it or add [[smoke.source.keyframe]]"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _ramp_is_in_order(self) -> Self:
+        for number, (before, after) in enumerate(pairwise(self.ramp), start=1):
+            if after.time_s <= before.time_s:
+                raise ValueError(
+                    f"ramp[{number}].time_s must be after {before.time_s:g} s, that of the point before, "
+                    f"got {after.time_s:g} s"
+                )
+        if "flicker_rate" in self.model_fields_set and not self.flicker:
+            raise ValueError("flicker_rate has no meaning without flicker; remove it or give flicker")
+        return self
+
     def emits_during(self, begin_s: float, end_s: float) -> bool:
         """Whether it emits in some part of a span of time [s]: no short source falls between two steps."""
         return self.start_s < end_s and (self.end_s is None or begin_s < self.end_s)
+
+    def span_of(self, begin_s: float, end_s: float) -> tuple[float, float]:
+        """The part of a span of time in which it emits [s]; there must be one."""
+        return max(begin_s, self.start_s), end_s if self.end_s is None else min(end_s, self.end_s)
+
+    def largest_strength(self, begin_s: float, end_s: float) -> float:
+        """Largest strength by the ramp within a span of time [s]: what emission in ever shorter steps comes to."""
+        if not self.ramp:
+            return 1.0
+        times = [point.time_s for point in self.ramp]
+        strengths = [point.strength for point in self.ramp]
+        inner = [strength for time, strength in zip(times, strengths, strict=True) if begin_s < time < end_s]
+        return max(_interpolated(begin_s, times, strengths), _interpolated(end_s, times, strengths), *inner)
+
+
+class TurbulenceParameters(Parameters):
+    """Gusts that stir all air of the box: random accelerations that neither spread nor squeeze the air."""
+
+    strength: NonNegative = Field(default=0.0, description="Root mean square of the acceleration [m/s²]; 0: none.")
+    size: Positive = Field(default=0.2, description="Distance of neighbouring eddies [m].")
+    rate: NonNegative = Field(default=2.0, description="How often they change [1/s]; 0: never.")
+    seed: Seed = Field(default=0, description="Of their random numbers.")
 
 
 class SmokeParameters(Parameters):
@@ -70,6 +163,17 @@ class SmokeParameters(Parameters):
     )
     density_dissipation: NonNegative = Field(default=0.0, description="Rate at which smoke thins out [1/s].")
     cooling: NonNegative = Field(default=0.2, description="Rate at which it cools to the air's temperature [1/s].")
+    radiative_cooling: NonNegative = Field(
+        default=0.0,
+        description="Rate at which gas as hot as the hottest source cools by radiation, on top [K/s]; it falls with "
+        "the fourth power of the excess over the air (Nguyen et al. 2002). Fires have some thousands.",
+    )
+    wind: Vector3 = Field(
+        default=(0.0, 0.0, 0.0),
+        description="Velocity of the air at the start, and of what flows in through the open sides that it blows onto "
+        "[m/s].",
+    )
+    turbulence: TurbulenceParameters = Field(default=TurbulenceParameters(), description="Gusts in the air.")
     advection: Literal["maccormack", "semi_lagrangian"] = Field(
         default="maccormack",
         description="maccormack: second order, clamped (Selle et al. 2008); or semi_lagrangian.",
@@ -79,6 +183,33 @@ class SmokeParameters(Parameters):
     )
     projection_max_iterations: int = Field(default=100, ge=1, description="Most iterations of the projection [-].")
     cfl: Positive = Field(default=2.0, le=10.0, description="Most cells that smoke may cross in a substep [-].")
+
+    @property
+    def hottest_excess(self) -> float:
+        """Of the hottest source, over the air's temperature [K]; 0 if none is hotter than that."""
+        return max(0.0, *(source.temperature - self.ambient_temperature for source in self.source))
+
+    @property
+    def windward_faces(self) -> tuple[Face, ...]:
+        """Sides of the box that the wind blows onto from outside, open or not."""
+        faces: tuple[tuple[Face, Face], ...] = (("x-", "x+"), ("y-", "y+"), ("z-", "z+"))
+        return tuple(
+            upper if speed < 0.0 else lower
+            for (lower, upper), speed in zip(faces, self.wind, strict=True)
+            if speed != 0.0
+        )
+
+    def wind_problem(self) -> str | None:
+        """Why air that cannot be compressed cannot take this wind, with a remedy; None if it can."""
+        for face in self.windward_faces:
+            if face not in self.open_faces:
+                return f'blows in through the side "{face}", which is closed; add it to open_faces, or turn the wind'
+        if self.windward_faces and not set(self.open_faces) - set(self.windward_faces):
+            return (
+                f"lets air in through {', '.join(self.windward_faces)}, and no other side is open: as much must flow "
+                "out, for air of constant density cannot be compressed; add a side on the lee to open_faces"
+            )
+        return None
 
     def corners(self, domain: DomainParameters) -> tuple[Vector3, Vector3]:
         """Lower and upper corner of its box [m]: its own, or the domain's where it names none.
@@ -102,3 +233,13 @@ def boxes_overlap(a: tuple[Vector3, Vector3], b: tuple[Vector3, Vector3]) -> boo
     """Whether two boxes, given by their corners [m], have a volume in common."""
     (a_low, a_high), (b_low, b_high) = a, b
     return all(max(p, q) < min(r, s) for p, q, r, s in zip(a_low, b_low, a_high, b_high, strict=True))
+
+
+def _interpolated(time_s: float, times: list[float], values: list[float]) -> float:
+    """A piecewise linear function, constant beyond its ends."""
+    if time_s <= times[0]:
+        return values[0]
+    for (begin, end), (first, last) in zip(pairwise(times), pairwise(values), strict=True):
+        if time_s < end:
+            return first + (last - first) * (time_s - begin) / (end - begin)
+    return values[-1]

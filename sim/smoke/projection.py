@@ -17,9 +17,11 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from sim.launch import fast_launch
+from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.multigrid import MultigridVCycle
 from sim.smoke.obstacles import Obstacles
-from sim.smoke.reductions import RowReductions
+from sim.smoke.reductions import Pair, RowReductions
 from sim.smoke.regions import ClosedRegions
 
 SAFETY = 0.7
@@ -76,7 +78,9 @@ class PressureProjection:
             self.multigrid.solution,
             self.multigrid.spare,
         )
+        self._lanes = lane_count()
         self._rows = RowReductions(self._nx, self._ny)
+        self._alpha, self._beta, self._r_z = (ti.field(ti.f32, shape=()) for _ in range(3))
 
     def update(self) -> None:
         """Follow the obstacles."""
@@ -101,25 +105,19 @@ class PressureProjection:
         )
 
     def _solve(self, goal: float, max_iterations: int) -> int:
-        """Solve A q = r for the current residual until max|r| <= goal; returns the iterations it took."""
+        """Solve A q = r for the current residual until max|r| <= goal; returns the iterations it took.
+
+        The host waits once an iteration, for that norm; all other numbers stay on the device.
+        """
         self.multigrid.apply()
         self._start_search()
-        r_z, _ = self._dot_solution()
-        for iteration in range(1, max_iterations + 1):
-            self._apply_operator()
-            p_Ap, _ = self._rows.sums()
-            # Both vanish together once the residual does; written so that NaN ends the solve as well.
-            if not (p_Ap > 0.0 and r_z > 0.0):
-                return iteration
-            alpha = r_z / p_Ap
-            self._advance(alpha)
-            residual, _ = self._rows.maxima()
-            if residual <= goal:
+        for iteration in range(1, max_iterations):
+            residual, advanced = map(float, self._advance())
+            if residual <= goal or advanced == 0.0:
                 return iteration
             self.multigrid.apply()
-            r_z_new, z_Ap = self._dot_solution()
-            self._turn_search(-alpha * z_Ap / r_z)
-            r_z = r_z_new
+            self._turn_search()
+        self._advance()
         return max_iterations
 
     def _measure(self) -> tuple[float, float, float]:
@@ -128,17 +126,11 @@ class PressureProjection:
         Returns:
             Its largest magnitude, the largest face velocity, and the largest magnitude of a mean.
         """
-        self._compute_residual()
-        largest, speed = self._rows.maxima()
+        largest, speed = map(float, self._compute_residual())
         mean = self.regions.subtract_means(self.multigrid.right_hand_side, largest)
         if mean > 0.0:
-            self._find_largest_residual()
-            largest, _ = self._rows.maxima()
+            largest = self._find_largest_residual()
         return largest, speed, mean
-
-    def _dot_solution(self) -> tuple[float, float]:
-        self._compute_dots()
-        return self._rows.sums()
 
     @ti.kernel
     def _clear_work(self):
@@ -151,13 +143,13 @@ class PressureProjection:
             self.multigrid.right_hand_side[at] = 0.0
 
     @ti.kernel
-    def _compute_residual(self):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+    def _compute_residual(self) -> Pair:
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
             largest = 0.0
             speed = 0.0
-            for k in range(1, self._nz + 1):
-                at = row + k
+            for n in range(lane_items(self._nz, lane)):
+                at = row + lane_place(n, lane)
                 u, v, w = self._u[at], self._v[at], self._w[at]
                 u_next, v_next, w_next = self._u[at + self._step_x], self._v[at + self._step_y], self._w[at + 1]
                 residual = (u - u_next) + (v - v_next) + (w - w_next)
@@ -168,76 +160,105 @@ class PressureProjection:
                 lower = ti.max(ti.abs(u), ti.abs(v), ti.abs(w))
                 upper = ti.max(ti.abs(u_next), ti.abs(v_next), ti.abs(w_next))
                 speed = ti.max(speed, lower, upper)
-            self._rows.row[i - 1, j - 1] = ti.Vector([largest, speed])
+            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([largest, speed])
+        self._rows.find_maxima()
+        return self._rows.result[None]
 
     @ti.kernel
-    def _find_largest_residual(self):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+    def _find_largest_residual(self) -> ti.f32:
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
             largest = 0.0
-            for k in range(1, self._nz + 1):
-                largest = ti.max(largest, ti.abs(self.multigrid.right_hand_side[row + k]))
-            self._rows.row[i - 1, j - 1] = ti.Vector([largest, 0.0])
+            for n in range(lane_items(self._nz, lane)):
+                largest = ti.max(largest, ti.abs(self.multigrid.right_hand_side[row + lane_place(n, lane)]))
+            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([largest, 0.0])
+        self._rows.find_maxima()
+        return self._rows.result[None][0]
 
     @ti.kernel
     def _start_search(self):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+        """p = z, and r.z."""
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
-            for k in range(1, self._nz + 1):
-                self._search[row + k] = self.multigrid.solution[row + k]
-                self._correction[row + k] = 0.0
+            r_z = 0.0
+            for n in range(lane_items(self._nz, lane)):
+                at = row + lane_place(n, lane)
+                z = self.multigrid.solution[at]
+                self._search[at] = z
+                self._correction[at] = 0.0
+                r_z += z * self.multigrid.right_hand_side[at]
+            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([r_z, 0.0])
+        self._rows.sum_up()
+        self._r_z[None] = self._rows.result[None][0]
 
+    @fast_launch
     @ti.kernel
-    def _apply_operator(self):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
-            row = i * self._step_x + j * self._step_y
-            total = 0.0
-            for k in range(1, self._nz + 1):
-                image = self.multigrid.laplacian(self._search, row + k, self._step_x, self._step_y)
-                self._search_image[row + k] = image
-                total += image * self._search[row + k]
-            self._rows.row[i - 1, j - 1] = ti.Vector([total, 0.0])
+    def _advance(self) -> Pair:
+        """Go along p to the smallest error: alpha = r.z / p.Ap, q += alpha p, r -= alpha Ap.
 
-    @ti.kernel
-    def _advance(self, alpha: ti.f32):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+        Returns:
+            max|r|, and 1, or 0 where there was no way to go: p.Ap and r.z vanish together once the residual does.
+        """
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
+            p_Ap = 0.0
+            for n in range(lane_items(self._nz, lane)):
+                at = row + lane_place(n, lane)
+                image = self.multigrid.laplacian(self._search, at, self._step_x, self._step_y)
+                self._search_image[at] = image
+                p_Ap += image * self._search[at]
+            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([p_Ap, 0.0])
+        self._rows.sum_up()
+        self._alpha[None] = 0.0
+        # Written so that NaN ends the solve as well.
+        if self._rows.result[None][0] > 0.0 and self._r_z[None] > 0.0:
+            self._alpha[None] = self._r_z[None] / self._rows.result[None][0]
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
+            row = i * self._step_x + j * self._step_y
+            alpha = self._alpha[None]
             largest = 0.0
-            for k in range(1, self._nz + 1):
-                at = row + k
+            for n in range(lane_items(self._nz, lane)):
+                at = row + lane_place(n, lane)
                 self._correction[at] += alpha * self._search[at]
                 residual = self.multigrid.right_hand_side[at] - alpha * self._search_image[at]
                 self.multigrid.right_hand_side[at] = residual
                 largest = ti.max(largest, ti.abs(residual))
-            self._rows.row[i - 1, j - 1] = ti.Vector([largest, 0.0])
+            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([largest, 0.0])
+        self._rows.find_maxima()
+        return Pair(self._rows.result[None][0], ti.select(self._alpha[None] > 0.0, 1.0, 0.0))
 
+    @fast_launch
     @ti.kernel
-    def _compute_dots(self):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+    def _turn_search(self):
+        """p = z + beta p with beta = -alpha z.Ap / r.z of the last direction, and the new r.z (Notay 2000)."""
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
-            z_r = 0.0
+            r_z = 0.0
             z_Ap = 0.0
-            for k in range(1, self._nz + 1):
-                z = self.multigrid.solution[row + k]
-                z_r += z * self.multigrid.right_hand_side[row + k]
-                z_Ap += z * self._search_image[row + k]
-            self._rows.row[i - 1, j - 1] = ti.Vector([z_r, z_Ap])
-
-    @ti.kernel
-    def _turn_search(self, beta: ti.f32):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+            for n in range(lane_items(self._nz, lane)):
+                at = row + lane_place(n, lane)
+                z = self.multigrid.solution[at]
+                r_z += z * self.multigrid.right_hand_side[at]
+                z_Ap += z * self._search_image[at]
+            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([r_z, z_Ap])
+        self._rows.sum_up()
+        self._beta[None] = -self._alpha[None] * self._rows.result[None][1] / self._r_z[None]
+        self._r_z[None] = self._rows.result[None][0]
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
-            for k in range(1, self._nz + 1):
-                self._search[row + k] = self.multigrid.solution[row + k] + beta * self._search[row + k]
+            beta = self._beta[None]
+            for n in range(lane_items(self._nz, lane)):
+                at = row + lane_place(n, lane)
+                self._search[at] = self.multigrid.solution[at] + beta * self._search[at]
 
     @ti.kernel
     def _subtract_gradient(self):
         open_x, open_y, open_z = ti.static(self.multigrid.coefficients.fields)
         # The last planes of faces belong to ghost cells, whose pressure is 0 and whose other faces are closed.
-        for i, j in ti.ndrange((1, self._nx + 2), (1, self._ny + 2)):
+        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
             row = i * self._step_x + j * self._step_y
-            for k in range(1, self._nz + 2):
-                at = row + k
+            for n in range(lane_items(self._nz + 1, lane)):
+                at = row + lane_place(n, lane)
                 here = self._correction[at]
                 self._u[at] -= open_x[at] * (here - self._correction[at - self._step_x])
                 self._v[at] -= open_y[at] * (here - self._correction[at - self._step_y])

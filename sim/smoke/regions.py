@@ -11,6 +11,7 @@ import numpy as np
 import taichi as ti
 
 from sim.arrays import Floats, Integers, LongIntegers
+from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import AIR, Obstacles
 
 NO_REGION = -1
@@ -36,6 +37,7 @@ class ClosedRegions:
     def __init__(self, obstacles: Obstacles) -> None:
         grid = obstacles.grid
         self._obstacles = obstacles
+        self._lanes = lane_count()
         self._nx, self._ny, self._nz = grid.cells
         self._step_x, self._step_y = grid.padded[1] * grid.padded[2], grid.padded[2]
         self._open = tuple(grid.is_open(axis, side) for axis in range(3) for side in (0, 1))
@@ -235,9 +237,9 @@ class ClosedRegions:
 
     @ti.kernel
     def _shift(self, values: ti.template(), means: Floats):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
-            for k in range(1, self._nz + 1):
-                number = self.number[row + k]
-                if number != NO_REGION:
-                    values[row + k] -= means[number]
+            for n in range(lane_items(self._nz, lane)):
+                at = row + lane_place(n, lane)
+                if self.number[at] != NO_REGION:
+                    values[at] -= means[self.number[at]]

@@ -12,14 +12,18 @@ from sim.reductions import is_finite
 from sim.scene import DomainParameters
 from sim.smoke.advection import Advection
 from sim.smoke.air_force import AirForce
+from sim.smoke.balance import CorrectionBalance
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import Forces, upward
 from sim.smoke.grid import SmokeGrid, SolidRegion
+from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import Obstacles, time_of_travel
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.projection import PressureProjection
-from sim.smoke.reductions import RowReductions
+from sim.smoke.reductions import Pair, RowReductions
 from sim.smoke.sources import build_sources
+from sim.smoke.turbulence import Turbulence
+from sim.smoke.wind import Wind
 from sim.snapshots import Snapshot
 from sim.solver import Arrays, Diagnostics
 
@@ -34,9 +38,9 @@ class SmokeSolver:
     One substep, by operator splitting as in Stam 1999: advect, let obstacles move on, accelerate, emit, project, cool.
     Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
 
-    Exact: smoke is added by sources only, and what they add is counted. Approximate: advection does not conserve the
-    total of density where the flow spreads or closes in, nor at open sides, so `mass` is a measured quantity. Not
-    supported: expansion by heat.
+    Exact: smoke is added by sources only, and what they add is counted. Approximate: MacCormack advection keeps the
+    total of smoke and of heat (`CorrectionBalance`), but at open sides and moving solids to first order only, and
+    semi-Lagrangian advection does not, so `mass` is a measured quantity. Not supported: expansion by heat.
 
     Solids that move drive air by the velocity of their surface (`Obstacles`), and take whole cells from time to time:
     in between, air flows through the sides of their cells at the speed of the solid. So the smoke of a cell that they
@@ -52,6 +56,7 @@ class SmokeSolver:
         grid: the cells, with the solids that stand still.
         obstacles: all solids, and how others put some in that move.
         air_forces: what pushes the air from outside, in this order in every substep.
+        sources: where smoke comes from, in the order of the parameters.
 
     Args:
         parameters: the smoke of a job.
@@ -105,6 +110,7 @@ class SmokeSolver:
             cell_fields=cell_fields,
             work=work,
             maccormack=parameters.advection == "maccormack",
+            balance=CorrectionBalance(self.obstacles, velocity),
         )
         self._forces = Forces(
             self.obstacles,
@@ -120,15 +126,28 @@ class SmokeSolver:
         self._extrapolation = Extrapolation(
             self.obstacles, velocity=velocity, cell_fields=cell_fields, reach=parameters.cfl
         )
+        self._lanes = lane_count()
         self._rows = RowReductions(self._nx, self._ny)
-        self._sources = build_sources(
+        self.sources = build_sources(
             parameters, self.obstacles, openness=self.openness, velocity=velocity, cell_fields=cell_fields
         )
+        self._turbulence = self._build_turbulence(velocity)
+        self._wind = self._build_wind(velocity)
         self.air_forces: list[AirForce] = []
         self._has_gravity = any(upward(gravity))
         self._time_s = 0.0
         self._emitted_mass = self._covered_mass = self._uncovered_mass = 0.0
         self.begin_frame(0.0)
+        if self._wind is not None:
+            self._wind.fill()
+            self._project()
+            self._extrapolation.fill()
+            self.begin_frame(0.0)
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time [s]."""
+        return self._time_s
 
     @property
     def openness(self) -> tuple[ti.Field, ti.Field, ti.Field]:
@@ -148,7 +167,8 @@ class SmokeSolver:
             *self._projection.regions.fields,
             *self._extrapolation.fields,
         ]
-        return 4 * sum(math.prod(field.shape) for field in arrays)
+        turbulence = 0 if self._turbulence is None else self._turbulence.device_bytes
+        return 4 * sum(math.prod(field.shape) for field in arrays) + turbulence
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no air crosses more than `cfl` cells, and no obstacle more than one.
@@ -156,15 +176,15 @@ class SmokeSolver:
         The speed at the end of the step counts, v + a dt with the largest buoyant acceleration a, so that a start
         from rest is bounded as well: dt solves (v + a dt) dt = cfl h.
         """
-        self._compute_speed_and_acceleration()
-        speed, acceleration = self._rows.maxima()
-        without_sources = self._largest_step(speed, acceleration)
-        for source in self._sources:
+        speed, acceleration = map(float, self._find_speed_and_acceleration())
+        gusts = 0.0 if self._turbulence is None else self._turbulence.acceleration
+        without_sources = self._largest_step(speed, acceleration + gusts)
+        for source in self.sources:
             if source.parameters.emits_during(self._time_s, self._time_s + without_sources):
                 speed = max(speed, source.speed)
                 acceleration = max(acceleration, self._buoyancy_bound(source.target_excess, source.target_density))
         limits = [self.obstacles.stable_dt(), *(force.stable_dt() for force in self.air_forces)]
-        return min(self._largest_step(speed, acceleration), *limits)
+        return min(self._largest_step(speed, acceleration + gusts), *limits)
 
     def _largest_step(self, speed: float, acceleration: float) -> float:
         distance = self.parameters.cfl * self.grid.cell_size
@@ -175,13 +195,18 @@ class SmokeSolver:
         self._advection.advance(dt)
         self.move_obstacles()
         self._forces.accelerate(dt)
+        if self._turbulence is not None:
+            self._turbulence.accelerate(self._time_s + 0.5 * dt, dt)
         for force in self.air_forces:
             force.accelerate(dt)
+        if self._wind is not None:
+            self._wind.blow_in()
         self._emit(dt)
         self._project()
         self._cool(
             math.exp(-self.parameters.density_dissipation * dt),
             math.exp(-self.parameters.cooling * dt),
+            self._radiated(dt),
         )
         self._extrapolation.fill()
         self._time_s += dt
@@ -256,8 +281,7 @@ class SmokeSolver:
         there are also `covered_mass` and `uncovered_mass` [m³], of the cells that they entered and left since the
         start, and `compression` [1/s], the worst of the frame (`ProjectionReport`).
         """
-        self._compute_speed_and_acceleration()
-        speed, _ = self._rows.maxima()
+        speed, _ = map(float, self._find_speed_and_acceleration())
         air = self.obstacles.is_air()
         excess = self._cells("excess_temperature")[air]
         numbers = {
@@ -282,14 +306,13 @@ class SmokeSolver:
             count = self._count_not_finite(field)
             if count:
                 return f"{name} is not finite at {count} places"
-        self._compute_speed_and_acceleration()
-        speed, _ = self._rows.maxima()
+        speed, _ = map(float, self._find_speed_and_acceleration())
         return f"max_speed is {speed:.3g} m/s" if speed > RUNAWAY_SPEED else None
 
     def _emit(self, dt: float) -> None:
-        for source in self._sources:
+        for source in self.sources:
             if source.parameters.emits_during(self._time_s, self._time_s + dt):
-                self._emitted_mass += source.emit(self._time_s) * self.grid.cell_size**3
+                self._emitted_mass += source.emit(self._time_s, dt) * self.grid.cell_size**3
 
     def _project(self) -> None:
         report = self._projection.project()
@@ -314,24 +337,55 @@ class SmokeSolver:
             return 0.0
         return self.parameters.buoyancy_temperature * abs(excess) + self.parameters.buoyancy_density * density
 
-    @ti.kernel
-    def _cool(self, density_factor: ti.f32, excess_factor: ti.f32):
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
-            row = i * self._step_x + j * self._step_y
-            for k in range(1, self._nz + 1):
-                self.density[row + k] *= density_factor
-                self.excess_temperature[row + k] *= excess_factor
+    def _build_turbulence(self, velocity: tuple) -> Turbulence | None:
+        parameters = self.parameters.turbulence
+        if parameters.strength == 0.0:
+            return None
+        return Turbulence(self.grid, parameters, wind=self.parameters.wind, openness=self.openness, velocity=velocity)
+
+    def _build_wind(self, velocity: tuple) -> Wind | None:
+        if not any(self.parameters.wind):
+            return None
+        windward = self.parameters.windward_faces
+        return Wind(self.obstacles, self.parameters.wind, windward, openness=self.openness, velocity=velocity)
+
+    def _radiated(self, dt: float) -> float:
+        """The factor r of `_cool` [1/K³], by which e' = e exp(-c dt) (1 + r e³)^(-1/3) solves both laws exactly.
+
+        de/dt = -c e - k (e/e_max)⁴ of the excess e is linear in e^-3: r = k (1 - exp(-3 c dt)) / (c e_max⁴).
+        """
+        hottest = self.parameters.hottest_excess
+        if self.parameters.radiative_cooling == 0.0 or hottest == 0.0:
+            return 0.0
+        rate = 3.0 * self.parameters.cooling
+        time = -math.expm1(-rate * dt) / rate if rate > 0.0 else dt
+        return 3.0 * self.parameters.radiative_cooling * time / hottest**4
 
     @ti.kernel
-    def _compute_speed_and_acceleration(self):
-        """Largest face velocity [m/s] and a bound of the largest buoyant acceleration [m/s²], row by row."""
+    def _cool(self, density_factor: ti.f32, excess_factor: ti.f32, radiated: ti.f32):
+        """Thin smoke out, and cool it by Newton's law and by radiation (Nguyen, Fedkiw & Jensen 2002)."""
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
+            row = i * self._step_x + j * self._step_y
+            for n in range(lane_items(self._nz, lane)):
+                k = lane_place(n, lane)
+                self.density[row + k] *= density_factor
+                excess = self.excess_temperature[row + k]
+                if ti.static(self.parameters.radiative_cooling > 0.0):
+                    heat = ti.max(excess, 0.0)
+                    excess *= (1.0 + radiated * heat * heat * heat) ** (-1.0 / 3.0)
+                self.excess_temperature[row + k] = excess * excess_factor
+
+    @ti.kernel
+    def _find_speed_and_acceleration(self) -> Pair:
+        """Largest face velocity [m/s] and a bound of the largest buoyant acceleration [m/s²]."""
         alpha = ti.static(self.parameters.buoyancy_density if self._has_gravity else 0.0)
         beta = ti.static(self.parameters.buoyancy_temperature if self._has_gravity else 0.0)
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
+        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
             speed = 0.0
             acceleration = 0.0
-            for k in range(1, self._nz + 1):
+            for n in range(lane_items(self._nz, lane)):
+                k = lane_place(n, lane)
                 at = row + k
                 lower = ti.max(ti.abs(self.u_face_x[at]), ti.abs(self.v_face_y[at]), ti.abs(self.w_face_z[at]))
                 upper = ti.max(
@@ -342,7 +396,9 @@ class SmokeSolver:
                 speed = ti.max(speed, lower, upper)
                 buoyancy = alpha * self.density[at] + beta * ti.abs(self.excess_temperature[at])
                 acceleration = ti.max(acceleration, buoyancy)
-            self._rows.row[i - 1, j - 1] = ti.Vector([speed, acceleration])
+            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([speed, acceleration])
+        self._rows.find_maxima()
+        return self._rows.result[None]
 
     @ti.kernel
     def _count_not_finite(self, field: ti.template()) -> ti.i32:

@@ -1,15 +1,21 @@
 """Sources: regions that set smoke, heat and velocity to at least given values."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.arrays import Floats, Integers
+from sim.rigid import rotation
 from sim.shapes import build_solid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.obstacles import Obstacles
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
+from sim.smoke.random_numbers import hash_to_unit, smooth_noise, spread
+from sim.smoke.source_motion import SourceMotion, motion_of
+from sim.smoke.sweep import CELLS, SweptShape
 
 BLOCK = 256
 """Cells whose emission one thread adds up."""
@@ -20,28 +26,46 @@ FLUCTUATION_CELLS = 4
 FLUCTUATION_RATE_HZ = 20.0
 """How often the fluctuation changes."""
 
+POSES_PER_CELL = 4.0
+"""A source that moves emits at poses of which none is farther than a quarter of a cell from the next."""
 
-@ti.func
-def hash_to_unit(key: ti.u32):
-    """A number in [0, 1) from 32 bits (Jarzynski & Olano 2020, PCG)."""
-    state = key * ti.u32(747796405) + ti.u32(2891336453)
-    word = ((state >> ((state >> ti.u32(28)) + ti.u32(4))) ^ state) * ti.u32(277803737)
-    return ti.cast(((word >> ti.u32(22)) ^ word) >> ti.u32(8), ti.f32) / 16777216.0
+
+class _Places:
+    """Cells that a source raises, or faces that it drives, as they are now; room grows as it is needed."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.indices = ti.ndarray(ti.i32, 1)
+        self.values = ti.ndarray(ti.f32, 1)
+
+    def put(self, indices: NDArray[np.int32], values: NDArray[np.float64] | float = 0.0) -> None:
+        """Take flat indices, (n,), and a value for each."""
+        self.count = len(indices)
+        room = self.indices.shape[0]
+        if self.count > room:
+            room = max(self.count, 2 * room)
+            self.indices, self.values = ti.ndarray(ti.i32, room), ti.ndarray(ti.f32, room)
+        padded = np.zeros(room, np.int32), np.zeros(room, np.float32)
+        padded[0][: self.count], padded[1][: self.count] = indices, values
+        self.indices.from_numpy(padded[0])
+        self.values.from_numpy(padded[1])
 
 
 @ti.data_oriented
 class Source:
     """One source on one grid: the open cells and faces whose centres lie inside it.
 
-    What an obstacle that moves covers just now emits nothing.
+    What an obstacle covers just now emits nothing. A source that moves emits where it is in any part of the step, so
+    that what it leaves behind in air at rest is its swept volume, however long the steps are.
 
     Velocity is imposed before the projection, which may change it: a source drives the flow, it is no inlet. So it
     never creates volume, and also blows in a closed box.
 
     Attributes:
-        target_density, target_excess: what cells inside are raised to [-], [K above the air].
-        speed: largest component of the imposed velocity [m/s].
-        cell_count: how many cells outside of static solids lie inside.
+        parameters: of the source.
+        motion: how it moves; None if it stays.
+        target_density, target_excess: what cells inside are raised to at full strength [-], [K above the air].
+        cell_count: how many cells outside of static solids lie inside; of a source that moves, in the last step.
     """
 
     def __init__(
@@ -57,9 +81,8 @@ class Source:
         self.parameters = parameters
         self.target_density = parameters.density
         self.target_excess = parameters.temperature - ambient_temperature
-        self.speed = max(map(abs, parameters.velocity)) if parameters.velocity is not None else 0.0
         grid = obstacles.grid
-        self._obstacles = obstacles
+        self._grid, self._obstacles = grid, obstacles
         self._step_x, self._step_y, self._padded_y = (
             grid.padded[1] * grid.padded[2],
             grid.padded[2],
@@ -67,69 +90,124 @@ class Source:
         )
         self._density, self._excess = cell_fields
         self._openness, self._velocity = openness, velocity
-        region = build_solid(parameters)
-        cells = grid.cells_inside(region) & ~grid.solid
-        self.cell_count = int(np.count_nonzero(cells))
-        self._cells = _index_field(_flat_indices(grid, cells))
-        self._block_count = -(-max(1, self.cell_count) // BLOCK)
-        self._emitted = ti.field(ti.f32, shape=self._block_count)
-        faces = [
-            _flat_indices(grid, grid.faces_inside(region, axis) & (grid.open_area[axis] > 0.0)) for axis in range(3)
-        ]
-        self._face_counts = [len(indices) for indices in faces]
-        self._faces = [_index_field(indices) for indices in faces]
+        self._cells, self._faces = _Places(), [_Places() for _ in range(3)]
+        self._emitted = ti.ndarray(ti.f32, 1)
+        # Random numbers of other seeds are others; seed 0 leaves the key of a patch as it is.
+        self._salt = spread(parameters.seed)
+        self.motion: SourceMotion | None = None
+        if parameters.moves:
+            self._shape = SweptShape(parameters, grid)
+            self.motion = motion_of(parameters, self._shape.reach)
+            start = np.asarray(parameters.velocity or (0.0, 0.0, 0.0))
+            self._own_velocity = rotation.rotated(
+                rotation.conjugate(rotation.from_degrees(parameters.rotation_deg)), start
+            )
+        else:
+            self._stay(grid)
 
-    def emit(self, time_s: float) -> float:
-        """Bring the fields to the source's values at a simulated time [s].
+    @property
+    def cell_count(self) -> int:
+        """See the class."""
+        return self._cells.count
 
-        The fluctuation is a function of place and time alone, so a run that continues sees the same.
+    @property
+    def speed(self) -> float:
+        """Largest component of the velocity that it imposes in the coming step [m/s]; 0 if it imposes none."""
+        if self.parameters.velocity is None:
+            return 0.0
+        if self.motion is None:
+            return max(map(abs, self.parameters.velocity))
+        return math.hypot(*self.parameters.velocity) + self.motion.speed()
+
+    def emit(self, time_s: float, dt: float) -> float:
+        """Bring the fields to the source's values in a step of dt [s] from a simulated time [s] on.
+
+        Fluctuation and flicker are functions of place and time alone, so a run that continues sees the same.
 
         Returns:
             The density added, summed over cells [-].
         """
-        self._raise_cells(int(time_s * FLUCTUATION_RATE_HZ))
+        begin_s, end_s = self.parameters.span_of(time_s, time_s + dt)
+        if self.motion is not None:
+            self._move(self.motion, begin_s, end_s)
+        strength = self.parameters.largest_strength(begin_s, end_s) * self._steadiness(end_s)
+        blocks = -(-max(1, self._cells.count) // BLOCK)
+        if self._emitted.shape[0] < blocks:
+            self._emitted = ti.ndarray(ti.f32, blocks)
+        tick = int(time_s * FLUCTUATION_RATE_HZ)
+        self._raise_cells(
+            self._cells.indices, self._cells.count, blocks, tick, self._salt,
+            strength * self.target_density, strength * self.target_excess, self._emitted,
+        )  # fmt: skip
+        if self.parameters.velocity is not None:
+            for axis, faces in enumerate(self._faces):
+                self._set_faces(faces.indices, faces.values, self._openness[axis], self._velocity[axis], faces.count)
+        return float(self._emitted.to_numpy()[:blocks].sum(dtype=np.float64))
+
+    def _stay(self, grid: SmokeGrid) -> None:
+        region = build_solid(self.parameters)
+        self._cells.put(_flat_indices(grid, grid.cells_inside(region) & ~grid.solid))
         if self.parameters.velocity is not None:
             for axis, speed in enumerate(self.parameters.velocity):
-                self._set_faces(
-                    self._faces[axis], self._openness[axis], self._velocity[axis], self._face_counts[axis], speed
-                )
-        return float(self._emitted.to_numpy().sum(dtype=np.float64))
+                inside = grid.faces_inside(region, axis) & (grid.open_area[axis] > 0.0)
+                self._faces[axis].put(_flat_indices(grid, inside), speed)
+
+    def _move(self, motion: SourceMotion, begin_s: float, end_s: float) -> None:
+        poses = motion.poses(begin_s, end_s, spacing=self._grid.cell_size / POSES_PER_CELL)
+        self._cells.put(self._shape.covered(poses, CELLS).indices)
+        if self.parameters.velocity is None:
+            return
+        origins = np.stack([pose.position for pose in poses])
+        spins = np.stack([pose.angular_velocity for pose in poses])
+        blown = np.stack([pose.velocity + rotation.rotated(pose.orientation, self._own_velocity) for pose in poses])
+        for axis, faces in enumerate(self._faces):
+            swept = self._shape.covered(poses, axis)
+            turning = rotation.cross(spins[swept.poses], swept.places - origins[swept.poses])
+            faces.put(swept.indices, (blown[swept.poses] + turning)[:, axis])
+
+    def _steadiness(self, time_s: float) -> float:
+        """What flickering leaves of its strength [-]."""
+        flicker = self.parameters.flicker
+        return 1.0 - flicker * smooth_noise(time_s * self.parameters.flicker_rate, self.parameters.seed)
 
     @ti.kernel
-    def _raise_cells(self, tick: ti.i32):
-        for block in range(self._block_count):
+    def _raise_cells(
+        self, cells: Integers, count: ti.i32, blocks: ti.i32, tick: ti.i32, salt: ti.u32,
+        target_density: ti.f32, target_excess: ti.f32, added: Floats,
+    ):  # fmt: skip
+        for block in range(blocks):
             emitted = 0.0
-            for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, self.cell_count)):
-                at = self._cells[n]
+            for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, count)):
+                at = cells[n]
                 if not self._obstacles.is_solid(at):
                     before = self._density[at]
-                    after = ti.max(before, self.target_density)
+                    after = ti.max(before, target_density)
                     self._density[at] = after
                     emitted += after - before
-                    shortfall = self.parameters.fluctuation * self._fluctuate(at, tick)
-                    target = (1.0 - shortfall) * self.target_excess
+                    shortfall = self.parameters.fluctuation * self._fluctuate(at, tick, salt)
+                    target = (1.0 - shortfall) * target_excess
                     # Heat is raised to the target, and cold lowered.
                     excess = self._excess[at]
-                    self._excess[at] = ti.max(excess, target) if self.target_excess >= 0.0 else ti.min(excess, target)
-            self._emitted[block] = emitted
+                    self._excess[at] = (
+                        ti.max(excess, target) if ti.static(self.target_excess >= 0.0) else ti.min(excess, target)
+                    )
+            added[block] = emitted
 
     @ti.func
-    def _fluctuate(self, at: ti.i32, tick: ti.i32):
+    def _fluctuate(self, at: ti.i32, tick: ti.i32, salt: ti.u32):
         """A number in [0, 1) that a few neighbouring cells share."""
         patch_i = at // self._step_x // FLUCTUATION_CELLS
         patch_j = at // self._step_y % self._padded_y // FLUCTUATION_CELLS
         patch_k = at % self._step_y // FLUCTUATION_CELLS
         patch = (patch_i * 1024 + patch_j) * 1024 + patch_k
         # The odd factor (Knuth's) spreads ticks over all bits, so that they do not shift the pattern.
-        return hash_to_unit(ti.cast(patch, ti.u32) ^ (ti.cast(tick, ti.u32) * ti.u32(2654435769)))
+        return hash_to_unit(ti.cast(patch, ti.u32) ^ (ti.cast(tick, ti.u32) * ti.u32(2654435769)) ^ salt)
 
     @ti.kernel
-    def _set_faces(
-        self, faces: ti.template(), openness: ti.template(), field: ti.template(), count: ti.i32, speed: ti.f32
-    ):
+    def _set_faces(self, faces: Integers, speeds: Floats, openness: ti.template(), field: ti.template(), count: ti.i32):
         for n in range(count):
             if openness[faces[n]] > 0.0:
-                field[faces[n]] = speed
+                field[faces[n]] = speeds[n]
 
 
 def build_sources(
@@ -145,7 +223,8 @@ def build_sources(
         cell_fields: density and temperature excess, flat fields.
 
     Raises:
-        ValueError: a source contains no open cell: it lies outside the box, in a solid, or is smaller than a cell.
+        ValueError: a source that stays contains no open cell: it lies outside the box, in a solid, or is smaller than
+            a cell.
     """
     sources = [
         Source(
@@ -160,7 +239,7 @@ def build_sources(
     ]
     grid = obstacles.grid
     for number, source in enumerate(sources):
-        if source.cell_count == 0:
+        if source.motion is None and source.cell_count == 0:
             raise ValueError(
                 f'smoke "{parameters.name}", source {number}: no cell centre lies inside it; move it into the box '
                 f"from {grid.origin} to {grid.upper} m, out of solids, or make it larger than a cell "
@@ -171,11 +250,3 @@ def build_sources(
 
 def _flat_indices(grid: SmokeGrid, mask: NDArray[np.bool_]) -> NDArray[np.int32]:
     return np.flatnonzero(grid.pad(mask)).astype(np.int32)
-
-
-def _index_field(indices: NDArray[np.int32]) -> ti.Field:
-    """A field of at least one entry, as Taichi knows no empty ones."""
-    field = ti.field(ti.i32, shape=max(1, len(indices)))
-    if len(indices):
-        field.from_numpy(indices)
-    return field

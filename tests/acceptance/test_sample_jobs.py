@@ -13,6 +13,7 @@ JOBS = sorted((Path(__file__).parents[2] / "jobs").glob("*.toml"))
 
 TINY = {
     "ball_into_cloth": {"cloth.sheet.shape.counts": [9, 9]},
+    "campfire": {"smoke.fire.cell_size": 0.04},
     "cloth_over_bunny": {"cloth.veil.shape.counts": [11, 11]},
     "cloth_over_sphere": {"cloth.sheet.shape.counts": [11, 11]},
     "dam_break": {"fluid.water.particle_radius": 0.025},
@@ -29,6 +30,9 @@ TINY = {
     "hammock_of_water": {"cloth.sheet.shape.counts": [13, 13], "fluid.water.emitter.0.start_s": 0.0},
     "honey": {"fluid.honey.particle_radius": 0.0014},
     "quickstart": {"fluid.water.particle_radius": 0.02, "smoke.plume.cell_size": 0.06},
+    "smoke_in_box": {"smoke.plume.cell_size": 0.06},
+    "smoke_moving_duck": {"smoke.fog.cell_size": 0.06},
+    "smoke_past_sphere": {"smoke.smoke.cell_size": 0.02},
 }
 
 

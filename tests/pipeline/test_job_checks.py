@@ -76,7 +76,7 @@ def test_starter_passes_every_check_without_a_warning(template, preview, tmp_pat
         ),
         (
             HEAD + PLUME + '[material.plume]\nlook = "metal"',
-            'dam.toml:11 material.plume.look: smoke can only look like "smoke", got "metal"',
+            'dam.toml:11 material.plume.look: smoke can only look like "smoke" or "fire", got "metal"',
         ),
         (
             HEAD + WATER + '[domain]\nopen_faces = ["z+", "x-", "z+"]',

@@ -192,6 +192,25 @@ def test_what_is_always_zero_is_said_and_not_drawn():
     assert found.zero == ("water: wall contacts",)
 
 
+def test_iterations_residual_and_divergence_of_smoke_are_drawn_for_each_frame():
+    start = {"substeps": 0, "mass": 0.0, "emitted_mass": 0.0, "max_temperature": 293.0, "max_speed": 0.0}
+    solves = {"iterations": 0, "residual": 0.0, "divergence": 0.0, "not_converged": 0}
+    frames = [{**start, **solves}]
+    for iterations, residual, divergence, missed in ((12, 8e-6, 2e-4, 0), (200, 3e-4, 9e-3, 2)):
+        solves = {"iterations": iterations, "residual": residual, "divergence": divergence, "not_converged": missed}
+        frames.append({**start, **solves, "substeps": 2, "mass": 0.1, "max_speed": 1.0})
+    job = numbers("a", *({"plume": each} for each in frames), kinds={"plume": "smoke"})
+    expected = {
+        "Solver iterations": [12, 200],
+        "Residual": [8e-6, 3e-4],
+        "Divergence": [2e-4, 9e-3],
+        "Solves at their limit": [0, 2],
+    }
+    for title, values in expected.items():
+        (line,) = panel([job], title).lines
+        assert list(line.y)[1:] == values, title
+
+
 # --- the page ------------------------------------------------------------------------------------------------------
 
 

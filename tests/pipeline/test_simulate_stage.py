@@ -64,6 +64,19 @@ keyframe = [{{ time_s = 0.0 }}, {{ time_s = 0.1, offset = [0.05, 0.0, 0.1] }}]
 """
 """Cloth, a body and contacts, coupled both ways."""
 
+PLUME = """
+name = "drop"
+frames = {frames}
+
+[[smoke]]
+name = "plume"
+cell_size = 0.0625
+[[smoke.source]]
+shape = {{ type = "sphere", radius = 0.15 }}
+position = [0.05, 0.0, 0.3]
+"""
+"""Its frames are rounded, and end around the smoke: continuing from them instead of a checkpoint would show."""
+
 
 def simulate(layout: JobLayout, *, frames: int, attempt: int = 1, job: str = JOB) -> TaskEvent:
     """Run the task of a job of so many frames until it ends; returns how it ended."""
@@ -110,6 +123,7 @@ def frames_of(layout: JobLayout, count: int) -> list[bytes]:
         pytest.param("write_frame", JOB, id="frame"),
         pytest.param("write_checkpoint", JOB, id="checkpoint"),
         pytest.param("write_checkpoint", DRAPE, id="checkpoint of cloth", marks=pytest.mark.slow),
+        pytest.param("write_frame", PLUME, id="frame of smoke", marks=pytest.mark.slow),
     ],
 )
 def test_killed_in_the_middle_of_a_write_it_continues_to_the_same_frames(

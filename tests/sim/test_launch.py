@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from sim.launch import fast_launch
+from sim.launch import MOST_LAUNCHES, fast_launch
 
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 AnyNumbers = ti.types.ndarray(ndim=1)
@@ -61,6 +61,31 @@ def test_later_calls_pass_every_argument_as_the_first_one_does(taichi_cpu):
         np.testing.assert_array_equal(numbers.to_numpy(), expected)
         assert returned == count + cell[2]
         assert list(ends(numbers, 5)) == [expected[0], expected[4]]
+
+
+def test_calls_that_come_again_write_to_the_arrays_of_the_call(taichi_cpu):
+    """Also where arrays take turns, and where a new one has the place in memory of one that is gone."""
+    first, second = ti.ndarray(ti.f32, 4), ti.ndarray(ti.f32, 4)
+    for k in range(4):
+        for numbers, scale in ((first, 1.0), (second, -1.0)):
+            fill(numbers, 4, scale * k, 0, (0.0, 0.0, 0.0), (0, 0, 0))
+            np.testing.assert_array_equal(numbers.to_numpy(), scale * k * np.arange(4))
+    for length in (4, 1000, 4, 7):
+        halved = ti.ndarray(ti.f32, length)
+        halved.fill(length)
+        for power in (1, 2):
+            halve(halved)
+            np.testing.assert_array_equal(halved.to_numpy(), length / 2**power)
+        del halved
+
+
+def test_a_kernel_forgets_calls_rather_than_remember_ever_more(taichi_cpu):
+    kept = [ti.ndarray(ti.f32, 2) for _ in range(MOST_LAUNCHES + 10)]
+    for _ in range(2):
+        for number, array in enumerate(kept):
+            fill(array, 2, 1.0, 0, (number, 0.0, 0.0), (0, 0, 0))
+    assert len(fill._launches) <= MOST_LAUNCHES
+    np.testing.assert_array_equal([array.to_numpy()[0] for array in kept], np.arange(len(kept)))
 
 
 def test_each_element_type_has_its_own_compiled_kernel(taichi_cpu):

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import taichi as ti
 import trimesh
 from cloth_scenes import (
     GRAVITY,
@@ -261,6 +262,21 @@ def test_strong_wind_on_light_cloth_does_not_throw_it_about():
         fastest = max(fastest, solver.diagnostics()["max_speed"])
     assert fastest < 100.01
     assert momentum(solver)[2] > 0.9 * 1e-3 * 0.04 * 100.0
+
+
+@pytest.mark.parametrize("rotation_deg", [(20.0, 0.0, 0.0), (0.0, 35.0, 0.0), (50.0, 10.0, 70.0), (-65.0, 25.0, 5.0)])
+def test_wind_straight_onto_a_slanting_sheet_pushes_it_straight_and_alike_everywhere(rotation_deg):
+    """Rounding leaves a trace of wind along the sheet, which must not get the skin drag of all of the wind."""
+    solver = solver_of(cloth(mass_per_area=1e-3, rotation_deg=rotation_deg), gravity=WEIGHTLESS)
+    x = solver.state.positions()[solver.state.host.triangles]
+    normal = np.cross(x[0, 1] - x[0, 0], x[0, 2] - x[0, 0])
+    normal /= np.linalg.norm(normal)
+    solver.change("sheet", wind=tuple(100.0 * normal))
+    solver.air.blow(range(1), ti.math.vec3(WEIGHTLESS), 1.0 / 1200.0)
+    force = solver.air.force.to_numpy().astype(np.float64)
+    along = force @ normal
+    np.testing.assert_allclose(force - along[:, None] * normal, 0.0, atol=1e-4 * along.max())
+    np.testing.assert_allclose(along, along.mean(), rtol=1e-4)
 
 
 def test_air_does_not_push_stretched_cloth_beyond_its_own_speed():

@@ -27,6 +27,13 @@ def geometry(shape, **keys):
 # --- distances ------------------------------------------------------------------------------------------------------
 
 
+def test_a_sphere_is_looked_at_within_its_radius_and_not_within_that_of_its_box():
+    """Patches of cloth that are farther away are not looked at: with 3^(1/2) times the radius, many near a ball are."""
+    box = geometry({"type": "box", "size": (0.2, 0.4, 0.4)})
+    radius = CollisionBodies([geometry(BALL, scale=1.5), box], [0.5, 0.5]).radius.to_numpy()
+    np.testing.assert_allclose(radius, [0.075, 0.3], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("shape", "tolerance"),
     [

@@ -58,7 +58,8 @@ def test_search_lists_all_pairs_within_reach_once_and_no_others():
         np.repeat([[[0.0, 0.0, 2e-3], [0.0, 0.0, -2e-3]]], 25, axis=0).reshape(50, 3)[:49].astype(np.float32)
     )
     pairs = SelfCollision(state)
-    pairs.prepare(state, 2e-3, 0.01)
+    pairs.look(state)
+    pairs.prepare(state)
     found = _listed(pairs.with_triangles)
     # A pair of patches is searched as far as its own motion asks for, to a thickness at least.
     reach = pairs._met.reach.to_numpy()[: pairs._met.count].max()
@@ -328,9 +329,9 @@ def test_contacts_do_not_depend_on_when_pairs_were_searched_for():
     pairs = contacts_of(cloth_of(anew))._pairs
     search = pairs.prepare
 
-    def search_always(state, motion, margin):
-        pairs.forget(state)
-        search(state, motion, margin)
+    def search_always(state):
+        pairs.forget()
+        search(state)
 
     pairs.prepare = search_always
     for _ in range(12):

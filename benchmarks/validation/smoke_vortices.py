@@ -1,0 +1,234 @@
+"""Air that turns: a blob in solid rotation, Taylor and Green's vortices, and a lone one that confinement spins up."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.validation.checks import CaseResult, Check, fitted_order
+from benchmarks.validation.smoke_boxes import (
+    FACES,
+    Advection,
+    Array,
+    advance,
+    build_box,
+    kinetic_energy,
+    rms_error,
+    set_flow,
+)
+
+SOLVERS = ("maccormack",)
+
+STEPS_PER_CELL = 2
+"""Steps in which the fastest air crosses a cell: time and space are refined together."""
+
+PLANE_CELLS, PLANE_DURATION = (32, 64, 128), 1.0
+"""Across the unit square with a blob that goes round once, or a plane vortex, and how long that turns [s]."""
+
+SPACE_CELLS, SPACE_DURATION = (16, 32, 64), 1.0
+"""Across the box of pi metres with the one in space, and how long it is compared [s]."""
+
+LONE_CELLS, LONE_LAYERS, CORE = 32, 12, 0.1
+"""Across and along the box of 1 m with the lone vortex, and the radius of its core [m]."""
+
+STRENGTHS = (0.5, 1.0)
+"""Confinements [-] with which the lone vortex is spun up."""
+
+SPAN, SHOWN = 0.01, 0.5
+"""How long it is spun up to measure the rate, a radian of its core, and for the figure [s]."""
+
+
+def run(solver: Advection, *, quick: bool = False) -> CaseResult:
+    """Rest, rotation, vortices in the plane and in space, and a lone vortex with confinement."""
+    plane_cells, space_cells = (PLANE_CELLS[:2], SPACE_CELLS[:2]) if quick else (PLANE_CELLS, SPACE_CELLS)
+    plane = [_in_the_plane(n, solver) for n in plane_cells]
+    space = _vortex_in_space(space_cells, solver, modes=32 if quick else 48)
+    spun = _spin_up(solver)
+    spacings = [1.0 / n for n in plane_cells]
+    rotation_errors, plane_errors, plane_losses = (list(column) for column in zip(*plane, strict=True))
+    space_errors, space_losses = (list(column) for column in zip(*space, strict=True))
+    splitting = "advection by the velocity of the step's start, pressure after it: a splitting of first order in time"
+    checks = [
+        Check("largest change of any field in air at rest", _change_at_rest(solver), 0.0, 0.0, "to the bit"),
+        Check("order of a blob in solid rotation, MacCormack", fitted_order(spacings, rotation_errors), 2.0, 0.5,
+              "second, but for the crest that the limiter cuts"),
+        Check("order of the velocity in a plane vortex", fitted_order(spacings, plane_errors), 1.0, 0.25, splitting),
+        Check("order of the energy that it loses", fitted_order(spacings, plane_losses), 1.0, 0.25, "likewise"),
+        Check("order of the velocity in a vortex in space", fitted_order([1.0 / n for n in space_cells], space_errors),
+              1.0, 0.25, "likewise; against a spectral solution"),
+        *[
+            Check(f"power of confinement {strength:g} over that of the formula", spun[strength]["gain"], 1.0, 0.12,
+                  "linear in epsilon and h; central differences flatten a core of 3.2 cells by about (h/a)²")
+            for strength in STRENGTHS
+        ],
+    ]  # fmt: skip
+    series = {
+        "plane_cells": list(plane_cells), "rotation_errors": rotation_errors, "plane_errors": plane_errors,
+        "plane_losses": plane_losses, "space_cells": list(space_cells), "space_errors": space_errors,
+        "space_losses": space_losses, "times": spun[0.0]["times"],
+        **{f"energy_{strength:g}": spun[strength]["energies"] for strength in (0.0, *STRENGTHS)},
+    }  # fmt: skip
+    settings = {
+        "steps_per_cell": STEPS_PER_CELL, "plane_duration_s": PLANE_DURATION, "space_duration_s": SPACE_DURATION,
+        "core_m": CORE, "strengths": STRENGTHS, "projection_tolerance": 1e-5,
+    }  # fmt: skip
+    return CaseResult("smoke-vortices", solver, settings, checks, series)
+
+
+def plane_vortex(positions: Array) -> Array:
+    """Taylor and Green's plane vortex in the unit square, at rest across its walls: steady without viscosity."""
+    x, y = math.pi * positions[:, 0], math.pi * positions[:, 1]
+    return np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), np.zeros_like(x)], axis=1)
+
+
+def vortex_in_space(positions: Array) -> Array:
+    """Taylor and Green's vortex in an eighth of its period, whose walls no flow crosses."""
+    x, y, z = positions.T
+    return np.stack([np.sin(x) * np.cos(y) * np.cos(z), -np.cos(x) * np.sin(y) * np.cos(z), np.zeros_like(x)], axis=1)
+
+
+def lone_vortex(positions: Array) -> Array:
+    """Lamb and Oseen's, of circulation 2 pi m²/s, in the middle of the unit square: omega = 2/a² exp(-r²/a²)."""
+    x, y = positions[:, 0] - 0.5, positions[:, 1] - 0.5
+    r_squared = np.maximum(x**2 + y**2, 1e-12)
+    swirl = -np.expm1(-r_squared / CORE**2) / r_squared
+    return np.stack([-y * swirl, x * swirl, np.zeros_like(x)], axis=1)
+
+
+def rotation(positions: Array) -> Array:
+    """Solid rotation about the middle of the unit square, once a second."""
+    x, y = positions[:, 0] - 0.5, positions[:, 1] - 0.5
+    return 2.0 * math.pi * np.stack([-y, x, np.zeros_like(x)], axis=1)
+
+
+def _change_at_rest(advection: Advection) -> float:
+    """Largest change of any array of the state in three steps of air at rest with uneven smoke and heat in it."""
+    random = np.random.default_rng(1)
+    solver = build_box((12, 10, 8), 0.1, advection=advection)
+    density, excess = random.random((2, 12, 10, 8))
+    set_flow(solver, np.zeros_like, density=density, excess_temperature=100.0 * excess)
+    before = solver.checkpoint()
+    advance(solver, 0.3, 3)
+    after = solver.checkpoint()
+    return max(float(np.abs(after[name] - array).max()) for name, array in before.items() if name != "clock")
+
+
+def _in_the_plane(n: int, advection: Advection) -> tuple[float, float, float]:
+    """Errors in the unit square with n cells across.
+
+    Returns:
+        Mean error of a smooth blob after one turn in 4 n steps of advection alone, over its mean; error of the
+        velocity of Taylor and Green's vortex over its rms; part of the kinetic energy that this loses.
+    """
+    solver = build_box((n, n, 4), 1.0 / n, advection=advection)
+    grid, fields = solver.grid, [getattr(solver, name) for name in FACES]
+    x, y, _ = (grid.cell_centres() - 0.5).T
+    blob = np.exp(-((x - 0.2) ** 2 + y**2) / 0.01)
+    set_flow(solver, np.zeros_like, density=blob)
+    turning = [rotation(grid.face_centres(axis))[:, axis].reshape(grid.face_shape(axis)) for axis in range(3)]
+    stored = [grid.pad(values.astype(np.float32)).ravel() for values in turning]
+    for _ in range(4 * n):
+        # The velocity would advect itself; the flow is to stay the same, and goes through the walls.
+        for field, values in zip(fields, stored, strict=True):
+            field.from_numpy(values)
+        solver._advection.advance(0.25 / n)
+    density = grid.trim(solver.checkpoint()["density"], grid.cells).ravel()
+    blob_error = float(np.abs(density - blob).sum() / blob.sum())
+
+    set_flow(solver, plane_vortex)
+    before, scale = kinetic_energy(solver), rms_error(solver, np.zeros_like)
+    advance(solver, PLANE_DURATION, round(STEPS_PER_CELL * n * PLANE_DURATION))
+    return blob_error, rms_error(solver, plane_vortex) / scale, 1.0 - kinetic_energy(solver) / before
+
+
+def _vortex_in_space(counts: tuple[int, ...], advection: Advection, *, modes: int) -> list[tuple[float, float]]:
+    """Error of the velocity over its rms against a spectral solution, and part of the kinetic energy that is lost."""
+    exact = SpectralEuler(modes)
+    exact.advance(SPACE_DURATION, 40)
+    found = []
+    for n in counts:
+        solver = build_box((n, n, n), math.pi / n, advection=advection)
+        set_flow(solver, vortex_in_space)
+        before, scale = kinetic_energy(solver), rms_error(solver, np.zeros_like)
+        advance(solver, SPACE_DURATION, math.ceil(STEPS_PER_CELL * n * SPACE_DURATION / math.pi))
+        found.append((rms_error(solver, exact.velocity) / scale, 1.0 - kinetic_energy(solver) / before))
+    return found
+
+
+def _spin_up(advection: Advection) -> dict[float, dict[str, Any]]:
+    """By confinement: its power over what the formula says, and the energy over that of the start, over time."""
+    n, middle = LONE_CELLS, slice(LONE_LAYERS // 2 - 1, LONE_LAYERS // 2 + 1)  # near the lids no confinement acts
+    found: dict[float, dict[str, Any]] = {}
+    for strength in (0.0, *STRENGTHS):
+        solver = build_box((n, n, LONE_LAYERS), 1.0 / n, advection=advection, vorticity_confinement=strength)
+        set_flow(solver, lone_vortex)
+        advance(solver, SPAN, 4)
+        energies = [kinetic_energy(solver, layers=middle)]
+        for _ in range(round(SHOWN / SPAN / 4)):
+            advance(solver, 4 * SPAN, 4)
+            energies.append(kinetic_energy(solver, layers=middle))
+        times = [SPAN * (1 + 4 * number) for number in range(len(energies))]
+        found[strength] = {"times": times, "energies": [energy / energies[0] for energy in energies]}
+        found[strength]["first"] = energies[0]
+        # epsilon h (N x omega) points along the flow where vorticity falls outwards: its power is epsilon h times the
+        # integral of omega u, here over two layers.
+        power = 2.0 * math.pi**1.5 / CORE * (1.0 - math.sqrt(0.5)) * strength / n * 2.0 / n
+        if strength > 0.0:
+            found[strength]["gain"] = (energies[0] - found[0.0]["first"]) / (power * SPAN)
+    return found
+
+
+class SpectralEuler:
+    """Taylor and Green's vortex without viscosity, by Fourier series in a cube of 2 pi metres (Brachet et al. 1983).
+
+    Rotational form, 2/3 rule, Runge and Kutta's fourth order: far more exact than the grids that are compared with it,
+    as long as the vortex has no structures finer than its shortest wave.
+    """
+
+    def __init__(self, modes: int) -> None:
+        self._n = modes
+        frequency = np.fft.fftfreq(modes, 1.0 / modes)
+        waves = np.meshgrid(frequency, frequency, frequency[: modes // 2 + 1], indexing="ij")
+        self._k = np.abs(np.stack(waves)) * np.sign(np.stack(waves))
+        self._k[2] = np.abs(self._k[2])
+        self._k_squared = np.maximum((self._k**2).sum(axis=0), 1.0)
+        self._kept = (np.abs(self._k) < modes / 3).all(axis=0)
+        x = 2.0 * math.pi * np.arange(modes) / modes
+        positions = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
+        start = vortex_in_space(positions).T.reshape(3, modes, modes, modes)
+        self.coefficients = np.fft.rfftn(start, axes=(1, 2, 3))
+
+    def advance(self, duration: float, steps: int) -> None:
+        """Advance by a duration [s] in equal steps."""
+        dt = duration / steps
+        for _ in range(steps):
+            now = self.coefficients
+            a = self._rate(now)
+            b = self._rate(now + 0.5 * dt * a)
+            c = self._rate(now + 0.5 * dt * b)
+            d = self._rate(now + dt * c)
+            self.coefficients = now + dt / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+
+    def _rate(self, u_k: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """du/dt = u x omega, less its gradient part."""
+        shape, axes = (self._n,) * 3, (1, 2, 3)
+        omega_k = 1j * np.cross(self._k, u_k, axis=0)
+        u, omega = np.fft.irfftn(u_k, shape, axes), np.fft.irfftn(omega_k, shape, axes)
+        force = np.fft.rfftn(np.cross(u, omega, axis=0), axes=axes) * self._kept
+        projected: NDArray[np.complex128] = force - self._k * (self._k * force).sum(axis=0) / self._k_squared
+        return projected
+
+    def velocity(self, positions: Array) -> Array:
+        """The series at positions that form a lattice, (n, 3), in C order."""
+        axes = [np.unique(positions[:, axis].round(12)) for axis in range(3)]
+        frequency = np.fft.fftfreq(self._n, 1.0 / self._n)
+        half = np.arange(self._n // 2 + 1)
+        # The other half of the last axis is the conjugate one: twice the real part, but for its ends.
+        weights = np.where((half == 0) | (half == self._n // 2), 1.0, 2.0)
+        waves = [np.exp(1j * np.outer(x, k)) for x, k in zip(axes, (frequency, frequency, half), strict=True)]
+        values = np.einsum("xa,yb,zc,dabc->xyzd", *waves[:2], waves[2] * weights, self.coefficients, optimize=True)
+        found: Array = values.real.reshape(-1, 3) / self._n**3
+        return found

@@ -1,0 +1,125 @@
+"""Looks of volumes: smoke, and fire, which is smoke that glows where it is hot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from blender_scripts.black_body import LUMINANCE_EXPONENT_K
+from blender_scripts.flames import Glow
+from blender_scripts.shading import LookContext, NodeBuilder, SmokeBox, or_default
+
+_OPTICAL_SIZE = 22.0
+"""Optical depth of smoke of density 1 across the whole domain."""
+_EDGE_FADE = 0.08
+"""Width of the fade at open faces, in shortest edges of the box."""
+_FAR = 1.0e6
+"""Distance of a face that does not fade [m]."""
+DEFAULT_FLAME_TEMPERATURE_K = 1500.0
+"""Of wood fires: 1100 to 1600 K where they glow."""
+DEFAULT_EMISSION = 30.0
+"""Flames are thin: some tenth of this reaches the eye, a few times what white paper does in a studio."""
+
+
+def build_smoke(builder: NodeBuilder, context: LookContext) -> None:
+    """Light smoke that scatters forwards a little; extinction follows the `density` grid."""
+    _principled(builder, context, color=(0.86, 0.88, 0.90), anisotropy=0.3)
+
+
+def build_fire(builder: NodeBuilder, context: LookContext) -> None:
+    """Sooty smoke that glows as a black body does, by the `temperature` grid.
+
+    Emission per metre is extinction x emission x L(T) / L(T_flame) in the colour of a black body of T (Kirchhoff: what
+    is dense enough to hide what is behind it glows the most), so thick flames have the radiance `emission` at the flame
+    temperature whatever their density.
+    """
+    glow = glow_of(context)
+    shader, extinction = _principled(builder, context, color=(0.42, 0.40, 0.38), anisotropy=0.3)
+    kelvin = builder.math("ADD", _grid(builder, "temperature"), glow.ambient_temperature)
+    exponent = builder.math("MULTIPLY_ADD", builder.math("DIVIDE", 1.0, kelvin), -LUMINANCE_EXPONENT_K, 0.0)
+    shift = LUMINANCE_EXPONENT_K / glow.flame_temperature
+    luminance = builder.math("EXPONENT", builder.math("ADD", exponent, shift))
+    color = builder.node("ShaderNodeBlackbody")
+    builder.link(kelvin, color.inputs[0])
+    # Lamps stand in for the glow (`flames`) where a ray would find it by chance only.
+    path = builder.node("ShaderNodeLightPath")
+    by_chance = builder.math("MAXIMUM", path.outputs["Is Diffuse Ray"], path.outputs["Is Volume Scatter Ray"])
+    seen = builder.math("MULTIPLY", builder.math("SUBTRACT", 1.0, by_chance), glow.emission)
+    per_metre = builder.math("MULTIPLY", extinction, _grid(builder, "density"))
+    strength = builder.math("MULTIPLY", builder.math("MULTIPLY", luminance, per_metre), seen)
+    builder.link(strength, shader.inputs["Emission Strength"])
+    builder.link(color.outputs[0], shader.inputs["Emission Color"])
+
+
+def glow_of(context: LookContext) -> Glow:
+    """What the look says about the light of a fire."""
+    box = _box(context)
+    return Glow(
+        extinction=_extinction(context),
+        emission=or_default(context.emission, DEFAULT_EMISSION),
+        flame_temperature=or_default(context.flame_temperature, DEFAULT_FLAME_TEMPERATURE_K),
+        ambient_temperature=box.ambient_temperature,
+        box_min=box.box_min,
+        box_max=box.box_max,
+    )
+
+
+def _principled(
+    builder: NodeBuilder, context: LookContext, *, color: tuple[float, float, float], anisotropy: float
+) -> tuple[Any, Any]:
+    """A volume that scatters and absorbs: its node, and its extinction at density 1 [1/m] as a number or socket."""
+    extinction: Any = _extinction(context)
+    fade = _fade(builder, context)
+    if fade is not None:
+        extinction = builder.math("MULTIPLY", fade, extinction)
+    shader = builder.node(
+        "ShaderNodeVolumePrincipled",
+        Color=or_default(context.color, color),
+        Anisotropy=or_default(context.anisotropy, anisotropy),
+    )
+    # The node multiplies its density by the grid of the name in "Density Attribute", `density` unless changed.
+    if fade is None:
+        shader.inputs["Density"].default_value = extinction
+    else:
+        builder.link(extinction, shader.inputs["Density"])
+    builder.volume(shader)
+    return shader, extinction
+
+
+def _extinction(context: LookContext) -> float:
+    return or_default(context.density, _OPTICAL_SIZE / context.domain_size)
+
+
+def _fade(builder: NodeBuilder, context: LookContext) -> Any | None:
+    """0 at the open faces of the box, 1 from the fade's width inwards; None where nothing fades.
+
+    Smoke that leaves would otherwise end in a flat cut, where its box does.
+    """
+    box = _box(context)
+    size = [high - low for low, high in zip(box.box_min, box.box_max, strict=True)]
+    width = or_default(context.edge_fade, _EDGE_FADE * min(size))
+    if not box.open_faces or width == 0.0:
+        return None
+    low = tuple(x if f"{axis}-" in box.open_faces else -_FAR for axis, x in zip("xyz", box.box_min, strict=True))
+    high = tuple(x if f"{axis}+" in box.open_faces else _FAR for axis, x in zip("xyz", box.box_max, strict=True))
+    position = builder.node("ShaderNodeNewGeometry").outputs["Position"]
+    inwards = builder.vector_math("SUBTRACT", position, low), builder.vector_math("SUBTRACT", high, position)
+    separate = builder.node("ShaderNodeSeparateXYZ")
+    builder.link(builder.vector_math("MINIMUM", *inwards), separate.inputs[0])
+    distance = builder.math("MINIMUM", builder.math("MINIMUM", *separate.outputs[:2]), separate.outputs[2])
+    fade = builder.node("ShaderNodeMapRange")
+    fade.interpolation_type = "SMOOTHSTEP"
+    builder.link(distance, fade.inputs["Value"])
+    fade.inputs["From Max"].default_value = width
+    return fade.outputs[0]
+
+
+def _grid(builder: NodeBuilder, name: str) -> Any:
+    """The output socket of a grid's value."""
+    attribute = builder.node("ShaderNodeAttribute")
+    attribute.attribute_name = name
+    return attribute.outputs[2]  # `Fac`, from 5.0 on `Factor`
+
+
+def _box(context: LookContext) -> SmokeBox:
+    assert context.smoke_box is not None, "looks of volumes are for volumes"
+    return context.smoke_box

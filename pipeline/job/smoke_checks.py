@@ -1,0 +1,310 @@
+"""Whether the smokes of a job fit into memory, have air to move in, and emit something where they are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.job.amounts import count, gigabytes, rounded_up
+from pipeline.job.boxes import Box, overlap, span, touch
+from pipeline.job.memory_budget import MemoryBudget
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings, format_path, suggestion
+from sim.scene import DomainParameters
+from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+    from sim.shapes import Solid
+
+BYTES_PER_CELL = 250
+"""Upper bound of what the smoke solver takes, multigrid levels and snapshot included: 92 for itself and what moves in
+it, 32 for fluid, 24 for cloth, 14 for turbulence."""
+ALL = 1.0 - 1e-6
+"""Share of a box that counts as all of it: sizes and positions written in decimal do not add up exactly."""
+COUNTED_CELLS = 1_000_000
+"""A source whose box has more cells than this is taken to have some of its own."""
+HOTTEST = 10_000.0
+"""Hotter gas is a plasma, which neither these equations nor a film's light describe [K]."""
+HOTTEST_FLAME = 4_000.0
+"""The hottest flames in air or oxygen have 3,000 to 3,500 K; wood burns at 1,300 to 1,600 K [K]."""
+COLDEST_AIR = 150.0
+"""Numbers below are degrees Celsius, most likely; the coldest air on earth has 184 K [K]."""
+GONE = 0.01
+"""Part of smoke or heat that counts as nothing."""
+SMALLEST_TOLERANCE = 2.0e-7
+"""Divergence that single precision can be rid of, over the largest speed and times the cell [-]: a plume of 32³ cells
+came to 1.4e-7 to 0.7e-7 in 60 iterations a step."""
+
+
+def check_smokes(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget, findings: Findings) -> int:
+    """Note what is wrong with the smokes, their sources and what moves in them.
+
+    Args:
+        job: the job.
+        solids: its shapes as far as they can be built, where they start, by path.
+        budget: of the machine that simulates.
+        findings: where errors and warnings go.
+
+    Returns:
+        Cells of all smokes.
+    """
+    cells = 0
+    for index, smoke in enumerate(job.smoke):
+        cells += _check_size(job, index, budget, cells, findings)
+        _check_air(job, smoke, index, findings)
+        for number, source in enumerate(smoke.source):
+            path: KeyPath = ("smoke", index, "source", number)
+            _check_numbers(smoke, source, path, findings)
+            _check_following(job, source, path, findings)
+            if path in solids:
+                _check_place(job, index, number, solids, findings)
+    _check_bodies_in_smoke(job, solids, findings)
+    return cells
+
+
+def smoke_box(smoke: SmokeParameters, domain: DomainParameters) -> Box:
+    """The box of a smoke as the job gives it, empty or not."""
+    return np.array([smoke.min or domain.min, smoke.max or domain.max])
+
+
+# --- the grid ------------------------------------------------------------------------------------------------------
+
+
+def _check_size(job: Job, index: int, budget: MemoryBudget, cells_before: int, findings: Findings) -> int:
+    """Cells of the smoke's grid, which comes after so many of others."""
+    smoke = job.smoke[index]
+    box = smoke_box(smoke, job.domain)
+    extent = box[1] - box[0]
+    if np.any(extent <= 0.0):
+        corner = "max" if smoke.max is not None else "min"
+        findings.error(("smoke", index, corner), f"max must be above min on every axis, got {span(box)}")
+        return 0
+    if np.any(extent < 4.0 * smoke.cell_size):
+        findings.error(
+            ("smoke", index, "cell_size"),
+            f"{smoke.cell_size:g} m leaves fewer than 4 cells along an edge of {extent.min():.3g} m; "
+            f"use {extent.min() / 4.0:.3g} m or less",
+        )
+    cells = float(np.prod(np.ceil(extent / smoke.cell_size)))
+    if (cells + cells_before) * BYTES_PER_CELL > budget.bytes:
+        possible = max(0, budget.bytes // BYTES_PER_CELL - cells_before)
+        size = _cell_size_that_fits(extent, smoke.cell_size, possible)
+        beside = f" beside the {count(cells_before)} of other smoke" if cells_before else ""
+        findings.error(
+            ("smoke", index, "cell_size"),
+            f"{count(cells)} cells need {gigabytes(cells * BYTES_PER_CELL)}, "
+            f"{budget.owner} has {gigabytes(budget.bytes)}; "
+            f"at most {count(possible)} fit{beside}: use {rounded_up(size):g} m or more",
+        )
+    return int(cells)
+
+
+def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, most_cells: int) -> float:
+    """The smallest cell size [m], not below a given one, that cuts a box into at most so many cells, or one."""
+    most = max(1, most_cells)
+    size = max(cell_size, float(np.cbrt(np.prod(extent) / most)))
+    while np.prod(layers := np.ceil(extent / size)) > most:
+        # Counts are rounded up: the next size of use is the one that saves a layer of cells.
+        size = float(np.min(extent[layers > 1.0] / (layers[layers > 1.0] - 1.0))) * (1.0 + 1.0e-9)
+    return size
+
+
+def _check_air(job: Job, smoke: SmokeParameters, index: int, findings: Findings) -> None:
+    """Wind, gusts, gravity and what air does to smoke."""
+    path: KeyPath = ("smoke", index)
+    if problem := smoke.wind_problem():
+        findings.error((*path, "wind"), problem)
+    gusts = smoke.turbulence
+    if gusts.strength > 0.0 and gusts.size < 2.0 * smoke.cell_size * (1.0 - 1.0e-9):
+        findings.error(
+            (*path, "turbulence", "size"),
+            f"{gusts.size:g} m is less than two cells of {smoke.cell_size:g} m, which carry no such eddies; "
+            f"use {2.0 * smoke.cell_size:g} m or more",
+        )
+    blown = any(smoke.wind) or gusts.strength > 0.0
+    driven = any(source.velocity is not None for source in smoke.source)
+    pushed = job.fluid or any(body.kind != "static" for body in job.rigid)
+    if not (any(job.gravity) or blown or driven or pushed):
+        findings.warn(
+            ("gravity",),
+            f'is zero, so heat and weight do not move smoke "{smoke.name}", and nothing else does: it stays where '
+            "it comes from; give its source a velocity, or the smoke wind",
+        )
+    frame_s, most = 1.0 / job.fps, -math.log(GONE) * job.fps
+    for key, fate in (("density_dissipation", "no smoke is to be seen"), ("cooling", "no heat is left to rise")):
+        if (rate := getattr(smoke, key)) > most:
+            findings.warn(
+                (*path, key),
+                f"{rate:g} 1/s leaves {100.0 * GONE:g} % after {-math.log(GONE) / rate:.2g} s, less than a frame of "
+                f"{frame_s:.2g} s: {fate}; use well below {most:.2g} 1/s",
+            )
+    if smoke.projection_tolerance < SMALLEST_TOLERANCE:
+        findings.warn(
+            (*path, "projection_tolerance"),
+            f"{smoke.projection_tolerance:g} is below what single precision reaches, about {SMALLEST_TOLERANCE:g}: "
+            "solves will hit their iteration limit",
+        )
+    ambient = smoke.ambient_temperature
+    if not COLDEST_AIR <= ambient <= HOTTEST_FLAME:
+        findings.warn((*path, "ambient_temperature"), f"{ambient:g} K is no air; 20 °C are 293 K")
+
+
+# --- sources -------------------------------------------------------------------------------------------------------
+
+
+def _check_numbers(smoke: SmokeParameters, source: SmokeSourceParameters, path: KeyPath, findings: Findings) -> None:
+    kelvin = source.temperature
+    if kelvin > HOTTEST:
+        findings.error(
+            (*path, "temperature"), f"{kelvin:g} K is beyond {HOTTEST:g} K, where gas is a plasma; flames have 1500 K"
+        )
+    elif kelvin > HOTTEST_FLAME:
+        findings.warn((*path, "temperature"), f"{kelvin:g} K is hotter than any flame; wood burns at 1500 K")
+    elif kelvin < COLDEST_AIR:
+        findings.warn((*path, "temperature"), f"{kelvin:g} K is colder than any air; 20 °C are 293 K")
+    is_empty = source.density == 0.0 and kelvin == smoke.ambient_temperature
+    if is_empty and source.velocity is None:
+        findings.warn(path, "has no density, and the temperature of the air: it emits nothing")
+    if source.ramp and not any(point.strength for point in source.ramp):
+        findings.warn((*path, "ramp"), "is 0 at all times: it emits nothing")
+
+
+def _check_following(job: Job, source: SmokeSourceParameters, path: KeyPath, findings: Findings) -> None:
+    names = [body.name for body in job.rigid]
+    if source.follow is not None and source.follow not in names:
+        hint = suggestion(source.follow, names) or (f"; bodies are {', '.join(names)}" if names else "; add [[rigid]]")
+        findings.error((*path, "follow"), f'no rigid body is named "{source.follow}"{hint}')
+
+
+def _check_place(job: Job, index: int, number: int, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+    path: KeyPath = ("smoke", index, "source", number)
+    smoke, source, solid = job.smoke[index], job.smoke[index].source[number], solids[path]
+    body = next((each for each in job.rigid if each.name == source.follow), None)
+    box = smoke_box(smoke, job.domain)
+    if body is not None and body.kind == "dynamic":
+        pass  # nobody knows where it gets
+    elif source.keyframe or (body is not None and body.kind == "kinematic"):
+        _check_way(job, path, solid, box, findings)
+    else:
+        _check_source(job, path, solids, box, findings)
+    if source.moves and np.min(solid.bounds[1] - solid.bounds[0]) < smoke.cell_size:
+        findings.warn(path, f"is thinner than a cell of {smoke.cell_size:g} m and may emit nothing; enlarge it")
+    _check_what_fills_source(job, path, solid, solids, findings)
+
+
+def _check_source(job: Job, path: KeyPath, solids: Mapping[KeyPath, Solid], box: Box, findings: Findings) -> None:
+    """A source that stays: is it in the box, and which cells are its own?"""
+    solid, cell_size = solids[path], job.smoke[int(path[1])].cell_size
+    inside = overlap(solid.bounds, box)
+    if inside == 0.0:
+        findings.error(path, f"is wholly outside the smoke's grid: it spans {span(solid.bounds)}, not {span(box)}")
+        return
+    if inside < ALL:
+        findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the smoke's grid and emit nothing")
+    centres = _centres_inside(solid, box, cell_size)
+    if centres is None:
+        return
+    if len(centres) == 0:
+        thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
+        findings.error(
+            path,
+            f"holds no centre of a cell: it is {thinnest:.3g} m thin, and cells are {cell_size:g} m; "
+            "enlarge it or use a smaller cell_size",
+        )
+        return
+    is_free = np.ones(len(centres), bool)
+    for other, body in solids.items():
+        if other[0] == "rigid" and job.rigid[int(other[1])].kind == "static":
+            near = touch(body.bounds, solid.bounds, margin=0.0)
+            is_free &= body.signed_distance(centres) >= 0.0 if near else True
+    if not is_free.any():
+        findings.error(path, "lies wholly inside solid bodies, so it emits nothing; move it")
+
+
+def _centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float64] | None:
+    """Centres of cells that a solid contains [m], (n, 3); None if they are too many to look at each."""
+    low = np.maximum(solid.bounds[0], box[0])
+    high = np.minimum(solid.bounds[1], box[1])
+    first = np.ceil((low - box[0]) / cell_size - 0.5)
+    last = np.floor((high - box[0]) / cell_size - 0.5)
+    if np.prod(np.maximum(last - first + 1.0, 0.0)) > COUNTED_CELLS:
+        return None
+    axes = [
+        corner + (np.arange(a, b + 1.0) + 0.5) * cell_size for corner, a, b in zip(box[0], first, last, strict=True)
+    ]
+    centres: NDArray[np.float64] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    if len(centres) == 0:
+        return centres
+    inside: NDArray[np.bool_] = solid.signed_distance(centres) < 0.0
+    return centres[inside]
+
+
+def _check_way(job: Job, path: KeyPath, solid: Solid, box: Box, findings: Findings) -> None:
+    """A source on a path: does that come into the box?"""
+    from sim.rigid.keyframes import path_of, path_through
+
+    source = job.smoke[int(path[1])].source[int(path[3])]
+    reach = float(np.linalg.norm(solid.bounds[1] - solid.bounds[0]))
+    if source.keyframe:
+        low, high = path_through(source.keyframe, linear=source.interpolation == "linear").hull()
+    else:
+        low, high = path_of(next(body for body in job.rigid if body.name == source.follow)).hull()
+        reach += math.hypot(*source.position)
+    way = np.stack([low - reach, high + reach])
+    if not touch(way, box, margin=0.0):
+        findings.error(path, f"never comes into the smoke's grid: its way spans {span(way)}, not {span(box)}")
+
+
+def _check_what_fills_source(
+    job: Job, path: KeyPath, source: Solid, solids: Mapping[KeyPath, Solid], findings: Findings
+) -> None:
+    """Note a source wholly within water or a body that moves, as far as the corners of its box tell."""
+    corners = np.array(np.meshgrid(*source.bounds.T)).reshape(3, 8).T
+    followed = job.smoke[int(path[1])].source[int(path[3])].follow
+    for other, solid in solids.items():
+        body = job.rigid[int(other[1])] if other[0] == "rigid" else None
+        is_own = body is not None and body.name == followed
+        is_mover = body is not None and body.kind != "static"
+        if not (is_own or is_mover or other[0] == "fluid") or not touch(solid.bounds, source.bounds, margin=0.0):
+            continue
+        if not (solid.signed_distance(corners) < 0.0).all():
+            continue
+        if is_own:
+            findings.error(
+                path, f"lies wholly inside {format_path(other)}, which it follows: it emits nothing; move it"
+            )
+        else:
+            findings.warn(
+                path,
+                f"lies wholly inside {format_path(other)} at the start, and emits nothing until that has moved off",
+            )
+
+
+# --- what moves in it ----------------------------------------------------------------------------------------------
+
+
+def _check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+    """Note bodies that move and are too thin for the cells of a smoke into whose box they can come."""
+    from sim.coupling.smoke_reach import too_thin_bodies
+    from sim.rigid.geometry import BodyGeometry
+    from sim.shapes import ShapeError
+
+    moving = [index for index, body in enumerate(job.rigid) if body.kind != "static" and ("rigid", index) in solids]
+    if not (moving and job.smoke):
+        return
+    bodies = [job.rigid[index] for index in moving]
+    geometries = []
+    for index, body in zip(moving, bodies, strict=True):
+        try:
+            geometries.append(BodyGeometry(body))
+        except ShapeError as error:
+            findings.error(("rigid", index, "shape"), f"is too thin for a body that moves in smoke: {error}")
+            return
+    for smoke in job.smoke:
+        for number, reason in too_thin_bodies(smoke, bodies, geometries, job.domain):
+            findings.error(("rigid", moving[number]), reason)

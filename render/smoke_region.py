@@ -1,0 +1,66 @@
+"""Where smoke may be drawn: the cells that hold some, and those that it crosses while the shutter is open."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Box = tuple[slice, slice, slice]
+
+_SLAB = 8
+"""Cells along x that are looked at together: their velocities in float64 take little room."""
+
+
+def bounding_box(mask: NDArray[np.bool_]) -> Box | None:
+    """The smallest box of cells around those that are marked, or None where there are none; mask (nx, ny, nz)."""
+    across = mask.any(axis=2)
+    spans = []
+    for marked in (across.any(axis=1), across.any(axis=0), mask.any(axis=(0, 1))):
+        cells = np.flatnonzero(marked)
+        if not cells.size:
+            return None
+        spans.append(slice(int(cells[0]), int(cells[-1]) + 1))
+    return spans[0], spans[1], spans[2]
+
+
+def blur_reach(velocity: NDArray[np.float32], mask: NDArray[np.bool_], *, shutter_s: float, cell_size: float) -> int:
+    """How many cells around the smoke a renderer looks velocities up in, max|v| shutter / 2, and one to interpolate.
+
+    A frame is at the middle of the time that the shutter is open, so smoke is drawn up to half of it away.
+
+    Args:
+        velocity: (nx, ny, nz, 3) [m/s].
+        mask: (nx, ny, nz), where there is smoke.
+        shutter_s: how long the shutter is open [s].
+        cell_size: edge of a cell [m].
+
+    Returns:
+        The reach [cells]; no more than the longest side of the grid, which reaches everything.
+    """
+    fastest = 0.0
+    for start in range(0, mask.shape[0], _SLAB):
+        slab = slice(start, start + _SLAB)
+        moving = velocity[slab][mask[slab]].astype(np.float64)
+        if moving.size:
+            fastest = max(fastest, float(np.einsum("nc,nc->n", moving, moving).max()))
+    return min(math.ceil(math.sqrt(fastest) * shutter_s / (2.0 * cell_size)) + 1, max(mask.shape))
+
+
+def grown(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """All cells at most `reach` cells along each axis from a marked one, in an array that is longer by it on all sides.
+
+    A window that looks back is doubled until it is as wide as it must be: few passes for any reach.
+    """
+    width = 2 * reach + 1
+    found = np.zeros([n + 2 * reach for n in mask.shape], np.bool_)
+    found[tuple(slice(0, n) for n in mask.shape)] = mask
+    for axis in range(mask.ndim):
+        along = np.moveaxis(found, axis, 0)
+        covered = 1
+        while covered < width:
+            step = min(covered, width - covered)
+            along[step:] |= along[:-step].copy()
+            covered += step
+    return found

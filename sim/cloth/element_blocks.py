@@ -1,0 +1,101 @@
+"""Bounds of a patch's edges and triangles, laid out so that a processor compares one element with a block of them."""
+
+from itertools import pairwise
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.arrays import Floats, Integers, Vectors
+from sim.cloth.patches import Patches
+from sim.cloth.self_collision_kernels import BLOCK, FAR, NONE, Pairs, Triples
+from sim.cloth.state import ClothState
+from sim.launch import fast_launch
+
+
+class ElementBlocks:
+    """Edges and triangles of each patch in whole blocks, which are filled up with elements that are far from all.
+
+    One array for each component, and blocks of a length that the compiler knows: so it compares eight elements in an
+    instruction, where it took one after another from arrays of vectors.
+
+    Attributes:
+        edges: first block of each patch, (m + 1,); ends of the edges, (p,) ivec2, `NONE` in places that only fill up;
+            then x, y, z of their midpoints, and half their vectors [m], (p,) each.
+        triangles: first block of each patch, (m + 1,); corners, (q,) ivec3; then their boxes' lowest x, y, z, and
+            highest [m], (q,) each.
+
+    Args:
+        patches: of the cloths.
+    """
+
+    def __init__(self, patches: Patches) -> None:
+        self._patches = patches
+        self.edges = _blocks(patches.edges, patches.first_edge, patches.count)
+        self.triangles = _blocks(patches.triangles, patches.first_triangle, patches.count)
+
+    def enclose(self, state: ClothState, searched: ti.Ndarray, count: int, found: ti.Ndarray,
+                found_edges: ti.Ndarray, needed: ti.Ndarray) -> None:  # fmt: skip
+        """Note where the elements of patches are that are searched; nothing is found in their pairs yet.
+
+        Args:
+            state: at the start of a substep.
+            searched: numbers of pairs of patches, (count,).
+            count: how many.
+            found, found_edges: number of elements found, by pair of patches.
+            needed: by patch, whether a pair of it is searched; 0 after.
+        """
+        enclose_elements(
+            self._patches.count, needed, state.position, *self.edges, *self.triangles, count, searched, found,
+            found_edges,
+        )  # fmt: skip
+
+
+def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Ndarray, ...]:
+    """First block of each patch, the elements in their places, and room for six components."""
+    numbers, starts = elements.to_numpy(), first.to_numpy()[: count + 1].astype(np.int64)
+    blocks: NDArray[np.int64] = np.concatenate([[0], np.cumsum(-(-np.diff(starts) // BLOCK))]).astype(np.int64)
+    places = max(int(blocks[-1]), 1) * BLOCK
+    padded = np.full((places, numbers.shape[1]), NONE, dtype=np.int32)
+    for block, (start, end) in zip(blocks, pairwise(starts), strict=False):
+        padded[block * BLOCK : block * BLOCK + end - start] = numbers[start:end]
+    first_block = ti.ndarray(ti.i32, max(len(blocks), 2))
+    first_block.from_numpy(np.resize(blocks, max(len(blocks), 2)).astype(np.int32))
+    members = ti.Vector.ndarray(numbers.shape[1], ti.i32, places)
+    members.from_numpy(padded)
+    return first_block, members, *(ti.ndarray(ti.f32, places) for _ in range(6))
+
+
+@fast_launch
+@ti.kernel
+def enclose_elements(
+    patch_count: ti.i32, needed: Integers, position: Vectors,
+    first_edges: Integers, edges: Pairs, mid_x: Floats, mid_y: Floats, mid_z: Floats,
+    half_x: Floats, half_y: Floats, half_z: Floats,
+    first_triangles: Integers, triangles: Triples, low_x: Floats, low_y: Floats, low_z: Floats,
+    high_x: Floats, high_y: Floats, high_z: Floats,
+    count: ti.i32, searched: Integers, found: Integers, found_edges: Integers,
+):  # fmt: skip
+    """Midpoints of edges and half the vectors along them, and boxes of triangles, of the patches that are needed."""
+    for m in range(patch_count):
+        if needed[m] == 1:
+            needed[m] = 0
+            for place in range(first_edges[m] * BLOCK, first_edges[m + 1] * BLOCK):
+                middle, half = ti.math.vec3(FAR), ti.math.vec3(0.0)
+                if edges[place][0] != NONE:
+                    a, b = position[edges[place][0]], position[edges[place][1]]
+                    middle, half = 0.5 * (a + b), 0.5 * (b - a)
+                mid_x[place], mid_y[place], mid_z[place] = middle[0], middle[1], middle[2]
+                half_x[place], half_y[place], half_z[place] = half[0], half[1], half[2]
+            for place in range(first_triangles[m] * BLOCK, first_triangles[m + 1] * BLOCK):
+                low, high = ti.math.vec3(FAR), ti.math.vec3(-FAR)
+                if triangles[place][0] != NONE:
+                    a, b, c = (
+                        position[triangles[place][0]], position[triangles[place][1]], position[triangles[place][2]]
+                    )  # fmt: skip
+                    low, high = ti.min(a, b, c), ti.max(a, b, c)
+                low_x[place], low_y[place], low_z[place] = low[0], low[1], low[2]
+                high_x[place], high_y[place], high_z[place] = high[0], high[1], high[2]
+    for k in range(count):
+        found[searched[k]] = 0
+        found_edges[searched[k]] = 0

@@ -1,0 +1,95 @@
+"""Springs of rectangles on a CPU, without lists: every direction eight lines at a time."""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.cloth.parameters import ClothParameters
+from sim.cloth.row_blocks import LANES, load_blocks, row_blocks, store_blocks, strips_of
+from sim.cloth.row_springs import bend_lines, solve_diagonals
+from sim.cloth.row_threads import solve_lines, straighten_lines
+from sim.cloth.sheet import Grid
+from sim.cloth.springs import bend_share, diagonal_share, line_widths
+from sim.cloth.state import ClothState, HostCloths
+from sim.reductions import runs_on_gpu
+
+ALONG_Y, ALONG_X = 0, 1
+"""Directions of lines: upright blocks, then turned ones."""
+
+
+def rectangles_in_rows(host: HostCloths) -> dict[int, Grid]:
+    """Cloths that `RectangleSprings` serves, by number: the rectangles on a CPU.
+
+    A GPU has use for all lines and pieces at once, and solves those of lists.
+    """
+    if runs_on_gpu():
+        return {}
+    return {number: grid for number, grid in enumerate(host.grids) if grid is not None}
+
+
+class RectangleSprings:
+    """The springs of one rectangle: the same ones in the same order as `XPBDSprings` solves those of lists.
+
+    Args:
+        state: what they move.
+        grid: how the rectangle is divided.
+        first_node: number of its first node.
+    """
+
+    def __init__(self, state: ClothState, grid: Grid, first_node: int) -> None:
+        self._state, self._grid, self._first = state, grid, first_node
+        self._blocks = row_blocks(grid.columns, grid.rows)
+        self._strips = (strips_of(grid.columns), strips_of(grid.rows))
+        self._lengths = (grid.rows, grid.columns)
+        self._steps = (grid.step_y, grid.step_x)
+        self._thread_stiffness, self._bend_stiffness = (
+            tuple(ti.ndarray(ti.f32, strips * LANES) for strips in self._strips) for _ in range(2)
+        )
+        self._diagonal_stiffness = self._bend_damping = 0.0
+
+    def take_parameters(self, cloth: ClothParameters) -> None:
+        """Stiffness and damping as they are now; `springs` says how those of a sheet become those of its springs."""
+        grid = self._grid
+        across = ((grid.columns, grid.step_x), (grid.rows, grid.step_y))
+        for axis, ((lines, spacing), step) in enumerate(zip(across, self._steps, strict=True)):
+            width = line_widths(lines, spacing)
+            padding = np.zeros(self._strips[axis] * LANES - lines)
+            _fill(self._thread_stiffness[axis], cloth.stretch_stiffness * width / step, padding + 1.0)
+            _fill(self._bend_stiffness[axis], cloth.bend_stiffness * bend_share(width, step), padding)
+        self._diagonal_stiffness = (cloth.shear_stiffness or 0.0) * diagonal_share(grid)
+        self._bend_damping = cloth.bend_damping
+
+    def displace(self, dt: float, iterations: int) -> None:
+        """Bring the displacements of a step of dt [s] to where the springs let them go."""
+        state, grid, blocks = self._state, self._grid, self._blocks
+        load_blocks(
+            blocks, state.lattice, state.displacement, state.inverse_mass, self._first, grid.columns, grid.rows,
+            *self._strips,
+        )  # fmt: skip
+        for axis in (ALONG_X, ALONG_Y):
+            bend_lines(
+                blocks, *self._lines(axis), self._bend_stiffness[axis], state.quantum, dt * dt, self._bend_damping / dt
+            )
+        for iteration in range(iterations):
+            is_first = int(iteration == 0)
+            for parity in range(2):
+                solve_diagonals(
+                    blocks, parity, grid.columns, grid.rows, self._strips[ALONG_Y], self._diagonal_stiffness,
+                    float(np.hypot(grid.step_x, grid.step_y)), state.quantum, dt * dt, is_first,
+                )  # fmt: skip
+            for axis in (ALONG_X, ALONG_Y):
+                solve_lines(
+                    blocks, *self._lines(axis), self._thread_stiffness[axis], self._steps[axis], state.quantum,
+                    dt * dt, is_first,
+                )  # fmt: skip
+        for axis in (ALONG_X, ALONG_Y):
+            straighten_lines(blocks, *self._lines(axis))
+        store_blocks(blocks, self._first, grid.columns, grid.rows, self._strips[ALONG_Y], state.displacement)
+
+    def _lines(self, axis: int) -> tuple[int, int, int, int]:
+        """Whether lines are turned, how many nodes one has, their strips, and those of the other direction."""
+        return axis, self._lengths[axis], self._strips[axis], self._strips[1 - axis]
+
+
+def _fill(array: ti.Ndarray, values: NDArray[np.float64], padding: NDArray[np.float64]) -> None:
+    array.from_numpy(np.concatenate([values, padding]).astype(np.float32))

@@ -1,0 +1,139 @@
+"""Bend springs and diagonals of a rectangle, eight lines at a time (see `row_blocks`)."""
+
+import taichi as ti
+
+from sim.arrays import Floats
+from sim.cloth.device_springs import TINY_LENGTH
+from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, two_blocks
+from sim.launch import fast_launch
+
+BEND_COLOURS = 3
+"""Bend springs along a line that share no node: every third one."""
+
+
+@fast_launch
+@ti.kernel
+def bend_lines(
+    blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32, stiffness: Floats,
+    quantum: ti.f32, dt_squared: ti.f32, gamma: ti.f32,
+):  # fmt: skip
+    """The bend springs of all lines along one direction, colour by colour; `solve_bend` has the formula.
+
+    Args:
+        blocks: workspace.
+        is_turned: whether lines run along x.
+        length: nodes of a line.
+        strips: blocks beside each other, LANES lines each.
+        other_strips: those of the other direction.
+        stiffness: of the springs of each line [N/m], (strips * LANES,).
+        quantum: unit of the lattice [m].
+        dt_squared: [s²].
+        gamma: damping over stiffness and dt [-].
+    """
+    for strip in range(strips):
+        first = 0
+        if is_turned:
+            first = blocks.turned
+            turn_displacements(blocks, strip, other_strips, strips)
+        strength = Block(0.0)
+        for at in range(LANES):
+            strength[at] = dt_squared * stiffness[strip * LANES + at]
+        for colour in range(BEND_COLOURS):
+            for m in range((length - colour) // BEND_COLOURS):
+                a = first + (colour + BEND_COLOURS * m) * strips + strip
+                b, c = a + strips, a + 2 * strips
+                a_x, a_y, a_z, w_a = blocks.u_x[a], blocks.u_y[a], blocks.u_z[a], blocks.inverse_mass[a]
+                b_x, b_y, b_z, w_b = blocks.u_x[b], blocks.u_y[b], blocks.u_z[b], blocks.inverse_mass[b]
+                c_x, c_y, c_z, w_c = blocks.u_x[c], blocks.u_y[c], blocks.u_z[c], blocks.inverse_mass[c]
+                p_x, p_y, p_z = blocks.lattice_x[a], blocks.lattice_y[a], blocks.lattice_z[a]
+                q_x, q_y, q_z = blocks.lattice_x[b], blocks.lattice_y[b], blocks.lattice_z[b]
+                r_x, r_y, r_z = blocks.lattice_x[c], blocks.lattice_y[c], blocks.lattice_z[c]
+                for at in range(LANES):
+                    moved_x = a_x[at] - 2.0 * b_x[at] + c_x[at]
+                    moved_y = a_y[at] - 2.0 * b_y[at] + c_y[at]
+                    moved_z = a_z[at] - 2.0 * b_z[at] + c_z[at]
+                    d_x = quantum * ti.cast((p_x[at] - q_x[at]) + (r_x[at] - q_x[at]), ti.f32) + moved_x
+                    d_y = quantum * ti.cast((p_y[at] - q_y[at]) + (r_y[at] - q_y[at]), ti.f32) + moved_y
+                    d_z = quantum * ti.cast((p_z[at] - q_z[at]) + (r_z[at] - q_z[at]), ti.f32) + moved_z
+                    squared = d_x * d_x + d_y * d_y + d_z * d_z
+                    error = squared + gamma * (d_x * moved_x + d_y * moved_y + d_z * moved_z)
+                    weight = strength[at] * (w_a[at] + 4.0 * w_b[at] + w_c[at])
+                    floor = ti.max(squared, TINY_LENGTH * TINY_LENGTH)  # flat cloth has no error either
+                    f = -strength[at] * error / (floor * (weight * (1.0 + gamma) + 1.0))
+                    a_x[at] += w_a[at] * f * d_x
+                    a_y[at] += w_a[at] * f * d_y
+                    a_z[at] += w_a[at] * f * d_z
+                    b_x[at] -= 2.0 * w_b[at] * f * d_x
+                    b_y[at] -= 2.0 * w_b[at] * f * d_y
+                    b_z[at] -= 2.0 * w_b[at] * f * d_z
+                    c_x[at] += w_c[at] * f * d_x
+                    c_y[at] += w_c[at] * f * d_y
+                    c_z[at] += w_c[at] * f * d_z
+                blocks.u_x[a], blocks.u_y[a], blocks.u_z[a] = a_x, a_y, a_z
+                blocks.u_x[b], blocks.u_y[b], blocks.u_z[b] = b_x, b_y, b_z
+                blocks.u_x[c], blocks.u_y[c], blocks.u_z[c] = c_x, c_y, c_z
+        if is_turned:
+            turn_displacements_back(blocks, strip, other_strips, strips)
+
+
+@ti.func
+def keep_two_blocks(values: ti.template(), block, pair, keeps_both):
+    """Write both blocks back, or the first."""
+    one, next_one = Block(0.0), Block(0.0)
+    for at in ti.static(range(LANES)):
+        one[at] = pair[at]
+        next_one[at] = pair[LANES + at]
+    values[block] = one
+    if keeps_both:
+        values[block + 1] = next_one
+
+
+@fast_launch
+@ti.kernel
+def solve_diagonals(
+    blocks: ti.template(), parity: ti.i32, columns: ti.i32, rows: ti.i32, strips: ti.i32, stiffness: ti.f32,
+    rest: ti.f32, quantum: ti.f32, dt_squared: ti.f32, is_first: ti.i32,
+):  # fmt: skip
+    """Both diagonals of all cells in every second row of cells, from row `parity` on; `solve_pairs` has the formula.
+
+    In each row first those that lead from node i of the lower line to node i + 1 of the upper one, then the others:
+    with the two lines exchanged these are the same.
+    """
+    for pair in range((rows - parity) // 2):
+        lower = (2 * pair + parity) * strips
+        strength = stiffness * dt_squared
+        for way in range(2):
+            for k in range(strips):
+                a, b = lower + way * strips + k, lower + (1 - way) * strips + k
+                m = way * blocks.turned + lower + k
+                a_x, a_y, a_z, w_a = blocks.u_x[a], blocks.u_y[a], blocks.u_z[a], blocks.inverse_mass[a]
+                p_x, p_y, p_z = blocks.lattice_x[a], blocks.lattice_y[a], blocks.lattice_z[a]
+                b_x, b_y, b_z = (
+                    two_blocks(blocks.u_x, b, b + 1),
+                    two_blocks(blocks.u_y, b, b + 1),
+                    two_blocks(blocks.u_z, b, b + 1),
+                )
+                q_x, q_y = two_blocks(blocks.lattice_x, b, b + 1), two_blocks(blocks.lattice_y, b, b + 1)
+                q_z, w_b = two_blocks(blocks.lattice_z, b, b + 1), two_blocks(blocks.inverse_mass, b, b + 1)
+                multiplier = blocks.diagonal_multiplier[m]
+                cells = columns - 1 - k * LANES
+                for at in range(LANES):
+                    d_x = quantum * ti.cast(p_x[at] - q_x[at + 1], ti.f32) + (a_x[at] - b_x[at + 1])
+                    d_y = quantum * ti.cast(p_y[at] - q_y[at + 1], ti.f32) + (a_y[at] - b_y[at + 1])
+                    d_z = quantum * ti.cast(p_z[at] - q_z[at + 1], ti.f32) + (a_z[at] - b_z[at + 1])
+                    length = ti.max(ti.sqrt(d_x * d_x + d_y * d_y + d_z * d_z), TINY_LENGTH)
+                    before = ti.select(is_first, 0.0, multiplier[at])
+                    error = ti.select(at < cells, strength * (length - rest) + before, 0.0)
+                    f = -error / (length * (strength * (w_a[at] + w_b[at + 1]) + 1.0))
+                    multiplier[at] = before + length * f
+                    a_x[at] += w_a[at] * f * d_x
+                    a_y[at] += w_a[at] * f * d_y
+                    a_z[at] += w_a[at] * f * d_z
+                    b_x[at + 1] -= w_b[at + 1] * f * d_x
+                    b_y[at + 1] -= w_b[at + 1] * f * d_y
+                    b_z[at + 1] -= w_b[at + 1] * f * d_z
+                blocks.diagonal_multiplier[m] = multiplier
+                blocks.u_x[a], blocks.u_y[a], blocks.u_z[a] = a_x, a_y, a_z
+                keep_two_blocks(blocks.u_x, b, b_x, k + 1 < strips)
+                keep_two_blocks(blocks.u_y, b, b_y, k + 1 < strips)
+                keep_two_blocks(blocks.u_z, b, b_z, k + 1 < strips)

@@ -1,0 +1,195 @@
+"""Threads of a rectangle, eight at a time (see `row_blocks`); `threads` has the method, and does the same for lists."""
+
+import taichi as ti
+
+from sim.arrays import Floats
+from sim.cloth.device_springs import TINY_LENGTH
+from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, turn_strip
+from sim.cloth.springs import SEGMENT_LENGTH
+from sim.cloth.threads import TURNED_EXPLICITLY
+from sim.launch import fast_launch
+
+LEAST_WEIGHT = 1.0e-20
+"""Inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions."""
+
+
+@ti.func
+def piece_count(length):
+    """Pieces of lines of so many nodes."""
+    return (length - 1 + SEGMENT_LENGTH - 1) // SEGMENT_LENGTH
+
+
+@fast_launch
+@ti.kernel
+def solve_lines(
+    blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32, stiffness: Floats,
+    rest: ti.f32, quantum: ti.f32, dt_squared: ti.f32, is_first: ti.i32,
+):  # fmt: skip
+    """The threads along one direction, piece by piece, even pieces first; arguments as of `bend_lines`.
+
+    `rest` is the length of a spring [m]; multipliers start at 0 if `is_first`.
+    """
+    for strip in range(strips):
+        first = 0
+        if is_turned:
+            first = blocks.turned
+            turn_displacements(blocks, strip, other_strips, strips)
+        compliance = Block(0.0)
+        for at in range(LANES):
+            compliance[at] = 1.0 / (dt_squared * stiffness[strip * LANES + at])
+        pieces = piece_count(length)
+        for parity in range(2):
+            for half in range((pieces + 1 - parity) // 2):
+                piece = 2 * half + parity
+                start = piece * SEGMENT_LENGTH
+                stop = ti.min(start + SEGMENT_LENGTH, length - 1)
+                solve_pieces(
+                    blocks, first + strip, strips, start, stop, compliance, rest, quantum, is_first,
+                    first + strip * pieces + piece,
+                )  # fmt: skip
+        if is_turned:
+            turn_displacements_back(blocks, strip, other_strips, strips)
+
+
+@ti.func
+def solve_pieces(
+    blocks: ti.template(), line, strips, start, stop, compliance, rest, quantum, is_first, number
+):  # fmt: skip
+    """One piece of LANES threads exactly: the Thomas algorithm forth, then back, where nodes move."""
+    n_x, n_y, n_z = Block(0.0), Block(0.0), Block(0.0)
+    inverse_pivot, solved = Block(0.0), Block(0.0)
+    for k in range(start, stop):
+        a = line + k * strips
+        b = a + strips
+        a_x, a_y, a_z, w_a = blocks.u_x[a], blocks.u_y[a], blocks.u_z[a], blocks.inverse_mass[a]
+        b_x, b_y, b_z, w_b = blocks.u_x[b], blocks.u_y[b], blocks.u_z[b], blocks.inverse_mass[b]
+        p_x, p_y, p_z = blocks.lattice_x[a], blocks.lattice_y[a], blocks.lattice_z[a]
+        q_x, q_y, q_z = blocks.lattice_x[b], blocks.lattice_y[b], blocks.lattice_z[b]
+        multiplier = blocks.multiplier[a]
+        inverse_length, factor = Block(0.0), Block(0.0)
+        for at in range(LANES):
+            d_x = quantum * ti.cast(p_x[at] - q_x[at], ti.f32) + (a_x[at] - b_x[at])
+            d_y = quantum * ti.cast(p_y[at] - q_y[at], ti.f32) + (a_y[at] - b_y[at])
+            d_z = quantum * ti.cast(p_z[at] - q_z[at], ti.f32) + (a_z[at] - b_z[at])
+            length = ti.max(ti.sqrt(d_x * d_x + d_y * d_y + d_z * d_z), TINY_LENGTH)
+            inverse = 1.0 / length
+            before = ti.select(is_first, 0.0, multiplier[at])
+            coupling = -w_a[at] * inverse * (d_x * n_x[at] + d_y * n_y[at] + d_z * n_z[at])  # n is of the spring before
+            lower = coupling * inverse_pivot[at]
+            pivot = 1.0 / (w_a[at] + w_b[at] + compliance[at] - coupling * lower)
+            solved[at] = (rest - length - compliance[at] * before - coupling * solved[at]) * pivot
+            inverse_pivot[at] = pivot
+            factor[at] = lower
+            inverse_length[at] = inverse
+            multiplier[at] = before
+            n_x[at] = inverse * d_x
+            n_y[at] = inverse * d_y
+            n_z[at] = inverse * d_z
+        blocks.n_x[a], blocks.n_y[a], blocks.n_z[a] = n_x, n_y, n_z
+        blocks.change[a], blocks.factor[a], blocks.inverse_length[a] = solved, factor, inverse_length
+        blocks.multiplier[a] = multiplier
+    factor_after, change = Block(0.0), Block(0.0)
+    after_x, after_y, after_z = Block(0.0), Block(0.0), Block(0.0)  # the push of the spring after the node
+    largest = Block(0.0)
+    for m in range(stop - start):
+        a = line + (stop - 1 - m) * strips
+        b = a + strips
+        b_x, b_y, b_z, w_b = blocks.u_x[b], blocks.u_y[b], blocks.u_z[b], blocks.inverse_mass[b]
+        s_x, s_y, s_z, w_a = blocks.n_x[a], blocks.n_y[a], blocks.n_z[a], blocks.inverse_mass[a]
+        forward, factor, inverse_length = blocks.change[a], blocks.factor[a], blocks.inverse_length[a]
+        multiplier = blocks.multiplier[a]
+        tension = Block(0.0)
+        for at in range(LANES):
+            own = forward[at] - factor_after[at] * change[at]
+            push_x, push_y, push_z = own * s_x[at], own * s_y[at], own * s_z[at]
+            b_x[at] += w_b[at] * (after_x[at] - push_x)
+            b_y[at] += w_b[at] * (after_y[at] - push_y)
+            b_z[at] += w_b[at] * (after_z[at] - push_z)
+            after_x[at] = push_x
+            after_y[at] = push_y
+            after_z[at] = push_z
+            factor_after[at] = factor[at]
+            change[at] = own
+            multiplier[at] += own
+            weight = ti.max(w_a[at] + w_b[at], LEAST_WEIGHT)
+            excess = ti.max(-multiplier[at] * inverse_length[at] - TURNED_EXPLICITLY / weight, 0.0)
+            tension[at] = excess
+            largest[at] = ti.max(largest[at], excess)
+        blocks.u_x[b], blocks.u_y[b], blocks.u_z[b] = b_x, b_y, b_z
+        blocks.multiplier[a], blocks.tension[a] = multiplier, tension
+    head = line + start * strips
+    a_x, a_y, a_z, w_a = blocks.u_x[head], blocks.u_y[head], blocks.u_z[head], blocks.inverse_mass[head]
+    for at in range(LANES):
+        a_x[at] += w_a[at] * after_x[at]
+        a_y[at] += w_a[at] * after_y[at]
+        a_z[at] += w_a[at] * after_z[at]
+    blocks.u_x[head], blocks.u_y[head], blocks.u_z[head] = a_x, a_y, a_z
+    blocks.is_taut[number] = ti.cast(largest.max() > 0.0, ti.i32)
+
+
+@fast_launch
+@ti.kernel
+def straighten_lines(blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32):
+    """Let tension turn with the threads along one direction, where any piece of a strip has too much of it."""
+    for strip in range(strips):
+        first = 0
+        if is_turned:
+            first = blocks.turned
+        pieces = piece_count(length)
+        taut = 0
+        for piece in range(pieces):
+            taut += blocks.is_taut[first + strip * pieces + piece]
+        if taut > 0:
+            if is_turned:
+                turn_displacements(blocks, strip, other_strips, strips)
+                for values in ti.static((blocks.predicted_x, blocks.predicted_y, blocks.predicted_z)):
+                    turn_strip(values, blocks.turned, strip, other_strips, strips)
+            for parity in range(2):
+                for half in range((pieces + 1 - parity) // 2):
+                    piece = 2 * half + parity
+                    start = piece * SEGMENT_LENGTH
+                    stop = ti.min(start + SEGMENT_LENGTH, length - 1)
+                    if blocks.is_taut[first + strip * pieces + piece]:
+                        straighten_pieces(blocks, first + strip, strips, start, stop)
+            if is_turned:
+                turn_displacements_back(blocks, strip, other_strips, strips)
+
+
+@ti.func
+def straighten_pieces(blocks: ti.template(), line, strips, start, stop):
+    """Solve (1 + w_i (t_i-1 + t_i)) e_i - w_i t_i-1 e_i-1 - w_i t_i e_i+1 = e~_i for one piece of LANES threads.
+
+    Forth, with what the head was moved by as the first row, and back; `n` and `factor` of a spring hold what is solved
+    at the node that it leads from.
+    """
+    e_x, e_y, e_z, share, t_before = Block(0.0), Block(0.0), Block(0.0), Block(0.0), Block(0.0)
+    for k in range(start, stop + 1):
+        a = line + k * strips
+        u_x, u_y, u_z, w_a = blocks.u_x[a], blocks.u_y[a], blocks.u_z[a], blocks.inverse_mass[a]
+        v_x, v_y, v_z = blocks.predicted_x[a], blocks.predicted_y[a], blocks.predicted_z[a]
+        t_after = blocks.tension[a]
+        is_last = k == stop  # the next piece has its own tension there
+        for at in range(LANES):
+            pull = w_a[at] * t_before[at]
+            t_l = ti.select(is_last, 0.0, t_after[at])
+            onward = w_a[at] * t_l
+            pivot = 1.0 / (1.0 + onward + pull * (1.0 - share[at]))
+            e_x[at] = pivot * (u_x[at] - v_x[at] + pull * e_x[at])
+            e_y[at] = pivot * (u_y[at] - v_y[at] + pull * e_y[at])
+            e_z[at] = pivot * (u_z[at] - v_z[at] + pull * e_z[at])
+            share[at] = pivot * onward
+            t_before[at] = t_l
+        blocks.n_x[a], blocks.n_y[a], blocks.n_z[a], blocks.factor[a] = e_x, e_y, e_z, share
+    e_x, e_y, e_z = Block(0.0), Block(0.0), Block(0.0)
+    for m in range(stop + 1 - start):
+        a = line + (stop - m) * strips
+        s_x, s_y, s_z, share_a = blocks.n_x[a], blocks.n_y[a], blocks.n_z[a], blocks.factor[a]
+        v_x, v_y, v_z = blocks.predicted_x[a], blocks.predicted_y[a], blocks.predicted_z[a]
+        for at in range(LANES):
+            e_x[at] = s_x[at] + share_a[at] * e_x[at]
+            e_y[at] = s_y[at] + share_a[at] * e_y[at]
+            e_z[at] = s_z[at] + share_a[at] * e_z[at]
+            s_x[at] = v_x[at] + e_x[at]
+            s_y[at] = v_y[at] + e_y[at]
+            s_z[at] = v_z[at] + e_z[at]
+        blocks.u_x[a], blocks.u_y[a], blocks.u_z[a] = s_x, s_y, s_z

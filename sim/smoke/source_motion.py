@@ -1,0 +1,176 @@
+"""Where sources that move are: along keyframes, or on a rigid body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.rigid import rotation
+from sim.rigid.keyframes import KeyframePath, Motion, path_through
+
+if TYPE_CHECKING:
+    from sim.rigid.parameters import RigidBodyParameters
+    from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
+
+Array = NDArray[np.float64]
+
+
+class SourceMotion(Protocol):
+    """How a source moves."""
+
+    def poses(self, begin_s: float, end_s: float, *, spacing: float) -> list[Motion]:
+        """Its motion at times so close that it leaves no gap.
+
+        Args:
+            begin_s, end_s: the span of time [s], which a step of the smoke contains.
+            spacing: largest way of any of its points from one of the poses to the next [m].
+
+        Returns:
+            From the beginning to the end, one at least.
+        """
+
+    def speed(self) -> float:
+        """Bound of the speed of its points in the coming step [m/s]."""
+
+
+class PathMotion:
+    """Along a path that is known ahead.
+
+    Args:
+        path: of its shape's origin.
+        reach: largest distance of its points from there [m].
+    """
+
+    def __init__(self, path: KeyframePath, reach: float) -> None:
+        self._path, self._way, self._speed = path, path.way(reach), path.largest_speed(reach)
+
+    def poses(self, begin_s: float, end_s: float, *, spacing: float) -> list[Motion]:
+        """See `SourceMotion`."""
+        begun, ended = np.interp([begin_s, end_s], self._way.times, self._way.lengths)
+        return [self._path.at(time) for time in _times(begin_s, end_s, float(ended - begun), spacing)]
+
+    def speed(self) -> float:
+        """The largest of the whole path [m/s]."""
+        return self._speed
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """A body's motion at the beginning and at the end of a step."""
+
+    begin_s: float
+    end_s: float
+    begin: Motion
+    end: Motion
+
+
+class BodyMotion:
+    """Fixed to a rigid body, which someone else tells the motion of, step by step.
+
+    Between the two ends of a step the body is taken to go straight and to turn about one axis.
+
+    Args:
+        offset: of the source's origin from that of the body's shape, along the body's axes [m], (3,).
+        orientation: unit quaternion, the source's axes to those of the body, (4,).
+        reach: largest distance of the source's points from its origin [m].
+    """
+
+    def __init__(self, offset: Array, orientation: Array, reach: float) -> None:
+        self._offset, self._orientation = offset, orientation
+        self._arm = reach + float(np.linalg.norm(offset))
+        self.stay(Motion(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3)))
+
+    def stay(self, body: Motion) -> None:
+        """The body is here: at the start, or where a run continues."""
+        self._leg = _Leg(0.0, 0.0, body, body)
+
+    def carry(self, body: Motion, begin_s: float, end_s: float) -> None:
+        """In the coming step of the smoke, from one time to another [s], the body gets here."""
+        self._leg = _Leg(begin_s, end_s, self._leg.end, body)
+
+    def poses(self, begin_s: float, end_s: float, *, spacing: float) -> list[Motion]:
+        """See `SourceMotion`."""
+        leg = self._leg
+        duration = leg.end_s - leg.begin_s
+        if duration <= 0.0:
+            return [self._on(leg.end)]
+        turn = rotation.logarithm(rotation.product(leg.end.orientation, rotation.conjugate(leg.begin.orientation)))
+        step = leg.end.position - leg.begin.position
+        length = (float(np.linalg.norm(step)) + self._arm * float(np.linalg.norm(turn))) * (end_s - begin_s) / duration
+        poses = []
+        for time in _times(begin_s, end_s, length, spacing):
+            part = (time - leg.begin_s) / duration
+            body = Motion(
+                leg.begin.position + part * step,
+                rotation.product(rotation.exponential(part * turn), leg.begin.orientation),
+                leg.begin.velocity + part * (leg.end.velocity - leg.begin.velocity),
+                leg.begin.angular_velocity + part * (leg.end.angular_velocity - leg.begin.angular_velocity),
+            )
+            poses.append(self._on(body))
+        return poses
+
+    def speed(self) -> float:
+        """At the end of the last step [m/s]."""
+        body = self._leg.end
+        return float(np.linalg.norm(body.velocity)) + self._arm * float(np.linalg.norm(body.angular_velocity))
+
+    def _on(self, body: Motion) -> Motion:
+        arm = rotation.rotated(body.orientation, self._offset)
+        return Motion(
+            body.position + arm,
+            rotation.product(body.orientation, self._orientation),
+            body.velocity + np.cross(body.angular_velocity, arm),
+            body.angular_velocity,
+        )
+
+
+def motion_of(source: SmokeSourceParameters, reach: float) -> SourceMotion | None:
+    """How a source moves, with points up to `reach` [m] from its origin; None if it stays where it is."""
+    if source.follow is not None:
+        return BodyMotion(np.asarray(source.position, float), rotation.from_degrees(source.rotation_deg), reach)
+    if not source.keyframe:
+        return None
+    return PathMotion(path_through(source.keyframe, linear=source.interpolation == "linear"), reach)
+
+
+def with_sources_on(smoke: SmokeParameters, bodies: Sequence[RigidBodyParameters]) -> SmokeParameters:
+    """The smoke with its sources on static bodies where these stand; only those on bodies that move still follow.
+
+    Raises:
+        ValueError: a source follows a body that is not there.
+    """
+    by_name = {body.name: body for body in bodies}
+    sources = []
+    for number, source in enumerate(smoke.source):
+        if source.follow is not None and source.follow not in by_name:
+            raise ValueError(f'smoke "{smoke.name}", source {number}: no rigid body is named "{source.follow}"')
+        body = None if source.follow is None else by_name[source.follow]
+        sources.append(placed_on(source, body) if body is not None and body.kind == "static" else source)
+    return smoke.model_copy(update={"source": tuple(sources)})
+
+
+def placed_on(source: SmokeSourceParameters, body: RigidBodyParameters) -> SmokeSourceParameters:
+    """The source where it is in the world at the start; one with a velocity blows along the world's axes there."""
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_euler("xyz", body.rotation_deg, degrees=True)
+    own = Rotation.from_euler("xyz", source.rotation_deg, degrees=True)
+    x, y, z = (np.asarray(body.position) + turned.apply(source.position)).tolist()
+    a, b, c = (turned * own).as_euler("xyz", degrees=True).tolist()
+    velocity = None if source.velocity is None else tuple(turned.apply(source.velocity).tolist())
+    return source.model_copy(
+        update={"position": (x, y, z), "rotation_deg": (a, b, c), "velocity": velocity, "follow": None}
+    )
+
+
+def _times(begin_s: float, end_s: float, length: float, spacing: float) -> list[float]:
+    """Times from beginning to end [s] so many that a way of a length [m] is cut into parts of a spacing [m]."""
+    if length <= 0.0 or end_s <= begin_s:
+        return [end_s]
+    count = max(1, math.ceil(length / spacing))
+    return [begin_s + (end_s - begin_s) * number / count for number in range(count + 1)]

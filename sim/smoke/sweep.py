@@ -1,0 +1,98 @@
+"""Which cells and faces of a grid a shape passes over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.rigid import rotation
+from sim.rigid.keyframes import Motion
+from sim.shapes.level_set import LevelSet
+from sim.shapes.parameters import BunnyShape, DuckShape, MeshShape, Placement
+from sim.shapes.placement import PlacedSolid, build_solid
+from sim.smoke.grid import Index3, SmokeGrid
+
+COSTLY_SHAPES = (DuckShape, BunnyShape, MeshShape)
+"""Their distances take long, and so are looked up."""
+
+LOOKUPS_PER_CELL = 2.0
+"""Nodes of such a table along the edge of a cell."""
+
+CELLS = 3
+"""Stands for cells where the axis of faces is asked for."""
+
+
+@dataclass(frozen=True)
+class Swept:
+    """The places that a shape passed over.
+
+    Attributes:
+        indices: of the places in flat arrays, ascending, (n,).
+        places: their positions [m], (n, 3).
+        poses: which of the poses was the last to cover each, (n,).
+    """
+
+    indices: NDArray[np.int32]
+    places: NDArray[np.float64]
+    poses: NDArray[np.int64]
+
+
+class SweptShape:
+    """A shape that moves over a grid; a place is covered if it lies inside, as for shapes that stay.
+
+    Attributes:
+        reach: largest distance of its points from its origin [m].
+    """
+
+    def __init__(self, placement: Placement, grid: SmokeGrid) -> None:
+        """Build the shape; where it stands does not matter.
+
+        Raises:
+            ShapeError: it cannot be built.
+        """
+        placed = build_solid(placement)
+        self._grid = grid
+        self._solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
+        self.reach = float(np.linalg.norm(np.abs(self._solid.bounds).max(axis=0)))
+        self._distance = self._solid.signed_distance
+        if isinstance(placement.shape, COSTLY_SHAPES):
+            spacing = grid.cell_size / LOOKUPS_PER_CELL
+            self._distance = LevelSet.sample(self._solid, spacing, exact_within=2.0 * spacing).signed_distance
+
+    def covered(self, poses: Sequence[Motion], axis: int) -> Swept:
+        """The faces across an axis, or the `CELLS`, that it covers in one of the poses at least."""
+        grid = self._grid
+        shape: Index3 = grid.cells if axis == CELLS else grid.face_shape(axis)
+        offset = np.array([0.0 if a == axis else 0.5 for a in range(3)])
+        windows = [self._window(pose, shape, offset) for pose in poses]
+        first = np.min([low for low, _ in windows], axis=0)
+        size = np.maximum(np.max([high for _, high in windows], axis=0) - first, 0)
+        last = np.full(size, -1, np.int64)
+        for number, (pose, (low, high)) in enumerate(zip(poses, windows, strict=True)):
+            if (high <= low).any():
+                continue
+            places = self._positions(np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), axis=-1), offset)
+            own = rotation.rotated(rotation.conjugate(pose.orientation), places.reshape(-1, 3) - pose.position)
+            inside = (self._distance(own) < 0.0).reshape(places.shape[:3])
+            part = last[tuple(map(slice, low - first, high - first))]
+            part[inside] = number
+        found = np.argwhere(last >= 0) + first
+        padded = grid.padded
+        indices = ((found[:, 0] + 1) * padded[1] + found[:, 1] + 1) * padded[2] + found[:, 2] + 1
+        return Swept(indices.astype(np.int32), self._positions(found, offset), last[last >= 0])
+
+    def _window(
+        self, pose: Motion, shape: Index3, offset: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The first place within the shape's box along each axis, from 0, and the first one after it."""
+        solid = PlacedSolid(self._solid.shape, self._solid.scale, rotation.matrices(pose.orientation), pose.position)
+        lower, upper = (solid.bounds - self._grid.origin) / self._grid.cell_size - offset
+        low = np.clip(np.ceil(lower), 0, shape).astype(np.int64)
+        return low, np.clip(np.floor(upper) + 1, low, shape).astype(np.int64)
+
+    def _positions(self, places: NDArray[np.int64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+        positions: NDArray[np.float64] = np.asarray(self._grid.origin) + (places + offset) * self._grid.cell_size
+        return positions

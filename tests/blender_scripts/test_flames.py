@@ -1,0 +1,89 @@
+"""The lamps of fires: where they stand and what they give, in a child process, as Blender's libraries are needed."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import pytest
+from fresh_python import run_python
+
+from render.system_libraries import missing_libraries
+
+pytestmark = pytest.mark.skipif(
+    find_spec("bpy") is None or bool(missing_libraries()),
+    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
+)
+
+SCENE = """
+    import math
+    import sys
+    from pathlib import Path
+    import numpy as np
+    from blender_scripts.black_body import black_body_color
+    from blender_scripts.compatibility import import_openvdb
+    from blender_scripts.errors import RenderInputError
+    from blender_scripts.flames import Glow, lamps_of_file, lamps_of_grids
+    openvdb = import_openvdb()
+
+    def grid(values, name):
+        made = openvdb.FloatGrid()
+        made.name = name
+        made.copyFromArray(np.ascontiguousarray(values, np.float32))
+        transform = openvdb.createLinearTransform(0.1)
+        transform.postTranslate((1.05, 2.05, 3.05))
+        made.transform = transform
+        return made
+
+    # A box of 4 m x 1 m x 1 m at (1, 2, 3), in blocks of 1 m: two fires, and warm smoke between them.
+    glow = Glow(2.0, 5.0, 1500.0, 300.0, (1.0, 2.0, 3.0), (5.0, 3.0, 4.0))
+    density, heat = np.zeros((40, 10, 10)), np.zeros((40, 10, 10))
+    density[:, 4:6, 4:6], heat[:, 4:6, 4:6] = 1.0, 200.0
+    heat[2:6, 4:6, 4:6] = 1200.0
+    density[34:36, 4:6, 4:6], heat[34:36, 4:6, 4:6] = 0.5, 1500.0
+    lamps = lamps_of_grids(grid(density, "density"), grid(heat, "temperature"), glow)
+"""
+
+
+def test_each_fire_has_its_lamp_with_the_light_of_its_cells():
+    run_python(
+        SCENE
+        + """
+    assert len(lamps) == 2, lamps
+    for lamp, x, kelvin, smoke in ((lamps[0], 1.4, 1500.0, 16.0), (lamps[1], 4.5, 1800.0, 4.0)):
+        np.testing.assert_allclose(lamp.position, (x, 2.5, 3.5), atol=1e-9)
+        luminance = math.exp(24000.0 * (1 / 1500.0 - 1 / kelvin))
+        power = 4 * math.pi * 2.0 * 5.0 * smoke * 1e-3 * luminance * black_body_color(np.array([kelvin]))[0]
+        np.testing.assert_allclose(lamp.power, power, rtol=1e-6)
+    # Centres of 4 x 2 x 2 cells: mean square radius (0.0125 + 0.0025 + 0.0025) m²; half the ball's that has the same.
+    assert abs(lamps[0].radius - 0.5 * math.sqrt(5 / 3 * 0.0175)) < 1e-6
+    """
+    )
+
+
+def test_what_hardly_shines_beside_another_fire_gets_no_lamp_and_a_dead_fire_none():
+    run_python(
+        SCENE
+        + """
+    heat[34:36, 4:6, 4:6] = 700.0
+    assert len(lamps_of_grids(grid(density, "density"), grid(heat, "temperature"), glow)) == 1
+    assert lamps_of_grids(grid(density, "density"), grid(np.minimum(heat, 350.0), "temperature"), glow) == []
+    assert lamps_of_grids(openvdb.FloatGrid(), openvdb.FloatGrid(), glow) == []
+    """
+    )
+
+
+def test_a_volume_without_temperature_is_refused_with_its_name(tmp_path):
+    run_python(
+        SCENE
+        + """
+    path = Path(sys.argv[1]) / "cold.vdb"
+    openvdb.write(str(path), [grid(density, "density")])
+    try:
+        lamps_of_file(path, glow)
+    except RenderInputError as error:
+        assert "cold.vdb has no grid named temperature, which the look of fire needs" in str(error)
+    else:
+        raise AssertionError("it was drawn as cold smoke")
+    """,
+        str(tmp_path),
+    )
