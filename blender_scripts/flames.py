@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from blender_scripts.black_body import black_body_color, relative_luminance
 from blender_scripts.compatibility import import_openvdb
@@ -22,7 +23,7 @@ BLOCKS_ALONG_EDGE = 4
 _DIMMEST_SHARE = 2.0e-3
 """Of all the light; a block that gives less gets no lamp."""
 _COLDEST_K = 700.0
-"""Below this nothing glows: a two-hundred-thousandth of the light at 1500 K [K]."""
+"""Below this nothing glows: a ninety-millionth of the light at 1500 K [K]."""
 _SLAB_CELLS = 32
 
 
@@ -37,6 +38,8 @@ class Glow:
         ambient_temperature: of the air, which the `temperature` grid is counted from [K].
         box_min: lower corner of the smoke's box [m].
         box_max: upper corner of the smoke's box [m].
+        open_faces: sides of the box towards which the look fades, of `x-`, `x+` to `z+`.
+        fade_width: distance from them on which it fades [m]; 0: it does not.
     """
 
     extinction: float
@@ -45,6 +48,8 @@ class Glow:
     ambient_temperature: float
     box_min: tuple[float, float, float]
     box_max: tuple[float, float, float]
+    open_faces: tuple[str, ...] = ()
+    fade_width: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,10 +84,11 @@ def lamps_of_grids(density: Any, temperature: Any, glow: Glow) -> list[Lamp]:
     """The lamps for a pair of OpenVDB grids of one transform: density [-] and temperature above ambient [K].
 
     Each cell of volume dV at density rho and temperature T emits 4 pi rho extinction emission L(T) / L(T_flame) dV in
-    the colour of a black body, the source of the light that the look's shader adds up along a ray. What the smoke
-    absorbs on the way out is left to the renderer. A block's ball has the glow's own centre, and half its radius.
+    the colour of a black body, less the fade at open faces: the source of the light that the look's shader adds up
+    along a ray. What the smoke absorbs on the way out is left to the renderer. A block's ball has the glow's own
+    centre, and half its radius. A look without emission has no lamps.
     """
-    if temperature.activeVoxelCount() == 0:
+    if glow.emission == 0.0 or temperature.activeVoxelCount() == 0:
         return []
     cell_size = temperature.transform.voxelSize()[0]
     origin = np.array(temperature.transform.indexToWorld((0, 0, 0)))
@@ -99,8 +105,8 @@ def lamps_of_grids(density: Any, temperature: Any, glow: Glow) -> list[Lamp]:
         temperature.copyToArray(heat, ijk=tuple(map(int, start)))
         hot = (heat > _COLDEST_K - glow.ambient_temperature) & (smoke > 0)
         kelvin = heat[hot].astype(np.float64) + glow.ambient_temperature
-        light = smoke[hot] * relative_luminance(kelvin, glow.flame_temperature)
         position = origin + cell_size * (np.argwhere(hot) + start)
+        light = smoke[hot] * relative_luminance(kelvin, glow.flame_temperature) * _fade(position, glow)
         block = np.clip(((position - box_min) / block_size).astype(int), 0, shape - 1)
         index = np.ravel_multi_index(tuple(block.T), tuple(shape))
         position -= box_min  # from a corner near by, so that the sums of squares keep their digits
@@ -118,3 +124,18 @@ def lamps_of_grids(density: Any, temperature: Any, glow: Glow) -> list[Lamp]:
         radius = max(0.5 * math.sqrt(5.0 / 3.0 * mean_square_radius), 0.5 * cell_size)
         lamps.append(Lamp(tuple(map(float, centre + box_min)), radius, tuple(float(scale * c) for c in rest[4:])))
     return lamps
+
+
+def _fade(position: NDArray[np.float64], glow: Glow) -> NDArray[np.float64]:
+    """What the look's fade leaves of the smoke at positions [m] (n, 3): from 0 at open faces to 1 [-], (n,)."""
+    distance = np.full(len(position), np.inf)
+    for axis, name in enumerate("xyz"):
+        if f"{name}-" in glow.open_faces:
+            distance = np.minimum(distance, position[:, axis] - glow.box_min[axis])
+        if f"{name}+" in glow.open_faces:
+            distance = np.minimum(distance, glow.box_max[axis] - position[:, axis])
+    if glow.fade_width == 0.0:
+        return np.ones(len(position))
+    part = np.clip(distance / glow.fade_width, 0.0, 1.0)
+    # Smoothstep, as the shader has it.
+    return part * part * (3.0 - 2.0 * part)

@@ -60,6 +60,8 @@ def glow_of(context: LookContext) -> Glow:
         ambient_temperature=box.ambient_temperature,
         box_min=box.box_min,
         box_max=box.box_max,
+        open_faces=box.open_faces,
+        fade_width=_fade_width(context),
     )
 
 
@@ -94,9 +96,7 @@ def _fade(builder: NodeBuilder, context: LookContext) -> Any | None:
 
     Smoke that leaves would otherwise end in a flat cut, where its box does.
     """
-    box = _box(context)
-    size = [high - low for low, high in zip(box.box_min, box.box_max, strict=True)]
-    width = or_default(context.edge_fade, _EDGE_FADE * min(size))
+    box, width = _box(context), _fade_width(context)
     if not box.open_faces or width == 0.0:
         return None
     low = tuple(x if f"{axis}-" in box.open_faces else -_FAR for axis, x in zip("xyz", box.box_min, strict=True))
@@ -111,6 +111,13 @@ def _fade(builder: NodeBuilder, context: LookContext) -> Any | None:
     builder.link(distance, fade.inputs["Value"])
     fade.inputs["From Max"].default_value = width
     return fade.outputs[0]
+
+
+def _fade_width(context: LookContext) -> float:
+    """Distance from open faces on which smoke fades [m]."""
+    box = _box(context)
+    size = [high - low for low, high in zip(box.box_min, box.box_max, strict=True)]
+    return or_default(context.edge_fade, _EDGE_FADE * min(size))
 
 
 def _grid(builder: NodeBuilder, name: str) -> Any:

@@ -26,6 +26,7 @@ CASES = {
     "inertia": "inertia",
     "cloth": "cloth",
     "smoke-vortices": "smoke_vortices",
+    "smoke-projection": "smoke_projection",
     "smoke-plume": "smoke_plume",
     "submerged-sphere": "submerged_sphere",
     "buoyancy": "buoyancy",

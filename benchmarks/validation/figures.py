@@ -367,6 +367,26 @@ def draw_smoke_vortices(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
+def draw_smoke_projection(results: Sequence[CaseResult]) -> Figure:
+    """Divergence left by each iteration, and refinement against an exact projection."""
+    figure, (left, order) = _panels(2, width=4.2)
+    series, settings = results[0].series, results[0].settings
+    finest = max(settings["rough_cells"])
+    histories = [name for name in series if name.startswith("left, ") and name.endswith(f", {finest}")]
+    for name, shade in zip(histories, SHADES, strict=False):
+        left.semilogy(series[name], "o-", markersize=4, color=shade, label=name.split(", ")[1])
+    left.axhline(settings["tolerance"], color=THEORY, linewidth=1.0, linestyle="--")
+    _label(left, "iteration", "max|div u| h / max|u|", f"jet with noise, {finest}³ cells; dashed: goal")
+    spacings = [1.0 / count for count in series["cells"]]
+    for name, shade in (("walls", SHADES[0]), ("open sides", SHADES[1])):
+        order.loglog(spacings, series[f"errors, {name}"], "o-", markersize=4, color=shade, label=name)
+    _order_line(order, spacings, max(series["errors, open sides"]), 2)
+    order.set_xticks(spacings, [f"1/{count}" for count in series["cells"]], minor=False)
+    order.set_xticks([], minor=True)
+    _label(order, "cell / box", "rms error / rms", "exact projection")
+    return figure
+
+
 def draw_smoke_plume(results: Sequence[CaseResult]) -> Figure:
     """Front of a plume at several resolutions, and smoke over what was emitted."""
     figure, (front, kept) = _panels(2, width=4.2)
@@ -397,5 +417,6 @@ DRAWINGS: dict[str, Callable[[Sequence[CaseResult]], Figure]] = {
     "rigid-contacts": draw_rigid_contacts,
     "cloth": draw_cloth,
     "smoke-vortices": draw_smoke_vortices,
+    "smoke-projection": draw_smoke_projection,
     "smoke-plume": draw_smoke_plume,
 }

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pipeline.job.models import Job
 from pipeline.job.overrides import Override
 from sim.cloth.parameters import RectangleSheet
+from sim.smoke.parameters import CELLS_PER_EDDY
 
 PREVIEW = "--preview"
 COARSENING = 2.0
 """Particle radii, cells and the cells of cloths grow by this factor: an eighth of the particles and cells, a quarter of
-the nodes, and larger steps."""
+the nodes, and larger steps. Gusts grow where coarser cells could not carry their eddies."""
 
 
 def preview_overrides(job: Job) -> list[Override]:
@@ -27,7 +28,11 @@ def preview_overrides(job: Job) -> list[Override]:
         if fluid.dt != "adaptive":
             changes.append((("fluid", index, "dt"), fluid.dt * COARSENING))
     for index, smoke in enumerate(job.smoke):
-        changes.append((("smoke", index, "cell_size"), smoke.cell_size * COARSENING))
+        cell_size = smoke.cell_size * COARSENING
+        changes.append((("smoke", index, "cell_size"), cell_size))
+        gusts = smoke.turbulence
+        if gusts.strength > 0.0 and gusts.size < CELLS_PER_EDDY * cell_size:
+            changes.append((("smoke", index, "turbulence", "size"), CELLS_PER_EDDY * cell_size))
     for index, cloth in enumerate(job.cloth):
         # Pins would hold others in a coarser sheet where they name nodes by number, and others or none in a region.
         by_place = all(pin.index is None and pin.region is None for pin in cloth.pin)

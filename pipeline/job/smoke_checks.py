@@ -9,21 +9,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.job.amounts import count, gigabytes, rounded_up
+from pipeline.job.amounts import count, gigabytes, rounded_down, rounded_up
 from pipeline.job.boxes import Box, overlap, span, touch
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from sim.scene import DomainParameters
-from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
+from sim.smoke.parameters import CELLS_PER_EDDY, SmokeParameters, SmokeSourceParameters
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
     from sim.shapes import Solid
 
 BYTES_PER_CELL = 250
-"""Upper bound of what the smoke solver takes, multigrid levels and snapshot included: 92 for itself and what moves in
+"""Upper bound of what the smoke solver takes, multigrid levels and snapshot included: 101 for itself and what moves in
 it, 32 for fluid, 24 for cloth, 14 for turbulence."""
+BYTES_PER_ROW_ON_GPU = 5 * 32 * 8
+"""On top for each row of cells along z: five reductions (`sim.smoke.reductions`) of 32 lanes, two numbers each. Boxes
+of few cells along z take more for these than for their cells. A CPU has one lane a row, within the bound above."""
 ALL = 1.0 - 1e-6
 """Share of a box that counts as all of it: sizes and positions written in decimal do not add up exactly."""
 COUNTED_CELLS = 1_000_000
@@ -53,15 +56,18 @@ def check_smokes(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
     Returns:
         Cells of all smokes.
     """
-    cells = 0
+    names = {body.name for body in job.rigid}
+    cells, size_bytes = 0, 0.0
     for index, smoke in enumerate(job.smoke):
-        cells += _check_size(job, index, budget, cells, findings)
+        more_cells, more_bytes = _check_size(job, index, budget, (cells, size_bytes), findings)
+        cells, size_bytes = cells + more_cells, size_bytes + more_bytes
         _check_air(job, smoke, index, findings)
         for number, source in enumerate(smoke.source):
             path: KeyPath = ("smoke", index, "source", number)
-            _check_numbers(smoke, source, path, findings)
+            _check_numbers(job, smoke, source, path, findings)
             _check_following(job, source, path, findings)
-            if path in solids:
+            # Where one is whose body is not known nobody can tell.
+            if path in solids and (source.follow is None or source.follow in names):
                 _check_place(job, index, number, solids, findings)
     _check_bodies_in_smoke(job, solids, findings)
     return cells
@@ -75,42 +81,54 @@ def smoke_box(smoke: SmokeParameters, domain: DomainParameters) -> Box:
 # --- the grid ------------------------------------------------------------------------------------------------------
 
 
-def _check_size(job: Job, index: int, budget: MemoryBudget, cells_before: int, findings: Findings) -> int:
-    """Cells of the smoke's grid, which comes after so many of others."""
+def _check_size(
+    job: Job, index: int, budget: MemoryBudget, before: tuple[int, float], findings: Findings
+) -> tuple[int, float]:
+    """Cells and bytes of the smoke's grid, which comes after so many of others."""
     smoke = job.smoke[index]
     box = smoke_box(smoke, job.domain)
     extent = box[1] - box[0]
     if np.any(extent <= 0.0):
         corner = "max" if smoke.max is not None else "min"
         findings.error(("smoke", index, corner), f"max must be above min on every axis, got {span(box)}")
-        return 0
+        return 0, 0.0
     if np.any(extent < 4.0 * smoke.cell_size):
         findings.error(
             ("smoke", index, "cell_size"),
             f"{smoke.cell_size:g} m leaves fewer than 4 cells along an edge of {extent.min():.3g} m; "
-            f"use {extent.min() / 4.0:.3g} m or less",
+            f"use {rounded_down(extent.min() / 4.0):g} m or less",
         )
-    cells = float(np.prod(np.ceil(extent / smoke.cell_size)))
-    if (cells + cells_before) * BYTES_PER_CELL > budget.bytes:
-        possible = max(0, budget.bytes // BYTES_PER_CELL - cells_before)
-        size = _cell_size_that_fits(extent, smoke.cell_size, possible)
+    layers = np.ceil(extent / smoke.cell_size)
+    cells, size_bytes = float(np.prod(layers)), _bytes_of(layers, on_gpu=budget.on_gpu)
+    cells_before, bytes_before = before
+    if size_bytes + bytes_before > budget.bytes:
+        room = max(0.0, budget.bytes - bytes_before)
+        size = _cell_size_that_fits(extent, smoke.cell_size, room, on_gpu=budget.on_gpu)
         beside = f" beside the {count(cells_before)} of other smoke" if cells_before else ""
         findings.error(
             ("smoke", index, "cell_size"),
-            f"{count(cells)} cells need {gigabytes(cells * BYTES_PER_CELL)}, "
+            f"{count(cells)} cells need {gigabytes(size_bytes)}, "
             f"{budget.owner} has {gigabytes(budget.bytes)}; "
-            f"at most {count(possible)} fit{beside}: use {rounded_up(size):g} m or more",
+            f"at most {count(room // (size_bytes / cells))} fit{beside}: use {rounded_up(size):g} m or more",
         )
-    return int(cells)
+    return int(cells), size_bytes
 
 
-def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, most_cells: int) -> float:
-    """The smallest cell size [m], not below a given one, that cuts a box into at most so many cells, or one."""
-    most = max(1, most_cells)
+def _bytes_of(layers: NDArray[np.float64], *, on_gpu: bool) -> float:
+    """Upper bound of the memory of a box of so many cells along x, y, z."""
+    rows = float(layers[0] * layers[1])
+    return float(np.prod(layers)) * BYTES_PER_CELL + (rows * BYTES_PER_ROW_ON_GPU if on_gpu else 0.0)
+
+
+def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, room: float, *, on_gpu: bool) -> float:
+    """The smallest cell size [m], not below a given one, that cuts a box into cells of so many bytes, or into one."""
+    most = max(1.0, room // BYTES_PER_CELL)
     size = max(cell_size, float(np.cbrt(np.prod(extent) / most)))
-    while np.prod(layers := np.ceil(extent / size)) > most:
+    layers = np.ceil(extent / size)
+    while _bytes_of(layers, on_gpu=on_gpu) > room and layers.max() > 1.0:
         # Counts are rounded up: the next size of use is the one that saves a layer of cells.
         size = float(np.min(extent[layers > 1.0] / (layers[layers > 1.0] - 1.0))) * (1.0 + 1.0e-9)
+        layers = np.ceil(extent / size)
     return size
 
 
@@ -120,11 +138,12 @@ def _check_air(job: Job, smoke: SmokeParameters, index: int, findings: Findings)
     if problem := smoke.wind_problem():
         findings.error((*path, "wind"), problem)
     gusts = smoke.turbulence
-    if gusts.strength > 0.0 and gusts.size < 2.0 * smoke.cell_size * (1.0 - 1.0e-9):
+    smallest = CELLS_PER_EDDY * smoke.cell_size
+    if gusts.strength > 0.0 and gusts.size < smallest * (1.0 - 1.0e-9):
         findings.error(
             (*path, "turbulence", "size"),
             f"{gusts.size:g} m is less than two cells of {smoke.cell_size:g} m, which carry no such eddies; "
-            f"use {2.0 * smoke.cell_size:g} m or more",
+            f"use {rounded_up(smallest * (1.0 - 1.0e-9)):g} m or more",
         )
     blown = any(smoke.wind) or gusts.strength > 0.0
     driven = any(source.velocity is not None for source in smoke.source)
@@ -157,7 +176,9 @@ def _check_air(job: Job, smoke: SmokeParameters, index: int, findings: Findings)
 # --- sources -------------------------------------------------------------------------------------------------------
 
 
-def _check_numbers(smoke: SmokeParameters, source: SmokeSourceParameters, path: KeyPath, findings: Findings) -> None:
+def _check_numbers(
+    job: Job, smoke: SmokeParameters, source: SmokeSourceParameters, path: KeyPath, findings: Findings
+) -> None:
     kelvin = source.temperature
     if kelvin > HOTTEST:
         findings.error(
@@ -170,8 +191,10 @@ def _check_numbers(smoke: SmokeParameters, source: SmokeSourceParameters, path: 
     is_empty = source.density == 0.0 and kelvin == smoke.ambient_temperature
     if is_empty and source.velocity is None:
         findings.warn(path, "has no density, and the temperature of the air: it emits nothing")
-    if source.ramp and not any(point.strength for point in source.ramp):
-        findings.warn((*path, "ramp"), "is 0 at all times: it emits nothing")
+    film_s = job.frame_count / job.fps
+    emits = source.emits_during(0.0, film_s)
+    if emits and source.largest_strength(*source.span_of(0.0, film_s)) == 0.0:
+        findings.warn((*path, "ramp"), f"is 0 whenever it emits in the film's {film_s:g} s: it emits nothing")
 
 
 def _check_following(job: Job, source: SmokeSourceParameters, path: KeyPath, findings: Findings) -> None:

@@ -29,7 +29,7 @@ class ClothAir:
         source: number of what the air belongs to, (k,) int32; `WIND` for wind.
         density: of the air [kg/m³], (k,); 0 where it drags nothing.
         force: of the air on each triangle in the last substep [N], (k,) vec3; of those that `blow` was called for.
-        impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3.
+        impulse: of the air on each triangle since a coupling set it to zero [N s], (k,) vec3; of those, too.
         wind: of the parameters [m/s], (k,) vec3.
         share: of each node in the force on any of its triangles [-], (n,).
         triangle_start: the triangles of node i are `triangle_list[triangle_start[i]:triangle_start[i + 1]]`.

@@ -23,7 +23,7 @@ LANES = 8
 compile."""
 
 LEAST_BLOCKS = 4096
-"""Workspaces have this many blocks, up to 181 x 181 nodes, or a power of 4 times as many: kernels are compiled for each
+"""Workspaces have this many blocks, up to 176 x 176 nodes, or a power of 4 times as many: kernels are compiled for each
 size, for some 20 s of a core until Taichi's cache on disk knows them."""
 
 SKEW = 5
@@ -88,6 +88,7 @@ def row_blocks(columns: int, rows: int) -> RowBlocks:
 
 @functools.cache
 def _workspace(blocks: int) -> RowBlocks:
+    """Kept for good: Taichi is started once a process (`sim.runtime`), and its fields live as long."""
     return RowBlocks(blocks)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -63,7 +62,7 @@ class SelfCollision:
         edges = state.host.position[state.host.edges]
         self.mean_edge = float(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).mean())
         self.thickness = 0.0
-        self._listed_for: tuple[float, tuple[bool, ...]] = (math.nan, ())
+        self._listed_for: tuple[bytes, tuple[bool, ...]] = (b"", ())
         self.begin_frame(state)
 
     def forget(self) -> None:
@@ -76,13 +75,14 @@ class SelfCollision:
         Lists are kept, unless thicknesses or flags have changed: no result depends on when they were made.
         """
         self._searched = 0
-        thickness = float(state.thickness.to_numpy().max())
-        if (thickness, state.self_collision) != self._listed_for:
-            self._listed_for = thickness, state.self_collision
-            self.thickness = thickness
+        thickness = state.thickness.to_numpy()  # of each node, as pairs are listed with the distance that they keep
+        listed_for = thickness.tobytes(), state.self_collision
+        if listed_for != self._listed_for:
+            self._listed_for = listed_for
+            self.thickness = float(thickness.max())
             self._collides.from_numpy(np.array(state.self_collision, dtype=np.int32))
             self.forget()
-        self._met.set_margin(thickness)
+        self._met.set_margin(self.thickness)
 
     @property
     def searches(self) -> float:

@@ -26,6 +26,9 @@ class CorrectionBalance:
     which no factor in [0, 1] reaches it. Through open sides and the sides of moving solids flows what an upwind scheme
     has flow in the step: their smoke is balanced to first order.
 
+    Attributes:
+        reductions: what it reduces rows with.
+
     Args:
         obstacles: in the grid where the fields live.
         velocity: the three face velocities [m/s], flat fields.
@@ -39,6 +42,7 @@ class CorrectionBalance:
         self._u, self._v, self._w = velocity
         self._lanes = lane_count()
         self._missing, self._corrections = (RowReductions(self._nx, self._ny) for _ in range(2))
+        self.reductions = [self._missing, self._corrections]
 
     @ti.kernel
     def restore(self, field: ti.template(), predicted: ti.template(), corrected: ti.template(), step: ti.f32):

@@ -103,6 +103,11 @@ class Obstacles:
         moving = [self.marked, self.velocity_x, self.velocity_y, self.velocity_z] if self.moving else []
         return [self.state, *moving]
 
+    @property
+    def reductions(self) -> list[RowReductions]:
+        """What it reduces rows with."""
+        return [self._rows] if self.moving else []
+
     def stable_dt(self) -> float:
         """Largest step [s] in which no solid crosses more than a cell, so that none leaps over the smoke in its way.
 

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 WHOLE = 1.0e-6
 """Part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001."""
 
+CELLS_PER_EDDY = 2.0
+"""Eddies of gusts are at least so many cells wide: the grid carries nothing finer."""
+
 Face = Literal["x-", "x+", "y-", "y+", "z-", "z+"]
 
 Seed = Annotated[int, Field(ge=0, le=1_000_000_000)]

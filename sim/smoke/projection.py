@@ -55,6 +55,7 @@ class PressureProjection:
         multigrid: the preconditioner; its coefficients say which faces are open.
         regions: the closed regions of air.
         work_fields: six flat float32 fields of at least the grid's size, free between two projections.
+        reductions: what it reduces rows with.
     """
 
     def __init__(self, obstacles: Obstacles, velocity: tuple, *, tolerance: float, max_iterations: int) -> None:
@@ -80,6 +81,7 @@ class PressureProjection:
         )
         self._lanes = lane_count()
         self._rows = RowReductions(self._nx, self._ny)
+        self.reductions = [self._rows]
         self._alpha, self._beta, self._r_z = (ti.field(ti.f32, shape=()) for _ in range(3))
 
     def update(self) -> None:

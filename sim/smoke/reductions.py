@@ -39,6 +39,11 @@ class RowReductions:
         self._node = ti.Vector.field(2, ti.f32, shape=self._nodes)
         self.result = ti.Vector.field(2, ti.f32, shape=())
 
+    @property
+    def device_bytes(self) -> int:
+        """Memory that it has allocated [bytes]; on a GPU nearly all of it is that of the lanes, 32 a row."""
+        return 8 * (self._length + self._nodes + 1)
+
     @ti.func
     def place(self, i: ti.i32, j: ti.i32, lane: ti.i32) -> ti.i32:
         """Where the lane of a row leaves its numbers; rows count from 1."""

@@ -13,6 +13,7 @@ from sim.scene import DomainParameters
 from sim.smoke.advection import Advection
 from sim.smoke.air_force import AirForce
 from sim.smoke.balance import CorrectionBalance
+from sim.smoke.cooling import Cooling
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import Forces, upward
 from sim.smoke.grid import SmokeGrid, SolidRegion
@@ -66,7 +67,8 @@ class SmokeSolver:
         moving: whether there will be obstacles that move.
 
     Raises:
-        ValueError: the box is empty or full of solids, or a source contains no open cell.
+        ValueError: the box is empty or full of solids, a source contains no open cell, or solids shut air in that
+            wind blows into.
     """
 
     def __init__(
@@ -104,13 +106,14 @@ class SmokeSolver:
             max_iterations=parameters.projection_max_iterations,
         )
         work = self._projection.work_fields
+        self._balance = CorrectionBalance(self.obstacles, velocity)
         self._advection = Advection(
             self.grid,
             velocity=velocity,
             cell_fields=cell_fields,
             work=work,
             maccormack=parameters.advection == "maccormack",
-            balance=CorrectionBalance(self.obstacles, velocity),
+            balance=self._balance,
         )
         self._forces = Forces(
             self.obstacles,
@@ -126,6 +129,7 @@ class SmokeSolver:
         self._extrapolation = Extrapolation(
             self.obstacles, velocity=velocity, cell_fields=cell_fields, reach=parameters.cfl
         )
+        self._cooling = Cooling(self.grid, parameters, density=self.density, excess_temperature=self.excess_temperature)
         self._lanes = lane_count()
         self._rows = RowReductions(self._nx, self._ny)
         self.sources = build_sources(
@@ -156,7 +160,7 @@ class SmokeSolver:
 
     @property
     def device_bytes(self) -> int:
-        """Memory of the state, the work arrays, the coefficients and the obstacles [bytes]."""
+        """Memory of the state, the work arrays, the coefficients, the obstacles and the reductions [bytes]."""
         coefficients = self._projection.multigrid.coefficients
         arrays = [
             *self._state.values(),
@@ -167,8 +171,10 @@ class SmokeSolver:
             *self._projection.regions.fields,
             *self._extrapolation.fields,
         ]
-        turbulence = 0 if self._turbulence is None else self._turbulence.device_bytes
-        return 4 * sum(math.prod(field.shape) for field in arrays) + turbulence
+        parts = [self._rows, *self._projection.reductions, *self._balance.reductions, *self.obstacles.reductions]
+        if self._turbulence is not None:
+            parts.append(self._turbulence)
+        return 4 * sum(math.prod(field.shape) for field in arrays) + sum(part.device_bytes for part in parts)
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no air crosses more than `cfl` cells, and no obstacle more than one.
@@ -203,11 +209,7 @@ class SmokeSolver:
             self._wind.blow_in()
         self._emit(dt)
         self._project()
-        self._cool(
-            math.exp(-self.parameters.density_dissipation * dt),
-            math.exp(-self.parameters.cooling * dt),
-            self._radiated(dt),
-        )
+        self._cooling.advance(dt)
         self._extrapolation.fill()
         self._time_s += dt
 
@@ -347,33 +349,13 @@ class SmokeSolver:
         if not any(self.parameters.wind):
             return None
         windward = self.parameters.windward_faces
+        if cut_off := [face for face in windward if self._projection.regions.lie_behind(face)]:
+            raise ValueError(
+                f'smoke "{self.name}": wind blows in through {", ".join(cut_off)}, but solids that stand still cut air '
+                "there off from every other open side: as much must flow out, for air of constant density cannot be "
+                "compressed; leave a way around them, close the side, or turn the wind"
+            )
         return Wind(self.obstacles, self.parameters.wind, windward, openness=self.openness, velocity=velocity)
-
-    def _radiated(self, dt: float) -> float:
-        """The factor r of `_cool` [1/K³], by which e' = e exp(-c dt) (1 + r e³)^(-1/3) solves both laws exactly.
-
-        de/dt = -c e - k (e/e_max)⁴ of the excess e is linear in e^-3: r = k (1 - exp(-3 c dt)) / (c e_max⁴).
-        """
-        hottest = self.parameters.hottest_excess
-        if self.parameters.radiative_cooling == 0.0 or hottest == 0.0:
-            return 0.0
-        rate = 3.0 * self.parameters.cooling
-        time = -math.expm1(-rate * dt) / rate if rate > 0.0 else dt
-        return 3.0 * self.parameters.radiative_cooling * time / hottest**4
-
-    @ti.kernel
-    def _cool(self, density_factor: ti.f32, excess_factor: ti.f32, radiated: ti.f32):
-        """Thin smoke out, and cool it by Newton's law and by radiation (Nguyen, Fedkiw & Jensen 2002)."""
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            for n in range(lane_items(self._nz, lane)):
-                k = lane_place(n, lane)
-                self.density[row + k] *= density_factor
-                excess = self.excess_temperature[row + k]
-                if ti.static(self.parameters.radiative_cooling > 0.0):
-                    heat = ti.max(excess, 0.0)
-                    excess *= (1.0 + radiated * heat * heat * heat) ** (-1.0 / 3.0)
-                self.excess_temperature[row + k] = excess * excess_factor
 
     @ti.kernel
     def _find_speed_and_acceleration(self) -> Pair:

@@ -9,14 +9,11 @@ from numpy.typing import NDArray
 from sim.parameters import Vector3
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import lane_count, lane_items, lane_place
-from sim.smoke.parameters import TurbulenceParameters
+from sim.smoke.parameters import CELLS_PER_EDDY, TurbulenceParameters
 from sim.smoke.random_numbers import hash_bits, hash_to_unit, spread
 
 REACH = 4
 """Nodes of the lattice along an axis that a cell and its faces depend on."""
-
-CELLS_PER_NODE = 2.0
-"""The lattice is at least so many cells wide: the grid carries nothing finer."""
 
 PEAK = 3.0
 """Largest acceleration that steps are cut for, over the root mean square: a bell curve exceeds it by chance only."""
@@ -51,7 +48,7 @@ class Turbulence:
     def __init__(
         self, grid: SmokeGrid, parameters: TurbulenceParameters, *, wind: Vector3, openness: tuple, velocity: tuple
     ) -> None:
-        if parameters.size < CELLS_PER_NODE * grid.cell_size * (1.0 - 1.0e-9):
+        if parameters.size < CELLS_PER_EDDY * grid.cell_size * (1.0 - 1.0e-9):
             raise ValueError(
                 f"turbulence.size: {parameters.size:g} m is less than two cells of {grid.cell_size:g} m, which carry "
                 "no such eddies; enlarge it or use a smaller cell_size"

@@ -30,7 +30,7 @@ TINY = {
     "hammock_of_water": {"cloth.sheet.shape.counts": [13, 13], "fluid.water.emitter.0.start_s": 0.0},
     "honey": {"fluid.honey.particle_radius": 0.0014},
     "quickstart": {"fluid.water.particle_radius": 0.02, "smoke.plume.cell_size": 0.06},
-    "smoke_in_box": {"smoke.plume.cell_size": 0.06},
+    "smoke_in_box": {"smoke.plume.cell_size": 0.016},
     "smoke_moving_duck": {"smoke.fog.cell_size": 0.06},
     "smoke_past_sphere": {"smoke.smoke.cell_size": 0.02},
 }

@@ -72,6 +72,62 @@ def test_what_hardly_shines_beside_another_fire_gets_no_lamp_and_a_dead_fire_non
     )
 
 
+def test_a_fire_without_emission_has_no_lamps(tmp_path):
+    run_python(
+        SCENE
+        + """
+    from dataclasses import replace
+    from blender_scripts.volumes import FireLight
+    dark = replace(glow, emission=0.0)
+    assert lamps_of_grids(grid(density, "density"), grid(heat, "temperature"), dark) == []
+    path = Path(sys.argv[1]) / "fire.vdb"
+    openvdb.write(str(path), [grid(density, "density"), grid(heat, "temperature")])
+    FireLight("dark", dark).shine(path)
+    """,
+        str(tmp_path),
+    )
+
+
+def test_lamps_fade_at_open_faces_as_the_smoke_does():
+    """The first fire has its cells 0.05 m, 0.15 m ... from the side x-; smoothstep over 0.2 m leaves 5/32 and 27/32."""
+    run_python(
+        SCENE
+        + """
+    from dataclasses import replace
+    heat[:2, 4:6, 4:6] = 1200.0
+    grids = grid(density, "density"), grid(heat, "temperature")
+    plain, faded, at_far_side, cut = (
+        lamps_of_grids(*grids, replace(glow, **fade))
+        for fade in (
+            {},
+            dict(open_faces=("x-",), fade_width=0.2),
+            dict(open_faces=("x+",), fade_width=0.2),
+            dict(open_faces=("x-", "x+"), fade_width=0.0),
+        )
+    )
+    assert plain == cut == at_far_side
+    assert len(faded) == 2 and faded[1] == plain[1]
+    weights = np.array([5 / 32, 27 / 32, 1.0, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(faded[0].power, np.array(plain[0].power) * weights.mean(), rtol=1e-6)
+    centre = 1.0 + weights @ (0.05 + 0.1 * np.arange(6)) / weights.sum()
+    np.testing.assert_allclose(faded[0].position, (centre, 2.5, 3.5), atol=1e-6)
+    """
+    )
+
+
+def test_the_look_tells_lamps_of_its_fade():
+    run_python(
+        """
+    from blender_scripts.shading import LookContext, SmokeBox
+    from blender_scripts.smoke_looks import glow_of
+    box = SmokeBox((0.0, 0.0, 0.0), (1.0, 0.5, 2.0), ("z+",), 300.0)
+    for own, width in (({}, 0.04), ({"edge_fade": 0.3}, 0.3), ({"edge_fade": 0.0}, 0.0)):
+        told = glow_of(LookContext.of(own, domain_size=2.0, pixel_angle=1e-3, smoke_box=box))
+        assert told.open_faces == ("z+",) and abs(told.fade_width - width) < 1e-12, told
+    """
+    )
+
+
 def test_a_volume_without_temperature_is_refused_with_its_name(tmp_path):
     run_python(
         SCENE

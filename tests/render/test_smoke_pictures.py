@@ -81,7 +81,7 @@ def test_hotter_flames_are_brighter_and_whiter_as_planck_says(flames):
     np.testing.assert_allclose(ratios, expected, rtol=0.06)
     green_of_red = [color[1] / color[0] for color in mean]
     planck = black_body_color(np.array([1500.0, 1800.0, 2200.0]))
-    # Blender's colours are a fit of its own; ours integrates Planck's law.
+    # Blender's colours are a fit of its own; ours is Krystek's of the chromaticity.
     np.testing.assert_allclose(green_of_red, planck[:, 1] / planck[:, 0], rtol=0.05)
     assert green_of_red[0] < green_of_red[1] < green_of_red[2]
 

@@ -168,6 +168,33 @@ def test_changed_thickness_is_searched_anew():
     assert listed(pairs) == listed(anew)
 
 
+def test_pairs_keep_a_changed_thickness_where_a_thicker_cloth_changes_nothing():
+    """Two sheets of 1 mm lie on each other and become 4 mm thick; a third, of 8 mm, hangs elsewhere."""
+    sheet = rectangle((0.3, 0.3), (13, 13))
+    solver = solver_of(
+        cloth("lower", shape=sheet, thickness=0.001),
+        cloth("upper", shape=sheet, thickness=0.001, position=(0.0, 0.0, 0.0011)),
+        cloth("thick", shape=sheet, thickness=0.008, position=(0.0, 0.0, 1.0)),
+        gravity=WEIGHTLESS,
+    )
+    state, pairs = solver.state, SelfCollision(solver.state)
+    for name in ("lower", "upper"):
+        pairs.begin_frame(state)
+        pairs.look(state)
+        pairs.prepare(state)
+        solver.change(name, thickness=0.004)
+    pairs.begin_frame(state)
+    pairs.look(state)
+    pairs.prepare(state)
+    assert pairs.thickness == np.float32(0.008)
+    for each in (pairs.with_triangles, pairs.of_edges):
+        vertices, wanted = each.vertices.to_numpy()[: each.end], each.wanted.to_numpy()[: each.end]
+        body = state.host.body[vertices]
+        across = (vertices[:, 0] >= 0) & (body[:, 0] != body[:, 2])
+        assert np.count_nonzero(across) > 100
+        np.testing.assert_allclose(wanted[across], 0.004, rtol=1e-6)
+
+
 def test_one_wild_vertex_has_only_its_own_surroundings_watched():
     """A vertex that contacts push by 2 cm in a substep, in the corner of a sheet at rest of a metre."""
     state = state_of(33, size=1.0)

@@ -169,3 +169,43 @@ def test_a_hot_plume_leans_with_a_cross_wind():
 def test_wind_that_air_cannot_follow_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         build(wind=(1.0, 0.0, 0.0), **changes)
+
+
+def plate(x: float, **changes) -> object:
+    """A plate across the whole box but for what `changes` leave open."""
+    shape = {"type": "box", "size": (2.0 * CELL, 2.0, 2.0), **changes}
+    return build_solid(Placement(shape=shape, position=(x, 0.375, 0.375)))
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "changes"),
+    [
+        (plate(0.75), {}),
+        (plate(0.75), {"wind": (-1.0, 0.0, 0.0)}),
+        # The same air, but the wind comes in at a corner of the box and could leave on the other side of y.
+        (plate(0.75), {"wind": (1.0, 1.0, 0.0), "open_faces": ("x-", "x+", "y-")}),
+    ],
+    ids=["from below", "from above", "at an angle"],
+)
+def test_wind_into_air_that_solids_cut_off_is_refused(obstacle, changes):
+    face = "x[+]" if changes.get("wind", (1.0,))[0] < 0.0 else "x-"
+    with pytest.raises(ValueError, match=f'smoke "plume": wind blows in through {face}.* cut air there off') as told:
+        build(obstacles=[obstacle], **{"wind": (1.0, 0.0, 0.0), "open_faces": ("x-", "x+"), **changes})
+    assert "leave a way around them, close the side, or turn the wind" in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "changes"),
+    [
+        # A way around it, two cells wide.
+        (plate(0.75, size=(2.0 * CELL, 0.5, 2.0)), {}),
+    ],
+    ids=["a gap"],
+)
+def test_wind_past_solids_loses_no_air(obstacle, changes):
+    solver = build(obstacles=[obstacle], **{"wind": (1.0, 0.0, 0.0), "open_faces": ("x-", "x+"), **changes})
+    for _ in range(3):
+        solver.substep(0.01)
+    flow_in, flow_out = fluxes(solver)
+    assert flow_in == pytest.approx(flow_out, rel=1.0e-3, abs=1.0e-6)
+    assert solver.diagnostics()["not_converged"] == 0.0
