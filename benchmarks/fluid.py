@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sim.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
 from sim.runtime import initialize
-from sim.scene import DomainParameters
 
 if TYPE_CHECKING:
     from sim.fluid.particle_fluid import ParticleFluid

@@ -21,9 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from render.blender import open_renderer
+from render.camera_path import CameraPath
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters, RenderParameters, StageParameters, VolumeParameters
-from render.spec import MeshSequenceObject, RenderSpec, VolumeSequenceObject
+from render.spec import Camera, MeshSequenceObject, RenderSpec, VolumeSequenceObject
 from render.volume import write_volume
 
 FPS = 60.0
@@ -94,11 +95,13 @@ def write_scene(folder: Path, frames: list[int], options: argparse.Namespace) ->
         positions, triangles, normals, velocities = wave(frame, options.triangles)
         write_ply(folder / f"water{frame:06d}.ply", positions, triangles, normals=normals, velocities=velocities)
         write_smoke(folder / f"smoke{frame:06d}.vdb", frame)
+    width, height = options.resolution
+    path = CameraPath(CameraParameters(), (-0.5, -0.5, 0.0), (0.5, 0.5, 1.0), aspect=width / height, starts={})
     spec = RenderSpec(
         fps=FPS,
         domain_min=(-0.5, -0.5, 0.0),
         domain_max=(0.5, 0.5, 1.0),
-        camera=CameraParameters(),
+        camera=Camera.on(path, f_stop=None, views=""),
         stage=StageParameters(),
         objects=(
             MeshSequenceObject(name="water", file="water{frame}.ply", material=MaterialParameters(look="water")),

@@ -14,8 +14,8 @@ import json
 import statistics
 import time
 
+from sim.domain import DomainParameters
 from sim.runtime import initialize
-from sim.scene import DomainParameters
 from sim.smoke.parameters import SmokeParameters
 
 BOX = DomainParameters(min=(-0.5, -0.5, 0.0), max=(0.5, 0.5, 1.0))

@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.volume import import_openvdb
+from sim.domain import DomainParameters
 from sim.runtime import initialize
-from sim.scene import DomainParameters
 from sim.smoke.parameters import SmokeParameters
 
 FPS = 24

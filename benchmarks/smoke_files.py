@@ -74,19 +74,7 @@ def least_time(work: Callable[[], object], repeats: int) -> float:
 def run_stage(cached: Path, volume: Path) -> None:
     """What the stage does with a cached frame."""
     smoke = read_smoke_in_box(cached, "plume")
-    write_volume(
-        volume,
-        density=smoke.density,
-        temperature=smoke.temperature,
-        velocity=smoke.velocity,
-        origin=smoke.origin,
-        cell_size=smoke.cell_size,
-        ambient_temperature=smoke.ambient_temperature,
-        parameters=VolumeParameters(),
-        fps=FPS,
-        shutter=SHUTTER,
-        first_cell=smoke.first_cell,
-    )
+    write_volume(volume, **vars(smoke), parameters=VolumeParameters(), fps=FPS, shutter=SHUTTER)
     validate_volume(volume)
 
 

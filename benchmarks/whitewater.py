@@ -15,8 +15,8 @@ from time import perf_counter
 
 import numpy as np
 
+from sim.domain import DomainParameters
 from sim.runtime import initialize
-from sim.scene import DomainParameters
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.motion import FluidState
 from sim.whitewater.parameters import WhitewaterParameters

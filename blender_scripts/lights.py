@@ -11,12 +11,15 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from blender_scripts.camera import View, aim
+from blender_scripts.camera import aim
 from blender_scripts.compatibility import node_tree_of, set_physical_sky
 from blender_scripts.geometry import TriangleMesh, new_mesh_object
 
 _REFERENCE_SIZE_M = math.sqrt(3.0)
 """Diagonal of the domain that the lights' powers are written for."""
+
+_SKY_MAP_PIXELS = 256
+"""Across the map by which light samples choose their way into the sky: 1.4 degrees each."""
 
 
 @dataclass(frozen=True)
@@ -28,23 +31,27 @@ class StageGeometry:
         floor_z: height of the ground [m].
         size: diagonal of the domain [m].
         to_camera: horizontal unit vector from the domain towards the camera.
+        camera_circle: how far from the domain's middle the camera gets, if it goes around it [m].
     """
 
     centre: Vector
     floor_z: float
     size: float
     to_camera: Vector
+    camera_circle: float | None
 
     @classmethod
-    def of(cls, spec: dict[str, Any], view: View) -> StageGeometry:
-        """The geometry for a specification, seen from a view."""
+    def of(cls, spec: dict[str, Any]) -> StageGeometry:
+        """The geometry for a specification, seen from where its camera starts."""
         box_min, box_max = Vector(spec["domain_min"]), Vector(spec["domain_max"])
         centre = (box_min + box_max) / 2
-        towards = Vector(view.position) - Vector(view.look_at)
+        camera = spec["camera"]
+        towards = Vector(camera["position"]) - Vector(camera["look_at"])
         towards.z = 0.0
         # A camera straight above has no horizontal direction; any will do.
         to_camera = towards.normalized() if towards.length > 1e-6 else Vector((0.0, -1.0, 0.0))
-        return cls(centre, box_min.z, (box_max - box_min).length, to_camera)
+        size = (box_max - box_min).length
+        return cls(centre, box_min.z, size, to_camera, camera["distance_all_round"])
 
     def place(self, *, right: float, towards_camera: float, above_floor: float) -> Vector:
         """A point given in domain sizes, in axes that turn with the camera [m]."""
@@ -58,9 +65,9 @@ class StageGeometry:
         return (self.size / _REFERENCE_SIZE_M) ** 2
 
 
-def build_stage(spec: dict[str, Any], view: View) -> None:
+def build_stage(spec: dict[str, Any]) -> None:
     """Build the stage that a specification names, and its extra lights."""
-    geometry = StageGeometry.of(spec, view)
+    geometry = StageGeometry.of(spec)
     STAGES[spec["stage"]["name"]](spec["stage"], geometry)
     for index, light in enumerate(spec["lights"]):
         _add_extra_light(f"light {index}", light)
@@ -68,7 +75,8 @@ def build_stage(spec: dict[str, Any], view: View) -> None:
 
 def _build_studio(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     """A cyclorama with a small warm key, a large cool fill and strong rims: water and smoke read by their rims."""
-    _add_ground(_cyclorama(geometry), "cyclorama", parameters["color"])
+    backdrop = _cyclorama(geometry) if geometry.camera_circle is None else _round_cyclorama(geometry)
+    _add_ground(backdrop, "cyclorama", parameters["color"])
     target = geometry.place(right=0.0, towards_camera=0.0, above_floor=0.22)
     strength = parameters["strength"] * geometry.power_scale
     for name, placement, size, spread_deg, power, color in (
@@ -107,6 +115,10 @@ def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     # The sky's rotation is measured from +y, clockwise seen from above.
     set_physical_sky(sky, sun_elevation=elevation, sun_rotation=math.atan2(towards_sun.x, towards_sun.y))
     _connect_background(tree, sky.outputs["Color"], 0.14 * parameters["strength"])
+    # Without its sun the sky is smooth. Cycles' own map of where it is bright is made anew for each frame, and so fine
+    # that it takes a third of a draft's time.
+    settings = bpy.context.scene.world.cycles
+    settings.sampling_method, settings.sample_map_resolution = "MANUAL", _SKY_MAP_PIXELS
 
 
 def _build_night(parameters: dict[str, Any], geometry: StageGeometry) -> None:
@@ -158,6 +170,40 @@ def _cyclorama(geometry: StageGeometry) -> TriangleMesh:
         [np.stack([left, right, right + 1], axis=1), np.stack([left, right + 1, left + 1], axis=1)]
     )
     return TriangleMesh(positions.astype(np.float32), triangles.astype(np.int32))
+
+
+def _round_cyclorama(geometry: StageGeometry) -> TriangleMesh:
+    """A floor that curves up into a wall all round, behind wherever the camera goes."""
+    assert geometry.camera_circle is not None
+    size = geometry.size
+    radius, height = 1.6 * size, 3.5 * size
+    wall_distance = max(6.0 * size, 1.3 * geometry.camera_circle + radius)
+    angles = np.linspace(0.0, np.pi / 2, 33)
+    # Profile in (distance from the middle, up), from where the floor ends to the top of the wall.
+    curve = np.stack([wall_distance - radius + radius * np.sin(angles), radius * (1 - np.cos(angles))], axis=1)
+    profile = np.concatenate([curve, [(wall_distance, height)]])
+    headings = np.linspace(0.0, 2 * np.pi, 128, endpoint=False)
+    directions = np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    rings = np.concatenate(
+        [
+            profile[:, None, :1] * directions,
+            np.broadcast_to(profile[:, None, 1:], (len(profile), len(headings), 1)),
+        ],
+        axis=2,
+    )
+    base = np.array((geometry.centre.x, geometry.centre.y, geometry.floor_z))
+    positions = np.concatenate([rings.reshape(-1, 3), np.zeros((1, 3))]) + base
+    count, middle = len(headings), len(profile) * len(headings)
+    here = np.arange(count)
+    beside = np.roll(here, -1)
+    triangles = [np.stack([np.full(count, middle), here, beside], axis=1)]
+    for ring in range(len(profile) - 1):
+        inner, outer = ring * count, (ring + 1) * count
+        triangles += [
+            np.stack([inner + here, outer + here, outer + beside], axis=1),
+            np.stack([inner + here, outer + beside, inner + beside], axis=1),
+        ]
+    return TriangleMesh(positions.astype(np.float32), np.concatenate(triangles).astype(np.int32))
 
 
 def _add_ground(mesh: TriangleMesh, name: str, color: list[float]) -> None:

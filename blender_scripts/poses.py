@@ -16,6 +16,7 @@ import bpy
 import numpy as np
 
 from blender_scripts.errors import RenderInputError
+from blender_scripts.keyframes import forget_keyframes
 
 POSES_VERSION = 1
 _LENGTHS = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity": 3}
@@ -71,7 +72,7 @@ def place(blender_object: Any, pose: Pose, *, frame: int) -> None:
     keyframe each, so nothing depends on how Blender interpolates between them.
     """
     scene = bpy.context.scene
-    _forget_keyframes(blender_object)
+    forget_keyframes(blender_object)
     half_open = 0.5 * scene.render.motion_blur_shutter if scene.render.use_motion_blur else 0.0
     frames_per_second = scene.render.fps / scene.render.fps_base
     for offset in sorted({-half_open, 0.0, half_open}):
@@ -80,13 +81,6 @@ def place(blender_object: Any, pose: Pose, *, frame: int) -> None:
         blender_object.rotation_quaternion = orientation
         for path in ("location", "rotation_quaternion"):
             blender_object.keyframe_insert(path, frame=frame + offset)
-
-
-def _forget_keyframes(blender_object: Any) -> None:
-    if blender_object.animation_data is not None:
-        action = blender_object.animation_data.action
-        blender_object.animation_data_clear()
-        bpy.data.actions.remove(action)
 
 
 def _pose(path: Path, name: str, values: dict[str, Any]) -> Pose:

@@ -31,7 +31,7 @@ from blender_scripts.errors import RenderFailedError, RenderInputError
 from blender_scripts.shading import LookContext, SmokeBox
 from blender_scripts.smoke_looks import glow_of
 
-SPEC_VERSION = 2
+SPEC_VERSION = 3
 EXIT_FRAME_FAILED = 1
 
 
@@ -64,9 +64,9 @@ class SceneRenderer:
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
         self.device = settings.choose_device(spec["render"]["device"])
-        view = camera.choose_view(spec)
-        camera.add_camera(spec, view)
-        lights.build_stage(spec, view)
+        self._camera = camera.add_camera(spec["camera"])
+        self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
+        lights.build_stage(spec)
         if spec["stage"]["tank"]:
             tank.add_tank(spec)
         self._sequences: list[tuple[dict[str, Any], Any]] = []
@@ -95,6 +95,7 @@ class SceneRenderer:
             else:
                 geometry.fill_mesh(blender_object.data, geometry.read_ply(path))
         self._place_bodies(frame)
+        self._place_camera(frame)
         bpy.context.scene.frame_set(frame)
         outcome = bpy.ops.render.render()
         if "FINISHED" not in outcome:
@@ -112,6 +113,13 @@ class SceneRenderer:
             if description["body"] not in of_file[path]:
                 raise RenderInputError(f'the poses {path} have none of "{description["body"]}"')
             poses.place(blender_object, of_file[path][description["body"]], frame=frame)
+
+    def _place_camera(self, frame: int) -> None:
+        if self._views is None:
+            return
+        camera.place_camera(self._camera, self._folder / self._views.replace("{frame}", f"{frame:06d}"), frame=frame)
+        # A pattern that stood still in a moving picture would look like dirt on the lens.
+        bpy.context.scene.cycles.seed = (self._seed + frame) % 2**31
 
     def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> None:
         name, kind = description["name"], description["type"]

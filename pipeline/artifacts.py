@@ -44,11 +44,15 @@ from blake3 import blake3
 from pipeline.errors import InvalidArtifactError, StaleAttemptError
 from pipeline.files import sync
 from pipeline.layout import JobLayout
+from pipeline.parameter_set import digest_of
+from pipeline.provenance import keep_texts, maker
 from pipeline.task import ArtifactPath, Task, TaskId
 
 _READ_BYTES = 4 << 20
 _PART_NAME = re.compile(r"^\..+\.part\.\d+$")
 _LOCK_NAME = ".lock"
+_MAX_RECEIPT_BYTES = 256 * 2**20
+"""A film of a million frames names them all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +70,8 @@ class Receipt:
         mtime_ns: modification time [ns since the epoch]; with the size it short-cuts to the hash.
         hash: blake3 of the bytes, in hexadecimal.
         inputs: hash of each input artifact that it was made from, so that a change can be named.
+        job: digest of the job file that it was made from; its text is `JobLayout.job_text`. Empty in older receipts.
+        maker: program, Python and kind of machine that wrote it; see `provenance.maker`. Empty in older receipts.
         host: name of the machine that wrote it.
         started: wall time when the part file was opened [s since the epoch].
         finished: wall time when it was committed [s since the epoch].
@@ -81,13 +87,16 @@ class Receipt:
     mtime_ns: int
     hash: str
     inputs: Mapping[ArtifactPath, str] = field(default_factory=dict)
+    job: str = ""
+    maker: str = ""
     host: str = ""
     started: float = 0.0
     finished: float = 0.0
 
     def to_json(self) -> str:
-        """The receipt file's text."""
-        return json.dumps(asdict(self), indent=1, sort_keys=True) + "\n"
+        """The receipt file's text; its seal is a digest of all the rest, so that no flipped bit goes unseen."""
+        values = asdict(self)
+        return json.dumps({**values, "seal": _seal(values)}, indent=1, sort_keys=True) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> Receipt:
@@ -98,9 +107,41 @@ class Receipt:
         """
         try:
             values: dict[str, Any] = json.loads(text)
+            _check_types(values)
+            seal = values.pop("seal", None)  # older receipts have none
+            if seal is not None and seal != _seal(values):
+                raise InvalidArtifactError("not a receipt any more: its seal is broken")
             return cls(**values)
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RecursionError) as error:
             raise InvalidArtifactError(f"not a receipt: {error}") from error
+
+
+def _now_s() -> float:
+    """Wall time [s since the epoch], of as many digits that none of them can change without changing the number."""
+    return round(time.time(), 6)
+
+
+def _seal(values: Mapping[str, Any]) -> str:
+    return digest_of(json.dumps(values, sort_keys=True, separators=(",", ":")))
+
+
+_TEXTS = ("artifact", "task", "stage", "fingerprint", "parameters", "hash", "job", "maker", "host")
+_NUMBERS = ("attempt", "size", "mtime_ns", "started", "finished")
+
+
+def _check_types(values: dict[str, Any]) -> None:
+    """Raise TypeError where a field of a receipt is of another kind, as a damaged file may have it."""
+    if not isinstance(values, dict):
+        raise TypeError("no JSON object")
+    for name in _TEXTS:
+        if not isinstance(values.get(name, ""), str):
+            raise TypeError(f"{name} is no text")
+    for name in _NUMBERS:
+        if isinstance(values.get(name, 0), bool) or not isinstance(values.get(name, 0), int | float):
+            raise TypeError(f"{name} is no number")
+    inputs = values.get("inputs", {})
+    if not isinstance(inputs, dict) or any(not isinstance(each, str) for each in inputs.values()):
+        raise TypeError("inputs are not hashes by path")
 
 
 def hash_file(path: Path) -> str:
@@ -117,9 +158,13 @@ def hash_file(path: Path) -> str:
 def read_receipt(layout: JobLayout, artifact: ArtifactPath) -> Receipt | None:
     """The artifact's receipt, or None if there is none or it is not readable as one (then it does not count)."""
     try:
-        return Receipt.from_json(layout.receipt(artifact).read_text())
+        with layout.receipt(artifact).open("rb") as file:
+            content = file.read(_MAX_RECEIPT_BYTES + 1)
+        receipt = Receipt.from_json(content.decode()) if len(content) <= _MAX_RECEIPT_BYTES else None
     except (FileNotFoundError, InvalidArtifactError, UnicodeDecodeError):
         return None
+    # One that speaks of another file, as after a mix-up, says nothing about this one.
+    return receipt if receipt is not None and receipt.artifact == artifact else None
 
 
 def verify_artifact(layout: JobLayout, receipt: Receipt, *, deep: bool = False) -> str | None:
@@ -200,7 +245,7 @@ class Commit:
         return self._receipt
 
     def __enter__(self) -> Self:
-        self._started = time.time()
+        self._started = _now_s()
         _make_folder(self._target.parent)
         self.path.unlink(missing_ok=True)
         return self
@@ -220,7 +265,8 @@ class Commit:
         if not self.path.is_file():
             raise InvalidArtifactError(f"{self._artifact}: nothing was written, or a newer run has swept it away")
         self._validate(self.path)
-        receipt = self._describe_part()
+        job = keep_texts(self._layout, self._task.parameters)
+        receipt = self._describe_part(job)
         receipt_path = self._layout.receipt(self._artifact)
         _make_folder(receipt_path.parent)
         self._receipt_part.write_text(receipt.to_json())
@@ -234,7 +280,7 @@ class Commit:
             sync(receipt_path.parent)
         self._receipt = receipt
 
-    def _describe_part(self) -> Receipt:
+    def _describe_part(self, job: str) -> Receipt:
         """Hash the part and force it to the disk; only then are its size and time settled."""
         content_hash = hash_file(self.path)
         sync(self.path)
@@ -250,9 +296,11 @@ class Commit:
             mtime_ns=status.st_mtime_ns,
             hash=content_hash,
             inputs=self._inputs,
+            job=job,
+            maker=maker(),
             host=platform.node(),
             started=self._started,
-            finished=time.time(),
+            finished=_now_s(),
         )
 
     def _fence(self) -> None:

@@ -39,7 +39,7 @@ out of place by 1/256 of a cell at most."""
 
 @dataclass(frozen=True)
 class SmokeInBox:
-    """The part of a smoke that is not empty, as dense arrays.
+    """The part of a smoke that is not empty, as dense arrays; its fields are keywords of `render.volume.write_volume`.
 
     Attributes:
         density: (nx, ny, nz) float32 [-].

@@ -9,12 +9,16 @@ from typing import Any
 
 import click
 
-from pipeline.commands.arguments import job_options, print_warnings
+from pipeline import __version__
+from pipeline.commands.arguments import job_options, print_warnings, require_own_programs
+from pipeline.commands.exporting import export, run_stage
 from pipeline.commands.inspecting import explain, logs, plan, status
 from pipeline.commands.keeping import clean, verify
+from pipeline.commands.queueing import cancel, pause, priority, queue, retry, watch, work
 from pipeline.commands.running import rerun, resume, submit
 from pipeline.commands.showing import report, sheet
-from pipeline.errors import PipelineError
+from pipeline.errors import PLACE_TROUBLES, DiskFullError, PipelineError
+from pipeline.executors.failures import is_disk_full
 
 TEMPLATES = ("dam-break", "drop", "smoke", "cloth")
 """As in `pipeline.job.starter`, which is too heavy to be imported for `--help`."""
@@ -31,6 +35,12 @@ class PipelineGroup(click.Group):
             for line in str(error).splitlines():
                 click.secho(f"error: {line}", err=True, fg="red")
             ctx.exit(error.exit_code)
+        except OSError as error:
+            if error.errno not in PLACE_TROUBLES:
+                raise
+            place = f"{error.filename}: " if error.filename else ""
+            click.secho(f"error: {place}{error.strerror}; what is finished stays: try again later", err=True, fg="red")
+            ctx.exit(DiskFullError.exit_code if is_disk_full(error) else PipelineError.exit_code)
 
 
 @click.group(
@@ -38,12 +48,16 @@ class PipelineGroup(click.Group):
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     epilog="Start with: pipeline new my-film, then: pipeline submit my-film.toml",
 )
-@click.version_option(package_name=None, version="0.1.0", prog_name="pipeline")
+@click.version_option(package_name=None, version=__version__, prog_name="pipeline")
 def main() -> None:
     """From a job file to a film of simulated physics, resumable after any crash."""
 
 
-for command in (submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report):
+for command in (
+    *(submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report),
+    *(queue, watch, pause, cancel, retry, priority, work),
+    *(export, run_stage),
+):
     main.add_command(command)
 
 
@@ -74,7 +88,9 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, as_json: bo
     pipeline check dam.toml --set fluid.water.particle_radius=0.005
     """
     from pipeline.job.checks import load_checked_job
+    from pipeline.job.loading import read_job
 
+    require_own_programs(read_job(job_file, overrides, preview=preview), overrides)
     loaded, findings = load_checked_job(job_file, overrides, preview=preview)
     print_warnings(loaded.warnings)
     if as_json:

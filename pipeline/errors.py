@@ -2,6 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+
+PLACE_TROUBLES = frozenset(
+    {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.ENODEV}
+    | {errno.ENXIO, errno.ENOTCONN, errno.ETIMEDOUT}
+)
+"""Codes of an OSError that are about a disk, a mount or permissions, and no fault of this program."""
+
+
+NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP})
+"""Codes of an OSError of `flock` where a file system has no locks."""
+
 
 class PipelineError(Exception):
     """Base of everything that ends a command with a clear line instead of a traceback.
@@ -44,6 +56,10 @@ class InvalidArtifactError(PipelineError):
 
 class StaleAttemptError(PipelineError):
     """A newer attempt of the same task has committed already; this one must not write."""
+
+
+DISK_FULL = "the disk is full ({}); free some space and submit the job again"
+"""Said with the folder that does not hold any more."""
 
 
 class DiskFullError(PipelineError):

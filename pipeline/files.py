@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from uuid import uuid4
 
 
 def replace_durably(path: Path, content: str | bytes) -> None:
@@ -16,7 +17,8 @@ def replace_durably(path: Path, content: str | bytes) -> None:
     Raises:
         OSError: it cannot be written, as on a full disk; the old file stands then, and nothing is left beside it.
     """
-    part = path.with_name(f".{path.name}.part.{os.getpid()}")
+    # Workers write the same text at once, and in containers they have the same process ids.
+    part = path.with_name(f".{path.name}.part.{uuid4().int}")
     try:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
         sync(part)

@@ -39,6 +39,19 @@ class JobLayout:
         """Folder of all receipts."""
         return self.root / ".receipts"
 
+    @property
+    def provenance(self) -> Path:
+        """Folder of the texts that receipts name by their digests."""
+        return self.root / ".provenance"
+
+    def job_text(self, digest: str) -> Path:
+        """A job file that artifacts were made from."""
+        return self.provenance / "jobs" / f"{digest}.toml"
+
+    def parameters_text(self, digest: str) -> Path:
+        """A parameter set that artifacts were made from."""
+        return self.provenance / "parameters" / f"{digest}.json"
+
     def log(self, task_id: TaskId, attempt: int) -> Path:
         """Log of one attempt."""
         return self.root / "logs" / f"{task_id}.{attempt}.log"
@@ -65,6 +78,11 @@ class JobLayout:
     def poses(self) -> str:
         """Poses of the moving bodies at a frame, for Blender: path relative to the folder, with {frame}."""
         return "poses/{frame}.json"
+
+    @property
+    def views(self) -> str:
+        """Where a camera that moves is at a frame, for Blender: path relative to the folder, with {frame}."""
+        return "views/{frame}.json"
 
     @property
     def checkpoints(self) -> Path:

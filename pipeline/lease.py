@@ -22,14 +22,14 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
 import psutil
 
-from pipeline.errors import JobBusyError, LeaseLostError
+from pipeline.errors import NO_LOCKS, JobBusyError, LeaseLostError, PipelineError
 
 HEARTBEAT_INTERVAL_S = 5.0
 """How often a holder says that it is alive."""
@@ -103,24 +103,14 @@ class Lease:
 
         Raises:
             JobBusyError: a live process holds it.
+            PipelineError: the file system has no locks.
         """
-        with _guard(path) as now_s:
-            takeover = None
-            if path.exists():
-                holder = read_holder(path)
-                evidence = _evidence_of_death(holder, age_s=now_s - path.stat().st_mtime, expiry_s=expiry_s)
-                if evidence is None:
-                    assert holder is not None
-                    raise JobBusyError(
-                        f"{path.parent} is being run already, by process {holder.pid} on {holder.host} "
-                        f"since {_clock(holder.acquired)}"
-                    )
-                takeover = f"taking over from {_describe(holder)}: {evidence}"
-            mine = LeaseHolder.this_process()
-            part = path.with_name(f".{path.name}.part.{mine.pid}")
-            part.write_text(json.dumps(asdict(mine), indent=1) + "\n")
-            part.replace(path)
-        return cls(path, mine, takeover)
+        try:
+            return cls(path, *_take(path, expiry_s))
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
+            raise PipelineError(f"{path.parent}: this file system has no locks (flock); use another folder") from error
 
     def heartbeat(self) -> None:
         """Say that the holder is alive; inside the context a thread does, every HEARTBEAT_INTERVAL_S.
@@ -180,7 +170,26 @@ class Lease:
         self._given_back.set()
         if self._beating is not None:
             self._beating.join()
-        self.release()
+        with suppress(OSError):  # a folder that refuses; once this process has ended, the lease counts for nothing
+            self.release()
+
+
+def _take(path: Path, expiry_s: float) -> tuple[LeaseHolder, str | None]:
+    """Write this process's name into a lease's file, unless a live one's is there; see `Lease.acquire`."""
+    with _guard(path) as now_s:
+        takeover = None
+        if path.exists():
+            holder = read_holder(path)
+            evidence = _evidence_of_death(holder, age_s=now_s - path.stat().st_mtime, expiry_s=expiry_s)
+            if evidence is None:
+                assert holder is not None
+                raise busy_error(path, holder)
+            takeover = f"taking over from {_describe(holder)}: {evidence}"
+        mine = LeaseHolder.this_process()
+        part = path.with_name(f".{path.name}.part.{mine.pid}")
+        part.write_text(json.dumps(asdict(mine), indent=1) + "\n")
+        part.replace(path)
+    return mine, takeover
 
 
 def read_holder(path: Path) -> LeaseHolder | None:
@@ -202,6 +211,20 @@ def live_holder(path: Path, *, expiry_s: float = EXPIRY_S) -> LeaseHolder | None
     except FileNotFoundError:
         return None
     return holder if _evidence_of_death(holder, age_s=age_s, expiry_s=expiry_s) is None else None
+
+
+def refuse_if_held(path: Path) -> None:
+    """Raise JobBusyError if a live process holds a lease."""
+    holder = live_holder(path)
+    if holder is not None:
+        raise busy_error(path, holder)
+
+
+def busy_error(path: Path, holder: LeaseHolder) -> JobBusyError:
+    """The error that says who runs what this lease is about."""
+    return JobBusyError(
+        f"{path.parent} is being run already, by process {holder.pid} on {holder.host} since {_clock(holder.acquired)}"
+    )
 
 
 def remove_guard(path: Path) -> None:

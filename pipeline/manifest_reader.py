@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+from pipeline.bulk import many_objects
 from pipeline.errors import ManifestError, OutdatedManifestError
 from pipeline.migrations import migrations, refuse_newer, schema_version
 from pipeline.parameter_set import ParameterSet
@@ -151,7 +152,19 @@ class ManifestReader:
 
     def artifacts(self) -> dict[ArtifactPath, ArtifactRow]:
         """Every artifact on record."""
-        return {row.artifact: row for row in map(ArtifactRow._make, self._rows("SELECT * FROM artifact"))}
+        with many_objects():
+            return {row.artifact: row for row in map(ArtifactRow._make, self._rows("SELECT * FROM artifact"))}
+
+    def is_at_rest(self, tasks: int) -> bool:
+        """Whether the last run ended well and cleanly, with so many tasks, and nothing has been started since."""
+        return bool(
+            self._rows(
+                "SELECT 1 FROM job WHERE clean_shutdown AND outcome = ?"
+                " AND (SELECT count(*) FROM task WHERE position IS NOT NULL) = ?"
+                " AND NOT EXISTS (SELECT 1 FROM attempt WHERE finished IS NULL)",
+                (SUCCEEDED, tasks),
+            )
+        )
 
     def states(self) -> dict[TaskId, TaskState]:
         """State of every planned task, in the plan's order."""

@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
+from pipeline.bulk import many_objects
 from pipeline.errors import PlanError
 from pipeline.fingerprint import task_fingerprint
 from pipeline.layout import JobLayout
@@ -106,7 +107,8 @@ def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage]) -> list[Task]
     Raises:
         PlanError: two tasks share a name or an output, an input has no maker, or tasks wait for each other in a circle.
     """
-    return in_order([task for stage in stages for task in stage.plan(job, layout)])
+    with many_objects():
+        return in_order([task for stage in stages for task in stage.plan(job, layout)])
 
 
 def in_order(tasks: Sequence[Task]) -> list[Task]:
@@ -125,12 +127,11 @@ def in_order(tasks: Sequence[Task]) -> list[Task]:
             if output in makers:
                 raise PlanError(f"{output} is made by two tasks, {makers[output]} and {task.id}")
             makers[output] = task.id
+    if _makers_first(tasks, makers):
+        return [*tasks]
     waiting: dict[TaskId, int] = {}
     users: dict[TaskId, list[Task]] = {}
     for task in tasks:
-        for path in task.inputs:
-            if path not in makers:
-                raise PlanError(f"{task.id} reads {path}, which no task makes")
         made_by = {makers[path] for path in task.inputs}
         waiting[task.id] = len(made_by)
         for maker in made_by:
@@ -148,6 +149,20 @@ def in_order(tasks: Sequence[Task]) -> list[Task]:
         stuck = [task.id for task in tasks if waiting[task.id]]
         raise PlanError(f"{len(stuck)} tasks wait for each other in a circle, {stuck[0]} among them")
     return ordered
+
+
+def _makers_first(tasks: Sequence[Task], makers: Mapping[ArtifactPath, TaskId]) -> bool:
+    """Whether the tasks stand in order already, as those of stages in order do; checks that every input is made."""
+    seen: set[TaskId] = set()
+    in_order = True
+    for task in tasks:
+        for path in task.inputs:
+            maker = makers.get(path)
+            if maker is None:
+                raise PlanError(f"{task.id} reads {path}, which no task makes")
+            in_order = in_order and maker in seen
+        seen.add(task.id)
+    return in_order
 
 
 def up_to_date(task: Task, rows: Mapping[ArtifactPath, ArtifactRow]) -> bool:
@@ -186,7 +201,8 @@ def assess(
         parameters: finds an old parameter set by its digest, to name what changed: `Manifest.parameters`.
         forced: tasks that are to run again whatever the record says.
     """
-    return [*_Assessor(rows, problems, parameters, forced).assess(tasks)]
+    with many_objects():
+        return [*_Assessor(rows, problems, parameters, forced).assess(tasks)]
 
 
 class _Assessor:
@@ -217,6 +233,12 @@ class _Assessor:
             return Assessment(task, Verdict.STALE, (_same("to be run again, as asked"),), task.outputs)
         rebuilt = [path for path in task.inputs if path in self._rebuilt]
         fingerprint = None if rebuilt else task_fingerprint(task, input_hashes(task, self._rows))
+        if len(task.outputs) == 1:  # as for nearly every task of a large job
+            reasons = self._reasons(task, task.outputs[0], fingerprint)
+            if reasons:
+                return Assessment(task, Verdict.STALE, reasons, task.outputs)
+            if not rebuilt:
+                return Assessment(task, Verdict.UP_TO_DATE)
         found = {output: self._reasons(task, output, fingerprint) for output in task.outputs}
         bad = {output: reasons for output, reasons in found.items() if reasons}
         if bad:

@@ -101,10 +101,14 @@ def inspect_files(layout: JobLayout, rows: Mapping[ArtifactPath, ArtifactRow]) -
             continue
         if status.st_mtime_ns == row.mtime_ns and status.st_size == row.size:
             continue
-        if status.st_size == row.size and hash_file(layout.path(artifact)) == row.hash:
-            new_mtimes_ns[artifact] = status.st_mtime_ns
-            continue
         receipt = read_receipt(layout, artifact)
+        if status.st_size == row.size and hash_file(layout.path(artifact)) == row.hash:
+            if receipt is None:
+                problems[artifact] = FileProblem(FileCondition.INTERRUPTED, "its receipt is missing or damaged")
+                continue
+            if artifact_row(receipt)._replace(mtime_ns=row.mtime_ns) == row:
+                new_mtimes_ns[artifact] = status.st_mtime_ns
+                continue
         if receipt is None:
             problems[artifact] = FileProblem(FileCondition.INTERRUPTED, "its commit was cut short")
             continue
@@ -139,7 +143,7 @@ def receipts(layout: JobLayout) -> Iterator[Receipt]:
             if name.endswith(".json"):
                 artifact = ArtifactPath(os.path.join(prefix, name.removesuffix(".json")))  # noqa: PTH118 - as above
                 receipt = read_receipt(layout, artifact)
-                if receipt is not None and receipt.artifact == artifact:
+                if receipt is not None:
                     yield receipt
 
 

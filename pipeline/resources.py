@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 
-import psutil
-
+from pipeline.executors.memory import machine_memory_bytes
 from pipeline.task import Resources
 
 MEMORY_SHARE = 0.9
@@ -16,7 +15,7 @@ MEMORY_SHARE = 0.9
 def machine_capacity(*, gpus: int = 0) -> Resources:
     """Cores this process may use, memory of the machine [bytes], and as many GPUs as the caller has found."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Resources(cores=cores, memory_bytes=int(psutil.virtual_memory().total * MEMORY_SHARE), gpus=gpus)
+    return Resources(cores=cores, memory_bytes=int(machine_memory_bytes() * MEMORY_SHARE), gpus=gpus)
 
 
 def plus(a: Resources, b: Resources) -> Resources:

@@ -13,8 +13,18 @@ from collections import deque
 from collections.abc import Sequence
 
 from pipeline.artifacts import Receipt, read_receipt, sweep_parts, verify_artifact
+from pipeline.errors import PlanError
 from pipeline.executors.attempt import load_stages
-from pipeline.executors.base import Assignment, Committed, Executor, Failed, Finished, TaskEvent
+from pipeline.executors.base import (
+    Assignment,
+    CapacityChanged,
+    Committed,
+    Executor,
+    ExecutorEvent,
+    Failed,
+    Finished,
+    TaskEvent,
+)
 from pipeline.executors.failures import is_disk_full
 from pipeline.files import replace_durably
 from pipeline.fingerprint import task_fingerprint
@@ -31,6 +41,7 @@ from pipeline.scheduler import OWN_FAILURES, Scheduler
 from pipeline.scheduler_events import (
     ArtifactCommitted,
     CancelRequested,
+    CapacityUpdated,
     DrainRequested,
     Finish,
     Instruction,
@@ -69,8 +80,8 @@ def run_job(
     control: RunControl | None = None,
     rerun: Selection | None = None,
     capacity: Resources | None = None,
+    machine: Resources | None = None,
     policy: Policy | None = None,
-    task_timeout_s: float | None = None,
 ) -> Outcome:
     """Run a job until nothing is left to do, or somebody stops it.
 
@@ -84,8 +95,8 @@ def run_job(
         control: how the caller stops the run; SIGINT and SIGTERM do in any case.
         rerun: tasks to run again although they are up to date.
         capacity: what tasks may use at a time; this machine by default.
-        policy: when failed tasks are tried again, and when the job gives up.
-        task_timeout_s: longest time that a task with a frame may take [s].
+        machine: the most that one task can be given, where `capacity` is that of several machines.
+        policy: when failed tasks are tried again, and when the job gives up; a stage's own limits come first.
 
     Raises:
         JobBusyError: another live process runs this job.
@@ -116,6 +127,7 @@ def run_job(
         observer.notify(RunStarted(assessments))
         lease.check()
         run = _Run(
+            job,
             layout,
             assessments,
             reconciliation,
@@ -127,8 +139,8 @@ def run_job(
             control=control,
             stages=stages,
             capacity=capacity or machine_capacity(gpus=max((task.resources.gpus for task in tasks), default=0)),
+            machine=machine,
             policy=policy,
-            task_timeout_s=task_timeout_s,
         )
         outcome = run.outcome(run.loop(), time.monotonic() - began)
     observer.notify(RunEnded(outcome))
@@ -140,6 +152,7 @@ class _Run:
 
     def __init__(
         self,
+        job: Job,
         layout: JobLayout,
         assessments: Sequence[Assessment],
         reconciliation: Reconciliation,
@@ -152,8 +165,8 @@ class _Run:
         control: RunControl,
         stages: str,
         capacity: Resources,
+        machine: Resources | None,
         policy: Policy | None,
-        task_timeout_s: float | None,
     ) -> None:
         self._layout = layout
         self._lease = lease
@@ -162,7 +175,7 @@ class _Run:
         self._observer = observer
         self._control = control
         self._stages = stages
-        self._task_timeout_s = task_timeout_s
+        self._job = job
         self._forced = forced
         self._rows = reconciliation.valid_rows
         self._last_failures: dict[TaskId, Failed] = {}
@@ -181,13 +194,18 @@ class _Run:
             if each.task.checkpointed and each.verdict is Verdict.STALE
             for artifact in set(each.task.outputs) - set(each.rebuilds)
         }
-        self._scheduler = Scheduler(
-            [assessment.task for assessment in assessments],
-            up_to_date=done,
-            committed=kept,
-            capacity=capacity,
-            policy=policy,
-        )
+        try:
+            self._scheduler = Scheduler(
+                [assessment.task for assessment in assessments],
+                up_to_date=done,
+                committed=kept,
+                capacity=capacity,
+                machine=machine,
+                policy=policy,
+                policies={stage: limits.policy(policy or Policy()) for stage, limits in job.limits.items()},
+            )
+        except ValueError as error:  # a GPU that is nowhere, for instance
+            raise PlanError(str(error)) from error
         self._scheduler.drain_changes()  # the initial states are recorded as a whole
         self._manifest.record_plan(
             [*self._tasks.values()], {task_id: self._scheduler.state(task_id) for task_id in self._tasks}
@@ -247,7 +265,7 @@ class _Run:
                 instructions += self._scheduler.handle(CancelRequested())
         return instructions
 
-    def _turn(self, events: Sequence[TaskEvent], instructions: Sequence[Instruction]) -> None:
+    def _turn(self, events: Sequence[ExecutorEvent], instructions: Sequence[Instruction]) -> None:
         """Take in what happened, in one commit to the manifest, and do what follows from it.
 
         The commit is not synced to the disk, which would cost a task more than everything else here: a killed process
@@ -261,16 +279,19 @@ class _Run:
         cancellations: list[tuple[TaskId, float]] = []
         with self._manifest.transaction(durable=False):
             for event in events:
+                if isinstance(event, CapacityChanged):
+                    todo += self._scheduler.handle(CapacityUpdated(event.capacity))
+                    continue
                 self._observer.notify(event)
                 todo += self._take(event)
             while todo:
                 match todo.popleft():
-                    case Start(task, threads):
+                    case Start(task, threads, need):
                         # Early cutoff: what was made anew upstream may have turned out the same.
                         if task.id not in self._forced and up_to_date(task, self._rows):
                             todo += self._scheduler.handle(TaskSkipped(task.id))
                         else:
-                            assignments.append(self._open_attempt(task, threads))
+                            assignments.append(self._open_attempt(task, threads, need))
                     case Stop(task_id):
                         cancellations.append((task_id, _STOP_GRACE_S))
                     case Kill(task_id):
@@ -292,19 +313,23 @@ class _Run:
 
     # --- starting ---
 
-    def _open_attempt(self, task: Task, threads: int) -> Assignment:
+    def _open_attempt(self, task: Task, threads: int, need: Resources) -> Assignment:
         attempt = self._manifest.start_attempt(task.id)
         inputs = input_hashes(task, self._rows)
+        limits = self._job.limits_of(task.stage)
         self._assignments[task.id] = assignment = Assignment(
             task=task,
             attempt=attempt,
             fingerprint=task_fingerprint(task, inputs),
             inputs=inputs,
             threads=threads,
-            job_file=self._layout.job_file,
-            root=self._layout.root,
+            job_file=self._layout.job_file.absolute(),  # wherever the worker's own folder is
+            root=self._layout.root.absolute(),
             stages=self._stages,
-            timeout_s=None if task.frame is None else self._task_timeout_s,
+            timeout_s=limits.timeout_s,
+            stall_s=limits.stall_s,
+            memory_bytes=limits.memory_bytes,
+            need=need,
         )
         return assignment
 

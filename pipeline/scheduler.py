@@ -22,6 +22,7 @@ from pipeline.resources import claim, fits, minus, plus, whole_machine
 from pipeline.scheduler_events import (
     ArtifactCommitted,
     CancelRequested,
+    CapacityUpdated,
     DrainRequested,
     Event,
     Finish,
@@ -70,6 +71,7 @@ class _Entry:
     state: TaskState = TaskState.PENDING
     missing: int = 0
     failures: int = 0
+    out_of_memory: int = 0
     runs_alone: bool = False
     history: list[TaskState] = field(default_factory=lambda: [TaskState.PENDING])
 
@@ -85,8 +87,10 @@ class Scheduler:
         tasks: all tasks of the job; stages in the order of their first task.
         up_to_date: tasks that need no run; their outputs count as committed.
         committed: further artifacts that are valid already, as those of a simulation that stopped half-way.
-        capacity: what the machine offers; `memory_bytes` 0 when memory is not to be counted.
-        policy: retries and limits.
+        capacity: what may be used at a time; `memory_bytes` 0 when memory is not to be counted.
+        machine: the most that one task can be given, where `capacity` is that of several machines.
+        policy: when tasks are tried again, and when the job gives up.
+        policies: the same by stage, where it is another.
 
     Raises:
         ValueError: a task needs what nobody makes, or more GPUs than there are.
@@ -99,17 +103,21 @@ class Scheduler:
         up_to_date: Collection[TaskId] = frozenset(),
         committed: Iterable[ArtifactPath] = (),
         capacity: Resources,
+        machine: Resources | None = None,
         policy: Policy | None = None,
+        policies: Mapping[str, Policy] | None = None,
     ) -> None:
-        self.capacity = capacity
-        self.policy = policy or Policy()
+        self.machine = machine or capacity
+        self.capacity = _at_least(self.machine, capacity)
+        self._policy = policy or Policy()
+        self._policies = policies or {}
         self._committed = set(committed)
         self._entries: dict[TaskId, _Entry] = {}
         self._readers: defaultdict[ArtifactPath, list[_Entry]] = defaultdict(list)
         self._ready: defaultdict[Resources, list[tuple[tuple[int, int, int], TaskId]]] = defaultdict(list)
         self._waiting: list[tuple[float, TaskId]] = []
         self._running: dict[TaskId, _Entry] = {}
-        self._free = capacity
+        self._free = self.capacity
         self._blocked: TaskId | None = None
         self._overtakers: set[TaskId] = set()
         self._counts: Counter[tuple[str, TaskState]] = Counter()
@@ -121,7 +129,7 @@ class Scheduler:
         for index, task in enumerate(tasks):
             rank = stages.setdefault(task.stage, len(stages))
             try:
-                need = claim(task.resources, capacity)
+                need = claim(task.resources, self.machine)
             except ValueError as error:
                 raise ValueError(f"{task.id} {error}") from None
             priority = (-1, rank, index) if task.frame is None else (task.frame, -rank, index)
@@ -212,6 +220,10 @@ class Scheduler:
                 self._end(entry, TaskState.UP_TO_DATE)
             case TaskFailed(task_id, kind, now):
                 instructions += self._fail(self._running_entry(task_id, kind), kind, now)
+            case CapacityUpdated(offered):
+                capacity = _at_least(self.machine, offered)
+                self._free = plus(self._free, minus(capacity, self.capacity))
+                self.capacity = capacity
             case DrainRequested():
                 instructions += self._drain(JobOutcome.DRAINED)
             case CancelRequested():
@@ -287,14 +299,17 @@ class Scheduler:
             return []
         # The machine's fault; a task stopped by somebody else than us counts as that, too.
         entry.failures += 1
+        policy = self._policy_of(entry.task.stage)
         out_of_memory = kind is FailureKind.OUT_OF_MEMORY
-        if entry.failures >= (self.policy.out_of_memory_attempts if out_of_memory else self.policy.attempts):
+        entry.out_of_memory += out_of_memory
+        # Want of memory is counted apart: a lost worker before it does not cost the task its turn alone on the machine.
+        if entry.out_of_memory >= policy.out_of_memory_attempts or entry.failures >= policy.attempts:
             return self._fail_for_good(entry)
         self._release(entry)
         self._set_state(entry, TaskState.READY)
         if out_of_memory:
-            entry.need = whole_machine(entry.need, self.capacity)
-        pause = self.policy.backoff_s * 2.0 ** (entry.failures - 1)
+            entry.need = whole_machine(entry.need, self.machine)
+        pause = policy.backoff_s * 2.0 ** (entry.failures - 1)
         heapq.heappush(self._waiting, (now + pause, entry.task.id))
         return []
 
@@ -303,9 +318,13 @@ class Scheduler:
         stage = entry.task.stage
         failed = self._counts[stage, TaskState.FAILED]
         ended = failed + self._counts[stage, TaskState.SUCCEEDED]
-        if failed >= self.policy.failure_count and failed >= self.policy.failure_share * ended:
+        policy = self._policy_of(stage)
+        if failed >= policy.failure_count and failed >= policy.failure_share * ended:
             return self._drain(JobOutcome.TOO_MANY_FAILURES)
         return []
+
+    def _policy_of(self, stage: str) -> Policy:
+        return self._policies.get(stage, self._policy)
 
     def _drain(self, outcome: JobOutcome) -> list[Instruction]:
         if self._ending is not None:
@@ -365,7 +384,7 @@ class Scheduler:
         self._set_state(entry, TaskState.RUNNING)
         self._running[entry.task.id] = entry
         self._free = minus(self._free, entry.need)
-        return Start(entry.task, threads=claim(entry.task.resources, self.capacity).cores)
+        return Start(entry.task, threads=claim(entry.task.resources, self.machine).cores, need=entry.need)
 
     def _close(self) -> JobOutcome:
         """Settle what never ran, and say how the job ended."""
@@ -387,3 +406,12 @@ class Scheduler:
             for artifact in task.inputs:
                 if artifact not in produced:
                     raise ValueError(f"{task.id} reads {artifact}, which no task makes")
+
+
+def _at_least(machine: Resources, capacity: Resources) -> Resources:
+    """A capacity that a task can claim its machine of: it waits for one that went, and does not block for ever."""
+    return Resources(
+        cores=max(machine.cores, capacity.cores),
+        memory_bytes=max(machine.memory_bytes, capacity.memory_bytes),
+        gpus=max(machine.gpus, capacity.gpus),
+    )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from pipeline.errors import PipelineError
-from pipeline.task import ArtifactPath, FailureKind, Task, TaskId, TaskState
+from pipeline.task import ArtifactPath, FailureKind, Resources, Task, TaskId, TaskState
 
 
 class InvalidTransitionError(PipelineError):
@@ -102,7 +102,23 @@ class Tick:
     now: float
 
 
-Event = ArtifactCommitted | TaskSucceeded | TaskSkipped | TaskFailed | DrainRequested | CancelRequested | Tick
+@dataclass(frozen=True, slots=True)
+class CapacityUpdated:
+    """Machines came or went: tasks may use this much together from now on; what runs goes on."""
+
+    capacity: Resources
+
+
+Event = (
+    ArtifactCommitted
+    | TaskSucceeded
+    | TaskSkipped
+    | TaskFailed
+    | DrainRequested
+    | CancelRequested
+    | Tick
+    | CapacityUpdated
+)
 
 
 # --- instructions ---
@@ -110,10 +126,11 @@ Event = ArtifactCommitted | TaskSucceeded | TaskSkipped | TaskFailed | DrainRequ
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Run this task now, on this many threads; its resources are taken."""
+    """Run this task now, on this many threads; `need` is taken for it."""
 
     task: Task
     threads: int
+    need: Resources
 
 
 @dataclass(frozen=True, slots=True)

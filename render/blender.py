@@ -29,6 +29,10 @@ class BlenderUnavailableError(RuntimeError):
     """Blender cannot be used on this machine; says what is missing and how to get it."""
 
 
+class BlenderKilledError(BlenderUnavailableError):
+    """The Blender executable was ended by a signal while it started: the machine's fault, which may be gone by now."""
+
+
 class FrameRenderError(RuntimeError):
     """A frame could not be drawn.
 
@@ -153,9 +157,9 @@ class ExecutableRenderer:
         try:
             answer = self._read_answer(("RENDERER_READY", "RENDERER_FAILED"))
             if answer is None:
-                self.close()
-                raise BlenderUnavailableError(
-                    f"Blender did not start: exit code {self._process.returncode} of {' '.join(self._argv)}; "
+                code = self._exit_code()
+                raise (BlenderKilledError if code < 0 else BlenderUnavailableError)(
+                    f"Blender did not start: exit code {code} of {' '.join(self._argv)}; "
                     f"its last lines:\n{self._last_lines()}"
                 )
             if answer.startswith("RENDERER_FAILED"):
@@ -210,6 +214,13 @@ class ExecutableRenderer:
             self._log_tail.append(text)
             logger.debug("blender: %s", text)
         return None
+
+    def _exit_code(self) -> int:
+        """How a child that has closed its output ends, by itself if it does so soon; negative for a signal."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return self._process.wait(_TERMINATE_TIMEOUT_S)
+        self.close()
+        return self._process.wait()
 
     def _died(self, frame: int) -> BlenderDiedError:
         self.close()

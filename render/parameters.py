@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from itertools import pairwise
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Vector3 = tuple[float, float, float]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -37,13 +38,71 @@ class VolumeParameters(Parameters):
     half_precision: bool = Field(default=True, description="Store 16-bit floats.")
 
 
+class CameraKeyframeParameters(Parameters):
+    """Where the camera is at one time."""
+
+    time_s: NonNegative = Field(description="Time [s]; later than that of the keyframe before.")
+    position: Vector3 = Field(description="Where it is [m].")
+    look_at: Vector3 | None = Field(default=None, description="What it looks at [m]; as without keyframes if omitted.")
+    focal_length_mm: Positive | None = Field(default=None, description="Focal length [mm]; the camera's if omitted.")
+
+
 class CameraParameters(Parameters):
-    """A fixed camera. Without a position it frames the whole domain from the front."""
+    """The camera: still, along keyframes, around what it looks at, or with a body.
+
+    Without a position it frames the whole domain from the front.
+    """
 
     position: Vector3 | None = Field(default=None, description="Where it stands [m]; frames the domain if omitted.")
-    look_at: Vector3 | None = Field(default=None, description="What it looks at [m]; the domain's middle if omitted.")
+    look_at: Vector3 | str | None = Field(
+        default=None,
+        description="What it looks at: a point [m], or a moving body by its name; the domain's middle if omitted.",
+    )
     focal_length_mm: Positive = Field(default=50.0, description="Focal length on a 36 mm sensor [mm].")
     f_stop: Positive | None = Field(default=None, description="Aperture; everything is in focus if omitted.")
+    focus: str | None = Field(
+        default=None, description="Name of the moving body in focus; the point that it looks at if omitted."
+    )
+    follow: str | None = Field(default=None, description="Name of the moving body that it travels along with.")
+    orbit_deg_per_s: float = Field(
+        default=0.0,
+        description="How fast it goes around what it looks at, counter-clockwise from above if positive [degrees/s].",
+    )
+    keyframe: tuple[CameraKeyframeParameters, ...] = Field(
+        default=(), description="Where it is at which time; it stands still before the first and after the last."
+    )
+    easing: Literal["smooth", "linear"] = Field(
+        default="smooth",
+        description="Between keyframes. smooth: starts and stops gently, without overshoot; linear: at constant speed.",
+    )
+
+    @property
+    def moves(self) -> bool:
+        """Whether its view differs from frame to frame."""
+        with_body = self.follow is not None or self.focus is not None or isinstance(self.look_at, str)
+        return bool(self.keyframe) or self.orbit_deg_per_s != 0.0 or with_body
+
+    @model_validator(mode="after")
+    def _is_one_motion(self) -> Self:
+        if self.keyframe and self.orbit_deg_per_s:
+            raise ValueError("orbit_deg_per_s has no meaning beside keyframes; remove one of them")
+        if self.keyframe and self.position is not None:
+            raise ValueError("position has no meaning beside keyframes, which say where the camera is; remove it")
+        if isinstance(self.look_at, str) and any(key.look_at is not None for key in self.keyframe):
+            raise ValueError(
+                "look_at of a keyframe has no meaning beside a body that the camera looks at; remove one of them"
+            )
+        if not self.keyframe and "easing" in self.model_fields_set:
+            raise ValueError("easing has no meaning without keyframes; remove it or add [[camera.keyframe]]")
+        if self.focus is not None and self.f_stop is None:
+            raise ValueError("focus has no effect without f_stop, such as f_stop = 2.8")
+        for number, (before, after) in enumerate(pairwise(self.keyframe), start=1):
+            if after.time_s <= before.time_s:
+                raise ValueError(
+                    f"keyframe[{number}].time_s must be after {before.time_s:g} s, that of the keyframe before, "
+                    f"got {after.time_s:g} s"
+                )
+        return self
 
 
 class LightParameters(Parameters):
@@ -128,7 +187,8 @@ class RenderParameters(Parameters):
     device: Literal["auto", "cpu", "gpu"] = Field(default="auto", description="What Cycles renders on.")
     blender: str | None = Field(
         default=None,
-        description="Path of a Blender executable, relative to the job file; the bpy module if omitted.",
+        description="Path of a Blender executable; the bpy module if omitted. Counts only with --set or "
+        "PIPELINE_BLENDER, as a job file runs no program.",
     )
 
 

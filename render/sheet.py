@@ -30,7 +30,7 @@ def contact_sheet(
         pictures: PNG files, row by row; each is fitted into a cell of the first one's proportions.
         output: the picture to write; its suffix names the format.
         columns: how many in a row; fewer when there are fewer pictures.
-        width: of the sheet [pixels].
+        width: of the sheet [pixels], at most: pictures are never enlarged.
         labels: one a picture; the frame number from the file's name if omitted.
 
     Raises:
@@ -48,6 +48,8 @@ def contact_sheet(
         raise ValueError(f"{columns} columns do not fit into {width} pixels")
 
     first_height, first_width, _ = read_rgb8(pictures[0]).shape
+    cell_width = min(cell_width, first_width)
+    width = columns * (cell_width + _GAP) + _GAP
     cell_height = max(1, round(cell_width * first_height / first_width))
     rows = math.ceil(len(pictures) / columns)
     sheet = Image.new("RGB", (width, rows * (cell_height + _GAP) + _GAP), _BACKGROUND)

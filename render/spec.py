@@ -7,13 +7,14 @@ the six-digit frame number.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
 
+from render.camera_path import CameraPath
 from render.parameters import (
-    CameraParameters,
     LightParameters,
     MaterialParameters,
     Parameters,
@@ -22,7 +23,7 @@ from render.parameters import (
     Vector3,
 )
 
-SPEC_VERSION: Literal[2] = 2
+SPEC_VERSION: Literal[3] = 3
 
 
 class MeshObject(Parameters):
@@ -92,14 +93,48 @@ SceneObject = Annotated[
 ]
 
 
+class Camera(Parameters):
+    """The camera; if it moves, at its first frame, and documents say where it goes."""
+
+    position: Vector3
+    look_at: Vector3
+    focal_length_mm: float = Field(gt=0.0)
+    focus_distance: float = Field(gt=0.0, description="[m]")
+    f_stop: float | None = Field(default=None, gt=0.0)
+    longest_focal_length_mm: float = Field(gt=0.0, description="Of all frames.")
+    views: str | None = Field(default=None, description="Path with {frame} of a JSON document; see docs/formats.md.")
+    distance_all_round: float | None = Field(
+        default=None,
+        ge=0.0,
+        description="How far from the domain's middle it gets, if it sees what lies behind its first place [m].",
+    )
+
+    @classmethod
+    def on(cls, path: CameraPath, *, f_stop: float | None, views: str) -> Camera:
+        """The camera on a path.
+
+        Args:
+            path: where it goes.
+            f_stop: aperture; None: everything is in focus.
+            views: path of the documents, for one that moves.
+        """
+        return cls(
+            **asdict(path.first()),
+            f_stop=f_stop,
+            longest_focal_length_mm=path.longest_focal_length(),
+            views=views if path.moves else None,
+            distance_all_round=path.distance_all_round(),
+        )
+
+
 class RenderSpec(Parameters):
     """Everything in front of the camera, and the camera."""
 
-    version: Literal[2] = SPEC_VERSION
+    version: Literal[3] = SPEC_VERSION
     fps: float = Field(gt=0.0)
     domain_min: Vector3
     domain_max: Vector3
-    camera: CameraParameters
+    camera: Camera
     stage: StageParameters
     lights: tuple[LightParameters, ...] = ()
     objects: tuple[SceneObject, ...]

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
 from sim.coupling.fluid_rigid import FluidRigidCoupling
+from sim.domain import DomainParameters
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
 from sim.fluid.nozzles import nozzle_collision, pipes
 from sim.fluid.opening import Opening, obstruction
 from sim.fluid.parameters import shared_conflicts
 from sim.rigid.static import StaticBody
-from sim.scene import DomainParameters, SceneParameters
+from sim.scene import SceneParameters
 from sim.shapes.placement import build_solid
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 from sim.solver import Coupling, Solver

@@ -24,11 +24,16 @@ MOST_LAUNCHES = 256
 
 
 class _Launch(NamedTuple):
-    """A call that a kernel remembers; its arrays only as long as somebody else has them."""
+    """A call that a kernel remembers, until nobody else has one of its arrays any more."""
 
     compiled: Any
     context: Any
     arrays: tuple[weakref.ref[Any], ...]
+
+
+def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: object) -> None:
+    """Forget a call, one of whose arrays is gone: another may have its number from now on."""
+    launches.pop(key, None)
 
 
 class FastKernel:
@@ -79,7 +84,7 @@ class FastKernel:
         arrays = [args[index] for index, _ in self._arrays]
         key = (*[args[index] for index in self._templates], *map(id, arrays))
         launch = self._launches.get(key)
-        if launch is None or not all(known() is array for known, array in zip(launch.arrays, arrays, strict=True)):
+        if launch is None:
             compiled = self._compiled.get(self._key(args))
             if compiled is None:
                 return self._first_call(program, args)
@@ -88,9 +93,10 @@ class FastKernel:
                 size = array.arr.nelement() * array.arr.element_size()
                 address = program.get_ndarray_data_ptr_as_int(array.arr)
                 context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
-            launch = _Launch(compiled[1], context, tuple(map(weakref.ref, arrays)))
             if len(self._launches) >= MOST_LAUNCHES:
                 self._launches.clear()
+            forget = functools.partial(_forget, self._launches, key)
+            launch = _Launch(compiled[1], context, tuple(weakref.ref(array, forget) for array in arrays))
             self._launches[key] = launch
         return self._launch(program, launch.compiled, launch.context, args)
 
@@ -113,7 +119,8 @@ class FastKernel:
         program.launch_kernel(compiled, context)
         if self._primal.return_type is None:
             return None
-        impl.get_runtime().sync()
+        if not self._on_cpu:
+            program.synchronize()
         return self._primal.construct_kernel_ret(context, self._primal.return_type[0], (0,))
 
     def __get__(self, owner: Any, kind: type | None = None) -> Any:

@@ -107,6 +107,9 @@ def reduced(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, 
     node_count = lanes // BRANCHES
     last_count = ti.min(node_count, LAST_BRANCHES)
     first_end, second_end, third_end = quantities * node_count, quantities * last_count, quantities
+    # A CPU's few nodes are summed up sooner than other threads wake.
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for n in range(first_end):
         q = n // node_count
         first = q * lanes + n % node_count
@@ -115,6 +118,8 @@ def reduced(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, 
             other = partial[first + k * node_count]
             value = ti.select(q < maxima, ti.max(value, other), value + other)
         nodes[n] = value
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for n in range(second_end):
         q = n // last_count
         first = q * node_count + n % last_count
@@ -123,6 +128,8 @@ def reduced(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, 
             other = nodes[first + k * last_count]
             value = ti.select(q < maxima, ti.max(value, other), value + other)
         nodes[first] = value
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for q in range(third_end):
         value = nodes[q * node_count]
         for k in range(1, last_count):

@@ -181,8 +181,9 @@ def _remove_stale_lock(kernel_cache: Path) -> None:
 
 
 def _cache_folder() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "physics-pipeline"
+    """Of kernels and devices; a relative XDG_CACHE_HOME counts as none, as its specification has it."""
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (base if base.is_absolute() else Path.home() / ".cache") / "physics-pipeline"
 
 
 def _machine_key() -> str:

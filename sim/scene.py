@@ -7,30 +7,13 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
+from sim.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
 from sim.parameters import Parameters, Vector3
 from sim.rigid.parameters import RigidBodyParameters
-from sim.smoke.parameters import Face, SmokeParameters, boxes_overlap
+from sim.smoke.parameters import SmokeParameters, boxes_overlap
 
 Device = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
-
-
-class DomainParameters(Parameters):
-    """The box that the fluid lives in; its closed faces are walls."""
-
-    min: Vector3 = Field(default=(-0.5, -0.5, 0.0), description="Lower corner [m].")
-    max: Vector3 = Field(default=(0.5, 0.5, 1.0), description="Upper corner [m].")
-    open_faces: tuple[Face, ...] = Field(
-        default=("z+",),
-        description="Faces without a wall; fluid that leaves through them is removed and counted.",
-    )
-
-    @model_validator(mode="after")
-    def _has_volume(self) -> Self:
-        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
-            if high <= low:
-                raise ValueError(f"max must be above min on every axis, got {axis} from {low:g} to {high:g} m")
-        return self
 
 
 class SceneParameters(Parameters):

@@ -10,6 +10,9 @@ import pytest
 FAMILIES = {"cloth": "cloth", "coupling": "fluid", "fluid": "fluid", "rigid": "rigid", "smoke": "smoke"}
 """Folders of tests/sim whose tests share kernels, and a name for those that share them."""
 
+ON_THEIR_OWN = {"tests/acceptance/test_sample_jobs.py"}
+"""Files of long tests that share nothing; they fill up whichever process is done first."""
+
 
 def bytecode_folder() -> Path:
     """Where compiled modules are kept; a relative XDG_CACHE_HOME counts as none, as its specification has it."""
@@ -35,6 +38,8 @@ if sys.dont_write_bytecode:
 def family_of(nodeid: str) -> str:
     """What `pytest -n 2 --dist loadfile` gives to one process: files, but families that compile the same kernels."""
     path = nodeid.partition("::")[0]
+    if path in ON_THEIR_OWN:
+        return nodeid
     folders = path.split("/")[:-1]
     is_kin = len(folders) == 3 and folders[:2] == ["tests", "sim"] and folders[2] in FAMILIES
     return FAMILIES[folders[2]] if is_kin else path

@@ -10,7 +10,7 @@ from benchmarks.validation.checks import CaseResult, Check
 from benchmarks.validation.fluids import FLUID_SOLVERS, WATER
 from benchmarks.validation.rigid_bodies import body
 from benchmarks.validation.tanks import SPACING, Tank, submerged_sphere
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 SOLVERS = FLUID_SOLVERS
 NEUTRAL_RADIUS = 3 * SPACING

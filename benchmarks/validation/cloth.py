@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from benchmarks.validation.checks import CaseResult, Check, fitted_order
 from sim.cloth.parameters import ClothParameters
-from sim.scene import DomainParameters, SceneParameters
+from sim.domain import DomainParameters
+from sim.scene import SceneParameters
 
 if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver

@@ -8,7 +8,7 @@ from benchmarks.validation.checks import CaseResult, Check
 from benchmarks.validation.fluids import EVERY_FACE, FLUID_SOLVERS, WATER, WEIGHTLESS, state_of
 from benchmarks.validation.rigid_bodies import body
 from benchmarks.validation.tanks import SPACING, Tank
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 SOLVERS = FLUID_SOLVERS
 DENSITIES, QUICK_DENSITIES = (100.0, 500.0, 2000.0), (500.0,)

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.validation.checks import CaseResult, Check
 from benchmarks.validation.fluids import FLUID_SOLVERS, GRAVITY, advance, lattice, make_fluid, state_of
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 SOLVERS = FLUID_SOLVERS
 REFERENCE = Path(__file__).resolve().parents[2] / "tests" / "reference" / "dam_break_front.csv"

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.validation.checks import CaseResult, Check, fitted_order
 from benchmarks.validation.fluids import FLUID_SOLVERS, WEIGHTLESS, advance, lattice, make_fluid, state_of
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 SOLVERS = FLUID_SOLVERS
 RADIUS, STRAIN_RATE, DURATION = 1.0, 100.0, 0.0076

@@ -388,17 +388,40 @@ def draw_smoke_projection(results: Sequence[CaseResult]) -> Figure:
 
 
 def draw_smoke_plume(results: Sequence[CaseResult]) -> Figure:
-    """Front of a plume at several resolutions, and smoke over what was emitted."""
-    figure, (front, kept) = _panels(2, width=4.2)
+    """Rise of a thermal at several resolutions, and smoke over what was emitted."""
+    figure, (rise, kept) = _panels(2, width=4.2)
     series = results[0].series
     for count, shade in zip(series["cells"], SHADES, strict=False):
-        front.plot(series["times"], series[f"fronts_{count}"], color=shade, label=f"{count} cells a metre")
-    _label(front, "time [s]", "height with 95 % of the smoke below [m]", "front of the plume")
+        rise.plot(series["thermal_times"], series[f"rises_{count}"], "o-", markersize=3, color=shade,
+                  label=f"{count} cells a metre")  # fmt: skip
+    _label(rise, "time [s]", "rise of its centre [m]", "thermal")
     kept.plot(series["times"], series["kept_closed"], color=SHADES[0], label="closed box")
     kept.plot(series["times"], series["kept_around"], color=SHADES[1], label="open box, past a ball")
     kept.axhspan(0.99, 1.01, color="#eeeeee", zorder=0)
     kept.set_ylim(0.97, 1.03)
     _label(kept, "time [s]", "smoke / emitted smoke", "balance; grey: 1 %")
+    return figure
+
+
+def draw_smoke_mass(results: Sequence[CaseResult]) -> Figure:
+    """Smoke left in an even wind, balance of a plume that leaves, smoke around a moving ball."""
+    figure, (blown, leaving, stirred) = _panels(3)
+    series = results[0].series
+    counts = results[0].settings["blob_cells"]
+    for count, shade in zip(counts, SHADES, strict=False):
+        blown.plot(series[f"blown_times_{count}"], series[f"blown_kept_{count}"], color=shade, label=f"{count} cells")
+    blown.plot(series[f"blown_times_{counts[-1]}"], series[f"blown_exact_{counts[-1]}"], ":", color=THEORY,
+               label="exact")  # fmt: skip
+    _label(blown, "time [s]", "smoke / at first", "blob in even wind")
+    leaving.plot(series["leaving_times"], series["leaving_kept"], color=SHADES[0], label="in the box")
+    leaving.plot(series["leaving_times"], series["leaving_balance"], color=SHADES[1], label="and what left")
+    leaving.set_ylim(bottom=0.0)
+    _label(leaving, "time [s]", "smoke / emitted smoke", "plume, open box")
+    stirred.plot(series["stirred_times"], series["stirred_kept"], color=SHADES[0], label="in the box")
+    for name, shade in (("covered", SHADES[1]), ("uncovered", SHADES[2])):
+        stirred.plot(series["stirred_times"], series[f"stirred_{name}"], color=shade, label=name)
+    stirred.set_ylim(bottom=0.0)
+    _label(stirred, "time [s]", "smoke / emitted smoke", "moving ball, closed box")
     return figure
 
 
@@ -419,4 +442,5 @@ DRAWINGS: dict[str, Callable[[Sequence[CaseResult]], Figure]] = {
     "smoke-vortices": draw_smoke_vortices,
     "smoke-projection": draw_smoke_projection,
     "smoke-plume": draw_smoke_plume,
+    "smoke-mass": draw_smoke_mass,
 }

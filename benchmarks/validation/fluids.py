@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.validation.stepping import landing_steps
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 if TYPE_CHECKING:
     from sim.fluid.forces import SPHFluid

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.validation.checks import CaseResult, Check
 from benchmarks.validation.fluids import EVERY_FACE, FLUID_SOLVERS, WEIGHTLESS, advance, lattice, make_fluid, state_of
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 SOLVERS = FLUID_SOLVERS
 SPACING, HALF_SIDE = 0.02, 0.1

@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.validation.checks import CaseResult, Check, fitted_order
 from benchmarks.validation.fluids import EARTH, FLUID_SOLVERS, GRAVITY, WATER, advance, lattice, make_fluid, state_of
+from sim.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import domain_wall_samples
-from sim.scene import DomainParameters
 
 if TYPE_CHECKING:
     pass

@@ -6,8 +6,8 @@ import numpy as np
 
 from benchmarks.validation.checks import CaseResult, Check, fitted_order
 from benchmarks.validation.fluids import EVERY_FACE, FLUID_SOLVERS, WATER, WEIGHTLESS, lattice, make_fluid
+from sim.domain import DomainParameters
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, lattice_offsets, particle_volume
-from sim.scene import DomainParameters
 
 SOLVERS = FLUID_SOLVERS
 SPACING = 0.02

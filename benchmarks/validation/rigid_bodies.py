@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.validation.stepping import landing_steps
+from sim.domain import DomainParameters
 from sim.rigid.parameters import RigidBodyParameters
-from sim.scene import DomainParameters
 
 if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.validation.checks import CaseResult, Check
 from benchmarks.validation.rigid_bodies import GRAVITY, HALL, WEIGHTLESS, advance, body, make_bodies
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 SOLVERS = ("rigid",)
 RADIUS, DROP_HEIGHT, RESTITUTION = 0.1, 1.0, (0.3, 0.5, 0.8, 0.95)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from sim.smoke.parameters import SmokeParameters
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ import numpy as np
 
 from benchmarks.validation.checks import CaseResult, Check, fitted_order
 from benchmarks.validation.smoke_boxes import Array
+from sim.domain import Face
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement, SphereShape
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.parameters import Face
 
 SOLVERS = ("smoke",)
 

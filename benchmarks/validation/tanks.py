@@ -9,8 +9,8 @@ import numpy as np
 from benchmarks.validation.fluids import EARTH, lattice, state_of
 from benchmarks.validation.rigid_bodies import body
 from benchmarks.validation.stepping import landing_steps
+from sim.domain import DomainParameters
 from sim.rigid.parameters import RigidBodyParameters
-from sim.scene import DomainParameters
 
 SPACING = 0.02
 """Of the particles around bodies that are validated in water [m]."""

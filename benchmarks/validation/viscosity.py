@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.validation.checks import CaseResult, Check, fitted_order
 from benchmarks.validation.fluids import EVERY_FACE, FLUID_SOLVERS, WEIGHTLESS, advance, lattice, make_fluid, state_of
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 SOLVERS = FLUID_SOLVERS
 WAVELENGTH, AMPLITUDE, VISCOSITY = 0.2, 1.0e-3, 1.0e-3

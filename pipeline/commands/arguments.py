@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import os
+import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from pipeline.errors import PipelineError
+from pipeline.errors import JobFileError, PipelineError
 from pipeline.layout import JobLayout
 
+if TYPE_CHECKING:
+    from pipeline.job.loading import LoadedJob
+
 DEFAULT_OUTPUT = Path("renders")
+
+PRIORITY = click.IntRange(-1000, 1000)
+
+BLENDER_VARIABLE = "PIPELINE_BLENDER"
+"""Names the Blender that job files may name, too."""
 
 
 def job_options(command: Any) -> Any:
@@ -54,31 +65,104 @@ def print_warnings(warnings: Sequence[str]) -> None:
         click.secho(f"warning: {warning}", err=True, fg="yellow")
 
 
-def find_job(job: str, output: Path) -> JobLayout:
-    """The folder of a submitted job.
+def require_own_programs(loaded: LoadedJob, overrides: Sequence[str]) -> None:
+    """Refuse a job file that names a program to be run: whose file it is decides nothing about what runs here.
+
+    The user names it with `--set`, or in the environment. A job's folder keeps what its user has named.
+
+    Raises:
+        JobFileError: it names one.
+    """
+    program = loaded.job.render.blender
+    if program is None or any(override.replace(" ", "").startswith("render.blender=") for override in overrides):
+        return
+    if loaded.path.name == "job.toml" and JobLayout(loaded.path.parent).manifest.exists():
+        return
+    if os.environ.get(BLENDER_VARIABLE) != program:
+        raise JobFileError(
+            [
+                f"{loaded.path.name}: render.blender names a program, and a job file may not choose what runs here; "
+                f"if you trust it: --set render.blender={shlex.quote(program)}"
+            ]
+        )
+
+
+def require_plannable(loaded: LoadedJob) -> None:
+    """Refuse numbers that planning would overflow with, before the whole scene is looked at.
+
+    Raises:
+        JobFileError: carries every such number.
+    """
+    from pipeline.job.magnitudes import check_magnitudes
+    from pipeline.job.problems import Findings
+
+    findings = Findings()
+    if not check_magnitudes(loaded.job, findings):
+        raise JobFileError(loaded.source.describe_all(findings.errors))
+
+
+def job_folder(job: str, output: Path) -> JobLayout:
+    """The folder that a job has, or will have when its first run begins.
 
     Args:
         job: path of its folder, its name under `output`, or its job file.
         output: the folder that jobs' folders lie in.
 
     Raises:
-        PipelineError: there is none.
         JobFileError: the job file that was named is wrong.
     """
     path = Path(job)
     if path.is_file():
         from pipeline.job.loading import load_job
 
-        folder = output / load_job(path).name
-        if path.name == "job.toml" and (path.parent / "manifest.db").exists():
-            folder = path.parent
-    else:
-        # A name wins over a folder of the same name that is no job's.
-        folder = path if JobLayout(path).job_file.exists() else output / job
-    layout = JobLayout(folder)
+        if path.name == "job.toml" and JobLayout(path.parent).manifest.exists():
+            return JobLayout(path.parent)
+        return JobLayout(output / load_job(path).name)
+    named = JobLayout(output / job)
+    # A name wins over a folder of the same name that is no job's.
+    if JobLayout(path).job_file.exists() or (path.is_dir() and not named.root.is_dir()):
+        return JobLayout(path)
+    return named
+
+
+def find_job(job: str, output: Path) -> JobLayout:
+    """The folder of a job that has been run; see `job_folder`.
+
+    Raises:
+        PipelineError: there is none.
+        JobFileError: the job file that was named is wrong.
+    """
+    layout = job_folder(job, output)
     if not layout.job_file.exists():
-        raise PipelineError(f"no submitted job in {folder}; submit one with: pipeline submit JOB.toml")
+        raise PipelineError(f"no submitted job in {layout.root}; submit one with: pipeline submit JOB.toml")
     return layout
+
+
+_SIZE = re.compile(r"(\d+(?:\.\d*)?)\s*([KMGT]?)(I?)B?", re.IGNORECASE)
+
+
+def parse_size(_context: click.Context, _parameter: click.Parameter, text: str | None) -> int | None:
+    """Bytes from `500MB`, `2GiB`, `1.5TB` or `0`; None stays None. Raises BadParameter."""
+    if text is None:
+        return None
+    match = _SIZE.fullmatch(text.strip())
+    if match is None:
+        raise click.BadParameter(f'"{text}" is not a size like 500MB or 2GiB')
+    base = 1024 if match[3] else 1000
+    return int(float(match[1]) * base ** " KMGT".index(match[2].upper() or " "))
+
+
+def parse_age(_context: click.Context, _parameter: click.Parameter, text: str | None) -> float | None:
+    """Seconds from `90m`, `12h`, `7d` or `2w`; None stays None. Raises BadParameter."""
+    if text is None:
+        return None
+    match = _AGE.fullmatch(text.strip())
+    if match is None:
+        raise click.BadParameter(f'"{text}" is not an age like 12h or 7d')
+    return float(match[1]) * {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}[match[2]]
+
+
+_AGE = re.compile(r"(\d+(?:\.\d*)?)\s*([smhdw])")
 
 
 def parse_frames(text: str) -> frozenset[int]:

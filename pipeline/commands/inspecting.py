@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -19,6 +19,7 @@ from pipeline.commands.arguments import (
     json_option,
     output_option,
     print_warnings,
+    require_own_programs,
     submitted_job_argument,
 )
 from pipeline.errors import PipelineError
@@ -27,7 +28,7 @@ from pipeline.task import TaskId, TaskState
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
-    from pipeline.manifest_reader import AttemptRow, ManifestReader, StageSummary
+    from pipeline.manifest_reader import AttemptRow, ManifestReader, StageCost, StageSummary
     from pipeline.plan import Assessment
 
 FOLLOW_INTERVAL_S = 0.5
@@ -51,11 +52,13 @@ def plan(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path
     pipeline plan dam.toml --set 'camera.position=[0, -3, 1]'
     """
     from pipeline.job.checks import load_checked_job
+    from pipeline.job.loading import read_job
     from pipeline.plan import Verdict, estimate, summarize
 
+    require_own_programs(read_job(job_file, overrides, preview=preview), overrides)
     loaded, _ = load_checked_job(job_file, overrides, preview=preview)
     layout = JobLayout(output / loaded.job.name)
-    assessments, estimates = assess_job(loaded.job, layout)
+    assessments, estimates, _ = assess_job(loaded.job, layout)
     if as_json:
         click.echo(json.dumps([_assessment_as_json(each) for each in assessments], indent=1))
         return
@@ -164,27 +167,31 @@ def logs(job: str, output: Path, task: str | None, attempt: int | None, follow: 
 @click.argument("task")
 @json_option
 def explain(job: str, output: Path, task: str, as_json: bool) -> None:
-    """Tell the whole story of one task.
+    """Tell the whole story of one task, or of one file.
 
-    Its inputs, its outputs, every attempt, and why it would run again.
+    Its inputs, its outputs, every attempt, why it would run again, and what its files were made from: job file,
+    parameters, versions and machine.
 
     \b
     pipeline explain quickstart render/000012
+    pipeline explain quickstart frames/000012.png
     pipeline explain quickstart simulate --json
     """
     from pipeline.artifacts import read_receipt, verify_artifact
     from pipeline.job.loading import load_job
     from pipeline.manifest_reader import ManifestReader
+    from pipeline.origins import origins_of
 
     layout = find_job(job, output)
-    assessments, _ = assess_job(load_job(layout.job_file), layout)
-    found = next((each for each in assessments if each.task.id == task), None)
+    assessments, _, _ = assess_job(load_job(layout.job_file), layout)
+    found = next((each for each in assessments if each.task.id == task or task in each.task.outputs), None)
     if found is None:
         raise PipelineError(f'the job has no task "{task}"{_nearest(task, [each.task.id for each in assessments])}')
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         state, history = _state(manifest, found.task.id), manifest.history(found.task.id)
         events = manifest.events(task=found.task.id)
     receipts = [(output_path, read_receipt(layout, output_path)) for output_path in found.task.outputs]
+    origins = [origin.as_json() for origin in origins_of(layout, [receipt for _, receipt in receipts if receipt])]
     if as_json:
         story = {
             **_assessment_as_json(found),
@@ -192,12 +199,13 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
             "parameters": json.loads(found.task.parameters.canonical),
             "inputs": list(found.task.inputs),
             "receipts": [json.loads(receipt.to_json()) for _, receipt in receipts if receipt is not None],
+            "provenance": origins,
             "attempts": [_attempt_as_json(attempt) for attempt in history],
         }
         click.echo(json.dumps(story, indent=1))
         return
     states = dict.fromkeys([state or "not planned yet", _VERDICT_WORDING[found.verdict.value]])
-    click.echo(f"{task}: {', '.join(states)}")
+    click.echo(f"{found.task.id}: {', '.join(states)}")
     for reason in found.reasons:
         click.echo(f"  {reason.text}")
     click.echo(f"reads   {_shortened(found.task.inputs) or 'the job file only'}")
@@ -213,26 +221,49 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
         there = sum(receipt is not None for _, receipt in receipts)
         click.echo(f"        ... {there} of {len(receipts)} files are there")
     click.echo(f"key     {found.task.parameters.digest[:16]} (its parameters: pipeline explain ... --json)")
+    for origin in origins_of(layout, [receipt for _, receipt in receipts if receipt is not None]):
+        for line in origin.lines():
+            click.echo(line)
     for attempt in history:
         click.echo(_attempt_line(attempt))
     for event in events:
         click.echo(f"  {wording.moment(event.time)}  {event.kind}: {event.message}")
 
 
-def assess_job(job: Job, layout: JobLayout) -> tuple[list[Assessment], dict[str, Any]]:
-    """What would run, and what the stages have taken so far."""
+class JobAssessment(NamedTuple):
+    """How a job stands.
+
+    Attributes:
+        assessments: what would run, and why.
+        costs: what the stages have taken so far.
+        at_rest: whether a run would find nothing at all to do or to put right: neither in the record nor in the files.
+    """
+
+    assessments: list[Assessment]
+    costs: Mapping[str, StageCost]
+    at_rest: bool
+
+
+def assess_job(job: Job, layout: JobLayout) -> JobAssessment:
+    """Hold a job against its record and its files; changes nothing."""
     from pipeline.manifest_reader import ManifestReader
-    from pipeline.plan import assess, plan_job
+    from pipeline.plan import Verdict, assess, plan_job
     from pipeline.reconcile import inspect_files
     from pipeline.stages import STAGES
 
     tasks = plan_job(job, layout, STAGES)
     if not layout.manifest.exists():
-        return assess(tasks, {}, {}, parameters=lambda _: None), {}
+        return JobAssessment(assess(tasks, {}, {}, parameters=lambda _: None), {}, at_rest=False)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         rows = manifest.artifacts()
-        problems = inspect_files(layout, rows).problems
-        return assess(tasks, rows, problems, parameters=manifest.parameters), dict(manifest.stage_costs())
+        found = inspect_files(layout, rows)
+        assessments = assess(tasks, rows, found.problems, parameters=manifest.parameters)
+        at_rest = (
+            not (found.problems or found.new_mtimes_ns or found.newer_receipts)
+            and all(each.verdict is Verdict.UP_TO_DATE for each in assessments)
+            and manifest.is_at_rest(len(tasks))
+        )
+        return JobAssessment(assessments, dict(manifest.stage_costs()), at_rest)
 
 
 def _state(manifest: ManifestReader, task: TaskId) -> TaskState | None:

@@ -1,21 +1,27 @@
-"""Watch a job that another process runs."""
+"""Watch a job that another process runs, or that waits in the queue."""
 
 from __future__ import annotations
 
 import time
 
+import click
+
 from pipeline.errors import OutdatedManifestError
 from pipeline.layout import JobLayout
-from pipeline.lease import live_holder
+from pipeline.lease import busy_error, live_holder
 from pipeline.manifest_reader import LastRun, ManifestReader, StageSummary
 from pipeline.progress import Display, StageProgress, open_display
 from pipeline.scheduler_events import JobOutcome
+from pipeline.spool import QueuedJob, Spool, Wish
 from pipeline.task import TaskState
 
 POLL_INTERVAL_S = 0.5
 
-INTERRUPTED = 130
+CTRL_C = 130
 """As shells report a program that Ctrl-C ended."""
+
+STOPPED_FROM_ELSEWHERE = 8
+"""The job was paused or cancelled by another command."""
 
 DONE = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
 
@@ -24,7 +30,7 @@ def watch(layout: JobLayout) -> int:
     """Show a running job's progress until its runner ends.
 
     Returns:
-        0 if that run itself says that it has done everything, else 5, as `submit` would have; INTERRUPTED after Ctrl-C.
+        0 if that run itself says that it has done everything, else 5, as `submit` would have; CTRL_C after Ctrl-C.
     """
     watched: str | None = None
     display = open_display()
@@ -44,9 +50,106 @@ def watch(layout: JobLayout) -> int:
             time.sleep(POLL_INTERVAL_S)
     except KeyboardInterrupt:
         display.say("not watching any more; the job runs on")
-        return INTERRUPTED
+        return CTRL_C
     finally:
         display.close()
+
+
+class Follower:
+    """Sees one submission through that waits in the queue or runs in another process.
+
+    Attributes:
+        ticket: the submission.
+    """
+
+    def __init__(self, spool: Spool, layout: JobLayout, *, ticket: str = "") -> None:
+        self._spool = spool
+        self._layout = layout
+        self._name = layout.root.absolute().name
+        self._before = _record(layout)[1].run
+        self._seen_running = live_holder(layout.lease) is not None
+        self._said = ""
+        self.ticket = ticket
+
+    def enqueue(self, entry: QueuedJob) -> QueuedJob:
+        """Queue a job and follow it from now on; returns its entry as it is in the queue."""
+        queued = self._spool.enqueue(entry)
+        self.ticket = queued.ticket
+        holder = live_holder(self._layout.lease)
+        if holder is not None:
+            self._say(f"{busy_error(self._layout.lease, holder)}; watching it instead (Ctrl-C ends the watching only)")
+            if queued.ticket == entry.ticket:
+                self._say("it runs an earlier version of the job; this one follows")
+        return queued
+
+    def follow(self) -> int | None:
+        """Show progress until the submission is settled, or nobody runs the queue any more.
+
+        Returns:
+            0 if its run says that it has done everything, else what `submit` would have returned; None if somebody has
+            to run the queue, and nobody does. CTRL_C after Ctrl-C: the job stays in the queue.
+        """
+        display = open_display()
+        stages: dict[str, StageProgress] = {}
+        try:
+            while True:
+                entry = self._spool.find(self._name)
+                runs = live_holder(self._layout.lease) is not None
+                summary, last_run = _record(self._layout)
+                _update(stages, summary)
+                if runs:
+                    self._seen_running = True
+                    display.show(stages.values())
+                if entry is None:
+                    if not runs:
+                        return self._say_how_it_left(display, summary, last_run)
+                elif entry.ticket != self.ticket:
+                    self.ticket = entry.ticket
+                    display.say("the job has been submitted again since; following that")
+                elif entry.wish is not Wish.RUN:
+                    if not runs:
+                        return self._say_why_it_stands(display, entry)
+                elif live_holder(self._spool.lease) is None:
+                    return None
+                elif not runs:
+                    self._say_place(display)
+                time.sleep(POLL_INTERVAL_S)
+        except KeyboardInterrupt:
+            entry = self._spool.find(self._name)
+            if entry is not None and entry.ticket == self.ticket and entry.wish is Wish.RUN:
+                self._spool.change(self._name, background=True)  # nobody waits for it here any more
+            display.say("not watching any more; the job runs on, or waits in the queue")
+            return CTRL_C
+        finally:
+            display.close()
+
+    def _say_place(self, display: Display) -> None:
+        names = [job.name for job in self._spool.waiting()]
+        ahead = names[: names.index(self._name)] if self._name in names else []
+        if ahead:
+            sentence = f"waiting for {', '.join(ahead[:3])}{f' and {len(ahead) - 3} more' if len(ahead) > 3 else ''}"
+            if sentence != self._said:
+                self._said = sentence
+                display.say(f"{self._name} is queued, {sentence} (Ctrl-C leaves it in the queue)")
+
+    def _say_how_it_left(self, display: Display, summary: list[StageSummary], last_run: LastRun) -> int:
+        if last_run.run == self._before and not self._seen_running:
+            display.say("it was cancelled before it ran")
+            return STOPPED_FROM_ELSEWHERE
+        code = _say_how_it_ended(display, self._layout, summary, last_run.outcome)
+        return STOPPED_FROM_ELSEWHERE if last_run.outcome in (JobOutcome.CANCELLED, JobOutcome.DRAINED) else code
+
+    def _say_why_it_stands(self, display: Display, entry: QueuedJob) -> int:
+        if entry.wish is Wish.NONE:
+            display.say(f"it failed: {entry.note}; try again with: pipeline retry {self._layout.root}")
+            return 5
+        why = f" ({entry.note})" if entry.note else ""
+        display.say(f"it pauses{why}; continue with: pipeline resume {self._layout.root}")
+        return STOPPED_FROM_ELSEWHERE
+
+    @staticmethod
+    def _say(sentence: str) -> None:
+        click.echo(sentence, err=True)
 
 
 def _say_how_it_ended(display: Display, layout: JobLayout, summary: list[StageSummary], ended_as: str | None) -> int:
@@ -69,6 +172,12 @@ def _record(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:
             return manifest.summary(), manifest.last_run()
     except OutdatedManifestError:
         return [], LastRun(None, None)
+
+
+def done_and_total(layout: JobLayout) -> tuple[int, int]:
+    """How many of a job's tasks are done, and how many there are."""
+    summary, _ = _record(layout)
+    return sum(map(_done, summary)), sum(stage.total for stage in summary)
 
 
 def _update(stages: dict[str, StageProgress], summary: list[StageSummary]) -> None:

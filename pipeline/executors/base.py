@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
 from pipeline.artifacts import Receipt
 from pipeline.layout import JobLayout
-from pipeline.task import ArtifactPath, FailureKind, Task, TaskId
+from pipeline.task import ArtifactPath, FailureKind, Resources, Task, TaskId
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +28,9 @@ class Assignment:
         root: the job's folder.
         stages: where the stages are, as `module:ATTRIBUTE`.
         timeout_s: longest time that the attempt may take [s], or None.
+        stall_s: longest time that it may show no sign of life [s]; None: the executor's own limit.
+        memory_bytes: most memory that its processes may hold together; None: the executor's own limit.
+        need: what it occupies while it runs, for executors that choose among machines.
     """
 
     task: Task
@@ -39,6 +42,9 @@ class Assignment:
     root: Path
     stages: str
     timeout_s: float | None = None
+    stall_s: float | None = None
+    memory_bytes: int | None = None
+    need: Resources = field(default=Resources())
 
     @property
     def layout(self) -> JobLayout:
@@ -117,6 +123,16 @@ class Failed:
 TaskEvent = Started | Progress | Committed | Finished | Failed
 
 
+@dataclass(frozen=True, slots=True)
+class CapacityChanged:
+    """Machines came or went: all that there are now offer this much together."""
+
+    capacity: Resources
+
+
+ExecutorEvent = TaskEvent | CapacityChanged
+
+
 class ShutDownOnExit(ABC):
     """Lets a `with` block shut an executor down at its end."""
 
@@ -142,7 +158,7 @@ class Executor(Protocol):
     def submit(self, assignment: Assignment) -> None:
         """Run this attempt. No other attempt of the same task may be under way."""
 
-    def wait(self, timeout_s: float) -> list[TaskEvent]:
+    def wait(self, timeout_s: float) -> Sequence[ExecutorEvent]:
         """What happened; returns as soon as there is something, and empty after `timeout_s` [s]."""
 
     def cancel(self, task_id: TaskId, *, grace_s: float) -> None:

@@ -11,21 +11,23 @@ from pipeline.task import FailureKind
 
 _DISK_FULL_CODES = {errno.ENOSPC, errno.EDQUOT}
 _DISK_FULL_TEXT = os.strerror(errno.ENOSPC)
+_OUT_OF_MEMORY_TEXTS = ("out of memory", "out of gpu")
+"""How libraries that raise RuntimeError say it, in small letters: CUDA and Vulkan by Taichi, and Cycles."""
 _DIVERGED = "SimulationDivergedError"
-_BLENDER_DIED = "BlenderDiedError"
+_BLENDER_LOST = ("BlenderDiedError", "BlenderKilledError")
 """By name: asking isinstance would import the simulation and the renderer into every process."""
 
 
 def classify(error: BaseException) -> FailureKind:
     """What kind of failure an exception is, going by it and by the exceptions behind it."""
     for link in _chain(error):
-        if isinstance(link, MemoryError):
+        if isinstance(link, MemoryError) or _means_out_of_memory(link):
             return FailureKind.OUT_OF_MEMORY
         if _means_disk_full(link):
             return FailureKind.DISK_FULL
         if _is_called(_DIVERGED, link):
             return FailureKind.DIVERGED
-        if _is_called(_BLENDER_DIED, link):
+        if any(_is_called(name, link) for name in _BLENDER_LOST):
             return FailureKind.WORKER_LOST
     return FailureKind.FAILED
 
@@ -56,6 +58,10 @@ def _means_disk_full(error: BaseException) -> bool:
         return True
     # Some libraries, HDF5 among them, pass the text on and lose the code.
     return isinstance(error, OSError | RuntimeError) and _DISK_FULL_TEXT in str(error)
+
+
+def _means_out_of_memory(error: BaseException) -> bool:
+    return isinstance(error, RuntimeError) and any(text in str(error).lower() for text in _OUT_OF_MEMORY_TEXTS)
 
 
 def _is_called(name: str, error: BaseException) -> bool:

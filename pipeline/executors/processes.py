@@ -13,14 +13,14 @@ import time
 from dataclasses import dataclass
 from math import inf
 
-import psutil
-
 from pipeline.executors.base import Assignment, Failed, Finished, ShutDownOnExit, TaskEvent
 from pipeline.executors.channel import Channel
 from pipeline.executors.failures import is_disk_full
+from pipeline.executors.memory import machine_memory_bytes
 from pipeline.executors.worker_process import WorkerProcess, log_tail
+from pipeline.resources import MEMORY_SHARE
 from pipeline.task import FailureKind, TaskId
-from pipeline.worker import STACK_DUMP_SIGNAL, Stop, Vitals
+from pipeline.worker import Stop, Vitals
 
 _STACK_DUMP_S = 1.0
 """Time a stalled worker gets to write its stacks before it is killed [s]."""
@@ -30,6 +30,8 @@ FURTHER_WORKERS = 6
 """Idle workers beyond one a core: as many as there are stages. They cost memory and no time; starting Blender anew
 for every frame, as one worker a core did on two cores with three stages, made the quickstart's frames three times as
 slow."""
+_MEMORY_WATCH_S = 0.5
+"""How often the memory of busy workers is looked at [s]; a look takes a fraction of a millisecond."""
 _POLL_S = 0.2
 """How often exits are looked for where the system has no pidfd [s]."""
 
@@ -43,13 +45,17 @@ class WorkerLimits:
         resident_memory_bytes: a worker larger than this after a task is replaced; None: a quarter of the machine's.
         workers: idle workers are let go when there would be more in all; None: one a core, and one for each further
             stage, so that stages that take turns frame by frame all keep theirs warm.
-        stall_timeout_s: a task that shows no sign of life for so long is ended as stalled [s].
+        stall_timeout_s: a task that shows no sign of life for so long is ended as stalled, where its assignment names
+            no limit of its own [s].
+        task_memory_bytes: a task whose processes hold more together is ended as out of memory, where its assignment
+            names no limit of its own; None: what tasks may claim of the machine.
     """
 
     tasks_per_worker: int = 50
     resident_memory_bytes: int | None = None
     workers: int | None = None
     stall_timeout_s: float = 900.0
+    task_memory_bytes: int | None = None
 
 
 class ProcessExecutor(ShutDownOnExit):
@@ -61,7 +67,10 @@ class ProcessExecutor(ShutDownOnExit):
 
     def __init__(self, limits: WorkerLimits | None = None) -> None:
         self._limits = limits or WorkerLimits()
-        self._memory_limit = self._limits.resident_memory_bytes or psutil.virtual_memory().total // 4
+        memory_bytes = machine_memory_bytes()
+        self._memory_limit = self._limits.resident_memory_bytes or memory_bytes // 4
+        self._task_memory_limit = self._limits.task_memory_bytes or int(memory_bytes * MEMORY_SHARE)
+        self._memory_watched_at = 0.0
         self._worker_limit = self._limits.workers or (os.cpu_count() or 1) + FURTHER_WORKERS
         self._workers: list[WorkerProcess] = []
         self._selector = selectors.DefaultSelector()
@@ -151,7 +160,8 @@ class ProcessExecutor(ShutDownOnExit):
             kind, sentence = worker.explain_exit()
             seconds = time.monotonic() - worker.began
             details = log_tail(assignment.log)
-            self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence, details, seconds))
+            peak = worker.peak_memory_bytes
+            self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence, details, seconds, peak))
         self._workers.remove(worker)
         self._close_channel(worker)
         if worker.exit_descriptor is not None:
@@ -176,6 +186,10 @@ class ProcessExecutor(ShutDownOnExit):
         for worker in [worker for worker in self._workers if worker.has_exited()]:
             self._bury(worker)
         now = time.monotonic()
+        if now - self._memory_watched_at >= _MEMORY_WATCH_S:
+            self._memory_watched_at = now
+            for worker in self._workers:
+                self._watch_memory(worker, now)
         for worker in self._workers:
             self._enforce_deadlines(worker, now)
 
@@ -187,7 +201,7 @@ class ProcessExecutor(ShutDownOnExit):
             if isinstance(message, Vitals):
                 worker.resident_memory_bytes = message.resident_memory_bytes
                 continue
-            self._events.append(message)
+            self._events.append(worker.explain_failure(message) if isinstance(message, Failed) else message)
             if isinstance(message, Finished | Failed):
                 worker.end_assignment(failed=isinstance(message, Failed))
                 if self._is_worn_out(worker):
@@ -207,11 +221,13 @@ class ProcessExecutor(ShutDownOnExit):
     def _seconds_to_next_deadline(self) -> float:
         now = time.monotonic()
         deadlines = [now + _POLL_S for worker in self._workers if worker.exit_descriptor is None]
+        if any(worker.assignment is not None for worker in self._workers):
+            deadlines.append(self._memory_watched_at + _MEMORY_WATCH_S)
         for worker in self._workers:
             if worker.kill_at is not None:
                 deadlines.append(worker.kill_at)
             elif worker.assignment is not None:
-                deadlines.append(worker.last_sign + self._limits.stall_timeout_s)
+                deadlines.append(worker.last_sign + (worker.assignment.stall_s or self._limits.stall_timeout_s))
                 deadlines.append(worker.began + (worker.assignment.timeout_s or inf))
         return min(deadlines, default=inf) - now
 
@@ -223,13 +239,23 @@ class ProcessExecutor(ShutDownOnExit):
             return
         if worker.assignment is None:
             return
-        stall_timeout_s, timeout_s = self._limits.stall_timeout_s, worker.assignment.timeout_s
-        if now - worker.last_sign >= stall_timeout_s:
-            sentence = f"no sign of life for {stall_timeout_s:g} s; the log shows where it hung"
-            worker.end_by(now + _STACK_DUMP_S, FailureKind.STALLED, sentence)
+        stall_s = worker.assignment.stall_s or self._limits.stall_timeout_s
+        timeout_s = worker.assignment.timeout_s
+        if now - worker.last_sign >= stall_s:
+            kind, sentence = FailureKind.STALLED, f"no sign of life for {stall_s:g} s; the log shows where it hung"
         elif timeout_s is not None and now - worker.began >= timeout_s:
-            sentence = f"not done after {timeout_s:g} s; the log shows where it was"
-            worker.end_by(now + _STACK_DUMP_S, FailureKind.TIMED_OUT, sentence)
+            kind, sentence = FailureKind.TIMED_OUT, f"not done after {timeout_s:g} s; the log shows where it was"
         else:
             return
-        worker.signal(STACK_DUMP_SIGNAL)
+        worker.end_by(now + _STACK_DUMP_S, kind, sentence)
+        worker.leave_evidence(sentence)
+
+    def _watch_memory(self, worker: WorkerProcess, now: float) -> None:
+        """End a task whose processes hold too much together, before the kernel ends somebody for it."""
+        if worker.assignment is None or worker.kill_at is not None:
+            return
+        limit, size = worker.assignment.memory_bytes or self._task_memory_limit, worker.look_at_memory()
+        if size > limit:
+            sentence = f"its processes held {size / 1e9:.3g} GB together, and may hold {limit / 1e9:.3g} GB"
+            worker.leave_evidence(sentence)
+            worker.end_by(now, FailureKind.OUT_OF_MEMORY, sentence)

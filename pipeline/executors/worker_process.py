@@ -10,17 +10,23 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 
-from pipeline.executors.base import Assignment
+import psutil
+
+from pipeline.executors.base import Assignment, Failed
 from pipeline.executors.channel import Channel
-from pipeline.executors.memory import out_of_memory_kills
+from pipeline.executors.memory import out_of_memory_kills, process_tree, tree_memory_bytes
 from pipeline.task import FailureKind
+from pipeline.worker import STACK_DUMP_SIGNAL
 
 _BOOT = "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from pipeline.worker import main; main()"
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 _LOG_TAIL_LINES = 20
 _LOG_TAIL_BYTES = 16_384
+_COMMAND_SHOWN = 100
+"""How much of a command line is shown [characters]."""
 
 
 class WorkerProcess:
@@ -35,6 +41,7 @@ class WorkerProcess:
         tasks_done: how many tasks it has ended.
         began: when its assignment was given to it, monotonic [s].
         last_sign: when it last said anything, monotonic [s].
+        peak_memory_bytes: most that it and all it started were seen to hold together during its assignment.
         kill_at: when its process group is killed, monotonic [s], or None.
         verdict: what its task fails of, when it is us who end it.
     """
@@ -47,6 +54,7 @@ class WorkerProcess:
         self.resident_memory_bytes = 0
         self.tasks_done = 0
         self.began = self.last_sign = time.monotonic()
+        self.peak_memory_bytes = 0
         self.kill_at: float | None = None
         self.verdict: tuple[FailureKind, str] | None = None
         self._out_of_memory_kills = 0
@@ -64,6 +72,7 @@ class WorkerProcess:
         self.assignment = assignment
         self.verdict = None
         self.began = self.last_sign = time.monotonic()
+        self.peak_memory_bytes = 0
         self._out_of_memory_kills = out_of_memory_kills()
         self.channel.send(assignment)
 
@@ -80,15 +89,38 @@ class WorkerProcess:
         self.kill_at = None
         self.tasks_done += 1
 
+    def look_at_memory(self) -> int:
+        """Resident memory of it and all that it started, now [bytes]; the peak takes note of it."""
+        size = tree_memory_bytes(self.pid)
+        self.peak_memory_bytes = max(self.peak_memory_bytes, size)
+        return size
+
+    def leave_evidence(self, sentence: str) -> None:
+        """Write into its task's log why it is about to be ended, and what its processes are doing; then their stacks.
+
+        A process that was stopped from outside is let go on for that: it could write nothing.
+        """
+        assert self.assignment is not None
+        lines = [f"the runner ends this attempt: {sentence}", *map(_describe_process, process_tree(self.pid))]
+        with suppress(OSError), self.assignment.log.open("a", encoding="utf-8") as log:  # on a full disk, without
+            log.write("\n".join(lines) + "\n")
+        with suppress(ProcessLookupError):
+            self._process.send_signal(STACK_DUMP_SIGNAL)
+            self._process.send_signal(signal.SIGCONT)
+
+    def explain_failure(self, failed: Failed) -> Failed:
+        """What it says of its task, or rather: a Blender that the kernel killed looks like one that was lost."""
+        failed = replace(failed, peak_memory_bytes=max(failed.peak_memory_bytes, self.peak_memory_bytes))
+        if failed.kind is FailureKind.WORKER_LOST and self._memory_ran_out():
+            sentence = f"{failed.message}; the kernel killed it: the machine is out of memory"
+            return replace(failed, kind=FailureKind.OUT_OF_MEMORY, message=sentence)
+        return failed
+
     def end_by(self, deadline: float, kind: FailureKind, sentence: str) -> None:
         """Kill it at `deadline`, monotonic [s], unless that was to happen earlier already."""
         if self.kill_at is None or deadline < self.kill_at:
             self.kill_at = deadline
         self.verdict = self.verdict or (kind, sentence)
-
-    def signal(self, number: int) -> None:
-        """Send a signal to the worker alone."""
-        self._process.send_signal(number)
 
     def kill(self) -> None:
         """Kill it with everything that it started."""
@@ -104,13 +136,17 @@ class WorkerProcess:
         if self.verdict is not None:
             return self.verdict
         code = self._process.returncode
-        if code == -signal.SIGKILL and out_of_memory_kills() > self._out_of_memory_kills:
+        if code == -signal.SIGKILL and self._memory_ran_out():
             return (
                 FailureKind.OUT_OF_MEMORY,
                 f"the kernel killed worker {self._process.pid}: the machine is out of memory",
             )
         how = f"died of {_signal_name(-code)}" if code < 0 else f"exited with code {code}"
         return FailureKind.WORKER_LOST, f"worker {self._process.pid} {how} in the middle of its task"
+
+    def _memory_ran_out(self) -> bool:
+        """Whether the kernel has killed a process for want of memory since the assignment was given."""
+        return out_of_memory_kills() > self._out_of_memory_kills
 
     def close(self) -> None:
         """Give its descriptors back."""
@@ -120,15 +156,28 @@ class WorkerProcess:
 
 
 def log_tail(log: Path) -> str:
-    """The last lines of a log; empty if there is none."""
+    """The last lines of a log; empty if there is none, or none that can be read."""
     try:
         with log.open("rb") as file:
             file.seek(0, os.SEEK_END)
             file.seek(max(0, file.tell() - _LOG_TAIL_BYTES))
             text = file.read().decode(errors="replace")
-    except FileNotFoundError:
+    except OSError:  # on a shared disk anything can be; the failure that it was to explain matters more
         return ""
     return "\n".join(text.splitlines()[-_LOG_TAIL_LINES:])
+
+
+def _describe_process(pid: int) -> str:
+    try:
+        process = psutil.Process(pid)
+        with process.oneshot():
+            times, memory, command = process.cpu_times(), process.memory_info().rss, " ".join(process.cmdline())
+            return (
+                f"  process {pid}, {process.status()}, {times.user + times.system:.1f} s of processor time, "
+                f"{memory / 1e6:.0f} MB: {command[:_COMMAND_SHOWN]}"
+            )
+    except psutil.Error:
+        return f"  process {pid} has ended"
 
 
 def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel]:
@@ -145,7 +194,7 @@ def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel]:
             stderr=log,
             pass_fds=[theirs.fileno()],
             start_new_session=True,
-            env={**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(first.threads))},
+            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(first.threads))},
         )
         on_failure.pop_all()
     return process, Channel(ours)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 Box = NDArray[np.float64]
 """Lower and upper corner [m], (2, 3)."""

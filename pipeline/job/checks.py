@@ -14,6 +14,7 @@ from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.scene_checks import check_scene
+from pipeline.stages import STAGES
 
 MANY_FRAMES = 100_000
 
@@ -35,6 +36,7 @@ def check_job(job: Job, *, memory_bytes: int | None = None) -> Findings:
     _check_faces(job, findings)
     _check_time(job, findings)
     _check_pictures(job, findings)
+    _check_limits(job, findings)
     if check_magnitudes(job, findings):
         check_scene(job, findings, memory_bytes)
     return findings
@@ -50,7 +52,7 @@ def named_bodies(job: Job) -> Iterator[tuple[KeyPath, str, str]]:
 def _check_bodies(job: Job, findings: Findings) -> None:
     if not job.body_names:
         findings.error((), "has no body; add [[fluid]], [[smoke]], [[cloth]] or [[rigid]]")
-    elif not (job.fluid or job.smoke or job.cloth) and all(body.kind == "static" for body in job.rigid):
+    elif not (job.fluid or job.smoke or job.cloth or job.moving_bodies or job.camera.moves):
         findings.warn((), "has neither fluid nor smoke nor cloth, so nothing will move")
     for kind, solver in (("rigid", "moving bodies"), ("cloth", "cloths")):
         moves = job.cloth if kind == "cloth" else [body for body in job.rigid if body.kind != "static"]
@@ -168,9 +170,32 @@ def _check_pictures(job: Job, findings: Findings) -> None:
         findings.error(("render", "blender"), f"no such file: {job.render.blender}; omit it to use the bpy module")
     if job.camera.position is not None and job.camera.position == job.camera.look_at:
         findings.error(("camera", "look_at"), "is where the camera stands; it must be somewhere else")
+    for number, key in enumerate(job.camera.keyframe):
+        if key.position == (key.look_at or job.camera.look_at or job.domain.middle):
+            findings.error(
+                ("camera", "keyframe", number, "look_at"), "is where the camera is; it must be somewhere else"
+            )
+        if key.time_s > job.frame_count / job.fps:
+            findings.warn(
+                ("camera", "keyframe", number, "time_s"),
+                f"is after the film's end at {job.frame_count / job.fps:g} s; the camera does not get there",
+            )
     for index, light in enumerate(job.light):
         if light.position == light.look_at and light.type != "point":
             findings.error(("light", index, "look_at"), "is where the light stands; it must be somewhere else")
+
+
+def _check_limits(job: Job, findings: Findings) -> None:
+    stages = [stage.name for stage in STAGES]
+    for name, limits in job.limits.items():
+        if name not in stages:
+            hint = suggestion(name, stages) or f"; stages are {', '.join(stages)}"
+            findings.error(("limits", name), f'no stage is named "{name}"{hint}')
+        if limits.timeout_s is not None and limits.timeout_s < limits.stall_s and "stall_s" in limits.model_fields_set:
+            findings.warn(
+                ("limits", name, "stall_s"),
+                f"has no effect: a task is ended after timeout_s = {limits.timeout_s:g} s in any case",
+            )
 
 
 def load_checked_job(

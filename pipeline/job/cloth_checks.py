@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pipeline.job.models import Job
     from sim.cloth.parameters import ClothParameters
     from sim.cloth.sheet import RestSheet
-    from sim.scene import DomainParameters
+    from sim.domain import DomainParameters
     from sim.shapes import Solid
 
 BYTES_PER_NODE = 6000

@@ -15,9 +15,9 @@ from sim.fluid.parameters import shared_conflicts
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
+    from sim.domain import DomainParameters
     from sim.fluid.opening import Opening
     from sim.fluid.parameters import FluidParameters
-    from sim.scene import DomainParameters
     from sim.shapes import Solid
 
 MOST_CELLS = 2**28

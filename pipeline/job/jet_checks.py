@@ -23,8 +23,8 @@ from sim.fluid.nozzles import is_same_nozzle
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
+    from sim.domain import DomainParameters
     from sim.fluid.opening import Opening
-    from sim.scene import DomainParameters
     from sim.shapes import Solid
 
 Points = NDArray[np.float64]

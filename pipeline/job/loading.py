@@ -96,6 +96,8 @@ def _read_text(path: Path) -> str:
     try:
         if path.is_dir():
             raise JobFileError([f"{path}: is a folder, not a job file"])
+        if path.exists() and not path.is_file():
+            raise JobFileError([f"{path}: is no file"])  # a device or a pipe may never end
         if path.stat().st_size > MAX_BYTES:
             raise JobFileError([f"{path}: {path.stat().st_size / 1e6:.0f} MB is not a job file; a few KB are usual"])
         return path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")

@@ -7,7 +7,9 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from pipeline.job.limits import LimitParameters
 from pipeline.job.looks import BODY, CLOTHS, FLUID, NATURAL_MATERIALS, PAINTED_LOOKS, SMOKE, SOLID, WHITEWATER
+from pipeline.job.problems import suggestion
 from render.parameters import (
     CameraParameters,
     LightParameters,
@@ -56,6 +58,10 @@ class Job(SceneParameters):
     camera: CameraParameters = Field(default=CameraParameters(), description="The camera.")
     render: RenderParameters = Field(default=RenderParameters(), description="How frames are made.")
     movie: MovieParameters = Field(default=MovieParameters(), description="How frames become a film.")
+    limits: dict[str, LimitParameters] = Field(
+        default_factory=dict,
+        description="When a stage's tasks are ended and tried again, by its name: [limits.render].",
+    )
 
     @property
     def frame_count(self) -> int:
@@ -88,11 +94,30 @@ class Job(SceneParameters):
                 return CLOTHS[cloth.material]
         return SMOKE if any(smoke.name == body for smoke in self.smoke) else SOLID
 
+    def limits_of(self, stage: str) -> LimitParameters:
+        """What the tasks of a stage may take: from the job file, else as is usual."""
+        return self.limits.get(stage, LimitParameters())
+
     def _bodies(self) -> Iterator[RigidBodyParameters | FluidParameters | SmokeParameters | ClothParameters]:
         yield from self.rigid
         yield from self.fluid
         yield from self.smoke
         yield from self.cloth
+
+    @property
+    def moving_bodies(self) -> tuple[str, ...]:
+        """Names of the rigid bodies whose pose changes from frame to frame."""
+        return tuple(body.name for body in self.rigid if body.kind != "static")
+
+    @model_validator(mode="after")
+    def _camera_knows_its_bodies(self) -> Self:
+        for key in ("look_at", "follow", "focus"):
+            name = getattr(self.camera, key)
+            if isinstance(name, str) and name not in self.moving_bodies:
+                known = f"; moving bodies are {', '.join(self.moving_bodies)}" if self.moving_bodies else ""
+                hint = suggestion(name, self.moving_bodies) or known
+                raise ValueError(f'camera.{key}: no dynamic or kinematic rigid body is named "{name}"{hint}')
+        return self
 
     @model_validator(mode="after")
     def _frames_or_duration(self) -> Self:

@@ -22,8 +22,9 @@ from pipeline.job.problems import Findings
 from pipeline.job.rigid_checks import check_ballast, check_rigid_start
 from pipeline.job.smoke_checks import check_smokes, smoke_box
 from pipeline.job.step_checks import check_time_steps
+from render.parameters import Vector3
+from sim.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
-from sim.scene import DomainParameters
 
 if TYPE_CHECKING:
     from sim.shapes import PlacedSolid, Solid
@@ -95,15 +96,19 @@ def _check_rigid_bodies(job: Job, solids: Mapping[KeyPath, Solid], findings: Fin
 
 
 def _check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    if job.camera.position is None:
-        return
-    eye = np.array([job.camera.position])
-    for path, solid in solids.items():
-        if path[0] == "smoke" or not touch(solid.bounds, np.repeat(eye, 2, axis=0), margin=0.0):
-            continue
-        if solid.signed_distance(eye)[0] < 0.0:
-            name = getattr(job, str(path[0]))[path[1]].name
-            findings.error(("camera", "position"), f'is inside "{name}"; move it out')
+    places: dict[KeyPath, Vector3] = {
+        ("camera", "keyframe", number, "position"): key.position for number, key in enumerate(job.camera.keyframe)
+    }
+    if job.camera.position is not None:
+        places["camera", "position"] = job.camera.position
+    for place, position in places.items():
+        eye = np.array([position])
+        for path, solid in solids.items():
+            if path[0] == "smoke" or not touch(solid.bounds, np.repeat(eye, 2, axis=0), margin=0.0):
+                continue
+            if solid.signed_distance(eye)[0] < 0.0:
+                name = getattr(job, str(path[0]))[path[1]].name
+                findings.error(place, f'is inside "{name}"; move it out')
 
 
 # --- fluid ---------------------------------------------------------------------------------------------------------

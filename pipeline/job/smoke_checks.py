@@ -14,7 +14,7 @@ from pipeline.job.boxes import Box, overlap, span, touch
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from sim.smoke.parameters import CELLS_PER_EDDY, SmokeParameters, SmokeSourceParameters
 
 if TYPE_CHECKING:
@@ -30,7 +30,8 @@ of few cells along z take more for these than for their cells. A CPU has one lan
 ALL = 1.0 - 1e-6
 """Share of a box that counts as all of it: sizes and positions written in decimal do not add up exactly."""
 COUNTED_CELLS = 1_000_000
-"""A source whose box has more cells than this is taken to have some of its own."""
+"""A source whose box has more cells than this is taken to have some of its own; in a larger box of smoke nobody looks
+for air that bodies shut in."""
 HOTTEST = 10_000.0
 """Hotter gas is a plasma, which neither these equations nor a film's light describe [K]."""
 HOTTEST_FLAME = 4_000.0
@@ -61,7 +62,7 @@ def check_smokes(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
     for index, smoke in enumerate(job.smoke):
         more_cells, more_bytes = _check_size(job, index, budget, (cells, size_bytes), findings)
         cells, size_bytes = cells + more_cells, size_bytes + more_bytes
-        _check_air(job, smoke, index, findings)
+        _check_air(job, smoke, index, solids, findings)
         for number, source in enumerate(smoke.source):
             path: KeyPath = ("smoke", index, "source", number)
             _check_numbers(job, smoke, source, path, findings)
@@ -132,11 +133,39 @@ def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, room: fl
     return size
 
 
-def _check_air(job: Job, smoke: SmokeParameters, index: int, findings: Findings) -> None:
+def _check_way_out(
+    job: Job, smoke: SmokeParameters, path: KeyPath, solids: Mapping[KeyPath, Solid], findings: Findings
+) -> None:
+    """Note wind into air that static bodies shut in; of a large grid the simulation tells it when it starts."""
+    from sim.smoke.grid import SmokeGrid
+
+    bodies = [
+        solids["rigid", index] for index, body in enumerate(job.rigid)
+        if body.kind == "static" and ("rigid", index) in solids
+    ]  # fmt: skip
+    low, high = smoke_box(smoke, job.domain)
+    is_too_large = math.prod(np.ceil((high - low) / smoke.cell_size).tolist()) > COUNTED_CELLS
+    if not (smoke.windward_faces and bodies) or np.any(high <= low) or is_too_large:
+        return
+    try:
+        grid = SmokeGrid.build(smoke, job.domain, bodies)
+    except ValueError as error:
+        # Its message begins with the smoke's name, which the path says as well.
+        findings.error(path, str(error).removeprefix(f'smoke "{smoke.name}": '))
+        return
+    if cut_off := grid.cut_off_faces():
+        findings.error((*path, "wind"), smoke.cut_off_problem(cut_off))
+
+
+def _check_air(
+    job: Job, smoke: SmokeParameters, index: int, solids: Mapping[KeyPath, Solid], findings: Findings
+) -> None:
     """Wind, gusts, gravity and what air does to smoke."""
     path: KeyPath = ("smoke", index)
     if problem := smoke.wind_problem():
         findings.error((*path, "wind"), problem)
+    else:
+        _check_way_out(job, smoke, path, solids, findings)
     gusts = smoke.turbulence
     smallest = CELLS_PER_EDDY * smoke.cell_size
     if gusts.strength > 0.0 and gusts.size < smallest * (1.0 - 1.0e-9):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -112,6 +113,8 @@ def _missing(file: str, error: OSError) -> MissingInputError:
 @cache
 def _hash(file: str, _size: int, _mtime_ns: int) -> str:
     try:
+        if not Path(file).is_file():
+            raise OSError(errno.EINVAL, "it is no file", file)  # a device or a pipe may never end
         return blake3(Path(file).read_bytes()).hexdigest()
     except OSError as error:
         raise _missing(file, error) from error

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from math import cos, prod, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from pipeline.cache import read_frame
 from pipeline.errors import StageUnavailableError
@@ -17,9 +21,11 @@ from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import tool_version
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
+from render.camera_path import CameraPath, write_views
 from render.point_clouds import KINDS
 from render.poses import write_poses
 from render.spec import (
+    Camera,
     MeshObject,
     MeshSequenceObject,
     MovingMeshObject,
@@ -50,12 +56,15 @@ class RenderStage:
     """One PNG a frame. A worker keeps Blender and the scene warm from frame to frame."""
 
     name = "render"
-    version = 2
+    version = 3
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
+        spec = render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
+        if job.camera.moves:
+            spec["camera"]["path"] = job.camera.model_dump(mode="json")
         parameters = ParameterSet.of(
-            render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS),
+            spec,
             stage=self.name,
             version=self.version,
             tools={"blender": _blender_version(job.render.blender)},
@@ -104,7 +113,7 @@ class RenderStage:
         def validate(path: Path) -> None:
             validate_picture(path, job.render.resolution)
 
-        _write_poses(context, task.frame)
+        _write_motion(context, task.frame)
         try:
             with context.committing(task.outputs[0], validate) as path:
                 renderer.render(task.frame, path)
@@ -158,7 +167,7 @@ def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
         fps=job.fps,
         domain_min=job.domain.min,
         domain_max=job.domain.max,
-        camera=job.camera,
+        camera=Camera.on(camera_path(job), f_stop=job.camera.f_stop, views=layout.views),
         stage=job.stage,
         lights=job.light,
         objects=tuple(objects),
@@ -176,9 +185,11 @@ def _body_object(job: Job, layout: JobLayout, body: RigidBodyParameters, part: s
     return MovingMeshObject(name=name, file=file, body=body.name, poses=layout.poses, material=material)
 
 
-def moving_bodies(job: Job) -> tuple[str, ...]:
-    """Names of the bodies whose pose changes from frame to frame."""
-    return tuple(body.name for body in job.rigid if body.kind != "static")
+def camera_path(job: Job) -> CameraPath:
+    """Where the camera of a job goes."""
+    width, height = job.render.resolution
+    starts = {body.name: body.position for body in job.rigid}
+    return CameraPath(job.camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts)
 
 
 @cache
@@ -204,20 +215,44 @@ def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]
     points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
     cloths = [layout.cloth(cloth.name, frame) for cloth in job.cloth]
     # The cache changes with every change of the simulation, so it is an input only where something of it is drawn.
-    cached = [layout.frame_cache(frame)] if moving_bodies(job) or not surfaces + cloths + volumes else []
+    cached = [layout.frame_cache(frame)] if job.moving_bodies or not surfaces + cloths + volumes else []
     return surfaces + cloths + volumes + points + cached
 
 
-def _write_poses(context: TaskContext, frame: int) -> None:
-    """Put the frame's poses where Blender finds them; they are no artifact, but a form of the cached frame."""
-    layout, bodies = context.layout, moving_bodies(context.job)
-    if not bodies:
-        return
-    cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies
-    path = layout.root / layout.poses.replace("{frame}", f"{frame:06d}")
+def _write_motion(context: TaskContext, frame: int) -> None:
+    """Put where bodies and camera are at a frame where Blender finds it.
+
+    These documents are no artifacts, but a form of the cached frame and of the job.
+    """
+    job, layout = context.job, context.layout
+    bodies, camera = job.moving_bodies, camera_path(job)
+    cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies if bodies else {}
+    poses = {name: cached[name].arrays for name in bodies}
+    if bodies:
+        with _replacing(context, layout.poses, frame) as path:
+            write_poses(path, frame, poses)
+    if camera.moves:
+        half_open = 0.5 * job.render.shutter if job.render.motion_blur else 0.0
+        views = {}
+        for offset in sorted({-half_open, 0.0, half_open}):
+            places = {name: _position_after(offset / job.fps, poses[name]) for name in camera.bodies}
+            views[offset] = camera.view((frame + offset) / job.fps, places)
+        with _replacing(context, layout.views, frame) as path:
+            write_views(path, frame, views)
+
+
+def _position_after(time_s: float, pose: Mapping[str, NDArray[Any]]) -> list[float]:
+    """Where a body is a short time before or after, its velocity kept [m]."""
+    return [float(x) for x in pose["position"] + time_s * pose["velocity"]]
+
+
+@contextmanager
+def _replacing(context: TaskContext, document: str, frame: int) -> Iterator[Path]:
+    """A path to write a frame's document to, which then takes the place of what is there."""
+    path = context.layout.root / document.replace("{frame}", f"{frame:06d}")
     path.parent.mkdir(exist_ok=True)
     part = path.with_name(f".{path.name}.part.{context.attempt}")
-    write_poses(part, frame, {name: cached[name].arrays for name in bodies})
+    yield part
     part.replace(path)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import ceil, prod
+from math import prod
 
 from pipeline.cache import read_smoke_in_box
 from pipeline.errors import InvalidArtifactError
@@ -13,8 +13,6 @@ from pipeline.stages.base import TaskContext
 from pipeline.stages.body_frames import tasks_of_bodies
 from pipeline.stages.inputs import ABSENT, tool_version
 from pipeline.task import Resources, Task
-from sim.scene import DomainParameters
-from sim.smoke.parameters import SmokeParameters
 
 WORKER_BYTES = 130_000_000
 BYTES_PER_CELL = 80
@@ -39,7 +37,7 @@ class VolumeStage:
             shutter=job.render.shutter,
         )
         smokes = [
-            (smoke.name, Resources(memory_bytes=WORKER_BYTES + BYTES_PER_CELL * _cells(smoke, job.domain)))
+            (smoke.name, Resources(memory_bytes=WORKER_BYTES + BYTES_PER_CELL * prod(smoke.cell_counts(job.domain))))
             for smoke in job.smoke
         ]
         return tasks_of_bodies(self.name, job, layout, bodies=smokes, output=layout.volume, parameters=parameters)
@@ -70,19 +68,7 @@ class VolumeStage:
         smoke = read_smoke_in_box(cached, task.subject)
         with context.committing(task.outputs[0], validate_volume) as path:
             try:
-                write_volume(
-                    path,
-                    density=smoke.density,
-                    temperature=smoke.temperature,
-                    velocity=smoke.velocity,
-                    origin=smoke.origin,
-                    cell_size=smoke.cell_size,
-                    ambient_temperature=smoke.ambient_temperature,
-                    parameters=job.volume,
-                    fps=job.fps,
-                    shutter=job.render.shutter,
-                    first_cell=smoke.first_cell,
-                )
+                write_volume(path, **vars(smoke), parameters=job.volume, fps=job.fps, shutter=job.render.shutter)
             except ValueError as error:
                 raise InvalidArtifactError(f'{cached}: smoke "{task.subject}": {error}') from error
         context.progress(1, 1)
@@ -92,8 +78,3 @@ def _openvdb() -> dict[str, str]:
     """The package that `import_openvdb` takes the binding from, with its version."""
     provider = "openvdb" if tool_version("openvdb") != ABSENT else "bpy"
     return {provider: tool_version(provider)}
-
-
-def _cells(smoke: SmokeParameters, domain: DomainParameters) -> int:
-    lower, upper = smoke.min or domain.min, smoke.max or domain.max
-    return prod(max(1, ceil((high - low) / smoke.cell_size)) for low, high in zip(lower, upper, strict=True))

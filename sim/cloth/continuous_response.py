@@ -11,7 +11,7 @@ weights). Where all contacts push alike, as between two layers, D_c is exact and
 of contacts Mazhar et al. 2015) brings the others.
 
 Sums over contacts are sums of integers, in units far below anything that matters: the same for any order of contacts
-and threads.
+and threads. Loops over bodies are serial on a CPU: a few bodies are done sooner than other threads wake.
 """
 
 import taichi as ti
@@ -19,7 +19,7 @@ import taichi as ti
 from sim.arrays import Floats, Integers, LongIntegers, Matrices, Vectors
 from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, Quadruples, Weights
 from sim.launch import fast_launch
-from sim.reductions import reduced
+from sim.reductions import reduced, runs_on_gpu
 
 SHARES_PER_UNIT = 65536.0
 """Resolution of the sums of weights; rounded up, so that the diagonal stays an upper bound."""
@@ -67,6 +67,8 @@ def weigh_contacts(
     counter[0], counter[1], counter[2] = 0, 0, 0
     for i in range(vertices_end):
         shares[i], uses[2 * i], uses[2 * i + 1] = 0, 0, 0
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for b in range(bodies_end):
         body_load[b] = ti.cast(0, ti.i64)
     for c in range(contacts_end):
@@ -183,6 +185,8 @@ def begin_push(
         i = touched[place]
         start[i] = displacement[i]
         reached[i] = displacement[i]
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for m in range(bodies_end):
         body_start[m] = body_motion[m]
         body_reached[m] = body_motion[m]
@@ -237,6 +241,8 @@ def push_apart(
             u = displacement[i] + (inverse_mass[i] * unit) * given_to(i, uses, used_by, use_weight, push)
             displacement[i] = u + momenta[step + 1] * (u - reached[i])
             reached[i] = u
+        if ti.static(not runs_on_gpu()):
+            ti.loop_config(serialize=True)
         for b in range(bodies_end):
             shift = body_motion[2 * b] + (body_inverse_mass[b] * unit) * take(body_gathered, 6 * b)
             turn = body_motion[2 * b + 1] + unit * (body_inverse_inertia[b] @ take(body_gathered, 6 * b + 3))
@@ -272,6 +278,8 @@ def finish_push(
     for place in range(touched_end):
         i = touched[place]
         displacement[i] = start[i] + (inverse_mass[i] * unit) * given_to(i, uses, used_by, use_weight, push)
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for b in range(bodies_end):
         for axis in ti.static(range(6)):
             body_impulse[6 * b + axis] += body_gathered[6 * b + axis]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.patches import Patches
+from sim.cloth.proximity_contacts import Quadruples
 from sim.cloth.self_collision_kernels import BLOCK, FAR, NONE, Pairs, Triples
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
@@ -42,7 +43,7 @@ class ElementBlocks:
             state: at the start of a substep.
             searched: numbers of pairs of patches, (count,).
             count: how many.
-            found, found_edges: number of elements found, by pair of patches.
+            found, found_edges: pieces of both lists.
             needed: by patch, whether a pair of it is searched; 0 after.
         """
         enclose_elements(
@@ -74,7 +75,7 @@ def enclose_elements(
     half_x: Floats, half_y: Floats, half_z: Floats,
     first_triangles: Integers, triangles: Triples, low_x: Floats, low_y: Floats, low_z: Floats,
     high_x: Floats, high_y: Floats, high_z: Floats,
-    count: ti.i32, searched: Integers, found: Integers, found_edges: Integers,
+    count: ti.i32, searched: Integers, found: Quadruples, found_edges: Quadruples,
 ):  # fmt: skip
     """Midpoints of edges and half the vectors along them, and boxes of triangles, of the patches that are needed."""
     for m in range(patch_count):
@@ -97,5 +98,5 @@ def enclose_elements(
                 low_x[place], low_y[place], low_z[place] = low[0], low[1], low[2]
                 high_x[place], high_y[place], high_z[place] = high[0], high[1], high[2]
     for k in range(count):
-        found[searched[k]] = 0
-        found_edges[searched[k]] = 0
+        found[searched[k]][2] = 0
+        found_edges[searched[k]][2] = 0

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.self_collision_kernels import Pairs
+from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE, Pairs
 from sim.launch import fast_launch
 from sim.reductions import Results, reduced
 
@@ -152,12 +152,42 @@ def merge_boxes(first: ti.i32, tree_low: Vectors, tree_high: Vectors):
 
 @fast_launch
 @ti.kernel
+def sort_known(
+    count: ti.i32, pairs: Pairs, slack: Floats, patch_count: ti.i32, first: Integers, known: Integers,
+    counter: Integers,
+):  # fmt: skip
+    """List the pairs of patches of whose elements something is known, `slack` being positive, by their first patch.
+
+    Numbers of the pairs of patch m are `known` from `first[2 m]` to `first[2 m + 1]`.
+    """
+    pairs_end, patches_end = count, patch_count
+    counter[0] = 0
+    for m in range(patches_end):
+        first[2 * m], first[2 * m + 1] = 0, 0
+    for p in range(pairs_end):
+        if slack[p] > 0.0:
+            ti.atomic_add(first[2 * pairs[p][0] + 1], 1)
+    for m in range(patches_end):
+        start = ti.atomic_add(counter[0], first[2 * m + 1])
+        first[2 * m], first[2 * m + 1] = start, start
+    for p in range(pairs_end):
+        if slack[p] > 0.0:
+            known[ti.atomic_add(first[2 * pairs[p][0] + 1], 1)] = p
+
+
+@fast_launch
+@ti.kernel
 def pair_patches(
-    count: ti.i32, leaves: ti.i32, tree_low: Vectors, tree_high: Vectors,
-    cloth: Integers, collides: Integers, pairs: Pairs, counter: Integers, capacity: ti.i32,
+    count: ti.i32, leaves: ti.i32, tree_low: Vectors, tree_high: Vectors, cloth: Integers, collides: Integers,
+    first_known: Integers, known: Integers, pairs_before: Pairs, slack_before: Floats,
+    pairs: Pairs, carried: Integers, wake: Floats, slack: Floats, left: Floats, approach: Floats, allowed: Floats,
+    counter: Integers, capacity: ti.i32,
 ) -> ti.i32:  # fmt: skip
     """List the patches whose boxes in the tree meet, each pair once, and each patch with itself; returns how many
-    there are."""
+    there are.
+
+    What was known before about a pair holds (`sort_known`): `carried` is its number there, or -1.
+    """
     counter[0] = 0
     for m in range(count):
         least, most = tree_low[leaves + m], tree_high[leaves + m]
@@ -175,7 +205,15 @@ def pair_patches(
                 if is_near and other >= m and (cloth[m] != cloth[other] or collides[cloth[m]] == 1):
                     slot = ti.atomic_add(counter[0], 1)
                     if slot < capacity:
-                        pairs[slot] = ti.Vector([m, other])
+                        before = -1
+                        for place in range(first_known[2 * m], first_known[2 * m + 1]):
+                            if pairs_before[known[place]][1] == other:
+                                before = known[place]
+                        pairs[slot], carried[slot] = ti.Vector([m, other]), before
+                        wake[slot], left[slot], approach[slot], allowed[slot] = -1.0, FAR, 0.0, 0.0
+                        slack[slot] = -1.0
+                        if before >= 0:
+                            slack[slot] = slack_before[before]
                 # On to the next node that is not below this one; 0 after the last.
                 while node % 2 == 1:
                     node = node // 2
@@ -210,10 +248,12 @@ def approach_of(
 def age_pairs(
     count: ti.i32, pairs: Pairs, low: Vectors, high: Vectors, centre: Vectors, shift: Vectors, turn: Vectors,
     radius: Floats, rest: Floats, motion: Floats, margin: Floats, more: Floats, spent: Floats, way: Floats,
-    thickness: ti.f32, least_skin: ti.f32, astray: ti.f32, is_new: ti.i32, wake: Floats, slack: Floats,
-    approach: Floats, allowed: Floats, reach: Floats, expired: Integers, needed: Integers, counter: Integers,
-) -> ti.i32:  # fmt: skip
-    """List the pairs of patches whose elements have to be searched before this substep; returns how many there are.
+    thickness: ti.f32, least_skin: ti.f32, astray: ti.f32, wake: Floats, slack: Floats, left: Floats,
+    approach: Floats, allowed: Floats, reach: Floats, first_due: Floats, first_due_of_edges: Floats,
+    due: Integers, expired: Integers, needed: Integers, counter: Integers,
+) -> ti.math.ivec2:  # fmt: skip
+    """List the pairs of patches whose elements have to be searched before this substep, and those of whose elements
+    some are due; returns how many there are.
 
     Pairs far apart sleep until their patches' motion can have closed the gap between their boxes.
 
@@ -224,34 +264,42 @@ def age_pairs(
         thickness: the largest [m].
         least_skin: how far beyond to search at least [m].
         astray: how far vertices are from where they were left at most [m].
-        is_new: whether nothing is known about the pairs yet.
         wake: what their patches spend until a pair wakes [m].
         slack: how much nearer the elements of a pair may come, that are not listed, and be a thickness apart [m].
+        left: what of the slack elements may use up, that are listed, until they are looked at [m]: an element that was
+            d apart when the slack was s is due when `left` is below s - d.
+        first_due, first_due_of_edges: the largest of these numbers of a pair of patches; `NEVER` after this where it is
+            due, as those that are looked at get other ones.
         approach: what this substep uses of it; 0 where a pair sleeps; `allowed` the margins of both, likewise.
         needed: gets 1 for patches of pairs that are searched.
         reach: how far to search for elements, so that the list lasts for some substeps [m].
     """
-    counter[0] = 0
+    counter[0], counter[1] = 0, 0
     for p in range(count):
-        if is_new == 1:
-            wake[p], slack[p], approach[p], allowed[p] = -1.0, -1.0, 0.0, 0.0
         m, other = pairs[p][0], pairs[p][1]
         if way[m] + way[other] > wake[p]:
             whole, besides = motion[m] + motion[other], more[m] + more[other]
             nearer = ti.min(approach_of(m, other, centre, shift, turn, radius, rest), whole)
             approach[p], allowed[p] = nearer, margin[m] + margin[other]
             slack[p] -= 2.0 * astray
-            if slack[p] < nearer + besides:
-                gap = gap_of_boxes(m, other, low, high) - thickness
+            is_searched = False
+            if slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
+                gap = gap_of_boxes(m, other, low, high) - (1.0 + SAFETY_OF_DUE) * thickness
                 if gap > whole + besides:
                     wake[p], slack[p] = spent[m] + spent[other] + 2.0 * astray + gap, -1.0
-                    approach[p], allowed[p] = 0.0, 0.0
+                    approach[p], allowed[p], left[p] = 0.0, 0.0, FAR
                 else:
-                    skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides
+                    skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
                     wake[p], slack[p], reach[p] = -1.0, skin, thickness + skin
+                    is_searched = True
                     expired[ti.atomic_add(counter[0], 1)] = p
                     needed[m], needed[other] = 1, 1
-    return counter[0]
+            if wake[p] < 0.0:
+                left[p] = slack[p] - ti.max(thickness, nearer + allowed[p]) - SAFETY_OF_DUE * thickness
+                if is_searched or first_due[p] >= left[p] or first_due_of_edges[p] >= left[p]:
+                    due[ti.atomic_add(counter[1], 1)] = p
+                    first_due[p], first_due_of_edges[p] = NEVER, NEVER
+    return ti.math.ivec2(counter[0], counter[1])
 
 
 @fast_launch

@@ -17,9 +17,10 @@ from sim.cloth.patch_motion_kernels import (
     merge_boxes,
     pair_patches,
     place_leaves,
+    sort_known,
 )
 from sim.cloth.patches import Patches
-from sim.cloth.self_collision_kernels import LANES, keep_distances, make_room
+from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces, make_room
 from sim.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
 
 if TYPE_CHECKING:
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 
 GROWTH = 1.5
 MAX_PAIRS = 2**28
-"""Most pairs of a list: 5 GiB on the device; so many mean that the step is far too large."""
+"""Most pairs of a list: 6 GiB on the device, and as much again while they are carried over. So many mean that the step
+is far too large."""
 
 SUBSTEPS_OF_PATCHES = (12.0, 60.0)
 PATCH_REACH_IN_EDGES = 3.0
@@ -49,74 +51,103 @@ class PairList:
 
     Attributes:
         end: pieces are before this place.
-        vertices: a vertex and a triangle's corners, or the ends of two edges, (capacity,) ivec4; `NONE` where a piece
-            is not full.
-        patches: number of the pair of patches, (capacity,).
-        wanted: distance that they keep [m], (capacity,).
-        found: number of elements in each piece.
+        vertices: a vertex and a triangle's corners, or the ends of two edges, (capacity,) ivec4.
+        wanted: distance that they keep [m], (capacity,); `UNKNOWN` until they have come so near that it matters.
+        due: they are looked at when `PatchPairs.left` is not above it [m], (capacity,).
+        pieces: first place of each piece, places, and how many of them are taken, (pairs of patches,) ivec4.
+        piece_due: the largest `due` of each piece [m]; `NEVER` where nothing is listed.
 
     Args:
-        are_edges: whether the elements are edges.
         capacity: pairs of elements to start with.
         pieces: pairs of patches.
     """
 
-    def __init__(self, *, are_edges: bool, capacity: int, pieces: int) -> None:
-        self._are_edges = are_edges
-        self._lanes = LANES if runs_on_gpu() else 1
+    def __init__(self, *, capacity: int, pieces: int) -> None:
+        self.lanes = LANES if runs_on_gpu() else 1
         self._end = ti.ndarray(ti.i32, 2)
         self._allocate(capacity)
         self.set_pieces(pieces)
 
+    @property
+    def _listed(self) -> tuple[ti.Ndarray, ...]:
+        return self.vertices, self.wanted, self.due
+
     def set_pieces(self, capacity: int) -> None:
         """Make room for the pieces of so many pairs of patches, all empty."""
-        self._start, self._room, self.found, self._again = (ti.ndarray(ti.i32, capacity) for _ in range(4))
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget all pieces."""
         self.end = 0
-        self._start.fill(0)
-        self._room.fill(0)
         self._end.fill(0)
+        self.pieces, self.piece_due, self._again = _room_for_pieces(capacity)
+        self._spare_pieces = _room_for_pieces(capacity)
 
-    def fill(self, search: Callable[..., None], state: ClothState, rest: ti.Ndarray, searched: ti.Ndarray, count: int,
-             *arguments: object) -> None:  # fmt: skip
-        """Have a search list the elements of some pairs of patches, `found` being 0; the pieces of all others stay.
+    def carry(self, count: int, carried: ti.Ndarray, capacity: int) -> None:
+        """Follow pairs of patches to their new numbers, with their pieces.
+
+        Args:
+            count: how many there are now.
+            carried: their numbers before, or -1, (count,).
+            capacity: most of them.
+        """
+        # Two sets of arrays in turn: new ones would have all launches prepared anew.
+        pieces, listed = (self.pieces, self.piece_due, self._again), self._listed
+        if self._spare_pieces[0].shape[0] < capacity:
+            self._spare_pieces = _room_for_pieces(capacity)
+        if self._spare[0].shape[0] < self._capacity:
+            self._spare = _room_for_pairs(self._capacity)
+        self.pieces, self.piece_due, self._again = self._spare_pieces
+        self.vertices, self.wanted, self.due = self._spare
+        self._spare_pieces, self._spare = pieces, listed
+        self.end = int(
+            carry_pieces(count, carried, *pieces[:2], *listed, self.pieces, self.piece_due, *self._listed, self._end)
+        )
+
+    def fill(self, search: Callable[..., None], searched: ti.Ndarray, count: int, *arguments: object) -> None:
+        """Have a search list the elements of some pairs of patches, in empty pieces; the pieces of all others stay.
 
         Raises:
             OverflowError: more pairs than any useful step has.
         """
-        pieces = (self._start, self._room, self.found)
-        search(count, self._lanes, searched, *arguments, *pieces, self.vertices)
-        short, end = make_room(
-            count, searched, *pieces, self.vertices, self._end, self._again
-        )[:2]  # fmt: skip
+        search(count, self.lanes, searched, *arguments, self.pieces, self.piece_due, *self._listed)
+        short, end = make_room(count, searched, self.pieces, self._end, self._again)[:2]
         if end < 0 or end > MAX_PAIRS:
             raise OverflowError(TOO_MANY)
         if end > self._capacity:
             self._grow(int(GROWTH * end))
         self.end = int(end)
         if short:
-            search(int(short), self._lanes, self._again, *arguments, *pieces, self.vertices)
-        keep_distances(
-            count, searched, *pieces, self.vertices, self._are_edges, rest, state.body,
-            state.thickness, self.wanted, self.patches,
-        )  # fmt: skip
+            search(int(short), self.lanes, self._again, *arguments, self.pieces, self.piece_due, *self._listed)
 
     def _allocate(self, capacity: int) -> None:
         self._capacity = capacity
-        self.vertices = ti.Vector.ndarray(4, ti.i32, capacity)
-        self.wanted = ti.ndarray(ti.f32, capacity)
-        self.patches = ti.ndarray(ti.i32, capacity)
+        self.vertices, self.wanted, self.due = _room_for_pairs(capacity)
+        self._spare = _room_for_pairs(1)
 
     def _grow(self, capacity: int) -> None:
         """Make room for so many pairs, and keep those that are listed: when lists grow shows in no search after it."""
-        old, before = self._capacity, (self.vertices, self.wanted, self.patches)
+        old, before = self._capacity, self._listed
         self._allocate(capacity)
-        for source, target in zip(before, (self.vertices, self.wanted, self.patches), strict=True):
+        for source, target in zip(before, self._listed, strict=True):
             values = source.to_numpy()
             target.from_numpy(np.concatenate([values, np.zeros((capacity - old, *values.shape[1:]), values.dtype)]))
+
+
+def _room_for_pairs(capacity: int) -> tuple[ti.Ndarray, ...]:
+    """Arrays of `PairList`: vertices, wanted, due."""
+    return ti.Vector.ndarray(4, ti.i32, capacity), *(ti.ndarray(ti.f32, capacity) for _ in range(2))
+
+
+def _room_for_pieces(capacity: int) -> tuple[ti.Ndarray, ...]:
+    """Arrays of `PairList`: pieces, all empty, when they are due, numbers of those that are searched again."""
+    pieces, piece_due, again = (
+        ti.Vector.ndarray(4, ti.i32, capacity), ti.ndarray(ti.f32, capacity), ti.ndarray(ti.i32, capacity)
+    )  # fmt: skip
+    pieces.fill(0)
+    piece_due.fill(NEVER)
+    return pieces, piece_due, again
+
+
+def _room_for_patch_pairs(capacity: int) -> tuple[ti.Ndarray, ti.Ndarray]:
+    """Arrays of `PatchPairs`: pairs, slack."""
+    return ti.Vector.ndarray(2, ti.i32, capacity), ti.ndarray(ti.f32, capacity)
 
 
 class PatchPairs:
@@ -129,8 +160,12 @@ class PatchPairs:
         motion_arrays: the rigid motion of each patch in the substep: centre [m], shift [m], turn [rad], (m,) vec3;
             distance of its corners from the centre, and of their displacements from that motion, at most [m], (m,).
         expired: numbers of the pairs to be searched; `needed` is 1 for their patches, (m,).
+        due: numbers of the pairs of which elements have to be looked at, `due_count` of them.
         approach: how much nearer points of a pair come at most in this substep [m], (count,); `allowed` how much
             contacts may add to it.
+        slack: how much nearer elements of a pair may come that are not listed [m], (count,); `left` how much of it
+            those may use up that are, until they are due.
+        carried: numbers that pairs had before the last `meet`, or -1, (count,).
         reach: how far to search for the elements of each pair [m], (count,).
 
     Args:
@@ -154,19 +189,21 @@ class PatchPairs:
         ) = (ti.ndarray(ti.f32, m) for _ in range(9))
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
         self._tree_low, self._tree_high = (ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2))
-        self._counter = ti.ndarray(ti.i32, 1)
+        self._counter = ti.ndarray(ti.i32, 2)
+        self._first_known = ti.ndarray(ti.i32, 2 * m)
         self.needed = ti.ndarray(ti.i32, m)
         self.needed.fill(0)
         self._maxima = LaneReduction(maxima=MAX_QUANTITIES, sums=0)
         self._astray, self._half_thickness, self._still = 0.0, 0.0, 0.0
-        self.count = 0
+        self.count = self.due_count = 0
         self._allocate(8 * m)
 
     def _allocate(self, capacity: int) -> None:
         self.capacity = capacity
-        self.pairs = ti.Vector.ndarray(2, ti.i32, capacity)
-        self.expired = ti.ndarray(ti.i32, capacity)
-        self.reach, self._wake, self._slack, self.approach, self.allowed = (
+        self.pairs, self.slack = _room_for_patch_pairs(capacity)
+        self._spare = _room_for_patch_pairs(capacity)
+        self.expired, self.carried, self._known, self.due = (ti.ndarray(ti.i32, capacity) for _ in range(4))
+        self.reach, self._wake, self.left, self.approach, self.allowed = (
             ti.ndarray(ti.f32, capacity) for _ in range(5)
         )
 
@@ -201,16 +238,21 @@ class PatchPairs:
         )  # fmt: skip
         return np.array(ends, dtype=np.float64), beyond <= 0.0
 
-    def meet(self, thickness: float, edge: float, collides: ti.Ndarray) -> None:
-        """List the pairs of patches that may get within a thickness [m]; nothing is known about them yet.
+    def meet(self, thickness: float, edge: float, collides: ti.Ndarray, *, keeps: bool = False) -> bool:
+        """List the pairs of patches that may get within a thickness [m].
+
+        Returns whether what was known about the pairs still holds, which have changed their numbers (`carried`).
 
         Args:
             thickness: the largest [m].
             edge: the mean one [m].
             collides: which cloths do with themselves, (b,).
+            keeps: whether what is known about pairs would hold, as far as this object knows.
         """
         patches = self.patches
-        self._astray = 0.0
+        keeps = keeps and self._astray < thickness  # else cloth was put elsewhere, and nothing would be left of it
+        if not keeps:
+            self.count, self._astray = 0, 0.0
         tree = self._tree_low, self._tree_high
         place_leaves(
             patches.count, patches.leaves, self.low, self.high, self._motion, self._change, self._more,
@@ -220,32 +262,39 @@ class PatchPairs:
         first = patches.leaves
         while first := first // 2:
             merge_boxes(first, *tree)
+        known, before = (self._first_known, self._known), (self.pairs, self.slack)
+        sort_known(self.count, *before, patches.count, *known, self._counter)
+        self.pairs, self.slack = self._spare
+        self._spare = before
         while True:
             found = pair_patches(
-                patches.count, patches.leaves, *tree, patches.cloth, collides, self.pairs, self._counter, self.capacity
-            )
+                patches.count, patches.leaves, *tree, patches.cloth, collides, *known, *before, self.pairs,
+                self.carried, self._wake, self.slack, self.left, self.approach, self.allowed, self._counter,
+                self.capacity,
+            )  # fmt: skip
             if found < 0 or found > MAX_PAIRS:
                 raise OverflowError(TOO_MANY)
             if found <= self.capacity:
                 break
             self._allocate(int(GROWTH * found))
         self.count = int(found)
+        return keeps
 
-    def age(self, thickness: float, least_skin: float, *, is_new: bool) -> int:
+    def age(self, thickness: float, least_skin: float, *first_due: ti.Ndarray) -> int:
         """Find which pairs have to be searched in this substep, and how far each; returns how many there are.
 
         Args:
             thickness: distance within which all elements have to be listed [m].
             least_skin: how far beyond to search at least [m].
-            is_new: whether elements of all pairs have to be looked at anew.
+            first_due: `PairList.piece_due` of both lists; `NEVER` after this where a pair is due.
         """
-        return int(
-            age_pairs(
-                self.count, self.pairs, *self._fitted, self._motion, self._margin, self._more, self._spent, self._way,
-                thickness, least_skin, self._astray, int(is_new), self._wake, self._slack, self.approach, self.allowed,
-                self.reach, self.expired, self.needed, self._counter,
-            )
-        )  # fmt: skip
+        expired, due = age_pairs(
+            self.count, self.pairs, *self._fitted, self._motion, self._margin, self._more, self._spent, self._way,
+            thickness, least_skin, self._astray, self._wake, self.slack, self.left, self.approach, self.allowed,
+            self.reach, *first_due, self.due, self.expired, self.needed, self._counter,
+        )[:2]  # fmt: skip
+        self.due_count = int(due)
+        return int(expired)
 
     def measure_changes(self, state: ClothState, predicted: ti.Ndarray) -> tuple[float, float]:
         """How far contacts displaced vertices at most [m]; and those that they displaced farther than allowed for.
@@ -274,5 +323,5 @@ class PatchPairs:
             patches.vertex_count, self._still, state.position, state.displacement, self._expected,
             patches.count, patches.first_corner, patches.corners, *self._fitted, self._motion, self._change,
             int(is_changed), self._astray, negligible, MARGIN * 2.0 * self._half_thickness, self._half_thickness,
-            self._margin, self._more, self._spent, self.count, self.pairs, self.approach, self._slack,
+            self._margin, self._more, self._spent, self.count, self.pairs, self.approach, self.slack,
         )  # fmt: skip

@@ -22,10 +22,10 @@ from sim.reductions import LaneReduction
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
 
-REACH_IN_EDGES = 0.6
+REACH_IN_EDGES = 0.85
 LEAST_SKIN_IN_EDGES = 0.15
 """How far lists of pairs reach, and at least farther than the thickness, in mean edges, if motion does not ask for
-more: to last for many substeps at rest, but not list the neighbours in flat cloth, 0.6 mean edges and more off."""
+more: to last for many substeps at rest, but not list most neighbours in flat cloth, 0.9 mean edges and more off."""
 
 NEGLIGIBLE = 0.01
 """Part of the thickness that contacts may add to the motion of a substep without it being looked at anew."""
@@ -57,17 +57,18 @@ class SelfCollision:
         self._rest.from_numpy(state.host.position.astype(np.float32))
         self._blocks = ElementBlocks(self._patches)
         self._collides = ti.ndarray(ti.i32, len(state.names))
-        self.with_triangles = PairList(are_edges=False, capacity=state.vertex_count, pieces=self._met.capacity)
-        self.of_edges = PairList(are_edges=True, capacity=state.edge_count, pieces=self._met.capacity)
+        self.with_triangles = PairList(capacity=state.vertex_count, pieces=self._met.capacity)
+        self.of_edges = PairList(capacity=state.edge_count, pieces=self._met.capacity)
         edges = state.host.position[state.host.edges]
         self.mean_edge = float(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).mean())
         self.thickness = 0.0
         self._listed_for: tuple[bytes, tuple[bool, ...]] = (b"", ())
+        self._is_forgotten, self._is_outrun = True, False
         self.begin_frame(state)
 
     def forget(self) -> None:
         """Search anew at the next `prepare`."""
-        self._is_new = True
+        self._is_forgotten = True
 
     def begin_frame(self, state: ClothState) -> None:
         """Margins of contacts are what they are at the start of a run, and searches are counted anew.
@@ -92,7 +93,7 @@ class SelfCollision:
     def look(self, state: ClothState) -> float:
         """Note how cloth moves in this substep; returns how far vertices get apart from their common motion [m]."""
         ends, holds = self._met.look(state)
-        self._is_new |= not holds
+        self._is_outrun |= not holds
         return float(0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def prepare(self, state: ClothState) -> None:
@@ -102,16 +103,16 @@ class SelfCollision:
         these displace vertices within their margins.
         """
         met, edge = self._met, self.mean_edge
-        if self._is_new:
-            room = met.capacity
-            met.meet(self.thickness, edge, self._collides)
+        if self._is_forgotten or self._is_outrun:
+            keeps = met.meet(self.thickness, edge, self._collides, keeps=not self._is_forgotten)
             for pairs in (self.with_triangles, self.of_edges):
-                if met.capacity > room:
+                if keeps:
+                    pairs.carry(met.count, met.carried, met.capacity)
+                else:
                     pairs.set_pieces(met.capacity)
-                pairs.clear()
+            self._is_forgotten = self._is_outrun = False
         least_skin = max(REACH_IN_EDGES * edge - self.thickness, LEAST_SKIN_IN_EDGES * edge)
-        count = met.age(self.thickness, least_skin, is_new=self._is_new)
-        self._is_new = False
+        count = met.age(self.thickness, least_skin, self.with_triangles.piece_due, self.of_edges.piece_due)
         if count:
             self._search(state, count)
 
@@ -136,11 +137,14 @@ class SelfCollision:
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
+        met = self._met
         for pairs, are_edges in ((self.with_triangles, False), (self.of_edges, True)):
-            if pairs.end:
+            if met.due_count:
                 find_near_pairs(
-                    pairs.vertices, pairs.wanted, pairs.patches, self._met.approach, self._met.allowed, pairs.end,
-                    are_edges, state.position, state.displacement, state.friction, recovery, *contacts.found_arrays,
+                    met.due_count, pairs.lanes, met.due, pairs.pieces, pairs.piece_due, pairs.vertices, pairs.wanted,
+                    pairs.due, met.slack, met.left, met.approach, met.allowed, are_edges, state.position,
+                    state.displacement, self._rest, state.body, state.thickness, state.friction, recovery,
+                    *contacts.found_arrays,
                 )  # fmt: skip
 
     @property
@@ -153,13 +157,12 @@ class SelfCollision:
         met, patches = self._met, self._patches
         self._searched += count
         where = (met.pairs, met.low, met.high, met.reach)
-        self._blocks.enclose(state, met.expired, count, self.with_triangles.found, self.of_edges.found, met.needed)
+        self._blocks.enclose(state, met.expired, count, self.with_triangles.pieces, self.of_edges.pieces, met.needed)
         vertices = (state.position, patches.first_vertex, patches.vertices)
         self.with_triangles.fill(
-            pair_vertices_with_triangles, state, self._rest, met.expired, count, *where, *vertices,
-            *self._blocks.triangles,
-        )  # fmt: skip
-        self.of_edges.fill(pair_edges, state, self._rest, met.expired, count, *where, *self._blocks.edges)
+            pair_vertices_with_triangles, met.expired, count, *where, *vertices, *self._blocks.triangles, met.slack
+        )
+        self.of_edges.fill(pair_edges, met.expired, count, *where, *self._blocks.edges, met.slack)
 
 
 def half_range(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple[float, float]:

@@ -40,7 +40,17 @@ FAR = 1.0e9
 """Coordinate of what is far from everything [m]; the fourth power of a distance to it is finite in float32."""
 
 NONE = -1
-"""In the place of a vertex: the list has no pair there."""
+"""In the place of a vertex: the block has no element there."""
+
+UNKNOWN = -1.0
+"""Distance that a pair keeps where nobody has asked for it yet [m]."""
+
+NEVER = -1.0e30
+"""When a place is due in which no pair is listed."""
+
+SAFETY_OF_DUE = 1.0e-3
+"""Part of the thickness by which pairs are listed, and looked at, earlier than they could have come near: a thousand
+times what sums of float32 lose, so that what is found does not depend on when lists were made."""
 
 
 @ti.func
@@ -69,7 +79,7 @@ def pair_vertices_with_triangles(
     count: ti.i32, lanes: ti.i32, searched: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats,
     position: Vectors, first_vertex: Integers, vertices: Integers, first_block: Integers, triangles: Triples,
     low_x: Floats, low_y: Floats, low_z: Floats, high_x: Floats, high_y: Floats, high_z: Floats,
-    start: Integers, room: Integers, found: Integers, pairs: Quadruples,
+    slack: Floats, pieces: Quadruples, piece_due: Floats, pairs: Quadruples, wanted: Floats, due: Floats,
 ):  # fmt: skip
     """List the vertices of each of two patches with the triangles of the other within `reach` [m] of them.
 
@@ -77,10 +87,12 @@ def pair_vertices_with_triangles(
         count: number of pairs of patches that are searched; their numbers are `searched`.
         lanes: threads that share a pair.
         first_block, triangles, low_x to high_z: see `ElementBlocks.triangles`.
-        start, room: where pairs of elements are listed, and how many fit; `found` gets how many there are.
+        slack: how much nearer pairs may come that are not listed [m].
+        pieces, piece_due, pairs, wanted, due: see `PairList`.
     """
     for item in range(count * lanes):
         p = searched[item // lanes]
+        soonest = NEVER
         for side in range(2):
             m, other = patches[p][side], patches[p][1 - side]
             place = first_vertex[m] + item % lanes
@@ -108,10 +120,15 @@ def pair_vertices_with_triangles(
                             own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
                             if own == 0:
                                 a, b, c = position[corners[0]] - x, position[corners[1]] - x, position[corners[2]] - x
-                                if distance_to_triangle(ti.math.vec3(0.0), a, b, c) < reach[p]:
-                                    slot = ti.atomic_add(found[p], 1)
-                                    if slot < room[p]:
-                                        pairs[start[p] + slot] = Four(v, corners[0], corners[1], corners[2])
+                                apart = distance_to_triangle(ti.math.vec3(0.0), a, b, c)
+                                if apart < reach[p]:
+                                    slot = ti.atomic_add(pieces[p][2], 1)
+                                    if slot < pieces[p][1]:
+                                        there = pieces[p][0] + slot
+                                        pairs[there] = Four(v, corners[0], corners[1], corners[2])
+                                        wanted[there], due[there] = UNKNOWN, slack[p] - apart
+                                        soonest = ti.max(soonest, slack[p] - apart)
+        ti.atomic_max(piece_due[p], soonest)
 
 
 @fast_launch
@@ -120,7 +137,7 @@ def pair_edges(
     count: ti.i32, lanes: ti.i32, searched: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats,
     first_block: Integers, edges: Pairs,
     mid_x: Floats, mid_y: Floats, mid_z: Floats, half_x: Floats, half_y: Floats, half_z: Floats,
-    start: Integers, room: Integers, found: Integers, pairs: Quadruples,
+    slack: Floats, pieces: Quadruples, piece_due: Floats, pairs: Quadruples, wanted: Floats, due: Floats,
 ):  # fmt: skip
     """List the edges of two patches that are within `reach` [m] of each other and share no vertex; as above.
 
@@ -129,6 +146,7 @@ def pair_edges(
     """
     for item in range(count * lanes):
         p = searched[item // lanes]
+        soonest = NEVER
         m, other = patches[p][0], patches[p][1]
         within = reach[p] * reach[p]
         least, most = low[other] - reach[p], high[other] + reach[p]
@@ -160,62 +178,71 @@ def pair_edges(
                         if share_no_vertex(e, f) == 1:
                             between = ti.math.vec3(mid_x[there], mid_y[there], mid_z[there]) - middle
                             far_half = ti.math.vec3(half_x[there], half_y[there], half_z[there])
-                            if distance_of_edges(-half, half, between - far_half, between + far_half) < reach[p]:
-                                slot = ti.atomic_add(found[p], 1)
-                                if slot < room[p]:
+                            apart = distance_of_edges(-half, half, between - far_half, between + far_half)
+                            if apart < reach[p]:
+                                slot = ti.atomic_add(pieces[p][2], 1)
+                                if slot < pieces[p][1]:
+                                    place_of_pair = pieces[p][0] + slot
                                     # In this order, so that rounding does not depend on that of the patches.
-                                    pairs[start[p] + slot] = ti.select(
+                                    pairs[place_of_pair] = ti.select(
                                         f[0] < e[0], Four(f[0], f[1], e[0], e[1]), Four(e[0], e[1], f[0], f[1])
                                     )
+                                    wanted[place_of_pair], due[place_of_pair] = UNKNOWN, slack[p] - apart
+                                    soonest = ti.max(soonest, slack[p] - apart)
+        ti.atomic_max(piece_due[p], soonest)
 
 
 @fast_launch
 @ti.kernel
-def make_room(
-    count: ti.i32, searched: Integers, start: Integers, room: Integers, found: Integers, pairs: Quadruples,
-    end: Integers, again: Integers,
-) -> ti.math.ivec2:  # fmt: skip
-    """Move lists that were too short to the end; returns how many, and where the end is now.
+def make_room(count: ti.i32, searched: Integers, pieces: Quadruples, end: Integers, again: Integers) -> ti.math.ivec2:
+    """After a search: pieces that were too short move to the end, empty.
 
-    Their numbers are `again`; `end` has the end, then how many there are.
+    Returns how many of these there are, and where the end is now. Their numbers are `again`; `end` has the end, then
+    how many there are.
     """
     end[1] = 0
     for k in range(count):
         p = searched[k]
-        if found[p] > room[p]:
-            for place in range(start[p], start[p] + room[p]):
-                pairs[place] = Four(NONE)
-            room[p] = found[p] + found[p] // 2
-            start[p] = ti.atomic_add(end[0], room[p])
-            found[p] = 0
+        found = pieces[p][2]
+        if found > pieces[p][1]:
+            room = found + found // 2
+            pieces[p] = Four(ti.atomic_add(end[0], room), room, 0, 0)
             again[ti.atomic_add(end[1], 1)] = p
     return ti.math.ivec2(end[1], end[0])
 
 
 @fast_launch
 @ti.kernel
-def keep_distances(
-    count: ti.i32, searched: Integers, start: Integers, room: Integers, found: Integers, pairs: Quadruples,
-    are_edges: ti.template(), rest: Vectors, cloth: Integers, thickness: Floats, wanted: Floats, patches: Integers,
-):  # fmt: skip
-    """Distances that the listed elements keep [m], and the number of their pair of patches; nothing is after them."""
-    for k in range(count):
-        p = searched[k]
-        for place in range(start[p], start[p] + found[p]):
-            v = pairs[place]
-            a, b, c, d = rest[v[0]], rest[v[1]], rest[v[2]], rest[v[3]]
-            at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
-            patches[place] = p
-            wanted[place] = pair_thickness(v[0], v[2], cloth, thickness, at_rest)
-        for place in range(start[p] + found[p], start[p] + room[p]):
-            pairs[place] = Four(NONE)
+def carry_pieces(
+    count: ti.i32, carried: Integers, pieces_before: Quadruples, piece_due_before: Floats, before: Quadruples,
+    wanted_before: Floats, due_before: Floats, pieces: Quadruples, piece_due: Floats, pairs: Quadruples,
+    wanted: Floats, due: Floats, end: Integers,
+) -> ti.i32:  # fmt: skip
+    """Pieces of the pairs of patches that were listed before, at the places of their numbers now; returns the end.
+
+    Args:
+        carried: numbers that pairs of patches had before, or -1.
+    """
+    end[0] = 0
+    for p in range(count):
+        pieces[p], piece_due[p] = Four(0), NEVER
+        if carried[p] >= 0:
+            first, found = pieces_before[carried[p]][0], pieces_before[carried[p]][2]
+            start = ti.atomic_add(end[0], found)
+            pieces[p], piece_due[p] = Four(start, found, found, 0), piece_due_before[carried[p]]
+            for k in range(found):
+                pairs[start + k] = before[first + k]
+                wanted[start + k], due[start + k] = wanted_before[first + k], due_before[first + k]
+    return end[0]
 
 
 @fast_launch
 @ti.kernel
 def find_near_pairs(
-    pairs: Quadruples, wanted: Floats, patches: Integers, approach: Floats, allowed: Floats, count: ti.i32,
-    are_edges: ti.template(), position: Vectors, displacement: Vectors, vertex_friction: Floats, recovery: ti.f32,
+    count: ti.i32, lanes: ti.i32, due_pairs: Integers, pieces: Quadruples, piece_due: Floats, pairs: Quadruples,
+    wanted: Floats, due: Floats, slack: Floats, left: Floats, approach: Floats, allowed: Floats,
+    are_edges: ti.template(), position: Vectors, displacement: Vectors, rest: Vectors, cloth: Integers,
+    thickness: Floats, vertex_friction: Floats, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
     friction: Floats, counter: Integers, capacity: ti.i32,
 ):  # fmt: skip
@@ -223,35 +250,64 @@ def find_near_pairs(
 
     The displacement along the line of shortest distance counts. A pair might cross when its vertices, displaced as
     they are now and by contacts besides, come together: then it is watched, `INACTIVE`. They come no nearer than by
-    twice their motion against their mean, nor than by the `approach` [m] of their `patches`; contacts are `allowed` so
-    much more [m].
+    twice their motion against their mean, nor than by the `approach` [m] of their patches; contacts are `allowed` so
+    much more [m]. Pairs that have been farther off than their patches have approached since are not even looked at.
+
+    Args:
+        count: number of pairs of patches that are looked at, `due_pairs`; `lanes` threads share one.
     """
-    for p in range(count):
-        v = pairs[p]
-        if v[0] == NONE:
-            continue
-        x, u = position[v[0]], displacement[v[0]]
-        x1, x2, x3 = position[v[1]] - x, position[v[2]] - x, position[v[3]] - x
+    for item in range(count * lanes):
+        both = due_pairs[item // lanes]
+        soonest = NEVER
+        place, end = pieces[both][0] + item % lanes, pieces[both][0] + pieces[both][2]
+        while place < end:
+            if due[place] >= left[both]:
+                due[place] = look_at_pair(
+                    place, pairs, wanted, slack[both], approach[both], allowed[both], are_edges, position,
+                    displacement, rest, cloth, thickness, vertex_friction, recovery, vertices, weights, normal,
+                    floor, kind, arm, friction, counter, capacity,
+                )  # fmt: skip
+            soonest = ti.max(soonest, due[place])
+            place += lanes
+        ti.atomic_max(piece_due[both], soonest)
+
+
+@ti.func
+def look_at_pair(
+    p: ti.i32, pairs: Quadruples, wanted: Floats, slack: ti.f32, approach: ti.f32, allowed: ti.f32,
+    are_edges: ti.template(), position: Vectors, displacement: Vectors, rest: Vectors, cloth: Integers,
+    thickness: Floats, vertex_friction: Floats, recovery: ti.f32,
+    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
+    friction: Floats, counter: Integers, capacity: ti.i32,
+) -> ti.f32:  # fmt: skip
+    """Append a pair if it has to be; returns when it is due [m]."""
+    v = pairs[p]
+    x, u = position[v[0]], displacement[v[0]]
+    x1, x2, x3 = position[v[1]] - x, position[v[2]] - x, position[v[3]] - x
+    zero = ti.math.vec3(0.0)
+    weight = ti.math.vec4(0.0)
+    part = 1.0
+    if ti.static(are_edges):
+        shares = closest_on_edges(zero, x1, x2, x3)
+        weight = ti.math.vec4(1.0 - shares[0], shares[0], shares[1] - 1.0, -shares[1])
+        # What is nearest at an end of an edge is a vertex, which is near to a triangle too.
+        part = ti.select(ti.min(shares, 1.0 - shares).min() > END_OF_EDGE, OF_EDGES, 0.0)
+    else:
+        shares = closest_on_triangle(zero, x1, x2, x3)
+        weight = ti.math.vec4(1.0, -shares[0], -shares[1], -shares[2])
+    apart = weight[1] * x1 + weight[2] * x2 + weight[3] * x3
+    distance = apart.norm()
+    if distance < ti.max(0.5 * (thickness[v[0]] + thickness[v[2]]), approach + allowed):
         u1, u2, u3 = displacement[v[1]] - u, displacement[v[2]] - u, displacement[v[3]] - u
-        zero = ti.math.vec3(0.0)
-        weight = ti.math.vec4(0.0)
-        across = ti.math.vec3(0.0)
-        keeps = wanted[p]
-        if ti.static(are_edges):
-            shares = closest_on_edges(zero, x1, x2, x3)
-            weight = ti.math.vec4(1.0 - shares[0], shares[0], shares[1] - 1.0, -shares[1])
-            across = x1.cross(x3 - x2)
-            # What is nearest at an end of an edge is a vertex, which is near to a triangle too.
-            keeps *= ti.select(ti.min(shares, 1.0 - shares).min() > END_OF_EDGE, OF_EDGES, 0.0)
-        else:
-            shares = closest_on_triangle(zero, x1, x2, x3)
-            weight = ti.math.vec4(1.0, -shares[0], -shares[1], -shares[2])
-            across = (x2 - x1).cross(x3 - x1)
-        apart = weight[1] * x1 + weight[2] * x2 + weight[3] * x3
-        distance = apart.norm()
         mean = 0.25 * (u1 + u2 + u3)
         motion = ti.max(mean.norm(), (u1 - mean).norm(), (u2 - mean).norm(), (u3 - mean).norm())
-        if distance < ti.max(keeps, ti.min(2.0 * motion, approach[patches[p]]) + allowed[patches[p]]):
+        if wanted[p] == UNKNOWN:
+            a, b, c, d = rest[v[0]], rest[v[1]], rest[v[2]], rest[v[3]]
+            at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
+            wanted[p] = pair_thickness(v[0], v[2], cloth, thickness, at_rest)
+        keeps = part * wanted[p]
+        if distance < ti.max(keeps, ti.min(2.0 * motion, approach) + allowed):
+            across = x1.cross(x3 - x2) if ti.static(are_edges) else (x2 - x1).cross(x3 - x1)
             n = unit_or(apart, across)
             least = least_displacement(distance, keeps, recovery)
             slot = ti.atomic_add(counter[0], 1)
@@ -262,6 +318,7 @@ def find_near_pairs(
                 kind[slot] = EDGE_EDGE if ti.static(are_edges) else VERTEX_TRIANGLE
                 arm[slot] = zero
                 friction[slot] = ti.sqrt(vertex_friction[v[0]] * vertex_friction[v[2]])
+    return slack - distance
 
 
 @fast_launch

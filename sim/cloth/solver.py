@@ -23,8 +23,8 @@ from sim.cloth.stable_step import too_few_substeps
 from sim.cloth.state import ClothState, HostCloths
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
+from sim.domain import DomainParameters
 from sim.parameters import Vector3
-from sim.scene import DomainParameters
 from sim.snapshots import Snapshot
 from sim.solver import Arrays, Diagnostics
 

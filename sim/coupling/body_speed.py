@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.pin_paths import path_of_pin
+from sim.domain import DomainParameters
 from sim.fluid.expected_speed import square_of_fall_speed
 from sim.parameters import Vector3
 from sim.rigid import rotation
 from sim.rigid.geometry import BodyGeometry
 from sim.rigid.keyframes import path_of
 from sim.rigid.parameters import RigidBodyParameters
-from sim.scene import DomainParameters
 
 
 def expected_body_speed(

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.domain import DomainParameters
 from sim.rigid import rotation
 from sim.rigid.contacts import Poses
 from sim.rigid.geometry import BodyGeometry
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.walls import walls_of
-from sim.scene import DomainParameters
 
 if TYPE_CHECKING:
     from sim.cloth.continuous_contacts import ContinuousContacts

@@ -8,7 +8,7 @@ import taichi as ti
 
 from sim.arrays import Vectors
 from sim.coupling.water_room import room_for_water
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 if TYPE_CHECKING:
     from sim.fluid.forces import SPHFluid

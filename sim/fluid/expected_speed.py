@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.domain import DomainParameters
 from sim.parameters import Vector3
-from sim.scene import DomainParameters
 
 SLOWEST_EXPECTED_SPEED = 0.1
 """Where neither gravity nor an initial velocity says what to expect [m/s]."""

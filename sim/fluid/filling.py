@@ -16,8 +16,8 @@ from sim.shapes.placement import build_solid
 from sim.shapes.sampling import fill_with_particles
 
 if TYPE_CHECKING:
+    from sim.domain import DomainParameters
     from sim.fluid.parameters import FluidParameters
-    from sim.scene import DomainParameters
     from sim.shapes.solid import Solid
 
 CLEARANCE_IN_SPACINGS = 0.5

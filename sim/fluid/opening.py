@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from sim.fluid.parameters import DiscOpening
 
 if TYPE_CHECKING:
+    from sim.domain import DomainParameters
     from sim.fluid.parameters import EmitterParameters
-    from sim.scene import DomainParameters
     from sim.shapes.solid import Solid
 
 NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35

@@ -27,9 +27,9 @@ from sim.snapshots import Snapshot
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from sim.domain import DomainParameters
     from sim.fluid.parameters import FluidParameters
     from sim.parameters import Vector3
-    from sim.scene import DomainParameters
     from sim.solver import Arrays, Diagnostics
 
 

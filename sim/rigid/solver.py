@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.domain import DomainParameters
 from sim.parameters import Vector3
 from sim.rigid import rotation
 from sim.rigid.collision import CollisionDetector
@@ -19,7 +20,6 @@ from sim.rigid.keyframes import Path, path_of, path_onwards
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.states import Inertia, MovingBodies
 from sim.rigid.walls import walls_of
-from sim.scene import DomainParameters
 from sim.shapes.solid import Points
 from sim.snapshots import Snapshot
 from sim.solver import Arrays, Diagnostics

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 Array = NDArray[np.float64]
 

@@ -7,6 +7,7 @@ is first-order in time by itself; MacCormack's second pass corrects the error of
 
 import taichi as ti
 
+from sim.parameters import Vector3
 from sim.smoke.balance import CorrectionBalance
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import lane_count, lane_items, lane_place
@@ -16,8 +17,9 @@ from sim.smoke.lanes import lane_count, lane_items, lane_place
 class Advection:
     """Advects cell and face fields of one grid.
 
-    Smoke that is carried in through an open side is clean air at the air's temperature (0 in every cell field); faces
-    beyond a side, and everything beyond a wall, have the value of the nearest place inside.
+    What is carried in through an open side is clean air at the air's temperature (0 in every cell field). It has the
+    velocity of the air outside along the side; across it that on the side itself, which the pressure gives it. Beyond
+    walls everything has the value of the nearest place inside.
 
     Args:
         grid: where the fields live.
@@ -25,6 +27,7 @@ class Advection:
         cell_fields: density and temperature excess, flat fields.
         work: six flat fields to work in.
         maccormack: whether to correct the semi-Lagrangian result.
+        wind: velocity of the air outside [m/s].
         balance: keeps the totals of the cell fields in spite of the limiter, if given.
     """
 
@@ -36,6 +39,7 @@ class Advection:
         cell_fields: tuple,
         work: tuple,
         maccormack: bool,
+        wind: Vector3 = (0.0, 0.0, 0.0),
         balance: CorrectionBalance | None = None,
     ) -> None:
         self._nx, self._ny, self._nz = grid.cells
@@ -45,12 +49,12 @@ class Advection:
         self._density, self._excess = cell_fields
         self._predicted_x, self._predicted_y, self._predicted_z, self._result_x, self._result_y, self._result_z = work
         self._cells_per_metre = 1.0 / grid.cell_size
-        self._maccormack, self._balance = maccormack, balance
+        self._maccormack, self._wind, self._balance = maccormack, wind, balance
         self._lanes = lane_count()
-        # Beyond these indices lies outside air; walls keep smoke in, so theirs are out of reach.
+        # From these centres on outside air mixes in; walls keep smoke in, so theirs are out of reach.
         far = 1.0e9
-        self._low = tuple(0.5 if grid.lets_in(axis, 0) else -far for axis in range(3))
-        self._high = tuple(n + 0.5 if grid.lets_in(axis, 1) else far for axis, n in enumerate(grid.cells))
+        self._low = tuple(1.0 if grid.lets_in(axis, 0) else -far for axis in range(3))
+        self._high = tuple(float(n) if grid.lets_in(axis, 1) else far for axis, n in enumerate(grid.cells))
 
     def advance(self, dt: float) -> None:
         """Advect all fields by dt [s] with the present velocity."""
@@ -151,16 +155,36 @@ class Advection:
         return ti.max(low, ti.min(value, high))
 
     @ti.func
-    def _is_outside(self, position):
-        """Whether a position lies beyond an open side."""
-        return (
-            position[0] < self._low[0]
-            or position[0] > self._high[0]
-            or position[1] < self._low[1]
-            or position[1] > self._high[1]
-            or position[2] < self._low[2]
-            or position[2] > self._high[2]
-        )
+    def _beyond(self, position, axis: ti.template()):
+        """How far the position of a cell lies beyond the last centres before open sides, by axis, in cells, up to 1.
+
+        Args:
+            position: in cells.
+            axis: across which the field's faces lie, and where nothing counts as beyond; 3 for cell fields.
+        """
+        beyond = ti.Vector([0.0, 0.0, 0.0])
+        for a in ti.static(range(3)):
+            if ti.static(a != axis):
+                beyond[a] = ti.min(ti.max(self._low[a] - position[a], position[a] - self._high[a], 0.0), 1.0)
+        return beyond
+
+    @ti.func
+    def _kept(self, position, axis: ti.template()):
+        """Weight of the nearest place inside in a look-up at a position; the rest is that of the air outside.
+
+        As if it filled a layer of cells around the box: air that comes in mixes into the first cells from the start.
+        """
+        beyond = self._beyond(position, axis)
+        return (1.0 - beyond[0]) * (1.0 - beyond[1]) * (1.0 - beyond[2])
+
+    @ti.func
+    def _has_no_past(self, position, axis: ti.template()):
+        """Whether the position of a face across an axis, or of a cell, lies beyond the last place before a side."""
+        is_beyond = False
+        for a in ti.static(range(3)):
+            half = ti.static(1.0 if a == axis else 0.0)
+            is_beyond = is_beyond or position[a] < self._low[a] or position[a] > self._high[a] + half
+        return is_beyond
 
     @ti.kernel
     def _predict_cells(self, step: ti.f32):
@@ -169,13 +193,10 @@ class Advection:
                 k = lane_place(n, lane)
                 at = self._row(i, j, k)
                 departure = ti.Vector([float(i), float(j), float(k)]) - step * self._velocity_at_cell(at)
-                density, excess = 0.0, 0.0
-                if not self._is_outside(departure):
-                    there, offset = self._locate(departure, 3)
-                    density = self._interpolate(self._density, there, offset)
-                    excess = self._interpolate(self._excess, there, offset)
-                self._predicted_x[at] = density
-                self._predicted_y[at] = excess
+                there, offset = self._locate(departure, 3)
+                kept = self._kept(departure, 3)
+                self._predicted_x[at] = kept * self._interpolate(self._density, there, offset)
+                self._predicted_y[at] = kept * self._interpolate(self._excess, there, offset)
 
     @ti.kernel
     def _correct_cells(self, step: ti.f32):
@@ -188,7 +209,7 @@ class Advection:
                 shift = step * self._velocity_at_cell(at)
                 density, excess = self._predicted_x[at], self._predicted_y[at]
                 # Outside air has no past to compare with: there the first-order value stands.
-                if not (self._is_outside(here - shift) or self._is_outside(here + shift)):
+                if not (self._has_no_past(here - shift, 3) or self._has_no_past(here + shift, 3)):
                     there, offset = self._locate(here + shift, 3)
                     density += 0.5 * (self._density[at] - self._interpolate(self._predicted_x, there, offset))
                     excess += 0.5 * (self._excess[at] - self._interpolate(self._predicted_y, there, offset))
@@ -204,8 +225,11 @@ class Advection:
             for n in range(lane_items(self._nz + (axis == 2), lane)):
                 k = lane_place(n, lane)
                 velocity = self._velocity_at_face(axis, i, j, k)
-                there, offset = self._locate(ti.Vector([float(i), float(j), float(k)]) - step * velocity, axis)
-                predicted[self._row(i, j, k)] = self._interpolate(field, there, offset)
+                departure = ti.Vector([float(i), float(j), float(k)]) - step * velocity
+                there, offset = self._locate(departure, axis)
+                kept = self._kept(departure, axis)
+                inside = self._interpolate(field, there, offset)
+                predicted[self._row(i, j, k)] = kept * inside + (1.0 - kept) * self._wind[axis]
 
     @ti.kernel
     def _correct_faces(
@@ -222,10 +246,13 @@ class Advection:
                 at = self._row(i, j, k)
                 here = ti.Vector([float(i), float(j), float(k)])
                 shift = step * self._velocity_at_face(axis, i, j, k)
-                there, offset = self._locate(here + shift, axis)
-                value = predicted[at] + 0.5 * (field[at] - self._interpolate(predicted, there, offset))
-                origin, _ = self._locate(here - shift, axis)
-                result[at] = self._clamp_to_corners(value, field, origin)
+                value = predicted[at]
+                if not (self._has_no_past(here - shift, axis) or self._has_no_past(here + shift, axis)):
+                    there, offset = self._locate(here + shift, axis)
+                    value += 0.5 * (field[at] - self._interpolate(predicted, there, offset))
+                    origin, _ = self._locate(here - shift, axis)
+                    value = self._clamp_to_corners(value, field, origin)
+                result[at] = value
 
     @ti.kernel
     def _store_cells(self, density: ti.template(), excess: ti.template()):

@@ -23,8 +23,8 @@ class CorrectionBalance:
     """Weakens corrections of one advected cell field after another.
 
     Exact for the total over all air cells of a closed box without moving obstacles, but for rounding and for steps in
-    which no factor in [0, 1] reaches it. Through open sides and the sides of moving solids flows what an upwind scheme
-    has flow in the step: their smoke is balanced to first order.
+    which no factor in [0, 1] reaches it. What leaves through open sides is balanced to second order; through the sides
+    of moving solids flows what an upwind scheme has flow in the step, so their smoke is balanced to first order.
 
     Attributes:
         reductions: what it reduces rows with.
@@ -64,7 +64,7 @@ class CorrectionBalance:
                     correction = corrected[at] - predicted[at]
                     raised += ti.max(correction, 0.0)
                     lowered += ti.min(correction, 0.0)
-                    missing += (field[at] - corrected[at]) - step * self._outflow(field, i, j, k, at)
+                    missing += (field[at] - corrected[at]) - self._outflow(field, i, j, k, at, step)
             place = self._missing.place(i, j, lane)
             self._missing.partial[place] = ti.Vector([missing, 0.0])
             self._corrections.partial[place] = ti.Vector([raised, lowered])
@@ -95,23 +95,32 @@ class CorrectionBalance:
         return part
 
     @ti.func
-    def _outflow(self, field: ti.template(), i: ti.i32, j: ti.i32, k: ti.i32, at: ti.i32):
-        """What leaves the air through the faces of a cell, times a velocity [m/s]."""
+    def _outflow(self, field: ti.template(), i: ti.i32, j: ti.i32, k: ti.i32, at: ti.i32, step: ti.f32):
+        """What leaves the air through the faces of a cell in the step, in cells full of it."""
         x, y, z = ti.static(self._step_x, self._step_y, 1)
         return (
-            self._through(field, at, at - x, i == 1, -self._u[at])
-            + self._through(field, at, at + x, i == self._nx, self._u[at + x])
-            + self._through(field, at, at - y, j == 1, -self._v[at])
-            + self._through(field, at, at + y, j == self._ny, self._v[at + y])
-            + self._through(field, at, at - z, k == 1, -self._w[at])
-            + self._through(field, at, at + z, k == self._nz, self._w[at + z])
+            self._through(field, at, -x, i == 1, -step * self._u[at])
+            + self._through(field, at, x, i == self._nx, step * self._u[at + x])
+            + self._through(field, at, -y, j == 1, -step * self._v[at])
+            + self._through(field, at, y, j == self._ny, step * self._v[at + y])
+            + self._through(field, at, -z, k == 1, -step * self._w[at])
+            + self._through(field, at, z, k == self._nz, step * self._w[at + z])
         )
 
     @ti.func
-    def _through(self, field: ti.template(), at: ti.i32, neighbour: ti.i32, is_side: ti.i32, speed: ti.f32):
-        """Upwind flux out of the air; clean air comes in from outside, and what was continued into solids from them."""
+    def _through(self, field: ti.template(), at: ti.i32, beside: ti.i32, is_side: ti.i32, crossed: ti.f32):
+        """Flux out of the air through a face, of air that crosses so many cells in the step.
+
+        Clean air comes in from outside, and what was continued into solids from them. What leaves through a side is
+        what a straight line through the last two cells has within the way to it; between nothing and twice as much
+        as the last one holds, as beyond its foot such a line goes below zero.
+        """
         flux = 0.0
-        if is_side or self._obstacles.is_solid(neighbour):
-            inside, beyond = field[at], ti.select(is_side, 0.0, field[neighbour])
-            flux = ti.max(speed, 0.0) * inside + ti.min(speed, 0.0) * beyond
+        if is_side or self._obstacles.is_solid(at + beside):
+            inside, beyond = field[at], field[at + beside]
+            if is_side:
+                leaving = inside + 0.5 * (1.0 - crossed) * (inside - field[at - beside])
+                twice = 2.0 * inside
+                inside, beyond = ti.max(ti.min(leaving, ti.max(twice, 0.0)), ti.min(twice, 0.0)), 0.0
+            flux = ti.max(crossed, 0.0) * inside + ti.min(crossed, 0.0) * beyond
         return flux

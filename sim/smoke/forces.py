@@ -36,7 +36,7 @@ class Forces:
         gravity: [m/s²]; only its direction matters.
         buoyancy_density: alpha [m/s²].
         buoyancy_temperature: beta [m/(s² K)].
-        confinement: epsilon [-].
+        confinement: epsilon [1/s]: with h [m] and omega [1/s] its force is an acceleration.
     """
 
     def __init__(

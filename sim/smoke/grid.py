@@ -16,9 +16,10 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from sim.scene import DomainParameters
-from sim.smoke.parameters import Face, SmokeParameters
+from sim.domain import DomainParameters, Face
+from sim.smoke.parameters import SmokeParameters
 
 Index3 = tuple[int, int, int]
 
@@ -135,6 +136,21 @@ class SmokeGrid:
     def lets_in(self, axis: int, side: int) -> bool:
         """Whether air from outside may come in through a side: one that is open, or that wind blows in through."""
         return self.is_open(axis, side) or f"{'xyz'[axis]}{'-+'[side]}" in self.inflow_faces
+
+    def cut_off_faces(self) -> list[Face]:
+        """Sides that wind blows in through where static solids shut some air behind them off from every open side."""
+        number, count = ndimage.label(~self.solid)
+        is_open = np.zeros(count + 1, bool)
+        is_open[0] = True  # solids
+        for axis in range(3):
+            for side in (0, 1):
+                if self.is_open(axis, side):
+                    is_open[np.moveaxis(number, axis, 0)[-side]] = True
+        return [
+            face
+            for face in sorted(self.inflow_faces)
+            if not is_open[np.moveaxis(number, "xyz".index(face[0]), 0)[0 if face[1] == "-" else -1]].all()
+        ]
 
     def cell_centres(self) -> NDArray[np.float64]:
         """Positions [m], (nx * ny * nz, 3)."""

@@ -57,11 +57,6 @@ class MultigridVCycle:
         self._lanes = lane_count()
         self._first_weight, self._second_weight = chebyshev_weights(2, SMOOTHED_SPECTRUM)
 
-    @property
-    def level_count(self) -> int:
-        """How many grids there are."""
-        return len(self._cells)
-
     def update(self) -> None:
         """Follow the obstacles."""
         self.coefficients.update()

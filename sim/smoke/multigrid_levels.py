@@ -122,7 +122,8 @@ class Coefficients:
     Attributes:
         levels: the grids, finest first.
         conductance_x, conductance_y, conductance_z: open area over distance of each face, flat, float32, in units of
-            the finest cell; 0 where closed, and 2 on an open side of the box, where pressure is 0 half a cell away.
+            the finest cell; 0 where closed, and 2 on an open side of the box, where pressure is 0 half a cell away,
+            or less on the finest level where air comes in (`OpenSides`).
         inverse_diagonal: flat, float32; 0 in cells without an open face, `DIRICHLET_GHOST` beyond open sides.
     """
 
@@ -235,11 +236,15 @@ class Coefficients:
             step_x, step_y = (ny + 2) * (nz + 2), nz + 2
             for n in range(lane_items(nz, lane)):
                 k = lane_place(n, lane)
-                at = offset + i * step_x + j * step_y + k
-                diagonal = self.conductance_x[at] + self.conductance_x[at + step_x]
-                diagonal += self.conductance_y[at] + self.conductance_y[at + step_y]
-                diagonal += self.conductance_z[at] + self.conductance_z[at + 1]
-                self.inverse_diagonal[at] = ti.select(diagonal > 0.0, 1.0 / diagonal, 0.0)
+                self.invert_diagonal_at(offset + i * step_x + j * step_y + k, step_x, step_y)
+
+    @ti.func
+    def invert_diagonal_at(self, at: ti.i32, step_x: ti.i32, step_y: ti.i32):
+        """Follow the conductances of a cell's faces; the steps lead to the next cell along x and y."""
+        diagonal = self.conductance_x[at] + self.conductance_x[at + step_x]
+        diagonal += self.conductance_y[at] + self.conductance_y[at + step_y]
+        diagonal += self.conductance_z[at] + self.conductance_z[at + 1]
+        self.inverse_diagonal[at] = ti.select(diagonal > 0.0, 1.0 / diagonal, 0.0)
 
     @ti.kernel
     def _copy_faces(self, offset: ti.i32, size: ti.i32, faces: Floats):

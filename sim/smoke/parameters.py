@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from sim.domain import DomainParameters, Face
 from sim.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.rigid.parameters import RigidKeyframeParameters, placed_at_first_keyframe, require_ascending_times
 from sim.shapes.parameters import Placement
-
-if TYPE_CHECKING:
-    from sim.scene import DomainParameters
 
 WHOLE = 1.0e-6
 """Part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001."""
 
 CELLS_PER_EDDY = 2.0
 """Eddies of gusts are at least so many cells wide: the grid carries nothing finer."""
-
-Face = Literal["x-", "x+", "y-", "y+", "z-", "z+"]
 
 Seed = Annotated[int, Field(ge=0, le=1_000_000_000)]
 
@@ -162,7 +159,7 @@ class SmokeParameters(Parameters):
         description="Lift beta of heat: upward acceleration per kelvin [m/(s² K)]; g/T of an ideal gas by default.",
     )
     vorticity_confinement: NonNegative = Field(
-        default=0.3, description="Strength epsilon of the vorticity confinement [-]; 0 switches it off."
+        default=0.3, description="Strength epsilon of the vorticity confinement [1/s]; 0 switches it off."
     )
     density_dissipation: NonNegative = Field(default=0.0, description="Rate at which smoke thins out [1/s].")
     cooling: NonNegative = Field(default=0.2, description="Rate at which it cools to the air's temperature [1/s].")
@@ -213,6 +210,15 @@ class SmokeParameters(Parameters):
                 "out, for air of constant density cannot be compressed; add a side on the lee to open_faces"
             )
         return None
+
+    @staticmethod
+    def cut_off_problem(faces: Sequence[Face]) -> str:
+        """Why wind cannot blow in through sides behind which static solids shut air in, with a remedy."""
+        return (
+            f"blows in through {', '.join(faces)}, but solids that stand still cut air there off from every other open "
+            "side: as much must flow out, for air of constant density cannot be compressed; leave a way around them, "
+            "close the side, or turn the wind"
+        )
 
     def corners(self, domain: DomainParameters) -> tuple[Vector3, Vector3]:
         """Lower and upper corner of its box [m]: its own, or the domain's where it names none.

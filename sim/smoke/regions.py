@@ -13,7 +13,6 @@ import taichi as ti
 from sim.arrays import Floats, Integers, LongIntegers
 from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import AIR, Obstacles
-from sim.smoke.parameters import Face
 
 NO_REGION = -1
 """Number of what is in no closed region: solids, and air that is connected with an open side."""
@@ -95,14 +94,6 @@ class ClosedRegions:
         self._means.from_numpy(means)
         self._shift(values, self._means)
         return float(np.abs(means).max())
-
-    def lie_behind(self, face: Face) -> bool:
-        """Whether some cell beside a side of the box is in a closed region."""
-        if self.count == 0:
-            return False
-        grid = self._obstacles.grid
-        numbers = np.moveaxis(grid.trim(self.number.to_numpy(), grid.cells), "xyz".index(face[0]), 0)
-        return bool((numbers[0 if face[1] == "-" else -1] != NO_REGION).any())
 
     def _allocate(self, room: int) -> None:
         self._roots, self._cells = (ti.ndarray(ti.i32, room) for _ in range(2))

@@ -7,9 +7,9 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.domain import DomainParameters
 from sim.parameters import Vector3
 from sim.reductions import is_finite
-from sim.scene import DomainParameters
 from sim.smoke.advection import Advection
 from sim.smoke.air_force import AirForce
 from sim.smoke.balance import CorrectionBalance
@@ -19,6 +19,7 @@ from sim.smoke.forces import Forces, upward
 from sim.smoke.grid import SmokeGrid, SolidRegion
 from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import Obstacles, time_of_travel
+from sim.smoke.open_sides import OpenSides
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.projection import PressureProjection
 from sim.smoke.reductions import Pair, RowReductions
@@ -40,8 +41,10 @@ class SmokeSolver:
     Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
 
     Exact: smoke is added by sources only, and what they add is counted. Approximate: MacCormack advection keeps the
-    total of smoke and of heat (`CorrectionBalance`), but at open sides and moving solids to first order only, and
-    semi-Lagrangian advection does not, so `mass` is a measured quantity. Not supported: expansion by heat.
+    total of smoke and of heat (`CorrectionBalance`), but at moving solids to first order only, and semi-Lagrangian
+    advection does not, so `mass` is a measured quantity. Not supported: expansion by heat.
+
+    Air that comes in through open sides was at rest outside, or moved with the wind, and is clean (`OpenSides`).
 
     Solids that move drive air by the velocity of their surface (`Obstacles`), and take whole cells from time to time:
     in between, air flows through the sides of their cells at the speed of the solid. So the smoke of a cell that they
@@ -105,6 +108,7 @@ class SmokeSolver:
             tolerance=parameters.projection_tolerance,
             max_iterations=parameters.projection_max_iterations,
         )
+        self._open_sides = OpenSides(self.obstacles, velocity, self._projection.multigrid.coefficients)
         work = self._projection.work_fields
         self._balance = CorrectionBalance(self.obstacles, velocity)
         self._advection = Advection(
@@ -113,6 +117,7 @@ class SmokeSolver:
             cell_fields=cell_fields,
             work=work,
             maccormack=parameters.advection == "maccormack",
+            wind=parameters.wind,
             balance=self._balance,
         )
         self._forces = Forces(
@@ -208,6 +213,7 @@ class SmokeSolver:
         if self._wind is not None:
             self._wind.blow_in()
         self._emit(dt)
+        self._open_sides.brake_inflow(dt)
         self._project()
         self._cooling.advance(dt)
         self._extrapolation.fill()
@@ -349,12 +355,8 @@ class SmokeSolver:
         if not any(self.parameters.wind):
             return None
         windward = self.parameters.windward_faces
-        if cut_off := [face for face in windward if self._projection.regions.lie_behind(face)]:
-            raise ValueError(
-                f'smoke "{self.name}": wind blows in through {", ".join(cut_off)}, but solids that stand still cut air '
-                "there off from every other open side: as much must flow out, for air of constant density cannot be "
-                "compressed; leave a way around them, close the side, or turn the wind"
-            )
+        if cut_off := self.grid.cut_off_faces():
+            raise ValueError(f'smoke "{self.name}": wind {self.parameters.cut_off_problem(cut_off)}')
         return Wind(self.obstacles, self.parameters.wind, windward, openness=self.openness, velocity=velocity)
 
     @ti.kernel

@@ -2,9 +2,9 @@
 
 import taichi as ti
 
+from sim.domain import Face
 from sim.parameters import Vector3
 from sim.smoke.obstacles import Obstacles
-from sim.smoke.parameters import Face
 
 
 @ti.data_oriented
@@ -14,7 +14,7 @@ class Wind:
     For the pressure windward sides are closed faces that move: u.n = U.n. Zero pressure there would let obstacles slow
     the wind down in time, as nothing but the air's inertia would drive it. What flows in has the whole velocity of the
     wind, so the first cells behind these sides are given its components along the side as well, before each projection.
-    At all other open sides the pressure is that of the air outside, and air comes and goes as the flow demands.
+    At all other open sides air comes and goes as the flow demands and the pressure outside can drive it (`OpenSides`).
 
     Args:
         obstacles: in the grid where the faces are; what they cover lets no wind in.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from sim.shapes.level_set import LevelSet
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid

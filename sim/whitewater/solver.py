@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.domain import DomainParameters
 from sim.parameters import Vector3
-from sim.scene import DomainParameters
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.fluid_field import FluidField
 from sim.whitewater.generation import Moment, generate, generation_rate

@@ -59,7 +59,7 @@ def test_a_finished_job_can_be_looked_at_from_all_sides(finished: Studio) -> Non
     plan = json.loads(finished.run("plan", "tiny.toml", "--json").assert_code(0).out)
     assert {each["verdict"] for each in plan} == {"up to date"}
     checked = json.loads(finished.run("verify", "tiny", "--deep", "--json").assert_code(0).out)
-    assert checked == {"checked": FILES, "deep": True, "flaws": {}}
+    assert checked == {"checked": FILES, "deep": True, "flaws": {}, "texts": []}
     story = finished.run("explain", "tiny", "render/000002").assert_code(0).out
     assert story.startswith("render/000002: succeeded, up to date\n")
     assert "frames/000002.png" in story

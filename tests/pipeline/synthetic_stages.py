@@ -27,6 +27,7 @@ from blake3 import blake3
 from pipeline.errors import InvalidArtifactError
 from pipeline.parameter_set import ParameterSet
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
+from render.blender import BlenderDiedError
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
@@ -241,6 +242,18 @@ def _leave_child(context: TaskContext) -> None:
     (context.layout.root / "child.pid").write_text(str(child.pid))
 
 
+def _start_large_child(context: TaskContext) -> None:
+    """Small itself; what it started holds 400 MB."""
+    command = "import sys, time; held = bytearray(b'x') * 400_000_000; time.sleep(600)"
+    child = subprocess.Popen([sys.executable, "-c", command])
+    (context.layout.root / "child.pid").write_text(str(child.pid))
+    time.sleep(600)
+
+
+def _lose_blender(context: TaskContext) -> None:
+    raise BlenderDiedError(3, -9, "(it wrote nothing)")
+
+
 def _start_child_and_hang(context: TaskContext) -> None:
     _leave_child(context)
     time.sleep(600)
@@ -265,4 +278,6 @@ FAULTS = {
     "wait for reader": _wait_for_reader,
     "leave child": _leave_child,
     "puts": _print_from_c,
+    "large child": _start_large_child,
+    "lose Blender": _lose_blender,
 }

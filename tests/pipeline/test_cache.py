@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import random
+
 import h5py
 import numpy as np
 import pytest
@@ -129,3 +131,42 @@ def test_a_checkpoint_reads_back_bit_for_bit(tmp_path):
     for key, array in arrays.items():
         np.testing.assert_array_equal(checkpoint.arrays[key], array)
         assert checkpoint.arrays[key].dtype == array.dtype
+
+
+def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(tmp_path):
+    """HDF5's own checksums are about the arrays, not about the attributes and what says how to read the arrays."""
+    path, chance = tmp_path / "c.h5", random.Random(2)
+    arrays = {"rigid/position": np.arange(9.0).reshape(3, 3), "rigid/count": np.int64(3), "smoke/on": np.array([True])}
+    write_checkpoint(path, Checkpoint(7, "f" * 64, "cpu", arrays))
+    whole = path.read_bytes()
+    refused = 0
+    for _ in range(1500):
+        flipped = bytearray(whole)
+        flipped[chance.randrange(len(whole))] ^= 1 << chance.randrange(8)
+        path.write_bytes(flipped)
+        try:
+            checkpoint = read_checkpoint(path)
+        except InvalidArtifactError:
+            refused += 1
+        else:  # in what holds nothing
+            assert (checkpoint.frame, checkpoint.fingerprint, checkpoint.device) == (7, "f" * 64, "cpu")
+            assert checkpoint.arrays.keys() == arrays.keys()
+            assert all(np.array_equal(checkpoint.arrays[key], array) for key, array in arrays.items())
+    assert refused > 100
+
+
+def test_a_dataset_that_claims_far_more_than_is_stored_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / "frame.h5"
+    write_frame(path, bodies(100), REPORT, device="cpu")
+    with h5py.File(path, "r+") as file:
+        group = next(group for group in file.values() if isinstance(group, h5py.Group) and "water" in group)["water"]
+        del group["density"]
+        group.create_dataset("density", shape=(10**13,), dtype="f4", chunks=(1 << 20,))  # 40 TB, none of it written
+    with pytest.raises(InvalidArtifactError, match="hardly any are stored"):
+        read_frame(path, "water")
+
+
+def test_the_most_compressible_array_is_still_read(tmp_path):
+    path = tmp_path / "c.h5"
+    write_checkpoint(path, Checkpoint(0, "f", "cpu", {"still": np.zeros(8 << 20)}))
+    assert not read_checkpoint(path).arrays["still"].any()

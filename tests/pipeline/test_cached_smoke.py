@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import h5py
@@ -188,17 +189,9 @@ def test_volumes_of_the_part_and_of_the_whole_are_the_same_file(tmp_path, where,
     except VolumeUnavailableError as error:
         pytest.skip(str(error))
     path = write(tmp_path / "a.h5", puff(where=where))
-    part, whole = read_smoke_in_box(path, "plume"), read_frame(path).bodies["plume"].arrays
-    for name, arrays in (("part", vars(part)), ("whole", whole)):
-        write_volume(
-            tmp_path / f"{name}.vdb",
-            **{key: arrays[key] for key in ("density", "temperature", "velocity")},
-            origin=part.origin,
-            cell_size=part.cell_size,
-            ambient_temperature=part.ambient_temperature,
-            parameters=VolumeParameters(),
-            fps=FPS,
-            shutter=shutter,
-            first_cell=part.first_cell if name == "part" else (0, 0, 0),
-        )
+    part, arrays = read_smoke_in_box(path, "plume"), read_frame(path).bodies["plume"].arrays
+    fields = {key: arrays[key] for key in ("density", "temperature", "velocity")}
+    whole = dataclasses.replace(part, **fields, first_cell=(0, 0, 0))
+    for name, smoke in (("part", part), ("whole", whole)):
+        write_volume(tmp_path / f"{name}.vdb", **vars(smoke), parameters=VolumeParameters(), fps=FPS, shutter=shutter)
     assert (tmp_path / "part.vdb").read_bytes() == (tmp_path / "whole.vdb").read_bytes()

@@ -112,3 +112,28 @@ def test_a_device_that_this_machine_lacks_is_refused_before_any_work_but_planned
         'error: simulate: device "cuda" is not available: no driver; use device = "auto" or "cpu"' in submitted.stderr
     )
     assert not (in_tmp_path / "renders").exists()
+
+
+@pytest.mark.parametrize(("key", "value"), [("fluid.0.particle_radius", "1e-320"), ("smoke.0.cell_size", "1e300")])
+def test_submit_refuses_numbers_that_nothing_can_be_planned_with(in_tmp_path, key, value):
+    job = Path(__file__).resolve().parents[2] / "jobs" / "everything.toml"
+    refused = pipeline("submit", job, "--set", f"{key}={value}")
+    assert refused.exit_code == 2
+    assert "units are SI" in refused.stderr
+    assert [*in_tmp_path.iterdir()] == []
+
+
+def test_a_job_file_may_not_name_the_program_to_run(in_tmp_path, monkeypatch):
+    program = in_tmp_path / "blender"
+    program.write_text(f"#!/bin/sh\ntouch {in_tmp_path}/ran\n")
+    program.chmod(0o755)
+    (in_tmp_path / "film.toml").write_text(f'name = "film"\nframes = 1\n[render]\nblender = "{program}"\n')
+    for command in ("submit", "plan", "check"):
+        refused = pipeline(command, "film.toml")
+        assert refused.exit_code == 2
+        assert "render.blender names a program" in refused.stderr
+    assert not (in_tmp_path / "ran").exists()
+    monkeypatch.setenv("PIPELINE_BLENDER", str(program))
+    assert "render.blender names a program" not in pipeline("check", "film.toml").stderr
+    monkeypatch.delenv("PIPELINE_BLENDER")
+    assert "names a program" not in pipeline("check", "film.toml", "--set", f"render.blender={program}").stderr

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from inline_tasks import run_task
 
 from pipeline.cache import read_frame, validate_frame, write_frame
-from pipeline.executors.base import Assignment, Finished
-from pipeline.executors.inline import InlineExecutor
+from pipeline.executors.base import Finished
 from pipeline.job.checks import load_checked_job
 from pipeline.job.inputs import keep_inputs
 from pipeline.job.loading import read_job
@@ -178,19 +178,7 @@ def test_the_mesh_has_the_frames_arrays_and_normals_of_its_own(frame, tmp_path):
     layout.job_file.write_text(JOB_FILE)
     write_frame(layout.path(layout.frame_cache(0)), frame, FrameReport(0, 0.0, {}, {}, {}), device="cpu")
     task = ClothStage().plan(job(), layout)[0]
-    assignment = Assignment(
-        task=task,
-        attempt=1,
-        fingerprint="f",
-        inputs={},
-        threads=1,
-        job_file=layout.job_file,
-        root=layout.root,
-        stages="pipeline.stages:STAGES",
-    )
-    with InlineExecutor() as executor:
-        executor.submit(assignment)
-        assert isinstance(executor.wait(0.0)[-1], Finished)
+    assert isinstance(run_task(task, layout), Finished)
     mesh, given = read_ply(layout.path(layout.cloth("sheet", 0))), frame["sheet"].arrays
     np.testing.assert_array_equal(mesh.vertices, given["position"])
     np.testing.assert_array_equal(mesh.faces, given["triangles"])

@@ -7,11 +7,12 @@ import json
 import os
 import sqlite3
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from synthetic_jobs import Recorder, contents, job_text, run_synthetic
-from synthetic_stages import write_faults
+from synthetic_stages import FilmStage, write_faults
 
 from pipeline.errors import JobBusyError, LeaseLostError, PlanError
 from pipeline.executors.base import Assignment, Committed, Failed, Finished, TaskEvent
@@ -408,3 +409,11 @@ def test_the_record_says_how_each_run_ended(root: Path) -> None:
         succeeded = manifest.last_run()
     assert (failed.outcome, succeeded.outcome) == (JobOutcome.FAILED, JobOutcome.SUCCEEDED)
     assert failed.run != succeeded.run
+
+
+def test_what_no_machine_has_is_a_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = FilmStage.plan
+    on_gpu = Resources(gpus=1)
+    monkeypatch.setattr(FilmStage, "plan", lambda *args: [replace(task, resources=on_gpu) for task in plan(*args)])
+    with InlineExecutor() as executor, pytest.raises(PlanError, match="film needs 1 GPUs"):
+        run_synthetic(tmp_path / "job", executor)

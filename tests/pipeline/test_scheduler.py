@@ -15,6 +15,7 @@ from pipeline.scheduler import TERMINAL_STATES, Scheduler
 from pipeline.scheduler_events import (
     ArtifactCommitted,
     CancelRequested,
+    CapacityUpdated,
     DrainRequested,
     Finish,
     Instruction,
@@ -103,10 +104,47 @@ def test_lower_frames_go_first_and_of_one_frame_the_later_stage() -> None:
     assert started(scheduler.start()) == ["render/0", "surface/0", "render/1", "surface/1"]
 
 
+def test_all_cores_of_a_task_are_those_of_one_machine_and_other_machines_go_on() -> None:
+    tasks = [task("simulate", resources=Resources(cores=0)), *(task(f"render/{k}", frame=k) for k in range(3))]
+    scheduler = Scheduler(tasks, capacity=Resources(cores=4), machine=TWO_CORES)
+    instructions = scheduler.start()
+    assert instructions[0] == Start(tasks[0], threads=2, need=Resources(cores=2))
+    assert started(instructions) == ["simulate", "render/0", "render/1"]
+
+
+def test_machines_that_come_are_used_at_once_and_those_that_go_are_not_missed_by_what_runs() -> None:
+    tasks = [task(f"render/{k}", frame=k) for k in range(6)]
+    scheduler = Scheduler(tasks, capacity=TWO_CORES)
+    assert started(scheduler.start()) == ["render/0", "render/1"]
+    assert started(scheduler.handle(CapacityUpdated(Resources(cores=4)))) == ["render/2", "render/3"]
+    assert started(scheduler.handle(CapacityUpdated(TWO_CORES))) == []
+    assert started(succeed(scheduler, tasks[0])) == started(succeed(scheduler, tasks[1])) == []
+    assert started(succeed(scheduler, tasks[2])) == ["render/4"]
+
+
+def test_a_task_for_a_machine_that_went_is_given_out_and_waits_for_another() -> None:
+    """The executor knows how long to wait; here nothing may stand still for ever."""
+    tasks = [task("simulate", resources=Resources(cores=0)), task("bake", resources=Resources(cores=0))]
+    scheduler = Scheduler(tasks, capacity=Resources(cores=4), machine=Resources(cores=4))
+    assert started(scheduler.start()) == ["simulate"]
+    assert started(scheduler.handle(CapacityUpdated(Resources(cores=1)))) == []
+    assert started(succeed(scheduler, tasks[0])) == ["bake"]
+
+
+def test_out_of_memory_is_tried_again_with_a_whole_machine_and_not_with_all_of_them() -> None:
+    tasks = [task(f"render/{k}", frame=k) for k in range(4)]
+    scheduler = Scheduler(tasks, capacity=Resources(cores=4), machine=TWO_CORES)
+    assert len(started(scheduler.start())) == 4
+    assert fail(scheduler, "render/0", FailureKind.OUT_OF_MEMORY) == []
+    assert scheduler.handle(Tick(1000.0)) == []
+    retried = succeed(scheduler, tasks[1])
+    assert retried == [Start(tasks[0], threads=1, need=Resources(cores=2))]
+
+
 def test_a_simulation_on_all_cores_runs_alone() -> None:
     tasks = film(2, simulation=Resources(cores=0))
     scheduler = Scheduler(tasks, capacity=TWO_CORES)
-    assert scheduler.start() == [Start(tasks[0], threads=2)]
+    assert scheduler.start() == [Start(tasks[0], threads=2, need=Resources(cores=2))]
     assert started(commit(scheduler, "simulate", "cache/0")) == []
     assert started(succeed(scheduler, tasks[0])) == ["surface/0", "surface/1"]
 
@@ -248,6 +286,17 @@ def test_after_running_out_of_memory_a_task_gets_the_machine_for_itself_once() -
     assert outcome(fail(scheduler, "render/0", FailureKind.OUT_OF_MEMORY)) is JobOutcome.FAILED
 
 
+def test_a_lost_worker_does_not_cost_a_task_its_turn_alone_on_the_machine() -> None:
+    scheduler = Scheduler([task("render/0", frame=0)], capacity=TWO_CORES)
+    scheduler.start()
+    fail(scheduler, "render/0", FailureKind.WORKER_LOST)
+    scheduler.handle(Tick(100.0))
+    fail(scheduler, "render/0", FailureKind.OUT_OF_MEMORY, now=100.0)
+    assert started(scheduler.handle(Tick(200.0))) == ["render/0"]
+    assert scheduler.free == Resources(cores=0)
+    assert outcome(fail(scheduler, "render/0", FailureKind.OUT_OF_MEMORY, now=200.0)) is JobOutcome.FAILED
+
+
 def test_a_task_that_somebody_else_stopped_is_started_again() -> None:
     scheduler = Scheduler(film(1), capacity=TWO_CORES)
     scheduler.start()
@@ -361,7 +410,7 @@ def test_random_events_never_break_an_invariant(jobs: list[Task], seed: int, fau
     for _ in range(2000):
         for instruction in instructions:
             match instruction:
-                case Start(one, threads):
+                case Start(one, threads, _):
                     assert one.id not in running
                     assert set(one.inputs) <= committed
                     assert 1 <= threads <= capacity.cores

@@ -31,6 +31,12 @@ name = "ball"
 shape = { type = "sphere", radius = 0.15 }
 position = [0.0, 0.0, 0.2]
 """
+WALL = """
+[[rigid]]
+name = "wall"
+shape = { type = "box", size = [0.1, 1.0, 1.0] }
+position = [0.3, 0.0, 0.5]
+"""
 PATH = """
 [[smoke.source]]
 shape = { type = "sphere", radius = 0.1 }
@@ -89,6 +95,12 @@ keyframe = [{ time_s = 0.0, position = [-2.0, 0.0, 0.5] }, { time_s = 1.0, posit
             HEAD + SMOKE + 'wind = [2.0, 0.0, 0.0]\nopen_faces = ["x-"]\n' + SOURCE,
             "fire.toml:7 smoke[0].wind: lets air in through x-, and no other side is open: as much must flow out, for "
             "air of constant density cannot be compressed; add a side on the lee to open_faces",
+        ),
+        (
+            HEAD + SMOKE + 'wind = [2.0, 0.0, 0.0]\nopen_faces = ["x-", "x+"]\n' + SOURCE + WALL,
+            "fire.toml:7 smoke[0].wind: blows in through x-, but solids that stand still cut air there off from every "
+            "other open side: as much must flow out, for air of constant density cannot be compressed; leave a way "
+            "around them, close the side, or turn the wind",
         ),
         (
             HEAD + SMOKE + "turbulence = { strength = 1.0, size = 0.06 }\n" + SOURCE,
@@ -170,6 +182,8 @@ def test_smoke_that_may_be_unintended_is_told_with_this_line(text, expected, tmp
     [
         HEAD + "gravity = [0.0, 0.0, 0.0]\n" + SMOKE + "wind = [1.0, 0.0, 0.0]\n" + SOURCE,
         HEAD + "gravity = [0.0, 0.0, 0.0]\n" + SMOKE + SOURCE + "velocity = [1.0, 0.0, 0.0]\n",
+        # There is a way over the wall.
+        HEAD + SMOKE + "wind = [1.0, 0.0, 0.0]\n" + SOURCE + WALL,
         # The path comes in from outside.
         HEAD + SMOKE + PATH,
         # On a body that is there, of either kind, and out of it.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeline.commands.running import GPU_TASKS
+from pipeline.commands.turns import GPU_TASKS
 from pipeline.job.looks import parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout

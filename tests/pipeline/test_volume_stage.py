@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from inline_tasks import run_task
 
 from pipeline.cache import write_frame
-from pipeline.executors.base import Assignment, Failed, Finished, TaskEvent
-from pipeline.executors.inline import InlineExecutor
+from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.stages.volume import VolumeStage
@@ -78,19 +78,7 @@ def volume_of(layout: JobLayout, smoke: Snapshot, *, longest_shutter_s: float | 
             "smoke": ({"name": "plume", "source": ({"shape": {"type": "sphere", "radius": 0.2}},)},),
         }
     )
-    assignment = Assignment(
-        task=VolumeStage().plan(job, layout)[1],
-        attempt=1,
-        fingerprint="f",
-        inputs={},
-        threads=1,
-        job_file=layout.job_file,
-        root=layout.root,
-        stages="pipeline.stages:STAGES",
-    )
-    with InlineExecutor() as executor:
-        executor.submit(assignment)
-        return executor.wait(0.0)[-1]
+    return run_task(VolumeStage().plan(job, layout)[1], layout)
 
 
 def test_a_volume_holds_what_the_cache_holds_where_it_is(layout):

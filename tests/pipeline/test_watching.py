@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 from record_samples import film
 
-from pipeline.commands.watching import watch
+from pipeline.commands.watching import Follower, watch
 from pipeline.layout import JobLayout
 from pipeline.lease import Lease
 from pipeline.manifest import Manifest
 from pipeline.scheduler_events import JobOutcome
+from pipeline.spool import Spool, submission
 from pipeline.task import TaskState
 
 TASKS = film(2)
@@ -48,6 +49,15 @@ def watch_while(layout: JobLayout, runner: Callable[[Lease], None]) -> int:
         return watch(layout)
     finally:
         running.join()
+
+
+def test_a_film_that_was_done_when_its_entry_went_was_not_cancelled(layout: JobLayout) -> None:
+    spool = Spool.of(layout)
+    entry = spool.enqueue(submission(layout.root.name))
+    with Lease.acquire(layout.lease):  # it runs, and its run is on record as ended already
+        follower = Follower(spool, layout, ticket=entry.ticket)
+    spool.drop(entry.name)
+    assert follower.follow() == 0
 
 
 def test_a_run_that_says_it_did_everything_is_a_success(layout: JobLayout, capsys: pytest.CaptureFixture[str]) -> None:

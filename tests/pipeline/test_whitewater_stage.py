@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from inline_tasks import run_task
 
 from pipeline.cache import write_frame
-from pipeline.executors.base import Assignment, Finished, TaskEvent
-from pipeline.executors.inline import InlineExecutor
+from pipeline.executors.base import Finished, TaskEvent
 from pipeline.job.checks import check_job
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
@@ -180,14 +180,7 @@ def run(layout: JobLayout, frames: Iterable[int]) -> list[TaskEvent]:
     """Run the tasks of these frames in this process; returns how each ended."""
     tasks = {task.frame: task for task in plan_job(load_job(layout.job_file), layout, STAGES) if task.subject == "water"
              and task.stage == "whitewater"}  # fmt: skip
-    ended = []
-    with InlineExecutor() as executor:
-        for frame in frames:
-            executor.submit(
-                Assignment(tasks[frame], 1, "f", {}, CORES, layout.job_file, layout.root, "pipeline.stages:STAGES")
-            )
-            ended.append(executor.wait(0.0)[-1])
-    return ended
+    return [run_task(tasks[frame], layout, threads=CORES) for frame in frames]
 
 
 def contents(layout: JobLayout) -> list[bytes]:
@@ -196,7 +189,7 @@ def contents(layout: JobLayout) -> list[bytes]:
 
 CHAIN = """
 import sys
-sys.path.insert(0, "tests/pipeline")
+sys.path[:0] = ["tests", "tests/pipeline"]
 from pathlib import Path
 from pipeline.layout import JobLayout
 from test_whitewater_stage import run

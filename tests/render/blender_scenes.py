@@ -10,10 +10,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from render.camera_path import CameraPath
 from render.parameters import CameraParameters, RenderParameters, StageParameters
-from render.spec import RenderSpec
+from render.spec import Camera, RenderSpec
 
 RESOLUTION = (64, 36)
+PIXELS_PER_METRE = RESOLUTION[0] * 50.0 / 36.0 / 2.5
+"""In the plane y = 0: a lens of 50 mm on a sensor of 36 mm, seen from 2.5 m."""
+
+HALF_A_PIXEL = 0.5 / PIXELS_PER_METRE
+"""What the centroid of a ball of 7 pixels, weighed by redness, is good to [m]; its shaded lower half is paler."""
 
 
 def sphere(center: tuple[float, float, float], radius: float, *, rings: int = 24, segments: int = 48):
@@ -61,6 +67,12 @@ def write_mesh(path: Path, positions: np.ndarray, triangles: np.ndarray, velocit
     )
 
 
+def still_camera(parameters: CameraParameters) -> Camera:
+    """A camera on the unit cube."""
+    path = CameraPath(parameters, (-0.5, -0.5, 0.0), (0.5, 0.5, 1.0), aspect=16 / 9, starts={})
+    return Camera.on(path, f_stop=parameters.f_stop, views="views/{frame}.json")
+
+
 def spec_of(*objects, **render) -> RenderSpec:
     """The unit cube seen straight from the front at 2 m; a red ball on grey."""
     settings = {"resolution": RESOLUTION, "quality": "draft", "samples": 4, "denoise": False, "device": "cpu"} | render
@@ -68,7 +80,7 @@ def spec_of(*objects, **render) -> RenderSpec:
         fps=60.0,
         domain_min=(-0.5, -0.5, 0.0),
         domain_max=(0.5, 0.5, 1.0),
-        camera=CameraParameters(position=(0.0, -2.5, 0.5), look_at=(0.0, 0.0, 0.5)),
+        camera=still_camera(CameraParameters(position=(0.0, -2.5, 0.5), look_at=(0.0, 0.0, 0.5))),
         stage=StageParameters(),
         objects=objects,
         render=RenderParameters(**settings),
@@ -98,6 +110,29 @@ def read(path: Path) -> np.ndarray:
 
 def redness(picture: np.ndarray) -> np.ndarray:
     return picture[..., 0] / (picture.sum(axis=2) + 1.0)
+
+
+def weight(folder: Path, frame: int) -> np.ndarray:
+    """How much of each pixel is ball: redness beyond that of the grey stage, which is up to 0.33."""
+    return np.clip(redness(read(folder / f"{frame}.png")) - 0.36, 0.0, None)
+
+
+def centroid(folder: Path, frame: int) -> np.ndarray:
+    """Where the ball is [m] in the plane y = 0, x and z."""
+    red = weight(folder, frame)
+    rows, columns = np.indices(red.shape)
+    x = (red * (columns + 0.5 - RESOLUTION[0] / 2)).sum() / red.sum()
+    z = (red * (RESOLUTION[1] / 2 - rows - 0.5)).sum() / red.sum()
+    return np.array([x, z]) / PIXELS_PER_METRE + [0.0, 0.5]
+
+
+def spread(folder: Path, frame: int) -> np.ndarray:
+    """Standard deviations of the ball's pixels [m] along x and z."""
+    red = weight(folder, frame)
+    rows, columns = np.indices(red.shape)
+    return (
+        np.array([np.sqrt(np.cov(axis.ravel(), aweights=red.ravel())) for axis in (columns, rows)]) / PIXELS_PER_METRE
+    )
 
 
 def write_blender_stand_in(folder: Path) -> Path:

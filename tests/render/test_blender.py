@@ -18,13 +18,14 @@ from blender_scenes import (
     redness,
     spec_of,
     sphere,
+    still_camera,
     write_blender_stand_in,
     write_mesh,
 )
 from fresh_python import run_python
+from inline_tasks import run_task
 
-from pipeline.executors.base import Assignment, Failed, Finished, TaskEvent
-from pipeline.executors.inline import InlineExecutor
+from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.stages import render as render_stage
@@ -202,12 +203,7 @@ def test_an_executable_killed_between_frames_or_while_it_draws_costs_an_attempt(
     tasks = RenderStage().plan(load_job(layout.job_file), layout)
 
     def attempt(frame: int, number: int) -> TaskEvent:
-        task = tasks[frame]
-        with InlineExecutor() as executor:
-            executor.submit(
-                Assignment(task, number, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES")
-            )
-            return executor.wait(0.0)[-1]
+        return run_task(tasks[frame], layout, attempt=number)
 
     def kill_blender(renderer: ExecutableRenderer) -> None:
         renderer._process.kill()
@@ -293,8 +289,9 @@ def test_every_look_and_stage_builds_and_draws(tmp_path):
         for index, look in enumerate(looks)
     )
     night = StageParameters(name="night", strength=30.0)
+    camera = still_camera(CameraParameters())
     for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor"), night):
-        spec = spec_of(*objects, samples=2).model_copy(update={"stage": stage, "camera": CameraParameters()})
+        spec = spec_of(*objects, samples=2).model_copy(update={"stage": stage, "camera": camera})
         spec.write(tmp_path / "spec.json")
         run_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")
         assert 10 < read(tmp_path / f"{stage.name}.png").mean() < 245

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blender_scenes import (
+    HALF_A_PIXEL,
     RENDER_FRAMES,
-    RESOLUTION,
-    read,
-    redness,
+    centroid,
     spec_of,
     sphere,
+    spread,
     write_blender_stand_in,
     write_mesh,
 )
 from fresh_python import run_python
+from inline_tasks import run_task
 
 from pipeline.cache import write_frame
-from pipeline.executors.base import Assignment, Finished
-from pipeline.executors.inline import InlineExecutor
+from pipeline.executors.base import Finished
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -41,9 +41,6 @@ pytestmark = pytest.mark.skipif(
     find_spec("bpy") is None or bool(missing_libraries()),
     reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
 )
-
-PIXELS_PER_METRE = RESOLUTION[0] * 50.0 / 36.0 / 2.5
-"""In the plane y = 0: a lens of 50 mm on a sensor of 36 mm, seen from 2.5 m."""
 
 # Fully rough, so that no highlight hides the colour.
 RED = MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0)
@@ -90,24 +87,6 @@ def pictures(tmp_path_factory) -> tuple[Path, str]:
     return folder, run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0,1,2,3,4,5,6,7,8")
 
 
-def weight(folder: Path, frame: int) -> np.ndarray:
-    """How much of each pixel is ball: redness beyond that of the grey stage, which is up to 0.33."""
-    return np.clip(redness(read(folder / f"{frame}.png")) - 0.36, 0.0, None)
-
-
-def centroid(folder: Path, frame: int) -> np.ndarray:
-    """Where the ball is [m] in the plane y = 0, x and z."""
-    red = weight(folder, frame)
-    rows, columns = np.indices(red.shape)
-    x = (red * (columns + 0.5 - RESOLUTION[0] / 2)).sum() / red.sum()
-    z = (red * (RESOLUTION[1] / 2 - rows - 0.5)).sum() / red.sum()
-    return np.array([x, z]) / PIXELS_PER_METRE + [0.0, 0.5]
-
-
-# Weighed by redness, the centroid of a ball of 7 pixels is good to half a pixel; its shaded lower half is paler.
-HALF_A_PIXEL = 0.5 / PIXELS_PER_METRE
-
-
 def test_the_body_is_where_the_pose_of_the_frame_says(pictures):
     folder, _ = pictures
     assert centroid(folder, 0) == pytest.approx([0.25, 0.5], abs=HALF_A_PIXEL)
@@ -117,15 +96,6 @@ def test_the_body_is_where_the_pose_of_the_frame_says(pictures):
 def test_the_orientation_turns_the_mesh_about_its_origin(pictures):
     # A quarter of a turn about y takes x to -z.
     assert centroid(pictures[0], 4) == pytest.approx([0.0, 0.25], abs=HALF_A_PIXEL)
-
-
-def spread(folder: Path, frame: int) -> np.ndarray:
-    """Standard deviations of the ball's pixels [m] along x and z."""
-    red = weight(folder, frame)
-    rows, columns = np.indices(red.shape)
-    return (
-        np.array([np.sqrt(np.cov(axis.ravel(), aweights=red.ravel())) for axis in (columns, rows)]) / PIXELS_PER_METRE
-    )
 
 
 def test_blur_is_along_the_velocity_and_centred_on_the_pose(pictures):
@@ -224,9 +194,7 @@ def test_a_job_is_drawn_with_the_poses_of_its_cache(tmp_path):
     write_frame(
         cache, {"ball": Snapshot("rigid", arrays, {}), "rock": rock}, FrameReport(2, 2 / 60, {}, {}, {}), device="cpu"
     )
-    with InlineExecutor() as executor:
-        executor.submit(Assignment(task, 1, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES"))
-        ended = executor.wait(0.0)[-1]
+    ended = run_task(task, layout)
     render_stage._close_renderers()
     assert isinstance(ended, Finished), ended
     layout.path(layout.picture(2)).rename(tmp_path / "2.png")

@@ -21,15 +21,24 @@ def pictures(tmp_path):
 
 
 def test_frames_stand_row_by_row(tmp_path, pictures):
-    contact_sheet(pictures, tmp_path / "sheet.png", columns=2, width=212)
+    contact_sheet(pictures, tmp_path / "sheet.png", columns=2, width=108)
     sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
-    # Two cells of 100 pixels and three gaps of 4; a cell is 100 * 36 / 64 = 56 pixels high; three rows.
-    assert sheet.shape == (3 * 60 + 4, 212, 3)
+    # Two cells of 48 pixels and three gaps of 4; a cell is 48 * 36 / 64 = 27 pixels high; three rows.
+    assert sheet.shape == (3 * 31 + 4, 108, 3)
     for index, color in enumerate(COLORS):
         row, column = divmod(index, 2)
-        middle = sheet[4 + 60 * row + 20, 4 + 104 * column + 50]
+        middle = sheet[4 + 31 * row + 10, 4 + 52 * column + 40]
         np.testing.assert_array_equal(middle, color)
-    np.testing.assert_array_equal(sheet[150, 160], sheet[0, 0])  # the last cell stays empty
+    np.testing.assert_array_equal(sheet[80, 80], sheet[0, 0])  # the last cell stays empty
+
+
+def test_small_frames_stand_without_gaps_between_them(tmp_path, pictures):
+    contact_sheet(pictures[:4], tmp_path / "sheet.png", columns=2, width=1440)
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
+    assert sheet.shape == (2 * 40 + 4, 2 * 68 + 4, 3)
+    for index, color in enumerate(COLORS[:4]):
+        row, column = divmod(index, 2)
+        np.testing.assert_array_equal(sheet[4 + 40 * row + 1, 4 + 68 * column + 62], color)
 
 
 def test_frames_carry_their_labels(tmp_path, pictures):

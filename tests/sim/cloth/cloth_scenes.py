@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.solver import ClothSolver
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 GRAVITY = 9.81
 EARTH = (0.0, 0.0, -GRAVITY)

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from sim.build import build_world
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.motion import finish_step
+from sim.cloth.patch_pairs import PairList
+from sim.cloth.self_collision import SelfCollision
 from sim.cloth.solver import ClothSolver
 from sim.rigid.solver import RigidSolver
 from sim.scene import SceneParameters
@@ -121,3 +123,15 @@ def point_triangle_distances(x: NDArray, a: NDArray, b: NDArray, c: NDArray) -> 
     height = np.abs(np.einsum("...i,...i", x - a, normal))
     edges = [point_segment_distances(x, p, q) for p, q in ((a, b), (b, c), (c, a))]
     return np.min([*edges, np.where(inside, height, np.inf)], axis=0)
+
+
+def listed_places(pairs: SelfCollision, each: PairList) -> NDArray[np.int64]:
+    """Places of a list where a pair of elements is, in the order of their pairs of patches."""
+    first, _, found, _ = each.pieces.to_numpy()[: pairs.patches.count].T
+    return np.concatenate([np.arange(a, a + n) for a, n in zip(first, found, strict=True)])
+
+
+def listed_pairs(pairs: SelfCollision) -> list[list[tuple[int, ...]]]:
+    """The pairs of elements in both lists, vertices with triangles first, in an order of their own."""
+    lists = ((each, listed_places(pairs, each)) for each in (pairs.with_triangles, pairs.of_edges))
+    return [sorted(map(tuple, each.vertices.to_numpy()[places].tolist())) for each, places in lists]

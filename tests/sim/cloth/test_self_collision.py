@@ -8,6 +8,7 @@ from contact_scenes import (
     cloth_of,
     contacts_of,
     displace,
+    listed_pairs,
     point_triangle_distances,
     segment_distances,
     world_of,
@@ -60,7 +61,7 @@ def test_search_lists_all_pairs_within_reach_once_and_no_others():
     pairs = SelfCollision(state)
     pairs.look(state)
     pairs.prepare(state)
-    found = _listed(pairs.with_triangles)
+    found, found_edges = listed_pairs(pairs)
     # A pair of patches is searched as far as its own motion asks for, to a thickness at least.
     reach = pairs._met.reach.to_numpy()[: pairs._met.count].max()
     assert reach < 0.1
@@ -71,17 +72,11 @@ def test_search_lists_all_pairs_within_reach_once_and_no_others():
     distance = point_triangle_distances(x[vertex], *np.moveaxis(x[corners], 1, 0))
     _expect_listed(found, np.concatenate([vertex[:, None], corners], axis=1), distance, 0.02, reach)
 
-    found = _listed(pairs.of_edges)
     edges = edges_of_triangles(triangles)
     first, second = np.triu_indices(len(edges), k=1)
     apart = ~(edges[first][:, :, None] == edges[second][:, None, :]).any(axis=(1, 2))
     both = np.concatenate([edges[first[apart]], edges[second[apart]]], axis=1)
-    _expect_listed(found, both, segment_distances(*np.moveaxis(x[both], 1, 0)), 0.02, reach)
-
-
-def _listed(pairs):
-    vertices = pairs.vertices.to_numpy()[: pairs.end]
-    return [tuple(row) for row in vertices[vertices[:, 0] >= 0].tolist()]
+    _expect_listed(found_edges, both, segment_distances(*np.moveaxis(x[both], 1, 0)), 0.02, reach)
 
 
 def _expect_listed(found, candidates, distance, radius, reach):

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from sim.coupling.body_samples import samples_of_moving_bodies
 from sim.coupling.body_speed import expected_body_speed
 from sim.coupling.fluid_rigid import FluidRigidCoupling
+from sim.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.solvers import SOLVERS
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
-from sim.scene import DomainParameters
 from sim.shapes.placement import build_solid
 from sim.world import World
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.coupling.smoke_fluid import SmokeFluidCoupling
+from sim.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.solvers import SOLVERS
-from sim.scene import DomainParameters
 from sim.smoke.obstacles import MOVING
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from coupled_tanks import EVERY_FACE, WEIGHTLESS, Tank
 
+from sim.domain import DomainParameters
 from sim.fluid.kernels import evaluate_slope
 from sim.fluid.viscosity_implicit import TOLERANCE
-from sim.scene import DomainParameters
 
 OPEN_SPACE = DomainParameters(min=(-0.5,) * 3, max=(0.5,) * 3, open_faces=EVERY_FACE)
 STICKY = {"wall_friction": 1.0, "artificial_viscosity": 0.0, "viscosity_solver": "implicit"}

@@ -6,9 +6,10 @@ from coupled_tanks import EARTH, SPACING, Tank
 
 from sim.build import build_world
 from sim.coupling.body_speed import expected_body_speed
+from sim.domain import DomainParameters
 from sim.rigid.geometry import BodyGeometry
 from sim.rigid.parameters import RigidBodyParameters
-from sim.scene import DomainParameters, SceneParameters
+from sim.scene import SceneParameters
 
 BOX = {"name": "box", "shape": {"type": "box", "size": (0.1, 0.1, 0.1)}}
 TANK = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.2, 0.2, 0.6))

@@ -4,8 +4,8 @@ import numpy as np
 from coupled_tanks import SPACING, Tank
 from scipy.spatial.distance import cdist
 
+from sim.domain import DomainParameters
 from sim.fluid.kernels import evaluate_slope
-from sim.scene import DomainParameters
 
 
 def two_light_bodies() -> Tank:

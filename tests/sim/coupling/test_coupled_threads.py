@@ -7,7 +7,7 @@ import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 from coupled_tanks import Tank
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.36, 0.36, 0.6))
 ball = {"kind": "dynamic", "density": 300.0, "shape": {"type": "sphere", "radius": 0.09}}
 for solver in ("wcsph", "dfsph"):

@@ -3,8 +3,8 @@
 import pytest
 from coupled_tanks import SPACING, Tank
 
+from sim.domain import DomainParameters
 from sim.fluid.solvers import SOLVERS
-from sim.scene import DomainParameters
 
 RADIUS = 2.5 * SPACING
 WIDTH, DEPTH = 16 * SPACING, 8 * SPACING

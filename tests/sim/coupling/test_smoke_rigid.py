@@ -7,11 +7,12 @@ from thread_counts import outputs_by_threads
 from sim.build import build_world
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
+from sim.domain import DomainParameters
 from sim.rigid import rotation
 from sim.rigid.geometry import BodyGeometry
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
-from sim.scene import DomainParameters, SceneParameters
+from sim.scene import SceneParameters
 from sim.smoke.obstacles import AIR, MOVING, STATIC
 from sim.smoke.parameters import SmokeParameters
 

@@ -8,9 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from sim.build import build_world
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies
+from sim.domain import DomainParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
-from sim.scene import DomainParameters, SceneParameters
+from sim.scene import SceneParameters
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 from sim.smoke.source_motion import BodyMotion, motion_of, placed_on, with_sources_on
 

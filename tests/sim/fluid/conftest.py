@@ -5,8 +5,8 @@ from collections.abc import Callable
 import pytest
 from small_fluids import lattice, make_fluid
 
+from sim.domain import DomainParameters
 from sim.fluid.forces import SPHFluid
-from sim.scene import DomainParameters
 
 
 @pytest.fixture

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.forces import SPHFluid
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.solvers import SOLVERS
-from sim.scene import DomainParameters
 
 EARTH = (0.0, 0.0, -9.81)
 EVERY_FACE = ("x-", "x+", "y-", "y+", "z-", "z+")

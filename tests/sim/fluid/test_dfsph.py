@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
+from sim.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.kernels import evaluate, evaluate_slope
 from sim.fluid.pressure_kernels import NOT_SOLVED
-from sim.scene import DomainParameters
 
 SPACING, SUPPORT = 0.02, 0.04
 CORNER = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.2, 0.2, 0.2), open_faces=("x+", "y+", "z+"))

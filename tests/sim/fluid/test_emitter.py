@@ -10,11 +10,12 @@ from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.build import build_world
 from sim.cells import CellGrid, Cells, CellSort
+from sim.domain import DomainParameters
 from sim.fluid.emitter import find_free_places
 from sim.fluid.nozzles import nozzle_collision, pipes
 from sim.fluid.opening import Opening, obstruction, pipe_clearance
 from sim.fluid.parameters import EmitterParameters
-from sim.scene import DomainParameters, SceneParameters
+from sim.scene import SceneParameters
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
 

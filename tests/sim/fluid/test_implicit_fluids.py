@@ -6,9 +6,10 @@ from small_fluids import EVERY_FACE, lattice, make_fluid
 from thread_counts import outputs_by_threads
 
 from sim.build import build_world
+from sim.domain import DomainParameters
 from sim.fluid.implicit_fluid import filled_diagonal, iterations_ahead, largest_eigenvalue
 from sim.fluid.solve_record import SolveRecord
-from sim.scene import DomainParameters, SceneParameters
+from sim.scene import SceneParameters
 
 OPEN_SPACE = DomainParameters(min=(-1.0, -1.0, -1.0), max=(1.0, 1.0, 1.0), open_faces=EVERY_FACE)
 BOTH = pytest.mark.parametrize("solver", ["dfsph", "pcisph"])
@@ -68,7 +69,7 @@ STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from small_fluids import lattice, make_fluid
 domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.5, 0.3, 0.4))
 digest = hashlib.sha256()

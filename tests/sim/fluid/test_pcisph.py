@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 OPEN_SPACE = DomainParameters(min=(-1.0,) * 3, max=(1.0,) * 3, open_faces=EVERY_FACE)
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.special import jv
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
+from sim.domain import DomainParameters
 from sim.fluid.viscosity_implicit import TOLERANCE, is_implicit
-from sim.scene import DomainParameters
 
 OPEN_SPACE = DomainParameters(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5), open_faces=EVERY_FACE)
 SPACING = 0.02

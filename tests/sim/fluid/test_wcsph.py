@@ -5,10 +5,10 @@ import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 from thread_counts import outputs_by_threads
 
+from sim.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import sink_samples
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.memory import estimate_bytes
-from sim.scene import DomainParameters
 
 OPEN_SPACE = DomainParameters(min=(-1.0, -1.0, -1.0), max=(1.0, 1.0, 1.0), open_faces=EVERY_FACE)
 
@@ -189,7 +189,7 @@ STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from small_fluids import lattice, make_fluid
 domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.5, 0.3, 0.4))
 fluid = make_fluid(domain, lattice((0.0, 0.0, 0.0), (0.3, 0.3, 0.2), 0.02))

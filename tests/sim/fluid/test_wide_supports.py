@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_fluids import lattice, make_fluid
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 
 SPACING = 0.02
 SIDE, LAYERS = 8, 8

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sim.domain import DomainParameters
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
-from sim.scene import DomainParameters
 
 GRAVITY = 9.81
 ROOM = DomainParameters(min=(-2, -2, 0), max=(2, 2, 4))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rigid_scenes import GRAVITY, SPACE, advance, ball, body, cube, in_room, in_space, totals
 
+from sim.domain import DomainParameters
 from sim.rigid.solver import RigidSolver
-from sim.scene import DomainParameters
 
 
 @pytest.mark.parametrize("restitution", [0.5, 0.8, 1.0])

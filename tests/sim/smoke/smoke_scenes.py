@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from sim.domain import Face
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement, SphereShape
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.obstacles import MOVING, Obstacles
-from sim.smoke.parameters import Face
 
 OPEN_BOX: tuple[Face, ...] = ("x-", "x+", "y-", "y+", "z+")
 CLOSED_BOX: tuple[Face, ...] = ()

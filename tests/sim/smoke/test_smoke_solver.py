@@ -2,10 +2,11 @@ import hashlib
 
 import numpy as np
 import pytest
+import taichi as ti
 from smoke_scenes import OPEN_BOX
 from thread_counts import outputs_by_threads
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
 from sim.smoke.grid import SmokeGrid
@@ -238,6 +239,36 @@ print(digest(solver))
 def digest(solver: SmokeSolver) -> str:
     state = solver.checkpoint()
     return hashlib.sha256(b"".join(state[name].tobytes() for name in sorted(state))).hexdigest()
+
+
+def count_values(module, monkeypatch) -> list[int]:
+    """Has the fields that a module makes from now on leave their sizes in a list [4-byte values]."""
+    sizes: list[int] = []
+    make, make_vectors = ti.field, ti.Vector.field
+
+    def field(dtype, shape):
+        sizes.append(int(np.prod(shape)))
+        return make(dtype, shape=shape)
+
+    def vectors(count, dtype, shape):
+        sizes.append(count * int(np.prod(shape)))
+        return make_vectors(count, dtype, shape=shape)
+
+    monkeypatch.setattr(module, "field", field)
+    monkeypatch.setattr(module.Vector, "field", vectors)
+    return sizes
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_memory_that_it_tells_is_what_it_allocates(monkeypatch, moving):
+    sizes = count_values(ti, monkeypatch)
+    ball = build_solid(Placement(**BALL, position=(0.0, 0.0, 0.7)))
+    gusts = {"strength": 1.0, "size": 0.2}
+    solver = SmokeSolver(plume(turbulence=gusts), domain=DOMAIN, gravity=GRAVITY, solids=[ball], moving=moving)
+    # Not counted: numbers of the conjugate gradients, distances of centres, the inverse of the coarsest grid.
+    allocated = 4 * sum(sizes)
+    assert solver.device_bytes <= allocated
+    assert allocated - solver.device_bytes < 4 * (64**2 + 2000)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import pytest
 import taichi as ti
 from thread_counts import outputs_by_threads
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters, TurbulenceParameters
 from sim.smoke.turbulence import Turbulence

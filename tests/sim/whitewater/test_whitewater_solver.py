@@ -7,7 +7,7 @@ import pytest
 from thread_counts import outputs_by_threads
 from whitewater_scenes import ALL_FACES, FPS, GRAVITY, NO_FLUID, RADIUS, SPACING, cloud, fluid, jets, lattice, solver
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.fluid_field import FluidField
 from sim.whitewater.generation import generation_rate

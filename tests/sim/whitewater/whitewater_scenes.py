@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.scene import DomainParameters
+from sim.domain import DomainParameters
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.motion import FluidState
 from sim.whitewater.parameters import WhitewaterParameters

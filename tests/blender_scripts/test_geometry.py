@@ -15,38 +15,6 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def test_automatic_camera_shows_the_whole_domain_and_no_more_than_needed():
-    run_python(
-        """
-        import itertools
-        import numpy as np
-        from blender_scripts.camera import frame_box
-
-        margin = 0.05
-        for low, high in (((-.5, -.5, 0), (.5, .5, 1)), ((0, 0, 0), (4, .3, .2)), ((10, 10, -3), (10.1, 10.2, 5))):
-            for aspect in (16 / 9, 1.0, 9 / 16):
-                view = frame_box(np.array(low), np.array(high), focal_length_mm=50, aspect=aspect, margin=margin)
-                forward = np.subtract(view.look_at, view.position)
-                forward /= np.linalg.norm(forward)
-                right = np.cross(forward, (0, 0, 1))
-                right /= np.linalg.norm(right)
-                up = np.cross(right, forward)
-                corners = np.array(list(itertools.product(*zip(low, high)))) - view.position
-                depth = corners @ forward
-                half_long = 18.0 / 50
-                half = half_long * min(1, aspect), half_long / max(1, aspect)
-                extents = []
-                for axis, tangent in ((right, half[0]), (up, half[1])):
-                    screen = corners @ axis / depth / tangent
-                    assert abs(screen).max() <= 1 - 2 * margin + 1e-9
-                    # The axis that decides the distance is filled on both sides, the other one is not.
-                    extents.append(min(screen.max(), -screen.min()))
-                assert abs(max(extents) - (1 - 2 * margin)) < 1e-9, (low, high, aspect, extents)
-                assert depth.min() > 0 and forward[2] < 0
-        """
-    )
-
-
 def test_ply_of_the_projects_writer_reads_back_and_fills_a_blender_mesh(tmp_path):
     run_python(
         """

@@ -1,0 +1,247 @@
+"""A job's turn in the queue: run it with progress, or watch whoever does, and say how it ended."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import click
+
+from pipeline import wording
+from pipeline.commands.arguments import print_warnings
+from pipeline.commands.executing import ExecutorChoice, open_machines
+from pipeline.commands.watching import CTRL_C, STOPPED_FROM_ELSEWHERE, Follower
+from pipeline.errors import DiskFullError, JobBusyError, PipelineError
+from pipeline.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background
+from pipeline.job.loading import job_of_text, load_job
+from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.lease import Lease
+from pipeline.news import notification_of
+from pipeline.notifications import send
+from pipeline.progress import ProgressObserver, open_display
+from pipeline.resources import machine_capacity
+from pipeline.run_control import RunControl, Selection
+from pipeline.run_events import Observer, Observers, Outcome
+from pipeline.runner import STAGES_REFERENCE, run_job
+from pipeline.scheduler_events import JobOutcome
+from pipeline.solver_numbers import SolverWatch, simulation_numbers
+from pipeline.spool import QueuedJob, Spool, SpoolError, Wish
+
+GPU_TASKS = 1
+"""One task at a time on the GPU. Whether there is one is not asked here: if not, a stage that has to run names it as an
+obstacle, and what is up to date needs none."""
+
+
+def stand_in_queue(spool: Spool, layout: JobLayout, entry: QueuedJob, *, detach: bool) -> int:
+    """Queue a job and see it through: run the queue if nobody does, else watch; returns the exit code."""
+    follower = Follower(spool, layout)
+    entry = follower.enqueue(entry)
+    if detach:
+        pid = start_in_background(spool)
+        how = "runs in the background" if pid is None else f"runs in the background, process {pid}"
+        click.echo(f"{entry.name} is queued; the queue {how}")
+        click.echo(f"see: pipeline queue --output {spool.farm}; pipeline watch {layout.root}")
+        return 0
+    while True:
+        try:
+            lease = Lease.acquire(spool.lease)
+        except JobBusyError:
+            code = follower.follow()
+            if code is not None:
+                return code
+        else:
+            try:
+                with lease:
+                    code = _run_queue(spool, layout, lease, follower.ticket)
+            finally:
+                _hand_over(spool)
+            if code is None:  # somebody else has settled it, or submitted it anew, while we ran another job
+                code = follower.follow()
+            if code is not None:
+                return code
+
+
+def _run_queue(spool: Spool, layout: JobLayout, lease: Lease, ticket: str) -> int | None:
+    """Run the queue until our job is settled; returns the exit code, or None if somebody else has to settle it."""
+    turns = Turns(spool, ticket)
+    runner = FarmRunner(spool, lease, turns.run, say, ticket=ticket, after_turn=turns.ended)
+    if lease.takeover is not None:
+        say(f"{lease.takeover}; its queue goes on")
+    try:
+        ended = runner.work()
+    except KeyboardInterrupt:  # between two jobs, or while another one ran, which stays in the queue
+        entry = spool.find(layout.root.absolute().name)
+        if entry is not None and entry.ticket == ticket and entry.wish is Wish.RUN:
+            spool.change(entry.name, wish=Wish.PAUSE, note="stopped by hand")
+        click.echo(f"continue with: pipeline resume {layout.root}", err=True)
+        return CTRL_C
+    if ended is None:
+        return None
+    if ended.error is not None:
+        raise ended.error
+    return exit_code_of(ended)
+
+
+def notify(name: str, folder: Path, ended: Ended) -> None:
+    """Tell those who want to know how a turn of a job ended."""
+    notification = notification_of(name, folder, ended)
+    if notification is not None:
+        print_warnings(send(notification))
+
+
+def exit_code_of(ended: Ended) -> int:
+    """What a command exits with whose job ended so."""
+    if ended.outcome is not None and (ended.reason is None or ended.outcome.kind not in _STOPPED):
+        return ended.outcome.exit_code  # it came to its own end before it could obey
+    return DiskFullError.exit_code if ended.reason is StopReason.DISK_SHORT else STOPPED_FROM_ELSEWHERE
+
+
+_STOPPED = {JobOutcome.DRAINED, JobOutcome.CANCELLED}
+
+
+class Turns:
+    """Runs the jobs of a queue, one at a time, and says how each turn ended once the queue knows it, too."""
+
+    def __init__(self, spool: Spool, ticket: str | None) -> None:
+        """`ticket` is the submission that this command is about; what it makes is said on standard output."""
+        self._spool = spool
+        self._ticket = ticket
+        self._job: Job | None = None
+        self._aside = False
+
+    def run(self, entry: QueuedJob, control: FarmControl, observer: TakeOver) -> Outcome:
+        """One job's turn: run it with progress on standard error.
+
+        Args:
+            entry: the job.
+            control: stops it.
+            observer: is told what happens.
+        """
+        layout = as_given(self._spool.layout(entry.name))
+        self._job = None
+        self._aside = entry.ticket != self._ticket
+        if self._aside:
+            say(f"{entry.name}: its turn")
+        job = load_job(layout.job_file) if entry.text is None else job_of_text(entry.text, layout.job_file)
+        outcome = _run_once(job, layout, entry, control=control, observer=observer)
+        self._job = job
+        return outcome
+
+    def ended(self, name: str, folder: Path, ended: Ended) -> None:
+        """Say how a turn ended, here and to those who want to be told."""
+        if ended.outcome is not None and self._job is not None:
+            try:
+                _report(self._job, as_given(JobLayout(folder)), ended.outcome, aside=self._aside)
+            except (OSError, PipelineError) as error:  # of its folder: the other jobs go on
+                print_warnings([f"{name}: {error}"])
+        notify(name, folder, ended)
+
+
+def as_given(layout: JobLayout) -> JobLayout:
+    """A folder below the working one by its short name, for messages."""
+    with suppress(ValueError):
+        return JobLayout(layout.root.relative_to(Path.cwd()))
+    return layout
+
+
+def run_now(spool: Spool, layout: JobLayout, job: Job, entry: QueuedJob) -> int | None:
+    """Run a job in which nothing is to be done, beside the queue.
+
+    Returns:
+        The exit code; None if somebody else works in its folder now.
+    """
+    try:
+        outcome = _run_once(job, layout, replace(entry, settings=()))  # no cluster is needed for nothing
+    except JobBusyError:
+        return None
+    _report(job, layout, outcome)
+    if outcome.kind is JobOutcome.SUCCEEDED and spool.folder.exists():
+        with spool.locked(), suppress(SpoolError):
+            old = spool.find(entry.name)
+            if old is not None and old.wish is not Wish.RUN:
+                spool.drop(entry.name)
+    return outcome.exit_code
+
+
+def _run_once(
+    job: Job,
+    layout: JobLayout,
+    entry: QueuedJob,
+    *,
+    control: RunControl | None = None,
+    observer: Observer | None = None,
+) -> Outcome:
+    capacity = machine_capacity(gpus=GPU_TASKS)
+    if entry.cores is not None:
+        capacity = replace(capacity, cores=min(entry.cores, capacity.cores))
+    rerun = None
+    if entry.rerun_stages is not None:
+        frames = None if entry.rerun_frames is None else frozenset(entry.rerun_frames)
+        rerun = Selection(frozenset(entry.rerun_stages), frames)
+    choice = ExecutorChoice.from_settings(entry.settings)
+    with (
+        ProgressObserver(open_display()) as progress,
+        open_machines(choice, layout, capacity, progress.display.say) as machines,
+    ):
+        solvers = SolverWatch(layout, lambda sentence: progress.display.say(f"warning: {sentence}", style="yellow"))
+        return run_job(
+            job,
+            layout,
+            executor=machines.executor,
+            job_text=entry.text,
+            stages=STAGES_REFERENCE,
+            observer=Observers(progress, solvers, *([] if observer is None else [observer])),
+            control=control,
+            rerun=rerun,
+            capacity=machines.capacity,
+            machine=machines.machine,
+        )
+
+
+def _report(job: Job, layout: JobLayout, outcome: Outcome, *, aside: bool = False) -> None:
+    """Say how a run ended; of a job that is not this command's own, on standard error."""
+    film = layout.path(layout.movie())
+    if outcome.kind is not JobOutcome.SUCCEEDED:
+        click.secho(f"{job.name}: {outcome.kind.value} after {wording.duration(outcome.seconds)}", err=True, fg="red")
+        for failed in outcome.failures[:5]:
+            click.echo(f"  {failed.task_id}: {failed.message}", err=True)
+            click.echo(f"    pipeline logs {layout.root} {failed.task_id}", err=True)
+        click.echo(f"continue with: pipeline resume {layout.root}", err=True)
+    elif outcome.ran == 0:
+        click.echo(f"up to date: {film}", err=aside)
+    else:
+        click.echo(
+            f"{film}: {job.frame_count} frames, {job.frame_count / (job.movie.playback_fps or job.fps):.3g} s of film, "
+            f"in {wording.duration(outcome.seconds)}",
+            err=aside,
+        )
+    if outcome.ran or outcome.failures:
+        print_warnings([str(each) for each in simulation_numbers(layout).warnings()])
+        _write_report(layout)
+
+
+def _write_report(layout: JobLayout) -> None:
+    """Leave the report in the job's folder. That it cannot be written is said, and changes nothing about the run."""
+    from pipeline.report.writing import write_report
+
+    try:
+        write_report([layout], layout.report)
+    except (OSError, PipelineError) as error:
+        print_warnings([f"no report was written: {error}"])
+    else:
+        click.echo(f"report: {layout.report}", err=True)
+
+
+def _hand_over(spool: Spool) -> None:
+    """Leave jobs that no terminal waits for to a runner in the background."""
+    if any(job.background for job in spool.waiting()):
+        pid = start_in_background(spool)
+        if pid is not None:
+            say(f"jobs that wait go on in the background, process {pid}")
+
+
+def say(sentence: str) -> None:
+    """A sentence for the user, beside what a command prints."""
+    click.secho(sentence, err=True, fg="yellow")

@@ -1,0 +1,111 @@
+"""Disk space: how much a job will take, and how much of it stays free."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from pipeline import wording
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+    from pipeline.job.problems import Findings
+    from pipeline.manifest_reader import StageCost
+    from pipeline.plan import Assessment
+
+RESERVE_BYTES = 2 * 2**30
+"""Free space at which a job pauses: a checkpoint of a large simulation and the frames that are being written fit."""
+RESERVE_SHARE = 0.05
+"""On small disks the reserve is this share of the disk."""
+
+
+def free_bytes(folder: Path) -> int:
+    """Free space on the disk that a folder lies on [bytes]."""
+    return shutil.disk_usage(folder).free
+
+
+def usual_reserve_bytes(folder: Path) -> int:
+    """The reserve where nobody has asked for another one [bytes]."""
+    return min(RESERVE_BYTES, int(shutil.disk_usage(folder).total * RESERVE_SHARE))
+
+
+def shortage(folder: Path, reserve_bytes: int | None) -> str | None:
+    """A sentence if less than the reserve is free, else None.
+
+    Args:
+        folder: on the disk in question.
+        reserve_bytes: the reserve [bytes]; None: the usual one.
+    """
+    free = free_bytes(folder)
+    reserve = usual_reserve_bytes(folder) if reserve_bytes is None else reserve_bytes
+    if free >= reserve:
+        return None
+    return f"only {wording.size(free)} are free on the disk, less than the reserve of {wording.size(reserve)}"
+
+
+class Size(NamedTuple):
+    """What decides how much a frame of a job takes.
+
+    Attributes:
+        particles: of all fluids.
+        cells: of all smoke grids.
+        nodes: of all cloths.
+        pixels: of a picture.
+    """
+
+    particles: int
+    cells: int
+    nodes: int
+    pixels: int
+
+
+def size_of(job: Job, findings: Findings) -> Size:
+    """The size of a job that was checked."""
+    width, height = job.render.resolution
+    return Size(findings.particles, findings.cells, findings.nodes, width * height)
+
+
+_BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
+    # Positions and velocities of particles; smoke is stored where there is some.
+    "simulate": lambda size: 22_000 + 22.0 * size.particles + 2.0 * size.cells + 32.0 * size.nodes,
+    # A surface grows with the two thirds of the volume.
+    "surface": lambda size: 2_500.0 * size.particles ** (2 / 3),
+    "volume": lambda size: 20_000 + 3.0 * size.cells,
+    "whitewater": lambda size: 10.0 * size.particles,
+    "cloth": lambda size: 70.0 * size.nodes,
+    "bodies": lambda _: 400_000.0,
+    "render": lambda size: 1_000 + 1.2 * size.pixels,
+    # Segments of 120 frames and the film; a frame takes a tenth of a byte a pixel in each.
+    "movie": lambda size: 12.0 * size.pixels,
+}
+"""What one file of a stage takes, about, where nothing has been made yet to go by [bytes]. The factors are those of a
+few small jobs, and rough."""
+
+
+def checkpoint_bytes(size: Size) -> float:
+    """What the two checkpoints that are kept take, about [bytes]."""
+    return 2 * (90.0 * size.particles + 26.0 * size.cells + 54.0 * size.nodes)
+
+
+def estimate_bytes(assessments: Iterable[Assessment], costs: Mapping[str, StageCost], size: Size) -> float:
+    """What is to be made will take, about [bytes]; by what the same stage has taken in this job, where it has.
+
+    Args:
+        assessments: the plan, held against the record.
+        costs: what the stages have taken so far: `ManifestReader.stage_costs`.
+        size: of the job.
+    """
+    total = 0.0
+    simulated = False
+    for each in assessments:
+        stage = each.task.stage
+        cost = costs.get(stage)
+        if cost is not None:
+            one = cost.bytes_per_artifact
+        else:
+            one = _BYTES_PER_ARTIFACT[stage](size) if stage in _BYTES_PER_ARTIFACT else 0.0
+        total += one * len(each.rebuilds)
+        simulated |= stage == "simulate" and bool(each.rebuilds)
+    return total + (checkpoint_bytes(size) if simulated else 0.0)

@@ -1,0 +1,100 @@
+"""Every process of a campaign: what runs, what it cost, and that nothing is left over."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+
+import psutil
+
+_PR_SET_CHILD_SUBREAPER = 36
+_PR_CAPBSET_DROP = 24
+_CAP_DAC_OVERRIDE, _CAP_DAC_READ_SEARCH = 1, 2
+
+
+class Family:
+    """All descendants of this process. Orphans come to it, so that none can hide and the cost of each is known."""
+
+    def __init__(self) -> None:
+        if sys.platform != "linux":
+            raise SystemExit("the campaign needs Linux: it adopts orphans (PR_SET_CHILD_SUBREAPER)")
+        libc = ctypes.CDLL(None, use_errno=True)
+        libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
+        # A folder without write permission would be none to the children of root.
+        for capability in (_CAP_DAC_OVERRIDE, _CAP_DAC_READ_SEARCH):
+            libc.prctl(_PR_CAPBSET_DROP, capability)
+        self.processor_s = 0.0
+        """Processor time of all that have ended so far [s]."""
+        self._codes: dict[int, int] = {}
+
+    def reap(self) -> None:
+        """Take note of all that have ended."""
+        while True:
+            try:
+                pid, status, usage = os.wait4(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if pid == 0:
+                return
+            self.processor_s += usage.ru_utime + usage.ru_stime
+            self._codes[pid] = os.waitstatus_to_exitcode(status)
+
+    def exit_code(self, pid: int) -> int | None:
+        """How a child of this process ended; None while it runs."""
+        self.reap()
+        return self._codes.get(pid)
+
+    def wait(self, pid: int, timeout_s: float) -> int:
+        """Wait for a child's end."""
+        until = time.monotonic() + timeout_s
+        while (code := self.exit_code(pid)) is None:
+            if time.monotonic() > until:
+                raise TimeoutError(f"process {pid} has not ended after {timeout_s:g} s")
+            time.sleep(0.01)
+        return code
+
+    def living(self) -> list[psutil.Process]:
+        """All that live."""
+        self.reap()
+        return [each for each in psutil.Process().children(recursive=True) if _status(each) != psutil.STATUS_ZOMBIE]
+
+    def workers(self) -> list[psutil.Process]:
+        """Worker processes, whatever they do."""
+        return self._called(lambda command: "pipeline.worker" in command)
+
+    def blenders(self) -> list[psutil.Process]:
+        """Blender executables that serve frames."""
+        return self._called(lambda command: "--serve" in command)
+
+    def left_over(self, within_s: float) -> list[str]:
+        """What still lives after so long [s] when nothing should; it is ended then, so that it troubles no others."""
+        until = time.monotonic() + within_s
+        while living := self.living():
+            if time.monotonic() > until:
+                told = [" ".join(each.cmdline())[:120] or each.name() for each in living if each.is_running()]
+                for each in living:
+                    each.send_signal(signal.SIGKILL)
+                return told
+            time.sleep(0.02)
+        return []
+
+    def _called(self, is_meant: Callable[[str], bool]) -> list[psutil.Process]:
+        found = []
+        for each in self.living():
+            try:
+                if is_meant(" ".join(each.cmdline())):
+                    found.append(each)
+            except psutil.Error:  # it ended just now
+                continue
+        return found
+
+
+def _status(process: psutil.Process) -> str:
+    try:
+        return str(process.status())
+    except psutil.NoSuchProcess:
+        return str(psutil.STATUS_ZOMBIE)

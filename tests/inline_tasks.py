@@ -1,0 +1,25 @@
+"""Runs one task of a job in this process, as a worker would."""
+
+from __future__ import annotations
+
+from pipeline.executors.base import Assignment, TaskEvent
+from pipeline.executors.inline import InlineExecutor
+from pipeline.layout import JobLayout
+from pipeline.task import Task
+
+
+def run_task(task: Task, layout: JobLayout, *, attempt: int = 1, threads: int = 1) -> TaskEvent:
+    """Run a task of a real stage, whose inputs are there; returns how it ended."""
+    assignment = Assignment(
+        task=task,
+        attempt=attempt,
+        fingerprint="f",
+        inputs={},
+        threads=threads,
+        job_file=layout.job_file,
+        root=layout.root,
+        stages="pipeline.stages:STAGES",
+    )
+    with InlineExecutor() as executor:
+        executor.submit(assignment)
+        return executor.wait(0.0)[-1]

@@ -1,0 +1,102 @@
+"""What `check` tells of a camera that moves."""
+
+import pytest
+from checked_jobs import checked
+
+from pipeline.errors import JobFileError
+from pipeline.job.loading import load_job
+from pipeline.layout import JobLayout
+from pipeline.stages.render import RenderStage
+
+DUCK = """
+name = "pond"
+duration = 2.0
+[[rigid]]
+name = "duck"
+kind = "kinematic"
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.5]
+velocity = [0.1, 0.0, 0.0]
+[[rigid]]
+name = "rock"
+shape = { type = "sphere", radius = 0.1 }
+position = [0.4, 0.0, 0.5]
+"""
+
+
+@pytest.mark.parametrize(
+    ("camera", "complaint"),
+    [
+        ('follow = "dukc"', 'camera.follow: no dynamic or kinematic rigid body is named "dukc"; did you mean "duck"?'),
+        (
+            'look_at = "rock"',
+            'camera.look_at: no dynamic or kinematic rigid body is named "rock"; moving bodies are duck',
+        ),
+        ('focus = "pike"\nf_stop = 2.8', 'camera.focus: no dynamic or kinematic rigid body is named "pike"'),
+    ],
+)
+def test_a_camera_follows_only_bodies_that_move(tmp_path, camera, complaint):
+    with pytest.raises(JobFileError) as refused:
+        checked(f"{DUCK}[camera]\n{camera}\n", tmp_path / "pond.toml")
+    assert complaint in str(refused.value)
+
+
+def test_a_camera_that_follows_a_body_is_fine(tmp_path):
+    camera = '[camera]\nfollow = "duck"\nlook_at = "duck"\nfocus = "duck"\nf_stop = 2.8\n'
+    found = checked(DUCK + camera, tmp_path / "pond.toml")
+    assert not found.errors + found.warnings
+
+
+MOTIONS = [
+    "",
+    "orbit_deg_per_s = 10.0",
+    "orbit_deg_per_s = 45.0",
+    'follow = "duck"',
+    'look_at = "duck"',
+    'follow = "duck"\nlook_at = "duck"',
+    "keyframe = [{ time_s = 0, position = [0, -2, 1] }, { time_s = 1, position = [1, -2, 1] }]",
+    "keyframe = [{ time_s = 0, position = [0, -2, 1] }, { time_s = 1, position = [2, -2, 1] }]",
+    "keyframe = [{ time_s = 0, position = [0, -2, 1] }, { time_s = 1, position = [2, -2, 1] }]\neasing = 'linear'",
+]
+
+
+def test_a_camera_that_moves_otherwise_has_every_frame_drawn_again(tmp_path):
+    path = tmp_path / "pond.toml"
+    digests = set()
+    for motion in MOTIONS:
+        path.write_text(f"{DUCK}[camera]\n{motion}\n")
+        digests.add(RenderStage().plan(load_job(path), JobLayout(tmp_path))[0].parameters.digest)
+    assert len(digests) == len(MOTIONS)
+
+
+def test_a_turntable_of_still_bodies_moves_and_a_still_camera_on_them_does_not(tmp_path):
+    still = DUCK.replace('kind = "kinematic"\n', "").replace("velocity = [0.1, 0.0, 0.0]\n", "")
+    path = tmp_path / "pond.toml"
+    assert "nothing will move" in checked(still, path).warnings[0]
+    assert not checked(still + "[camera]\norbit_deg_per_s = 90.0\n", path).warnings
+
+
+def test_keyframes_inside_a_body_or_after_the_end_are_told_with_their_place(tmp_path):
+    keyframes = """
+[[camera.keyframe]]
+time_s = 0.0
+position = [0.4, 0.02, 0.5]
+[[camera.keyframe]]
+time_s = 2.5
+position = [0.0, -2.0, 0.5]
+look_at = [0.0, -2.0, 0.5]
+[[camera.keyframe]]
+time_s = 2.6
+position = [0.0, 0.0, 0.7]
+"""
+    domain = "[domain]\nmin = [-0.5, -0.5, 0.0]\nmax = [0.5, 0.5, 1.4]\n"
+    found = checked(DUCK + domain + keyframes, tmp_path / "pond.toml")
+    assert found.errors == [
+        'pond.toml:20 camera.keyframe[0].position: is inside "rock"; move it out',
+        "pond.toml:24 camera.keyframe[1].look_at: is where the camera is; it must be somewhere else",
+        "pond.toml:25 camera.keyframe[2].look_at: is where the camera is; it must be somewhere else",
+    ]
+    after_the_end = "is after the film's end at 2 s; the camera does not get there"
+    assert found.warnings == [
+        f"pond.toml:{line} camera.keyframe[{number}].time_s: {after_the_end}" for number, line in ((1, 22), (2, 26))
+    ]
