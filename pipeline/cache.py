@@ -295,14 +295,19 @@ def _whole(dataset: h5py.Dataset) -> NDArray[Any]:
     return np.asarray(dataset[()])
 
 
+def _grid(dataset: h5py.Dataset) -> NDArray[Any]:
+    """All of a grid of smoke. It is stored where there is some: that all of it is empty is no reason for suspicion."""
+    stored_box(dataset)
+    return np.asarray(dataset[()])
+
+
 def _read_body(group: h5py.Group) -> Snapshot:
     attributes: dict[str, Attribute] = {}
     for key, value in group.attrs.items():
         if key != "kind":
             attributes[key] = tuple(float(item) for item in value) if np.ndim(value) else _plain(value)
     kind = cast(BodyKind, str(group.attrs["kind"]))
-    # Grids of smoke are stored where there is some: that all of one is empty is no reason for suspicion.
-    arrays = {key: np.asarray(dataset[()]) if kind == "smoke" else _whole(dataset) for key, dataset in group.items()}
+    arrays = {key: _grid(dataset) if kind == "smoke" else _whole(dataset) for key, dataset in group.items()}
     return Snapshot(kind, arrays, attributes)
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InvalidArtifactError
 from render.smoke_region import Box, blur_reach, bounding_box, grown
+from sim.smoke.parameters import MOST_CELLS
 from sim.snapshots import Snapshot
 
 Float32Array = NDArray[np.float32]
@@ -115,8 +116,15 @@ def write_smoke(
 
 
 def read_smoke(group: h5py.Group) -> SmokeInBox:
-    """Read what is there of a smoke, from the group of its body."""
+    """Read what is there of a smoke, from the group of its body.
+
+    Raises:
+        InvalidArtifactError: its grids are none that `write_smoke` writes.
+    """
     part = stored_box(group["velocity"])
+    for key in ("density", "temperature"):
+        if group[key].shape != group["velocity"].shape[:3]:
+            raise InvalidArtifactError(f"{group.name}: grids of {key} and velocity differ in shape")
     velocity = np.empty((*(side.stop - side.start for side in part), 3), np.float32)
     for axis in range(3):  # a third faster than all at once, as chunks hold one component each
         velocity[..., axis] = group["velocity"][(*part, axis)]
@@ -133,9 +141,18 @@ def read_smoke(group: h5py.Group) -> SmokeInBox:
 
 
 def stored_box(dataset: h5py.Dataset) -> Box:
-    """The cells outside of which a dataset of a smoke holds nothing; all of them where it was stored as it is."""
-    ends = dataset.attrs["box"] if "box" in dataset.attrs else ((0, 0, 0), dataset.shape[:3])
+    """The cells outside of which a dataset of a smoke holds nothing; all of them where it was stored as it is.
+
+    Raises:
+        InvalidArtifactError: the dataset has more cells than any smoke, or its box lies outside of them.
+    """
+    shape, components = dataset.shape[:3], (3,) if dataset.name.endswith("/velocity") else ()
+    if len(shape) < 3 or math.prod(shape) > MOST_CELLS or dataset.shape[3:] != components:
+        raise InvalidArtifactError(f"{dataset.name}: no smoke has a grid of shape {dataset.shape}")
+    ends = dataset.attrs["box"] if "box" in dataset.attrs else ((0, 0, 0), shape)
     x, y, z = (slice(int(low), int(high)) for low, high in zip(*ends, strict=True))
+    if not all(0 <= side.start <= side.stop <= n for side, n in zip((x, y, z), shape, strict=True)):
+        raise InvalidArtifactError(f"{dataset.name}: its box {np.asarray(ends).tolist()} leaves its grid of {shape}")
     return x, y, z
 
 

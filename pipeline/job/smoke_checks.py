@@ -15,7 +15,7 @@ from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from sim.domain import DomainParameters
-from sim.smoke.parameters import CELLS_PER_EDDY, SmokeParameters, SmokeSourceParameters
+from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, SmokeSourceParameters
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
@@ -102,7 +102,13 @@ def _check_size(
     layers = np.ceil(extent / smoke.cell_size)
     cells, size_bytes = float(np.prod(layers)), _bytes_of(layers, on_gpu=budget.on_gpu)
     cells_before, bytes_before = before
-    if size_bytes + bytes_before > budget.bytes:
+    if cells > MOST_CELLS:
+        findings.error(
+            ("smoke", index, "cell_size"),
+            f"{count(cells)} cells are more than a smoke may have, {count(MOST_CELLS)}; "
+            f"use {rounded_up(float(np.cbrt(np.prod(extent) / MOST_CELLS))):g} m or more",
+        )
+    elif size_bytes + bytes_before > budget.bytes:
         room = max(0.0, budget.bytes - bytes_before)
         size = _cell_size_that_fits(extent, smoke.cell_size, room, on_gpu=budget.on_gpu)
         beside = f" beside the {count(cells_before)} of other smoke" if cells_before else ""

@@ -195,3 +195,28 @@ def test_volumes_of_the_part_and_of_the_whole_are_the_same_file(tmp_path, where,
     for name, smoke in (("part", part), ("whole", whole)):
         write_volume(tmp_path / f"{name}.vdb", **vars(smoke), parameters=VolumeParameters(), fps=FPS, shutter=shutter)
     assert (tmp_path / "part.vdb").read_bytes() == (tmp_path / "whole.vdb").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("shape", "box", "complaint"),
+    [
+        ((1 << 20, 1 << 20, 64), None, "no smoke has a grid of shape"),
+        ((100, 60), None, "no smoke has a grid of shape"),
+        (SHAPE, ((0, 0, 0), (100, 60, 81)), "leaves its grid"),
+        (SHAPE, ((0, 20, 0), (100, 10, 80)), "leaves its grid"),
+    ],
+)
+def test_a_grid_that_no_smoke_has_is_refused_before_it_is_read(tmp_path, shape, box, complaint):
+    """Empty space is not stored, so a small file may claim any size."""
+    path = write(tmp_path / "frame.h5", puff())
+    with h5py.File(path, "r+") as file:
+        group = file["bodies/plume"]
+        for key in ("density", "velocity"):
+            del group[key]
+            components = (3,) if key == "velocity" else ()
+            dataset = group.create_dataset(key, shape=(*shape, *components), dtype="f4", chunks=True)
+            if box is not None:
+                dataset.attrs["box"] = np.array(box)
+    for read in (read_frame, validate_frame, lambda path: read_smoke_in_box(path, "plume")):
+        with pytest.raises(InvalidArtifactError, match=complaint):
+            read(path)

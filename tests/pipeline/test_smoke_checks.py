@@ -209,6 +209,15 @@ def test_two_smokes_share_the_memory(tmp_path):
     assert checked(PLUME + coarser, tmp_path / "fire.toml", memory_bytes=room).errors == []
 
 
+def test_a_smoke_has_no_more_cells_than_files_of_it_may_hold_however_much_memory_there_is(tmp_path):
+    def errors(cell_size: str) -> tuple[str, ...]:
+        return tuple(checked(PLUME.replace("0.05", cell_size, 1), tmp_path / "fire.toml", memory_bytes=10**13).errors)
+
+    (error,) = errors("0.0009")
+    assert "cells are more than a smoke may have, 1.07 billion; use " in error
+    assert errors(re.search(r"use ([\d.]+) m or more", error).group(1)) == ()
+
+
 @pytest.mark.parametrize("extent", [0.3, 0.0999, 1.0 / 7.0])
 def test_the_size_that_is_suggested_for_a_thin_box_is_small_enough(extent, tmp_path):
     text = HEAD + SMOKE.replace("0.05", "0.09") + f"min = [-0.5, -0.5, 0.0]\nmax = [0.5, 0.5, {extent!r}]\n"
