@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from sim.scene import Device
+from sim.tracing import tell_positions_unwrapped
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -34,6 +35,11 @@ PREFERENCE = ("cuda", "metal", "vulkan", "cpu")
 
 PROBE_TIMEOUT_S = 120.0
 STALE_LOCK_S = 600.0
+
+MOST_FIELD_TREES = 512
+"""Taichi's `kMaxNumSnodeTreesLlvm`: it does not count, and what comes after would overwrite its thread pool."""
+FIELD_TREES_OF_A_SOLVER = 12
+"""Fields that are made before any of them is used share a tree; no solver or coupling makes more of these."""
 OK = "ok"
 
 _in_use: dict[str, Any] = {}
@@ -119,6 +125,25 @@ def available_devices() -> dict[str, str]:
     return answers
 
 
+def require_room_for_fields() -> None:
+    """See that a process can hold the fields of one more solver; whoever makes fields asks first.
+
+    Taichi keeps fields until the process ends. Scenes are simulated in processes of their own, so only one that builds
+    dozens of them, as tests do, can run out.
+
+    Raises:
+        RuntimeError: too many fields were made in this process.
+    """
+    from taichi.lang import impl
+
+    trees = impl.get_runtime().prog.get_snode_tree_size()
+    if trees + FIELD_TREES_OF_A_SOLVER > MOST_FIELD_TREES:
+        raise RuntimeError(
+            f"this process has made {trees} groups of Taichi fields, which are kept until it ends, and Taichi holds "
+            f"{MOST_FIELD_TREES}; build further scenes in another process"
+        )
+
+
 def import_taichi() -> ModuleType:
     """Import Taichi, and say clearly what is missing where that fails.
 
@@ -156,6 +181,7 @@ def _usable_cores() -> int:
 
 def _start_taichi(device: str, threads: int) -> None:
     ti = import_taichi()
+    tell_positions_unwrapped()
     kernel_cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or _cache_folder() / "kernels")
     _remove_stale_lock(kernel_cache)
     # Taichi announces its back end with a bare print.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sim.domain import DomainParameters
 from sim.parameters import Vector3
 from sim.reductions import is_finite
+from sim.runtime import require_room_for_fields
 from sim.smoke.advection import Advection
 from sim.smoke.air_force import AirForce
 from sim.smoke.balance import CorrectionBalance
@@ -83,6 +84,7 @@ class SmokeSolver:
         solids: Sequence[SolidRegion] = (),
         moving: bool = False,
     ) -> None:
+        require_room_for_fields()
         self.name = parameters.name
         self.parameters = parameters
         self.grid = SmokeGrid.build(parameters, domain, solids)

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 from sim import runtime
+from sim.domain import DomainParameters
 from sim.runtime import DeviceUnavailableError, available_devices, initialize
+from sim.smoke.parameters import SmokeParameters
+from sim.smoke.solver import SmokeSolver
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,6 +48,16 @@ def test_importing_runtime_does_not_load_taichi():
 def test_starting_on_the_cpu_prints_nothing():
     started = run_python("import sim.runtime as r; r.initialize('cpu')")
     assert (started.returncode, started.stdout, started.stderr) == (0, "", "")
+
+
+def test_more_groups_of_fields_than_taichi_holds_are_refused_before_they_break_it(taichi_cpu, monkeypatch):
+    runtime.require_room_for_fields()
+    monkeypatch.setattr(runtime, "MOST_FIELD_TREES", 5)
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 1.0, 1.0))
+    source = {"shape": {"type": "sphere", "radius": 0.2}, "position": (0.5, 0.5, 0.5)}
+    fog = SmokeParameters.model_validate({"name": "fog", "cell_size": 0.1, "source": [source]})
+    with pytest.raises(RuntimeError, match="build further scenes in another process"):
+        SmokeSolver(fog, domain=domain, gravity=(0.0, 0.0, -9.81))
 
 
 def test_probe_answers_by_exit_code():
