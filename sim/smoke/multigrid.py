@@ -13,7 +13,7 @@ import taichi as ti
 
 from sim.launch import fast_launch
 from sim.smoke.lanes import lane_count, lane_items, lane_place
-from sim.smoke.multigrid_levels import Coefficients, operator_matrix
+from sim.smoke.multigrid_levels import Coefficients, operator_matrix, plan_levels
 from sim.smoke.obstacles import Obstacles
 
 SMOOTHED_SPECTRUM = (0.4, 2.0)
@@ -42,8 +42,7 @@ class MultigridVCycle:
     """
 
     def __init__(self, obstacles: Obstacles) -> None:
-        self.coefficients = Coefficients(obstacles)
-        levels = self.coefficients.levels
+        levels = plan_levels(obstacles.grid.cells)
         self._cells = [level.cells for level in levels]
         self._offsets = [level.offset for level in levels]
         total = sum(level.size for level in levels)
@@ -52,6 +51,7 @@ class MultigridVCycle:
         self.spare = ti.field(ti.f32, shape=total)
         self._coarsest_count = math.prod(levels[-1].cells)
         self._coarsest_inverse = ti.field(ti.f32, shape=(self._coarsest_count, self._coarsest_count))
+        self.coefficients = Coefficients(obstacles)
         self._coarsest_conductance = self.coefficients.coarsest_conductance()
         self._invert_coarsest()
         self._lanes = lane_count()

@@ -90,12 +90,12 @@ class Obstacles:
         self._lanes = lane_count()
         self.movers: list[Mover] = []
         self.state = ti.field(ti.i32, shape=grid.size)
-        self.state.from_numpy(self._static)
         if moving:
             self.marked = ti.field(ti.i32, shape=grid.size)
-            self.marked.from_numpy(self._static)
             self.velocity_x, self.velocity_y, self.velocity_z = (ti.field(ti.f32, shape=grid.size) for _ in range(3))
             self._rows = RowReductions(self._nx, self._ny)
+            self.marked.from_numpy(self._static)
+        self.state.from_numpy(self._static)
 
     @property
     def fields(self) -> list[ti.Field]:

@@ -66,11 +66,14 @@ class PressureProjection:
         self._size = grid.size
         self._u, self._v, self._w = velocity
         self._obstacles = obstacles
-        self.multigrid = MultigridVCycle(obstacles)
-        self.regions = ClosedRegions(obstacles)
+        # Before the multigrid, which uses its fields: what is made in between shares a group of them (`sim.runtime`).
         self._correction = ti.field(ti.f32, shape=grid.size)
         self._search = ti.field(ti.f32, shape=grid.size)
         self._search_image = ti.field(ti.f32, shape=grid.size)
+        self._alpha, self._beta, self._r_z = (ti.field(ti.f32, shape=()) for _ in range(3))
+        self._rows = RowReductions(self._nx, self._ny)
+        self.multigrid = MultigridVCycle(obstacles)
+        self.regions = ClosedRegions(obstacles)
         self.work_fields = (
             self._correction,
             self._search,
@@ -80,9 +83,7 @@ class PressureProjection:
             self.multigrid.spare,
         )
         self._lanes = lane_count()
-        self._rows = RowReductions(self._nx, self._ny)
         self.reductions = [self._rows]
-        self._alpha, self._beta, self._r_z = (ti.field(ti.f32, shape=()) for _ in range(3))
 
     def update(self) -> None:
         """Follow the obstacles."""
