@@ -28,6 +28,7 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.parameter_set import ParameterSet
+from pipeline.receipts import Receipt, hash_file
 from pipeline.run_events import RunEvent
 from pipeline.runner import run_job
 from pipeline.scheduler import Scheduler
@@ -123,7 +124,7 @@ def nothing_to_do_s(root: Path, tasks: int) -> tuple[float, float]:
         path.write_bytes(b"x")
         status = path.stat()
         receipts.append(
-            artifacts.Receipt(
+            Receipt(
                 artifact=task.outputs[0],
                 task=task.id,
                 stage=task.stage,
@@ -132,7 +133,7 @@ def nothing_to_do_s(root: Path, tasks: int) -> tuple[float, float]:
                 parameters=task.parameters.digest,
                 size=status.st_size,
                 mtime_ns=status.st_mtime_ns,
-                hash=artifacts.hash_file(path),
+                hash=hash_file(path),
             )
         )
     with Manifest(layout.manifest) as manifest:

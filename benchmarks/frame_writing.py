@@ -18,9 +18,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from pipeline.artifacts import hash_file
 from pipeline.cache import validate_frame, write_frame
 from pipeline.files import sync
+from pipeline.receipts import hash_file
 from sim.snapshots import Snapshot
 from sim.world import FrameReport
 

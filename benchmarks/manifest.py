@@ -18,12 +18,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.artifacts import Receipt, committing
+from pipeline.artifacts import committing
 from pipeline.fingerprint import task_fingerprint
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.parameter_set import ParameterSet
 from pipeline.plan import Assessment, Verdict, assess, in_order, summarize
+from pipeline.receipts import Receipt
 from pipeline.reconcile import reconcile
 from pipeline.task import ArtifactPath, Task, TaskId, TaskState
 

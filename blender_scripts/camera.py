@@ -6,7 +6,6 @@ A document is `{"version": 1, "frame": 12, "views": [{"offset": from the frame [
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
+from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderInputError
 from blender_scripts.keyframes import forget_keyframes
 
@@ -73,16 +73,7 @@ def read_views(path: Path) -> list[dict[str, Any]]:
     Raises:
         RenderInputError: the file is missing, of another version, or holds something else than views.
     """
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RenderInputError(f"cannot read the views {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise RenderInputError(f"the views {path} are not JSON: {error}") from error
-    version = document.get("version") if isinstance(document, dict) else None
-    if version != VIEWS_VERSION:
-        raise RenderInputError(f"the views {path} have version {version}; {VIEWS_VERSION} is needed")
-    views = document.get("views")
+    views = read_document(path, "views", version=VIEWS_VERSION).get("views")
     if not isinstance(views, list) or not views:
         raise RenderInputError(f"the views {path} hold none")
     for view in views:

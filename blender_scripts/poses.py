@@ -7,7 +7,6 @@ the velocity is that of the mesh's origin.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderInputError
 from blender_scripts.keyframes import forget_keyframes
 
@@ -53,15 +53,7 @@ def read_poses(path: Path) -> dict[str, Pose]:
     Raises:
         RenderInputError: the file is missing, of another version, or holds something else than poses.
     """
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RenderInputError(f"cannot read the poses {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise RenderInputError(f"the poses {path} are not JSON: {error}") from error
-    version = document.get("version") if isinstance(document, dict) else None
-    if version != POSES_VERSION:
-        raise RenderInputError(f"the poses {path} have version {version}; {POSES_VERSION} is needed")
+    document = read_document(path, "poses", version=POSES_VERSION)
     return {name: _pose(path, name, values) for name, values in document["bodies"].items()}
 
 

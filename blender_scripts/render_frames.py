@@ -11,7 +11,6 @@ after a line `RENDERER_READY version device`; the process ends with its input, s
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import queue
 import sys
@@ -27,6 +26,7 @@ import bpy
 
 from blender_scripts import camera, geometry, lights, looks, png, points, poses, settings, tank, volumes
 from blender_scripts.compatibility import blender_version, require_supported_version
+from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
 from blender_scripts.shading import LookContext, SmokeBox
 from blender_scripts.smoke_looks import glow_of
@@ -59,7 +59,7 @@ class SceneRenderer:
         """
         require_supported_version()
         self._folder = spec_path.resolve().parent
-        spec = _read_spec(spec_path)
+        spec = read_document(spec_path, "render specification", version=SPEC_VERSION)
         bpy.ops.wm.read_factory_settings(use_empty=True)
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
@@ -165,19 +165,6 @@ def _smoke_box(description: dict[str, Any]) -> SmokeBox:
         tuple(description["open_faces"]),
         description["ambient_temperature"],
     )
-
-
-def _read_spec(path: Path) -> dict[str, Any]:
-    try:
-        spec = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RenderInputError(f"cannot read the render specification {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise RenderInputError(f"the render specification {path} is not JSON: {error}") from error
-    version = spec.get("version") if isinstance(spec, dict) else None
-    if version != SPEC_VERSION:
-        raise RenderInputError(f"the render specification {path} has version {version}; {SPEC_VERSION} is needed")
-    return spec
 
 
 def _parse_frames(text: str) -> list[int]:

@@ -149,7 +149,7 @@ def stored_box(dataset: h5py.Dataset) -> Box:
     shape, components = dataset.shape[:3], (3,) if dataset.name.endswith("/velocity") else ()
     if len(shape) < 3 or math.prod(shape) > MOST_CELLS or dataset.shape[3:] != components:
         raise InvalidArtifactError(f"{dataset.name}: no smoke has a grid of shape {dataset.shape}")
-    ends = dataset.attrs["box"] if "box" in dataset.attrs else ((0, 0, 0), shape)
+    ends = dataset.attrs.get("box", ((0, 0, 0), shape))
     x, y, z = (slice(int(low), int(high)) for low, high in zip(*ends, strict=True))
     if not all(0 <= side.start <= side.stop <= n for side, n in zip((x, y, z), shape, strict=True)):
         raise InvalidArtifactError(f"{dataset.name}: its box {np.asarray(ends).tolist()} leaves its grid of {shape}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+from pathlib import Path
+from typing import Self
 
 PLACE_TROUBLES = frozenset(
     {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.ENODEV}
@@ -58,14 +60,15 @@ class StaleAttemptError(PipelineError):
     """A newer attempt of the same task has committed already; this one must not write."""
 
 
-DISK_FULL = "the disk is full ({}); free some space and submit the job again"
-"""Said with the folder that does not hold any more."""
-
-
 class DiskFullError(PipelineError):
     """There is no room for what a command has to write."""
 
     exit_code = 7
+
+    @classmethod
+    def of(cls, folder: Path) -> Self:
+        """The disk of this folder is full."""
+        return cls(f"the disk is full ({folder}); free some space and submit the job again")
 
 
 class JobBusyError(PipelineError):

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline import disk
-from pipeline.errors import DISK_FULL, DiskFullError, JobBusyError, LeaseLostError, PipelineError
+from pipeline.errors import DiskFullError, JobBusyError, LeaseLostError, PipelineError
 from pipeline.executors.failures import is_disk_full
 from pipeline.lease import Lease, live_holder
 from pipeline.run_control import RunControl
@@ -253,7 +253,7 @@ class FarmRunner:
             return Ended(None, error=error), control.signals > 0
         except OSError as error:  # of this job's folder: it ends this turn, and the others go on
             told = (
-                DiskFullError(DISK_FULL.format(self.spool.layout(job.name).root))
+                DiskFullError.of(self.spool.layout(job.name).root)
                 if is_disk_full(error)
                 else PipelineError(f"{job.name}: {error}")
             )

@@ -22,7 +22,6 @@ from typing import Self
 
 import psutil
 
-from pipeline.artifacts import Receipt
 from pipeline.errors import ManifestError
 from pipeline.layout import JobLayout
 from pipeline.manifest_reader import (
@@ -41,6 +40,7 @@ from pipeline.manifest_reader import (
     result_code,
 )
 from pipeline.migrations import migrate
+from pipeline.receipts import Receipt
 from pipeline.task import ArtifactPath, FailureKind, Task, TaskId, TaskState
 
 __all__ = [

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline import wording
-from pipeline.artifacts import Receipt
 from pipeline.layout import JobLayout
 from pipeline.provenance import read_text
+from pipeline.receipts import Receipt
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.artifacts import Receipt, edited_name, hash_file, read_receipt, sweep_parts, verify_artifact
+from pipeline.artifacts import edited_name, sweep_parts
 from pipeline.layout import JobLayout
 from pipeline.manifest import ArtifactRow, Manifest, artifact_row
 from pipeline.plan import FileCondition, FileProblem
+from pipeline.receipts import Receipt, hash_file, read_receipt, verify_artifact
 from pipeline.task import ArtifactPath, FailureKind, TaskState
 
 

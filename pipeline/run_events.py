@@ -55,7 +55,7 @@ class Outcome:
 
     @property
     def exit_code(self) -> int:
-        """What a command that ran the job exits with; none of them is used by a PipelineError."""
+        """What a command that ran the job exits with; a PipelineError shares only that of a full disk."""
         return _EXIT_CODES[self.kind]
 
 

@@ -12,34 +12,24 @@ import time
 from collections import deque
 from collections.abc import Sequence
 
-from pipeline.artifacts import Receipt, read_receipt, sweep_parts, verify_artifact
-from pipeline.errors import PlanError
+from pipeline.artifacts import sweep_parts
+from pipeline.errors import DiskFullError, PlanError
 from pipeline.executors.attempt import load_stages
-from pipeline.executors.base import (
-    Assignment,
-    CapacityChanged,
-    Committed,
-    Executor,
-    ExecutorEvent,
-    Failed,
-    Finished,
-    TaskEvent,
-)
+from pipeline.executors.base import Assignment, CapacityChanged, Executor, ExecutorEvent
 from pipeline.executors.failures import is_disk_full
 from pipeline.files import replace_durably
-from pipeline.fingerprint import task_fingerprint
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.lease import Lease
-from pipeline.manifest import Manifest, artifact_row
-from pipeline.plan import Assessment, Verdict, assess, input_hashes, plan_job, up_to_date
+from pipeline.manifest import Manifest
+from pipeline.plan import Assessment, Verdict, assess, plan_job, up_to_date
 from pipeline.reconcile import Reconciliation, reconcile
 from pipeline.resources import machine_capacity
 from pipeline.run_control import RunControl, Selection
 from pipeline.run_events import Notice, Observer, Outcome, RunEnded, RunStarted, SilentObserver, StateChanged
-from pipeline.scheduler import OWN_FAILURES, Scheduler
+from pipeline.run_record import RunRecord
+from pipeline.scheduler import Scheduler
 from pipeline.scheduler_events import (
-    ArtifactCommitted,
     CancelRequested,
     CapacityUpdated,
     DrainRequested,
@@ -50,12 +40,10 @@ from pipeline.scheduler_events import (
     Policy,
     Start,
     Stop,
-    TaskFailed,
     TaskSkipped,
-    TaskSucceeded,
     Tick,
 )
-from pipeline.task import FailureKind, Resources, Task, TaskId, TaskState
+from pipeline.task import Resources, TaskId, TaskState
 
 __all__ = ["Outcome", "RunControl", "Selection", "run_job"]
 
@@ -63,8 +51,6 @@ STAGES_REFERENCE = "pipeline.stages:STAGES"
 
 _TURN_S = 0.25
 """Longest time that the loop sleeps [s]; so soon it answers Ctrl-C."""
-_FORCED_ENDS = frozenset(FailureKind) - OWN_FAILURES - {FailureKind.DISK_FULL}
-"""Ends that may come from outside, at any moment: between a commit and the word of it, too."""
 _STOP_GRACE_S = 120.0
 """Time a long task gets to write its checkpoint when the run is drained [s]."""
 
@@ -174,18 +160,14 @@ class _Run:
         self._executor = executor
         self._observer = observer
         self._control = control
-        self._stages = stages
-        self._job = job
         self._forced = forced
-        self._rows = reconciliation.valid_rows
-        self._last_failures: dict[TaskId, Failed] = {}
+        self._record = RunRecord(
+            manifest, job, layout, stages=stages, rows=reconciliation.valid_rows, observer=observer
+        )
         self._obeyed = 0
-        self._parts_left = False
-        self._ended_by_force = False
-        self._assignments: dict[TaskId, Assignment] = {}
         self._outcome: JobOutcome | None = None
         self._tasks = {assessment.task.id: assessment.task for assessment in assessments}
-        self._invalidate_forced()
+        self._record.invalidate(self._tasks[task_id] for task_id in forced)
         done = {each.task.id for each in assessments if each.verdict is Verdict.UP_TO_DATE}
         # What a long task has committed of its present fingerprint stays; its readers need not wait for it.
         kept = {
@@ -219,16 +201,16 @@ class _Run:
                 events = self._executor.wait(self._sleep_s())
                 self._lease.check()
                 self._turn(events, self._obey_control() + self._scheduler.handle(Tick(time.monotonic())))
-            if self._parts_left:
+            if self._record.parts_left:
                 sweep_parts(self._layout)
-            self._manifest.end_run(self._outcome, clean=not self._ended_by_force)
+            self._manifest.end_run(self._outcome, clean=not self._record.ended_by_force)
         except OSError as error:
             if not is_disk_full(error):
                 raise
             # Our own record could not be written. The receipts can tell all of it, so nothing is lost; the run does
             # not count as ended cleanly, and the next one reads them.
             self._executor.shutdown()
-            self._notice(f"the disk is full ({self._layout.root}); free some space and submit the job again")
+            self._notice(str(DiskFullError.of(self._layout.root)))
             return JobOutcome.DISK_FULL
         return self._outcome
 
@@ -240,7 +222,7 @@ class _Run:
             ran=sum(count for (_, state), count in counts.items() if state is TaskState.SUCCEEDED),
             failures=tuple(
                 failed
-                for task_id, failed in self._last_failures.items()
+                for task_id, failed in self._record.failures.items()
                 if self._scheduler.state(task_id) is TaskState.FAILED
             ),
             counts=counts,
@@ -279,136 +261,40 @@ class _Run:
         cancellations: list[tuple[TaskId, float]] = []
         with self._manifest.transaction(durable=False):
             for event in events:
-                if isinstance(event, CapacityChanged):
-                    todo += self._scheduler.handle(CapacityUpdated(event.capacity))
-                    continue
-                self._observer.notify(event)
                 todo += self._take(event)
             while todo:
                 match todo.popleft():
                     case Start(task, threads, need):
                         # Early cutoff: what was made anew upstream may have turned out the same.
-                        if task.id not in self._forced and up_to_date(task, self._rows):
+                        if task.id not in self._forced and up_to_date(task, self._record.rows):
                             todo += self._scheduler.handle(TaskSkipped(task.id))
                         else:
-                            assignments.append(self._open_attempt(task, threads, need))
+                            assignments.append(self._record.open_attempt(task, threads=threads, need=need))
                     case Stop(task_id):
                         cancellations.append((task_id, _STOP_GRACE_S))
                     case Kill(task_id):
                         cancellations.append((task_id, 0.0))
                     case Finish(outcome):
                         self._outcome = outcome
-            self._record_states()
+            self._note_states()
         for assignment in assignments:
             self._executor.submit(assignment)
         for task_id, grace_s in cancellations:
             self._executor.cancel(task_id, grace_s=grace_s)
 
-    def _record_states(self) -> None:
+    def _take(self, event: ExecutorEvent) -> list[Instruction]:
+        if isinstance(event, CapacityChanged):
+            return self._scheduler.handle(CapacityUpdated(event.capacity))
+        self._observer.notify(event)
+        told = self._record.take(event, lacking=self._scheduler.lacking)
+        return [instruction for each in told for instruction in self._scheduler.handle(each)]
+
+    def _note_states(self) -> None:
         states = dict(self._scheduler.drain_changes())
         if states:
             self._manifest.set_states(states)
             for task_id, state in states.items():
                 self._observer.notify(StateChanged(task_id, self._tasks[task_id].stage, state))
-
-    # --- starting ---
-
-    def _open_attempt(self, task: Task, threads: int, need: Resources) -> Assignment:
-        attempt = self._manifest.start_attempt(task.id)
-        inputs = input_hashes(task, self._rows)
-        limits = self._job.limits_of(task.stage)
-        self._assignments[task.id] = assignment = Assignment(
-            task=task,
-            attempt=attempt,
-            fingerprint=task_fingerprint(task, inputs),
-            inputs=inputs,
-            threads=threads,
-            job_file=self._layout.job_file.absolute(),  # wherever the worker's own folder is
-            root=self._layout.root.absolute(),
-            stages=self._stages,
-            timeout_s=limits.timeout_s,
-            stall_s=limits.stall_s,
-            memory_bytes=limits.memory_bytes,
-            need=need,
-        )
-        return assignment
-
-    def _invalidate_forced(self) -> None:
-        """Drop the receipts of what is to run again, so that its stage finds nothing to reuse.
-
-        A file that was edited by hand keeps its receipt: that is how the commit knows to keep the edited one aside.
-        """
-        artifacts = [
-            output for task_id in self._forced for output in self._tasks[task_id].outputs if output in self._rows
-        ]
-        for artifact in artifacts:
-            self._layout.receipt(artifact).unlink(missing_ok=True)
-            del self._rows[artifact]
-        if artifacts:
-            self._manifest.forget_artifacts(artifacts)
-
-    # --- taking in events ---
-
-    def _take(self, event: TaskEvent) -> list[Instruction]:
-        match event:
-            case Committed(task_id, _, receipt):
-                return self._take_receipt(task_id, receipt)
-            case Finished(task_id, attempt, seconds, peak_memory_bytes):
-                instructions = self._adopt_lacking(task_id)
-                if lacking := self._scheduler.lacking(task_id):
-                    gone = f"{lacking[0]} was there when its task ended, and is not as it was committed any more"
-                    failed = Failed(task_id, attempt, FailureKind.FAILED, gone, "", seconds, peak_memory_bytes)
-                    return instructions + self._take_failure(failed)
-                self._manifest.finish_attempt(task_id, attempt, seconds=seconds, peak_memory_bytes=peak_memory_bytes)
-                return instructions + self._scheduler.handle(TaskSucceeded(task_id))
-            case Failed():
-                return self._take_failure(event)
-            case _:
-                return []
-
-    def _take_receipt(self, task_id: TaskId, receipt: Receipt) -> list[Instruction]:
-        self._manifest.record_artifact(receipt)
-        self._rows[receipt.artifact] = artifact_row(receipt)
-        return self._scheduler.handle(ArtifactCommitted(task_id, receipt.artifact))
-
-    def _take_failure(self, failed: Failed) -> list[Instruction]:
-        # A process that was killed could not remove what it was writing, nor tell of its last commit.
-        self._parts_left = True
-        self._ended_by_force |= failed.kind in _FORCED_ENDS
-        instructions = self._adopt_lacking(failed.task_id)
-        succeeded = failed.kind in _FORCED_ENDS and not self._scheduler.lacking(failed.task_id)
-        self._manifest.finish_attempt(
-            failed.task_id,
-            failed.attempt,
-            failure=None if succeeded else failed.kind,
-            message=f"after its last commit: {failed.message}" if succeeded else failed.message,
-            seconds=failed.seconds,
-            peak_memory_bytes=failed.peak_memory_bytes or None,
-        )
-        if succeeded:
-            return instructions + self._scheduler.handle(TaskSucceeded(failed.task_id))
-        self._last_failures[failed.task_id] = failed
-        if failed.kind is FailureKind.DISK_FULL:
-            self._notice(f"the disk is full ({self._layout.root}): the job pauses; free some space and submit it again")
-        return instructions + self._scheduler.handle(TaskFailed(failed.task_id, failed.kind, time.monotonic()))
-
-    def _adopt_lacking(self, task_id: TaskId) -> list[Instruction]:
-        """Take in outputs that are committed without the record knowing it.
-
-        The stage found them there already, or its process was killed between a commit and the word of it.
-        """
-        assignment = self._assignments[task_id]
-        instructions: list[Instruction] = []
-        for artifact in self._scheduler.lacking(task_id):
-            receipt = read_receipt(self._layout, artifact)
-            if (
-                receipt is not None
-                and receipt.fingerprint == assignment.fingerprint
-                and verify_artifact(self._layout, receipt) is None
-            ):
-                self._observer.notify(Committed(task_id, assignment.attempt, receipt))
-                instructions += self._take_receipt(task_id, receipt)
-        return instructions
 
     def _notice(self, sentence: str) -> None:
         self._observer.notify(Notice(sentence))

@@ -18,7 +18,8 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from pipeline.resources import claim, fits, minus, plus, whole_machine
+from pipeline.packing import Packing, Priority
+from pipeline.resources import claim, whole_machine
 from pipeline.scheduler_events import (
     ArtifactCommitted,
     CancelRequested,
@@ -67,12 +68,11 @@ OWN_FAILURES = frozenset({FailureKind.FAILED, FailureKind.DIVERGED})
 class _Entry:
     task: Task
     need: Resources
-    priority: tuple[int, int, int]
+    priority: Priority
     state: TaskState = TaskState.PENDING
     missing: int = 0
     failures: int = 0
     out_of_memory: int = 0
-    runs_alone: bool = False
     history: list[TaskState] = field(default_factory=lambda: [TaskState.PENDING])
 
 
@@ -107,19 +107,14 @@ class Scheduler:
         policy: Policy | None = None,
         policies: Mapping[str, Policy] | None = None,
     ) -> None:
-        self.machine = machine or capacity
-        self.capacity = _at_least(self.machine, capacity)
+        self._packing = Packing(machine=machine or capacity, capacity=capacity)
         self._policy = policy or Policy()
         self._policies = policies or {}
         self._committed = set(committed)
         self._entries: dict[TaskId, _Entry] = {}
         self._readers: defaultdict[ArtifactPath, list[_Entry]] = defaultdict(list)
-        self._ready: defaultdict[Resources, list[tuple[tuple[int, int, int], TaskId]]] = defaultdict(list)
         self._waiting: list[tuple[float, TaskId]] = []
         self._running: dict[TaskId, _Entry] = {}
-        self._free = self.capacity
-        self._blocked: TaskId | None = None
-        self._overtakers: set[TaskId] = set()
         self._counts: Counter[tuple[str, TaskState]] = Counter()
         self._changes: list[tuple[TaskId, TaskState]] = []
         self._ending: JobOutcome | None = None
@@ -129,7 +124,7 @@ class Scheduler:
         for index, task in enumerate(tasks):
             rank = stages.setdefault(task.stage, len(stages))
             try:
-                need = claim(task.resources, self.machine)
+                need = claim(task.resources, self._packing.machine)
             except ValueError as error:
                 raise ValueError(f"{task.id} {error}") from None
             priority = (-1, rank, index) if task.frame is None else (task.frame, -rank, index)
@@ -166,7 +161,7 @@ class Scheduler:
     @property
     def free(self) -> Resources:
         """What no running task occupies."""
-        return self._free
+        return self._packing.free
 
     def state(self, task_id: TaskId) -> TaskState:
         """Where a task stands."""
@@ -221,9 +216,7 @@ class Scheduler:
             case TaskFailed(task_id, kind, now):
                 instructions += self._fail(self._running_entry(task_id, kind), kind, now)
             case CapacityUpdated(offered):
-                capacity = _at_least(self.machine, offered)
-                self._free = plus(self._free, minus(capacity, self.capacity))
-                self.capacity = capacity
+                self._packing.resize(offered)
             case DrainRequested():
                 instructions += self._drain(JobOutcome.DRAINED)
             case CancelRequested():
@@ -257,7 +250,7 @@ class Scheduler:
         self._enqueue(entry)
 
     def _enqueue(self, entry: _Entry) -> None:
-        heapq.heappush(self._ready[entry.need], (entry.priority, entry.task.id))
+        self._packing.add(entry.task.id, need=entry.need, priority=entry.priority)
 
     def _commit(self, artifact: ArtifactPath) -> None:
         if artifact in self._committed:
@@ -270,8 +263,7 @@ class Scheduler:
 
     def _release(self, entry: _Entry) -> None:
         del self._running[entry.task.id]
-        self._overtakers.discard(entry.task.id)
-        self._free = plus(self._free, entry.need)
+        self._packing.give_back(entry.task.id, entry.need)
 
     def _end(self, entry: _Entry, state: TaskState) -> None:
         self._release(entry)
@@ -308,7 +300,7 @@ class Scheduler:
         self._release(entry)
         self._set_state(entry, TaskState.READY)
         if out_of_memory:
-            entry.need = whole_machine(entry.need, self.machine)
+            entry.need = whole_machine(entry.need, self._packing.machine)
         pause = policy.backoff_s * 2.0 ** (entry.failures - 1)
         heapq.heappush(self._waiting, (now + pause, entry.task.id))
         return []
@@ -332,59 +324,24 @@ class Scheduler:
         self._ending = outcome
         return [Stop(task_id) for task_id, entry in self._running.items() if entry.task.checkpointed]
 
-    # --- packing ---
+    # --- what follows ---
 
     def _next_instructions(self) -> list[Instruction]:
         instructions: list[Instruction] = []
         if self._ending is None:
-            while (entry := self._pick()) is not None:
-                instructions.append(self._start(entry))
-        if not self._running and not self._finished and (self._ending is not None or not self._startable):
+            while (task_id := self._packing.take()) is not None:
+                instructions.append(self._start(self._entries[task_id]))
+        startable = bool(self._waiting) or self._packing.has_ready
+        if not self._running and not self._finished and (self._ending is not None or not startable):
             self._finished = True
             instructions.append(Finish(self._close()))
         return instructions
 
-    @property
-    def _startable(self) -> bool:
-        return bool(self._waiting) or any(self._ready.values())
-
-    def _pick(self) -> _Entry | None:
-        """Take the most urgent task that fits, without starving a bigger one that is more urgent.
-
-        When the most urgent task does not fit, others may overtake it only as long as it would fit beside all who did:
-        once those end that ran before it was blocked, it starts.
-        """
-        for position, heap in enumerate(sorted((heap for heap in self._ready.values() if heap), key=lambda h: h[0])):
-            entry = self._entries[heap[0][1]]
-            if position == 0 and self._blocked not in {None, entry.task.id}:
-                self._blocked = None
-            if not fits(entry.need, self._free):
-                if position == 0 and self._blocked is None:
-                    self._blocked = entry.task.id
-                    self._overtakers = set()
-                continue
-            if self._blocked is not None and entry.task.id != self._blocked and self._would_delay_blocked(entry):
-                continue
-            heapq.heappop(heap)
-            if entry.task.id == self._blocked:
-                self._blocked = None
-            elif self._blocked is not None:
-                self._overtakers.add(entry.task.id)
-            return entry
-        return None
-
-    def _would_delay_blocked(self, entry: _Entry) -> bool:
-        assert self._blocked is not None
-        left = minus(self.capacity, self._entries[self._blocked].need)
-        for task_id in self._overtakers:
-            left = minus(left, self._entries[task_id].need)
-        return not fits(entry.need, left)
-
     def _start(self, entry: _Entry) -> Start:
         self._set_state(entry, TaskState.RUNNING)
         self._running[entry.task.id] = entry
-        self._free = minus(self._free, entry.need)
-        return Start(entry.task, threads=claim(entry.task.resources, self.machine).cores, need=entry.need)
+        threads = claim(entry.task.resources, self._packing.machine).cores
+        return Start(entry.task, threads=threads, need=entry.need)
 
     def _close(self) -> JobOutcome:
         """Settle what never ran, and say how the job ended."""
@@ -406,12 +363,3 @@ class Scheduler:
             for artifact in task.inputs:
                 if artifact not in produced:
                     raise ValueError(f"{task.id} reads {artifact}, which no task makes")
-
-
-def _at_least(machine: Resources, capacity: Resources) -> Resources:
-    """A capacity that a task can claim its machine of: it waits for one that went, and does not block for ever."""
-    return Resources(
-        cores=max(machine.cores, capacity.cores),
-        memory_bytes=max(machine.memory_bytes, capacity.memory_bytes),
-        gpus=max(machine.gpus, capacity.gpus),
-    )

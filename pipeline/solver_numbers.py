@@ -6,7 +6,6 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.artifacts import Receipt, read_receipt
 from pipeline.cache import FrameNumbers, read_numbers
 from pipeline.errors import InvalidArtifactError
 from pipeline.executors.base import Committed
@@ -14,6 +13,7 @@ from pipeline.layout import JobLayout
 from pipeline.manifest_reader import ManifestReader
 from pipeline.plan import frame_ranges
 from pipeline.quantities import WARNINGS, CountedEvent, in_order, quantity
+from pipeline.receipts import Receipt, read_receipt
 from pipeline.run_events import RunEvent
 from pipeline.task import ArtifactPath
 from pipeline.whitewater_numbers import (

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 
-from pipeline.artifacts import Receipt, is_committed, read_receipt, verify_artifact
 from pipeline.errors import PipelineError
 from pipeline.executors.attempt import load_stages, run_attempt
 from pipeline.executors.base import Assignment, Failed, Progress, TaskEvent
@@ -19,6 +18,7 @@ from pipeline.fingerprint import task_fingerprint
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
+from pipeline.receipts import Receipt, is_committed, read_receipt, verify_artifact
 from pipeline.resources import claim
 from pipeline.run_control import Selection
 from pipeline.task import ArtifactPath, FailureKind, Resources, Task

@@ -6,10 +6,10 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from pipeline.artifacts import Receipt, read_receipt
 from pipeline.errors import InvalidArtifactError
 from pipeline.layout import JobLayout
 from pipeline.plan import frame_ranges
+from pipeline.receipts import Receipt, read_receipt
 from pipeline.task import ArtifactPath
 from sim.solver import Diagnostics
 

@@ -139,30 +139,31 @@ def find_job(job: str, output: Path) -> JobLayout:
 
 
 _SIZE = re.compile(r"(\d+(?:\.\d*)?)\s*([KMGT]?)(I?)B?", re.IGNORECASE)
+_AGE = re.compile(r"(\d+(?:\.\d*)?)\s*([smhdw])")
+_AGE_UNITS_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
 
 
 def parse_size(_context: click.Context, _parameter: click.Parameter, text: str | None) -> int | None:
     """Bytes from `500MB`, `2GiB`, `1.5TB` or `0`; None stays None. Raises BadParameter."""
     if text is None:
         return None
-    match = _SIZE.fullmatch(text.strip())
-    if match is None:
-        raise click.BadParameter(f'"{text}" is not a size like 500MB or 2GiB')
-    base = 1024 if match[3] else 1000
-    return int(float(match[1]) * base ** " KMGT".index(match[2].upper() or " "))
+    number, prefix, binary = _match(_SIZE, text, "a size like 500MB or 2GiB")
+    return int(float(number) * (1024 if binary else 1000) ** " KMGT".index(prefix.upper() or " "))
 
 
 def parse_age(_context: click.Context, _parameter: click.Parameter, text: str | None) -> float | None:
     """Seconds from `90m`, `12h`, `7d` or `2w`; None stays None. Raises BadParameter."""
     if text is None:
         return None
-    match = _AGE.fullmatch(text.strip())
+    number, unit = _match(_AGE, text, "an age like 12h or 7d")
+    return float(number) * _AGE_UNITS_S[unit]
+
+
+def _match(pattern: re.Pattern[str], text: str, wanted: str) -> tuple[str, ...]:
+    match = pattern.fullmatch(text.strip())
     if match is None:
-        raise click.BadParameter(f'"{text}" is not an age like 12h or 7d')
-    return float(match[1]) * {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}[match[2]]
-
-
-_AGE = re.compile(r"(\d+(?:\.\d*)?)\s*([smhdw])")
+        raise click.BadParameter(f'"{text}" is not {wanted}')
+    return match.groups()
 
 
 def parse_frames(text: str) -> frozenset[int]:

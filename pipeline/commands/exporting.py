@@ -21,12 +21,12 @@ from pipeline.commands.arguments import (
     submitted_job_argument,
 )
 from pipeline.commands.executing import require_named_devices
+from pipeline.errors import DiskFullError
 from pipeline.layout import JobLayout
 
-STOPPED = 143
+STOPPED_EXIT_CODE = 143
 """As shells report a program that SIGTERM ended."""
-DISK_FULL = 7
-FAILED = 5
+FAILED_EXIT_CODE = 5
 
 
 @click.group()
@@ -136,10 +136,10 @@ def run_stage(job: str, *, output: Path, stage: str, frames: str | None, cores: 
         f"{stage}: {outcome.ran} tasks ran, {outcome.up_to_date} were up to date, {len(outcome.failures)} failed"
     )
     if stopped:
-        sys.exit(STOPPED)
+        sys.exit(STOPPED_EXIT_CODE)
     if outcome.failures:
         full = any(failed.kind is FailureKind.DISK_FULL for failed in outcome.failures)
-        sys.exit(DISK_FULL if full else FAILED)
+        sys.exit(DiskFullError.exit_code if full else FAILED_EXIT_CODE)
 
 
 def _tell(share: float, sentence: str) -> None:

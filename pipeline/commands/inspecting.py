@@ -177,10 +177,10 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
     pipeline explain quickstart frames/000012.png
     pipeline explain quickstart simulate --json
     """
-    from pipeline.artifacts import read_receipt, verify_artifact
     from pipeline.job.loading import load_job
     from pipeline.manifest_reader import ManifestReader
     from pipeline.origins import origins_of
+    from pipeline.receipts import read_receipt, verify_artifact
 
     layout = find_job(job, output)
     assessments, _, _ = assess_job(load_job(layout.job_file), layout)

@@ -66,9 +66,9 @@ def verify(job: str, output: Path, deep: bool, rebuild: bool, as_json: bool) -> 
 
 def _flaws(layout: JobLayout, *, deep: bool) -> tuple[int, dict[str, str]]:
     """How many files were checked, and what is wrong with which."""
-    from pipeline.artifacts import verify_artifact
     from pipeline.manifest import artifact_row
     from pipeline.manifest_reader import ManifestReader
+    from pipeline.receipts import verify_artifact
     from pipeline.reconcile import receipts
 
     flaws: dict[str, str] = {}

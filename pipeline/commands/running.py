@@ -26,7 +26,6 @@ from pipeline.commands.arguments import (
 )
 from pipeline.commands.executing import ExecutorChoice, executor_options, require_named_devices
 from pipeline.errors import (
-    DISK_FULL,
     DiskFullError,
     MissingInputError,
     OutdatedManifestError,
@@ -271,7 +270,7 @@ def run(
     except OSError as error:
         if not is_disk_full(error):
             raise
-        raise DiskFullError(DISK_FULL.format(layout.root)) from error
+        raise DiskFullError.of(layout.root) from error
 
 
 def _say_what_it_takes(state: JobAssessment, size: Size, layout: JobLayout, reserve_bytes: int | None) -> None:
@@ -361,7 +360,7 @@ def _keep(submitted: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
         return keep_inputs(submitted, layout)
     except OSError as error:
         if is_disk_full(error):
-            raise DiskFullError(DISK_FULL.format(layout.root)) from error
+            raise DiskFullError.of(layout.root) from error
         raise PipelineError(f"cannot copy {error.filename} into {layout.root}: {error.strerror}") from error
 
 
@@ -373,7 +372,7 @@ def _make_folder(layout: JobLayout) -> None:
         probe.unlink()
     except OSError as error:
         if is_disk_full(error):
-            raise DiskFullError(DISK_FULL.format(layout.root)) from error
+            raise DiskFullError.of(layout.root) from error
         raise PipelineError(
             f"cannot write to {layout.root}: {error.strerror}; name another folder with --output"
         ) from error

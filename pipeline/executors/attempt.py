@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline import artifacts
+from pipeline import artifacts, receipts
 from pipeline.errors import PipelineError
 from pipeline.executors.base import Assignment, Committed, Failed, Finished, Progress, Started, TaskEvent
 from pipeline.executors.failures import classify, describe
@@ -84,7 +84,7 @@ class AttemptContext:
 
     def is_committed(self, artifact: ArtifactPath) -> bool:
         """Whether this artifact is there, whole, and of this task's fingerprint."""
-        return artifacts.is_committed(self.layout, artifact, self.fingerprint)
+        return receipts.is_committed(self.layout, artifact, self.fingerprint)
 
     def progress(self, done: float, total: float, message: str = "") -> None:
         """Tell how far the task is; too frequent calls are dropped, except the last one."""

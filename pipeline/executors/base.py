@@ -9,8 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from pipeline.artifacts import Receipt
 from pipeline.layout import JobLayout
+from pipeline.receipts import Receipt
 from pipeline.task import ArtifactPath, FailureKind, Resources, Task, TaskId
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sys
-import textwrap
 import time
 from pathlib import Path
 
 import psutil
 import pytest
+from blender_stand_in import write_blender_stand_in
 from films import (
     FRAMES,
     PATIENCE_S,
@@ -174,24 +173,7 @@ def test_another_version_submitted_meanwhile_follows_the_one_that_runs(finished:
 
 @pytest.fixture
 def blender(tmp_path: Path) -> Path:
-    """An executable with Blender's command line around this environment's own Blender, the bpy module."""
-    script = tmp_path / "stand in" / "blender"
-    script.parent.mkdir()
-    script.write_text(
-        f"#!{sys.executable}\n"
-        + textwrap.dedent(
-            """
-            import runpy, sys
-            arguments = sys.argv[1:]
-            if arguments == ["--version"]:
-                print("Blender 5.0.1")
-                sys.exit()
-            runpy.run_path(arguments[arguments.index("--python") + 1], run_name="__main__")
-            """
-        )
-    )
-    script.chmod(0o755)
-    return script
+    return write_blender_stand_in(tmp_path)
 
 
 @pytest.mark.slow

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import pytest
 from fresh_python import run_python
+from needed_blender import needs_bpy
 
-from render.system_libraries import missing_libraries
-
-pytestmark = pytest.mark.skipif(
-    find_spec("bpy") is None or bool(missing_libraries()),
-    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
-)
+pytestmark = needs_bpy
 
 
 def test_ply_of_the_projects_writer_reads_back_and_fills_a_blender_mesh(tmp_path):

@@ -1,6 +1,6 @@
 """Run a job's simulation, a checkpoint after every frame, and be killed in the middle of a write.
 
-python killed_simulation.py FOLDER write_frame|write_checkpoint FRAME
+PYTHONPATH=.:tests python killed_simulation.py FOLDER write_frame|write_checkpoint FRAME
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pipeline.executors.base import Assignment
-from pipeline.executors.inline import InlineExecutor
+from inline_tasks import run_task
+
+from pipeline.executors.base import TaskEvent
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.stages import simulate as stage
@@ -21,23 +22,12 @@ from pipeline.task import TaskId
 TASK = TaskId("simulate")
 
 
-def simulate(layout: JobLayout, *, attempt: int = 1) -> Any:
+def simulate(layout: JobLayout, *, attempt: int = 1) -> TaskEvent:
     """Run the task until it ends; returns how it ended."""
     (task,) = stage.SimulateStage().plan(load_job(layout.job_file), layout)
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    assignment = Assignment(
-        task=task,
-        attempt=attempt,
-        fingerprint="f",
-        inputs={},
-        threads=threads,  # as every other test of this process that starts Taichi
-        job_file=layout.job_file,
-        root=layout.root,
-        stages="pipeline.stages:STAGES",
-    )
-    with InlineExecutor() as executor:
-        executor.submit(assignment)
-        return executor.wait(0.0)[-1]
+    # As many threads as every other test of this process that starts Taichi.
+    return run_task(task, layout, attempt=attempt, threads=threads)
 
 
 def kill_in(write: str, frame: int) -> None:

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.artifacts import Receipt, committing
+from pipeline.artifacts import committing
 from pipeline.cache import validate_frame, write_frame
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.parameter_set import ParameterSet
+from pipeline.receipts import Receipt
 from pipeline.task import Task, TaskId
 from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
 from sim.snapshots import Snapshot

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.artifacts import Receipt, committing
+from pipeline.artifacts import committing
 from pipeline.errors import InvalidArtifactError
 from pipeline.fingerprint import task_fingerprint
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
+from pipeline.receipts import Receipt
 from pipeline.task import ArtifactPath, Task, TaskId
 
 

@@ -1,6 +1,6 @@
 """Run a job's simulation until the disk is full, free some room, and run it again; prints what became of it as JSON.
 
-python simulation_on_a_full_disk.py FOLDER BALLAST
+PYTHONPATH=.:tests python simulation_on_a_full_disk.py FOLDER BALLAST
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from pathlib import Path
 
 import killed_simulation
 
-from pipeline.artifacts import is_committed
 from pipeline.executors.base import Failed
 from pipeline.layout import JobLayout
+from pipeline.receipts import is_committed
 
 FRAMES = 12
 

@@ -8,6 +8,7 @@ from typing import Any
 import synthetic_stages
 
 from pipeline.executors.base import Executor
+from pipeline.executors.inline import InlineExecutor
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.run_events import Outcome, RunEvent, StateChanged
@@ -57,6 +58,13 @@ class Recorder:
     def ran(self) -> list[TaskId]:
         """Tasks that were started, in order."""
         return [e.task_id for e in self.of(StateChanged) if e.state is TaskState.SUCCEEDED]
+
+
+def run_recorded(root: Path, text: str | None = None, **options: Any) -> tuple[Outcome, Recorder]:
+    """Run the synthetic job in this process; returns how it ended, and all that it told."""
+    recorder = Recorder()
+    with InlineExecutor() as executor:
+        return run_synthetic(root, executor, text, observer=recorder, **options), recorder
 
 
 def contents(root: Path) -> dict[str, bytes]:

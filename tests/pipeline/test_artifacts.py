@@ -13,18 +13,11 @@ import pytest
 from blake3 import blake3
 from record_samples import commit, film, validate_text
 
-from pipeline.artifacts import (
-    Receipt,
-    committing,
-    hash_file,
-    is_committed,
-    read_receipt,
-    sweep_parts,
-    verify_artifact,
-)
+from pipeline.artifacts import committing, sweep_parts
 from pipeline.errors import InvalidArtifactError, StaleAttemptError
 from pipeline.fingerprint import task_fingerprint
 from pipeline.layout import JobLayout
+from pipeline.receipts import is_committed, read_receipt, verify_artifact
 from pipeline.task import ArtifactPath
 
 SIMULATE = film(1)[0]
@@ -54,12 +47,6 @@ def test_a_committed_artifact_lies_with_its_receipt_and_nothing_else(layout: Job
     assert verify_artifact(layout, receipt, deep=True) is None
     assert is_committed(layout, ARTIFACT, FINGERPRINT)
     assert not is_committed(layout, ARTIFACT, task_fingerprint(CHANGED, {}))
-
-
-def test_hash_of_a_file_longer_than_the_buffer_is_blake3_of_its_bytes(tmp_path: Path) -> None:
-    content = os.urandom(5 << 20)
-    (tmp_path / "large").write_bytes(content)
-    assert hash_file(tmp_path / "large") == blake3(content).hexdigest()
 
 
 def test_a_file_that_does_not_decode_is_not_committed(layout: JobLayout) -> None:
@@ -132,50 +119,6 @@ def test_an_untouched_or_merely_copied_file_is_not_kept_aside(layout: JobLayout)
     commit(layout, SIMULATE, ARTIFACT, "ours again", attempt=2)
     commit(layout, SIMULATE, ARTIFACT, "and again", attempt=3)
     assert files_below(layout.root) == {"cache/000000.h5", ".receipts/cache/000000.h5.json"}
-
-
-def test_an_artifact_without_its_receipt_counts_no_more(layout: JobLayout) -> None:
-    commit(layout, SIMULATE, ARTIFACT, "ours")
-    layout.receipt(ARTIFACT).unlink()
-    assert layout.path(ARTIFACT).exists()
-    assert not is_committed(layout, ARTIFACT, FINGERPRINT)
-
-
-@pytest.mark.parametrize(
-    ("damage", "finding"),
-    [
-        (lambda path: path.unlink(), "file is missing"),
-        (lambda path: path.write_text(""), "file was edited or truncated: size 0, receipt says 8"),
-        (lambda path: path.write_text("ouRs END"), "file was edited: its hash differs from the receipt's"),
-    ],
-)
-def test_damage_is_found_by_size_time_and_hash(
-    layout: JobLayout, damage: Callable[[Path], object], finding: str
-) -> None:
-    receipt = commit(layout, SIMULATE, ARTIFACT, "ours")
-    damage(layout.path(ARTIFACT))
-    assert verify_artifact(layout, receipt) == finding
-
-
-def test_deep_verification_finds_a_flipped_bit_behind_an_unchanged_time(layout: JobLayout) -> None:
-    receipt = commit(layout, SIMULATE, ARTIFACT, "ours")
-    layout.path(ARTIFACT).write_text("ourt END")
-    os.utime(layout.path(ARTIFACT), ns=(receipt.mtime_ns, receipt.mtime_ns))
-    assert verify_artifact(layout, receipt) is None
-    assert verify_artifact(layout, receipt, deep=True) == "file was edited: its hash differs from the receipt's"
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"artifact": "x"}', '{"unknown": 1}'])
-def test_a_file_that_is_no_receipt_does_not_count(layout: JobLayout, text: str) -> None:
-    commit(layout, SIMULATE, ARTIFACT, "ours")
-    layout.receipt(ARTIFACT).write_text(text)
-    assert read_receipt(layout, ARTIFACT) is None
-    assert not is_committed(layout, ARTIFACT, FINGERPRINT)
-
-
-def test_receipts_survive_their_text_form(layout: JobLayout) -> None:
-    receipt = commit(layout, SIMULATE, ARTIFACT, "ours")
-    assert Receipt.from_json(receipt.to_json()) == receipt
 
 
 def test_sweep_removes_part_files_and_nothing_else(layout: JobLayout) -> None:

@@ -44,7 +44,7 @@ def test_a_fault_of_the_programs_own_keeps_its_traceback() -> None:
 
 
 def test_a_lease_that_cannot_be_given_back_hides_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(path: Path, missing_ok: bool = False) -> None:
+    def refuse(path: Path) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
 
     with pytest.raises(ValueError, match="the run's own"), Lease.acquire(tmp_path / "runner.lease"):

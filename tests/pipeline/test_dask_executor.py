@@ -13,19 +13,20 @@ from pathlib import Path
 import psutil
 import pytest
 from dask_processes import HOST, free_port, running, start_scheduler, start_worker
-from synthetic_jobs import contents, run_synthetic
-from synthetic_stages import write_faults
-from test_executors import (
+from executor_contract import (
     PATIENCE_S,
-    ExecutorContract,
-    _assert_gone,
-    _wait_for_pid,
+    ProcessesContract,
+    assert_gone,
     assign,
     events_until_end,
     failure,
     layout,
     run,
+    wait_for_commit,
+    wait_for_pid,
 )
+from synthetic_jobs import contents, run_synthetic
+from synthetic_stages import write_faults
 
 from pipeline.commands.executing import ExecutorChoice, open_machines
 from pipeline.executors.base import CapacityChanged, Committed, ExecutorEvent, Failed, Finished, Started
@@ -68,7 +69,7 @@ def test_a_cluster_of_this_machine_listens_to_this_machine_only(cluster: str) ->
     assert listening == {HOST}
 
 
-class TestDask(ExecutorContract):
+class TestDask(ProcessesContract):
     @pytest.fixture
     def executor(self, cluster: str, layout: JobLayout) -> Iterator[DaskExecutor]:
         with DaskExecutor(cluster, layout.root, of_runner=True) as executor:
@@ -92,38 +93,19 @@ class TestDask(ExecutorContract):
             *frames[1:]
         }
 
-    def test_a_cancelled_task_may_stop_by_itself(self, executor: DaskExecutor, layout: JobLayout) -> None:
-        write_faults(layout.root, {"steps": ["wait for stop@3"]})
-        executor.submit(assign(layout, "steps"))
-        _wait_for_commit(executor, "steps/000002.bin")
-        executor.cancel(TaskId("steps"), grace_s=PATIENCE_S)
-        failed = failure(events_until_end(executor))
-        assert failed.kind is FailureKind.CANCELLED
-        assert failed.message in {"stopped after 3 of 6 outputs", "stopped after 4 of 6 outputs"}
-
     def test_ctrl_c_at_the_terminal_is_the_runners_business(self, executor: DaskExecutor, layout: JobLayout) -> None:
         write_faults(layout.root, {}, pause_s=0.3)
         executor.submit(assign(layout, "steps"))
-        _wait_for_commit(executor, "steps/000000.bin")
+        wait_for_commit(executor, "steps/000000.bin")
         for process in _dask_workers():
             process.send_signal(signal.SIGINT)
         assert isinstance(events_until_end(executor)[-1], Finished)
-
-    def test_a_task_that_does_not_stop_is_killed_with_all_it_started(
-        self, executor: DaskExecutor, layout: JobLayout
-    ) -> None:
-        write_faults(layout.root, {"film": ["child"]})
-        executor.submit(assign(layout, "film"))
-        child = _wait_for_pid(executor, layout.root / "child.pid")
-        executor.cancel(TaskId("film"), grace_s=0.1)
-        assert failure(events_until_end(executor)).kind is FailureKind.CANCELLED
-        _assert_gone(child)
 
     def test_no_process_of_the_job_outlives_the_run(self, cluster: str, layout: JobLayout) -> None:
         with DaskExecutor(cluster, layout.root, of_runner=True) as executor:
             started = run(executor, assign(layout, "steps"))[0]
         assert isinstance(started, Started)
-        _assert_gone(started.pid)
+        assert_gone(started.pid)
 
     def test_a_killed_dask_worker_takes_its_children_with_it_and_the_task_runs_elsewhere(
         self, executor: DaskExecutor, layout: JobLayout
@@ -131,13 +113,13 @@ class TestDask(ExecutorContract):
         write_faults(layout.root, {"film": ["child"]})
         executor.submit(assign(layout, "film"))
         started = _wait_for_start(executor)
-        child = _wait_for_pid(executor, layout.root / "child.pid")
+        child = wait_for_pid(executor, layout.root / "child.pid")
         dask_worker = psutil.Process(started.pid).parent()
         assert dask_worker is not None
         dask_worker.kill()
         assert failure(events_until_end(executor)).kind is FailureKind.WORKER_LOST
-        _assert_gone(child)
-        _assert_gone(started.pid)
+        assert_gone(child)
+        assert_gone(started.pid)
         write_faults(layout.root, {"steps": ["wait for stop"]})
         executor.submit(assign(layout, "steps", attempt=2))
         parent = psutil.Process(_wait_for_start(executor).pid).parent()
@@ -353,10 +335,4 @@ def _wait_for_start(executor: DaskExecutor) -> Started:
         for event in executor.wait(0.5):
             if isinstance(event, Started):
                 return event
-        assert time.monotonic() < until
-
-
-def _wait_for_commit(executor: DaskExecutor, artifact: str) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not any(isinstance(each, Committed) and each.receipt.artifact == artifact for each in executor.wait(0.5)):
         assert time.monotonic() < until

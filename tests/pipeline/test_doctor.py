@@ -7,17 +7,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command_line import pipeline
 
 from pipeline import doctor
-from pipeline.cli import main
 from pipeline.doctor import Examination, examine, print_report
 from render.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
 
 
 @pytest.mark.slow
 def test_this_machine_is_fit_and_the_report_is_json(tmp_path):
-    result = CliRunner().invoke(main, ["doctor", "--json", "--output", str(tmp_path / "renders")])
+    result = pipeline("doctor", "--json", "--output", tmp_path / "renders")
     report = {each["name"]: each for each in json.loads(result.stdout)}
     assert {"Python", "shared libraries", "device cpu", "Blender", "OpenVDB", "video", "output folder"} <= set(report)
     assert report["device cpu"]["status"] == "ok"

@@ -7,6 +7,7 @@ import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from subprocess import Popen
 
 import pytest
 from farm_processes import Farm, wait_until
@@ -31,6 +32,13 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     with InlineExecutor() as executor:
         run_synthetic(root, executor)
     return contents(root)
+
+
+def start_long(farm: Farm, name: str) -> Popen[str]:
+    """Submit a job of sixty slow frames; returns when it has made some."""
+    process = farm.start("submit", farm.job(name, frames=60, pause_s=1.0).name)
+    wait_until(lambda: farm.frames_done(name) > 0, "it never began to work")
+    return process
 
 
 def assert_done_once(farm: Farm, *names: str, like: dict[str, bytes]) -> None:
@@ -68,8 +76,7 @@ def test_two_submits_at_once_take_turns(farm: Farm, undisturbed: dict[str, bytes
 def test_a_more_urgent_job_goes_first_and_the_other_continues_where_it_was(
     farm: Farm, undisturbed: dict[str, bytes]
 ) -> None:
-    slow = farm.start("submit", farm.job("slow", frames=60, pause_s=1.0).name)
-    wait_until(lambda: farm.frames_done("slow") > 0, "it never began to work")
+    slow = start_long(farm, "slow")
     urgent = farm.start("submit", farm.job("urgent").name, "--priority", "5")
     wait_until(lambda: farm.spool.find("urgent") is not None, "it was never queued")
     assert "renders/urgent/movie.mp4 is done" in farm.finish(urgent).err
@@ -126,8 +133,7 @@ def test_ctrl_c_while_a_job_of_somebody_else_runs_pauses_the_own_one_and_leaves_
 
 @pytest.mark.slow
 def test_paused_resumed_and_nothing_is_done_twice(farm: Farm, undisturbed: dict[str, bytes]) -> None:
-    submitted = farm.start("submit", farm.job("a", frames=60, pause_s=1.0).name)
-    wait_until(lambda: farm.frames_done("a") > 0, "it never began to work")
+    submitted = start_long(farm, "a")
     assert "a pauses as soon as what runs is finished" in farm.run("pause", "a").out
     stopped = farm.finish(submitted, code=8)
     assert "asked to pause" in stopped.err
@@ -158,8 +164,7 @@ def test_cancelled_stops_at_once_and_keeps_what_is_finished(farm: Farm) -> None:
 
 @pytest.mark.slow
 def test_cancelled_while_its_own_command_runs_a_more_urgent_job(farm: Farm) -> None:
-    low = farm.start("submit", farm.job("low", frames=60, pause_s=1.0).name)
-    wait_until(lambda: farm.frames_done("low") > 0, "it never began to work")
+    low = start_long(farm, "low")
     farm.job("urgent", pause_s=600.0)
     urgent = farm.start("submit", "urgent.toml", "--priority", "5")
     wait_until(lambda: farm.is_running("urgent"), "the more urgent job never ran")
@@ -186,8 +191,7 @@ def test_failed_tasks_are_tried_again_by_retry(farm: Farm, undisturbed: dict[str
 
 @pytest.mark.slow
 def test_when_a_runner_is_killed_whoever_waits_takes_the_queue_over(farm: Farm, undisturbed: dict[str, bytes]) -> None:
-    runner = farm.start("submit", farm.job("a", frames=60, pause_s=1.0).name)
-    wait_until(lambda: farm.frames_done("a") > 0, "it never began to work")
+    runner = start_long(farm, "a")
     waiting = farm.start("submit", farm.job("b").name)
     wait_until(lambda: farm.spool.find("b") is not None, "it was never queued")
     os.kill(runner.pid, signal.SIGKILL)
@@ -201,8 +205,7 @@ def test_when_a_runner_is_killed_whoever_waits_takes_the_queue_over(farm: Farm, 
 
 @pytest.mark.slow
 def test_another_version_submitted_meanwhile_follows_and_both_commands_end_well(farm: Farm) -> None:
-    first = farm.start("submit", farm.job("a", frames=60, pause_s=1.0).name)
-    wait_until(lambda: farm.frames_done("a") > 0, "it never began to work")
+    first = start_long(farm, "a")
     second = farm.start("submit", farm.job("a", frames=60, pause_s=1.0, focal_length_mm=70.0).name)
     wait_until(lambda: (entry := farm.spool.find("a")) is not None and entry.text is not None, "never queued")
     farm.faults("a", {})
@@ -214,8 +217,7 @@ def test_another_version_submitted_meanwhile_follows_and_both_commands_end_well(
 
 @pytest.mark.slow
 def test_a_folder_moved_elsewhere_continues_there(farm: Farm, tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
-    submitted = farm.start("submit", farm.job("a", frames=60, pause_s=1.0).name)
-    wait_until(lambda: farm.frames_done("a") > 0, "it never began to work")
+    submitted = start_long(farm, "a")
     farm.run("pause", "a")
     farm.finish(submitted, code=8)
     farm.faults("a", {})

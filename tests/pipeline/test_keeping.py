@@ -6,21 +6,13 @@ import shlex
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from command_line import pipeline
 from synthetic_jobs import contents, run_synthetic
 
-from pipeline.cli import main
 from pipeline.executors.inline import InlineExecutor
 from pipeline.layout import JobLayout
 from pipeline.lease import Lease, live_holder
 from pipeline.task import ArtifactPath
-
-
-def pipeline(*arguments: object) -> Result:
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
 
 
 @pytest.fixture

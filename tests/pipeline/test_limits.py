@@ -12,9 +12,9 @@ from pathlib import Path
 
 import psutil
 import pytest
+from executor_contract import PATIENCE_S, assert_gone, assign, events_until_end, failure, layout, run
 from synthetic_jobs import Recorder, job_text, run_synthetic
 from synthetic_stages import write_faults
-from test_executors import JOB, PATIENCE_S, assign, events_until_end, failure, run
 
 from pipeline.errors import JobFileError
 from pipeline.executors import memory, worker_process
@@ -31,13 +31,7 @@ from pipeline.stages import STAGES
 from pipeline.task import FailureKind, Resources, Task, TaskId, TaskState
 from render.blender import BlenderUnavailableError, ExecutableRenderer, FrameRenderError
 
-
-@pytest.fixture
-def layout(tmp_path: Path) -> JobLayout:
-    layout = JobLayout(tmp_path / "job")
-    layout.root.mkdir()
-    layout.job_file.write_text(JOB)
-    return layout
+__all__ = ["layout"]
 
 
 @pytest.fixture
@@ -67,10 +61,7 @@ def test_a_task_whose_child_grew_too_large_is_out_of_memory_and_its_child_gone(
     assert "the runner ends this attempt: its processes held" in failed.details
     child = int((layout.root / "child.pid").read_text())
     assert f"process {child}, " in failed.details
-    until = time.monotonic() + PATIENCE_S
-    while psutil.pid_exists(child) and psutil.Process(child).status() != psutil.STATUS_ZOMBIE:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    assert_gone(child)
 
 
 def test_a_blender_that_the_kernel_killed_for_want_of_memory_is_no_lost_worker(

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 from record_samples import film, make_film
 
-from pipeline.artifacts import Receipt
 from pipeline.errors import ManifestError
 from pipeline.layout import JobLayout
 from pipeline.manifest import SUCCEEDED, LastRun, Manifest, StageSummary, artifact_row, is_on_network
 from pipeline.manifest_reader import ManifestReader
 from pipeline.migrations import migrations, schema_version
+from pipeline.receipts import Receipt
 from pipeline.task import FailureKind, TaskId, TaskState
 
 SIMULATE = TaskId("simulate")

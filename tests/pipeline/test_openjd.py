@@ -12,13 +12,13 @@ import pytest
 from synthetic_jobs import job_text, run_synthetic
 from synthetic_stages import REFERENCE, STAGES, step_artifact, write_faults
 
-from pipeline.artifacts import read_receipt
 from pipeline.errors import PipelineError
 from pipeline.executors.inline import InlineExecutor
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.openjd import job_template
 from pipeline.plan import plan_job
+from pipeline.receipts import read_receipt
 from pipeline.scheduler_events import JobOutcome
 from pipeline.stage_run import StageOutcome, run_stage
 from pipeline.task import FailureKind, Resources, TaskId

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from record_samples import film, parameter_set
 
-from pipeline.artifacts import Receipt
 from pipeline.errors import PlanError
 from pipeline.fingerprint import task_fingerprint
 from pipeline.job.models import Job
@@ -30,6 +29,7 @@ from pipeline.plan import (
     summarize,
     up_to_date,
 )
+from pipeline.receipts import Receipt
 from pipeline.stages import STAGES
 from pipeline.task import ArtifactPath, Task, TaskId
 

@@ -11,10 +11,10 @@ from record_samples import film
 from rich.console import Console
 
 from pipeline import wording
-from pipeline.artifacts import Receipt
 from pipeline.executors.base import Committed, Failed, Progress
 from pipeline.plan import Assessment, Reason, Verdict
 from pipeline.progress import LiveDisplay, PlainDisplay, ProgressObserver, StageProgress
+from pipeline.receipts import Receipt
 from pipeline.run_events import Notice, RunStarted, StateChanged
 from pipeline.task import FailureKind, Task, TaskId, TaskState
 

@@ -10,25 +10,16 @@ from pathlib import Path
 
 import pytest
 import synthetic_stages
-from click.testing import CliRunner, Result
-from synthetic_jobs import Recorder, contents, job_text, run_synthetic
+from command_line import pipeline
+from synthetic_jobs import contents, job_text, run_recorded
 
 from pipeline import __version__
-from pipeline.artifacts import Receipt, read_receipt
-from pipeline.cli import main
 from pipeline.errors import InvalidArtifactError
-from pipeline.executors.inline import InlineExecutor
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import digest_of
 from pipeline.provenance import read_text
+from pipeline.receipts import Receipt, read_receipt
 from pipeline.task import ArtifactPath
-
-
-def pipeline(*arguments: object) -> Result:
-    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
 
 
 @pytest.fixture
@@ -42,9 +33,8 @@ def layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobLayout:
 
 def run(layout: JobLayout, text: str | None = None) -> list[str]:
     """Run the job; returns the tasks that ran."""
-    recorder = Recorder()
-    with InlineExecutor() as executor:
-        assert run_synthetic(layout.root, executor, text, observer=recorder).exit_code == 0
+    outcome, recorder = run_recorded(layout.root, text)
+    assert outcome.exit_code == 0
     return sorted(recorder.ran())
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from record_samples import commit, film, make_film
 
-from pipeline.artifacts import read_receipt
 from pipeline.errors import ManifestError
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.plan import FileCondition, Verdict, assess
+from pipeline.receipts import read_receipt
 from pipeline.reconcile import Reconciliation, inspect_files, rebuild_manifest, receipts, reconcile
 from pipeline.task import ArtifactPath, FailureKind, TaskId, TaskState
 

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import pipeline
 from numbered_frames import commit, commit_whitewater, submitted, whitewater_task
 from PIL import Image
 
 from pipeline.artifacts import committing
 from pipeline.cache import FrameNumbers
-from pipeline.cli import main
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.parameter_set import ParameterSet
@@ -278,7 +277,7 @@ def read(path: Path) -> tuple[str, Page]:
 
 
 def test_the_report_is_one_file_that_needs_no_other(layout):
-    result = CliRunner().invoke(main, ["report", str(layout.root)])
+    result = pipeline("report", layout.root)
     assert result.exit_code == 0, result.output
     text, page = read(layout.report)
     assert result.output.strip() == str(layout.report)
@@ -353,7 +352,7 @@ def test_jobs_in_comparison_share_their_charts(layout, tmp_path):
     other = submitted(tmp_path / "other", name="other")
     commit(other, 0, kinetic_energy=1.0, potential_energy=8.0)
     commit(other, 1, kinetic_energy=4.0, potential_energy=2.0)
-    result = CliRunner().invoke(main, ["report", str(layout.root), str(other.root), "--to", str(tmp_path / "c.html")])
+    result = pipeline("report", layout.root, other.root, "--to", tmp_path / "c.html")
     assert result.exit_code == 0, result.output
     text, _ = read(tmp_path / "c.html")
     assert "<th>other</th><td>9 J</td><td>6 J</td><td>3 J</td>" in text
@@ -364,7 +363,7 @@ def test_jobs_in_comparison_share_their_charts(layout, tmp_path):
 
 def test_a_comparison_must_be_told_where_to_go(layout, tmp_path):
     other = submitted(tmp_path / "other", name="other")
-    result = CliRunner().invoke(main, ["report", str(layout.root), str(other.root)])
+    result = pipeline("report", layout.root, other.root)
     assert result.exit_code == 2
     assert "--to comparison.html" in result.output
 
@@ -378,6 +377,6 @@ def test_a_job_without_frames_has_a_report_too(tmp_path):
 
 
 def test_a_report_that_cannot_be_written_says_so(layout, tmp_path):
-    result = CliRunner().invoke(main, ["report", str(layout.root), "--to", str(tmp_path / "nowhere/r.html")])
+    result = pipeline("report", layout.root, "--to", tmp_path / "nowhere/r.html")
     assert result.exit_code == 1
     assert "No such file or directory" in result.output

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command_line import pipeline
 from PIL import Image
 
-from pipeline.cli import main
 from pipeline.committed_pictures import evenly_spread
 
 
@@ -28,7 +27,7 @@ def job(tmp_path: Path) -> Path:
 
 
 def test_a_sheet_shows_the_finished_frames(job):
-    result = CliRunner().invoke(main, ["sheet", str(job), "--pictures", "9", "--columns", "3"])
+    result = pipeline("sheet", job, "--pictures", "9", "--columns", "3")
     assert result.exit_code == 0, result.output
     with Image.open(job / "sheet.png") as sheet:
         colours = sheet.convert("RGB").getcolors(maxcolors=1 << 20)
@@ -39,7 +38,7 @@ def test_a_sheet_shows_the_finished_frames(job):
 
 
 def test_a_sheet_of_an_unknown_kind_is_refused(job):
-    result = CliRunner().invoke(main, ["sheet", str(job), "--to", str(job / "sheet.doc")])
+    result = pipeline("sheet", job, "--to", job / "sheet.doc")
     assert result.exit_code == 1
     assert '".doc" is no kind of picture' in result.output
 
@@ -47,7 +46,7 @@ def test_a_sheet_of_an_unknown_kind_is_refused(job):
 def test_a_job_without_frames_says_so(job):
     for receipt in (job / ".receipts" / "frames").iterdir():
         receipt.unlink()
-    result = CliRunner().invoke(main, ["sheet", str(job)])
+    result = pipeline("sheet", job)
     assert result.exit_code == 1
     assert "no frame of" in result.output
 

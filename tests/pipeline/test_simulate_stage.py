@@ -15,14 +15,17 @@ import killed_simulation
 import pytest
 from simulation_on_a_full_disk import FRAMES as FRAMES_OF_FULL_DISK
 
-from pipeline.artifacts import is_committed, sweep_parts
+from pipeline.artifacts import sweep_parts
 from pipeline.cache import Checkpoint, read_frame, write_checkpoint, write_frame
 from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.layout import JobLayout
+from pipeline.receipts import is_committed
 from pipeline.task import FailureKind
 from sim import runtime
 
-PROJECT = Path(__file__).resolve().parents[2]
+TESTS = Path(__file__).resolve().parents[1]
+MODULES = os.pathsep.join([str(TESTS.parent), str(TESTS)])
+"""What scripts of these tests import from: the project, and what its tests share."""
 
 JOB = """
 name = "drop"
@@ -137,7 +140,7 @@ def test_killed_in_the_middle_of_a_write_it_continues_to_the_same_frames(
     script = Path(killed_simulation.__file__)
     killed = subprocess.run(
         [sys.executable, script, layout.root, write, "3"],
-        env={**os.environ, "PYTHONPATH": str(PROJECT)},
+        env={**os.environ, "PYTHONPATH": MODULES},
         timeout=120,
         check=False,
     )
@@ -177,7 +180,7 @@ def test_a_disk_that_fills_up_stops_the_simulation_at_its_frame_and_costs_nothin
     script = Path(killed_simulation.__file__).with_name("simulation_on_a_full_disk.py")
     ended = subprocess.run(
         ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", SMALL_DISK, tmp_path, sys.executable, script],
-        env={**os.environ, "PYTHONPATH": str(PROJECT)},
+        env={**os.environ, "PYTHONPATH": MODULES},
         capture_output=True,
         text=True,
         timeout=120,

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 
 import pytest
-from click.testing import CliRunner
+from command_line import pipeline
 from numbered_frames import commit, commit_whitewater, plan, submitted, whitewater_task
 
 from pipeline.cache import read_numbers
-from pipeline.cli import main
 from pipeline.executors.base import Committed
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
@@ -26,7 +25,7 @@ def layout(tmp_path) -> JobLayout:
 
 
 def status(layout: JobLayout, *options: str) -> str:
-    result = CliRunner().invoke(main, ["status", str(layout.root), *options])
+    result = pipeline("status", layout.root, *options)
     assert result.exit_code == 0, result.output
     return result.output
 

@@ -15,9 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from command_line import pipeline
 
-from pipeline.cli import main
 from pipeline.commands.arguments import find_job
 from pipeline.commands.queueing import place
 from pipeline.errors import PipelineError
@@ -151,7 +150,7 @@ def test_a_farm_that_cannot_be_written_to_is_told(spool: Spool, monkeypatch: pyt
 
 @pytest.mark.parametrize("command", ["pause", "cancel"])
 def test_a_folder_that_is_none_is_not_made_by_a_command_about_a_job(tmp_path: Path, command: str) -> None:
-    told = CliRunner().invoke(main, [command, "film", "--output", str(tmp_path / "typo")])
+    told = pipeline(command, "film", "--output", tmp_path / "typo")
     assert (told.exit_code, '"film" is not in the queue' in told.stderr) == (1, True)
     assert list(tmp_path.iterdir()) == []
 
@@ -161,7 +160,7 @@ def test_a_damaged_record_of_one_job_hides_no_other_from_the_list(spool: Spool) 
     spool.put(submission("bad"))
     spool.layout("bad").root.mkdir()
     spool.layout("bad").manifest.write_bytes(b"garbage" * 2000)
-    told = CliRunner().invoke(main, ["queue", "--output", str(spool.farm), "--json"])
+    told = pipeline("queue", "--output", spool.farm, "--json")
     listed = json.loads(told.stdout)
     assert [job["name"] for job in listed["jobs"]] == ["good", "bad"]
     assert len(listed["flaws"]) == 1

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import stat
-import sys
-import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -133,26 +130,3 @@ def spread(folder: Path, frame: int) -> np.ndarray:
     return (
         np.array([np.sqrt(np.cov(axis.ravel(), aweights=red.ravel())) for axis in (columns, rows)]) / PIXELS_PER_METRE
     )
-
-
-def write_blender_stand_in(folder: Path) -> Path:
-    """An executable with Blender's command line around this environment's own Blender, the bpy module."""
-    script = folder / "stand in" / "blender"
-    script.parent.mkdir()
-    script.write_text(
-        f"#!{sys.executable}\n"
-        + textwrap.dedent(
-            """
-            import runpy, sys
-            arguments = sys.argv[1:]
-            if arguments == ["--version"]:
-                print("Blender 5.0.1")
-                sys.exit()
-            print("noise that Blender prints before anything else")
-            assert arguments[:2] == ["--background", "--factory-startup"], arguments
-            runpy.run_path(arguments[arguments.index("--python") + 1], run_name="__main__")
-            """
-        )
-    )
-    script.chmod(script.stat().st_mode | stat.S_IXUSR)
-    return script

@@ -6,7 +6,6 @@ import os
 import pickle
 import signal
 import threading
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +18,12 @@ from blender_scenes import (
     spec_of,
     sphere,
     still_camera,
-    write_blender_stand_in,
     write_mesh,
 )
+from blender_stand_in import write_blender_stand_in
 from fresh_python import run_python
 from inline_tasks import run_task
+from needed_blender import needs_bpy
 
 from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.job.loading import load_job
@@ -43,13 +43,9 @@ from render.blender import (
 )
 from render.parameters import CameraParameters, MaterialParameters, StageParameters, VolumeParameters
 from render.spec import MeshObject, MeshSequenceObject, RenderSpec, VolumeSequenceObject
-from render.system_libraries import missing_libraries
 from render.volume import write_volume
 
-pytestmark = pytest.mark.skipif(
-    find_spec("bpy") is None or bool(missing_libraries()),
-    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
-)
+pytestmark = needs_bpy
 
 
 # Fully rough, so that no highlight hides the colour.

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 from blender_scenes import RENDER_FRAMES, read, redness, spec_of
 from fresh_python import run_python
+from needed_blender import needs_bpy
 
 from render.meshes import write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshSequenceObject
-from render.system_libraries import missing_libraries
 
-pytestmark = [
-    pytest.mark.skipif(
-        find_spec("bpy") is None or bool(missing_libraries()),
-        reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
-    ),
-    pytest.mark.slow,
-]
+pytestmark = [needs_bpy, pytest.mark.slow]
 
 THREADS = 12
 """A side of the sheet, three periods of twill; a thread is two pixels wide."""

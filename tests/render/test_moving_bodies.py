@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -15,37 +14,26 @@ from blender_scenes import (
     spec_of,
     sphere,
     spread,
-    write_blender_stand_in,
     write_mesh,
 )
+from blender_stand_in import write_blender_stand_in
+from drawn_jobs import RED, UPRIGHT, draw_frame
 from fresh_python import run_python
-from inline_tasks import run_task
+from needed_blender import needs_bpy
 
-from pipeline.cache import write_frame
-from pipeline.executors.base import Finished
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
-from pipeline.stages import render as render_stage
 from pipeline.stages.render import RenderStage
 from pipeline.task import Task
 from render.blender import open_renderer
-from render.parameters import MaterialParameters
 from render.poses import write_poses
 from render.spec import MovingMeshObject
-from render.system_libraries import missing_libraries
 from sim.snapshots import Snapshot
-from sim.world import FrameReport
 
-pytestmark = pytest.mark.skipif(
-    find_spec("bpy") is None or bool(missing_libraries()),
-    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
-)
+pytestmark = needs_bpy
 
-# Fully rough, so that no highlight hides the colour.
-RED = MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0)
 BALL = MovingMeshObject(name="ball", file="ball.ply", body="ball", poses="poses/{frame}.json", material=RED)
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 ABOUT_Y_90 = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
 CENTRE = (0.0, 0.0, 0.5)
 
@@ -187,17 +175,9 @@ def test_a_job_is_drawn_with_the_poses_of_its_cache(tmp_path):
         write_mesh(layout.path(layout.body_mesh(body)), positions, triangles)
     task = RenderStage().plan(load_job(layout.job_file), layout)[2]
     assert task.inputs == ("meshes/ball.ply", "meshes/rock.ply", "cache/000002.h5")
-    arrays = pose(position=(0.4, 0.0, 0.5), velocity=(24.0, 0.0, 0.0))["ball"]
+    ball = Snapshot("rigid", pose(position=(0.4, 0.0, 0.5), velocity=(24.0, 0.0, 0.0))["ball"], {})
     rock = Snapshot("rigid", pose(position=(0.0, 0.0, 0.9))["ball"], {})
-    cache = layout.path(layout.frame_cache(2))
-    cache.parent.mkdir()
-    write_frame(
-        cache, {"ball": Snapshot("rigid", arrays, {}), "rock": rock}, FrameReport(2, 2 / 60, {}, {}, {}), device="cpu"
-    )
-    ended = run_task(task, layout)
-    render_stage._close_renderers()
-    assert isinstance(ended, Finished), ended
-    layout.path(layout.picture(2)).rename(tmp_path / "2.png")
+    draw_frame(task, layout, 2, {"ball": ball, "rock": rock}, picture=tmp_path / "2.png")
     assert centroid(tmp_path, 2) == pytest.approx([0.4, 0.5], abs=HALF_A_PIXEL)
     assert spread(tmp_path, 2)[0] > 1.3 * spread(tmp_path, 2)[1]  # blurred along x, as it flies
     document = json.loads((layout.root / "poses/000002.json").read_text())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -16,33 +15,24 @@ from blender_scenes import (
     spread,
     still_camera,
     weight,
-    write_blender_stand_in,
     write_mesh,
 )
+from blender_stand_in import write_blender_stand_in
+from drawn_jobs import RED, UPRIGHT, draw_frame
 from fresh_python import run_python
-from inline_tasks import run_task
+from needed_blender import needs_bpy
 
-from pipeline.cache import write_frame
-from pipeline.executors.base import Finished
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
-from pipeline.stages import render as render_stage
 from pipeline.stages.render import RenderStage
 from render.camera_path import View, write_views
-from render.parameters import CameraParameters, MaterialParameters
+from render.parameters import CameraParameters
 from render.poses import write_poses
 from render.spec import MeshObject, MovingMeshObject
-from render.system_libraries import missing_libraries
 from sim.snapshots import Snapshot
-from sim.world import FrameReport
 
-pytestmark = pytest.mark.skipif(
-    find_spec("bpy") is None or bool(missing_libraries()),
-    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
-)
+pytestmark = needs_bpy
 
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-RED = MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0)
 BALL = MeshObject(name="ball", file="ball.ply", position=(0.0, 0.25, 0.5), material=RED)
 FRONT = View((0.0, -2.25, 0.5), (0.0, 0.25, 0.5), 50.0, 2.5)
 WAY_M = 0.2
@@ -160,13 +150,7 @@ def test_a_body_that_the_camera_follows_stays_in_the_middle_and_sharp(tmp_path):
         "angular_velocity": (0, 0, 0),
     }
     arrays = {key: np.array(values, dtype=np.float64) for key, values in pose.items()}
-    cache = layout.path(layout.frame_cache(2))
-    cache.parent.mkdir()
-    write_frame(cache, {"ball": Snapshot("rigid", arrays, {})}, FrameReport(2, 2 / 60, {}, {}, {}), device="cpu")
-    ended = run_task(task, layout)
-    render_stage._close_renderers()
-    assert isinstance(ended, Finished), ended
-    layout.path(layout.picture(2)).rename(tmp_path / "2.png")
+    draw_frame(task, layout, 2, {"ball": Snapshot("rigid", arrays, {})}, picture=tmp_path / "2.png")
     assert centroid(tmp_path, 2) == pytest.approx([0.0, 0.5], abs=HALF_A_PIXEL)
     width, height = spread(tmp_path, 2)
     assert width < 1.25 * height  # its lower half is paler; without following it is twice as wide as high

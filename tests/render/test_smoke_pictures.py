@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -10,18 +9,12 @@ import pytest
 from bare_volumes import PICTURE_WIDTH_M, draw_bare, smoke_object, write_frame
 from blender_scenes import RENDER_FRAMES, read, spec_of
 from fresh_python import run_python
+from needed_blender import needs_bpy
 
 from blender_scripts.black_body import black_body_color, relative_luminance
 from render.parameters import MaterialParameters
-from render.system_libraries import missing_libraries
 
-pytestmark = [
-    pytest.mark.skipif(
-        find_spec("bpy") is None or bool(missing_libraries()),
-        reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
-    ),
-    pytest.mark.slow,
-]
+pytestmark = [needs_bpy, pytest.mark.slow]
 
 BLACK = (0.0, 0.0, 0.0)
 LENGTH_M = 0.6

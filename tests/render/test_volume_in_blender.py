@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
 from fresh_python import run_python
+from needed_blender import needs_bpy
 
 from render.parameters import VolumeParameters
-from render.system_libraries import missing_libraries
 from render.volume import write_volume
 
-pytestmark = pytest.mark.skipif(
-    find_spec("bpy") is None or bool(missing_libraries()),
-    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
-)
+pytestmark = needs_bpy
 
 FIND_SMOKE = """
     import sys

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 from blender_scenes import RENDER_FRAMES, RESOLUTION, read, spec_of, sphere, write_mesh
 from fresh_python import run_python
+from needed_blender import needs_bpy
 
 from pipeline.job.looks import WHITEWATER
 from render.parameters import MaterialParameters
 from render.point_clouds import KINDS, PointCloud, write_point_cloud
 from render.spec import MeshSequenceObject, PointSequenceObject
-from render.system_libraries import missing_libraries
 
-pytestmark = pytest.mark.skipif(
-    find_spec("bpy") is None or bool(missing_libraries()),
-    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
-)
+pytestmark = needs_bpy
 
 SPRAY, FOAM, BUBBLES = range(3)
 GROUND_ROW = 29

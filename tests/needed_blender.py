@@ -1,0 +1,14 @@
+"""The mark of tests that draw: they need Blender's module, and the shared libraries that it loads."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import pytest
+
+from render.system_libraries import missing_libraries
+
+needs_bpy = pytest.mark.skipif(
+    find_spec("bpy") is None or bool(missing_libraries()),
+    reason=f"no bpy module for this Python, or shared libraries are missing: {missing_libraries()}",
+)
