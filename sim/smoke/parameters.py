@@ -18,7 +18,7 @@ WHOLE = 1.0e-6
 """Part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001."""
 
 MOST_CELLS = 2**30
-"""Of one smoke: 1024 along each edge. A job that asks for more is refused, a file that claims more was never written."""
+"""Of one smoke: 1024 along each edge. A job with more is refused, a file that claims more was never written."""
 
 CELLS_PER_EDDY = 2.0
 """Eddies of gusts are at least so many cells wide: the grid carries nothing finer."""
