@@ -36,6 +36,9 @@ PREFERENCE = ("cuda", "metal", "vulkan", "cpu")
 PROBE_TIMEOUT_S = 120.0
 STALE_LOCK_S = 600.0
 
+KEPT_KERNELS_BYTES = 2**30
+"""What is kept of compiled kernels. By itself Taichi keeps 100 MiB, a few scenes: the next one would compile anew."""
+
 MOST_FIELD_TREES = 512
 """Taichi's `kMaxNumSnodeTreesLlvm`: it does not count, and what comes after would overwrite its thread pool."""
 FIELD_TREES_OF_A_SOLVER = 12
@@ -192,6 +195,7 @@ def _start_taichi(device: str, threads: int) -> None:
             cpu_max_num_threads=threads,
             offline_cache=True,
             offline_cache_file_path=str(kernel_cache),
+            offline_cache_max_size_of_files=KEPT_KERNELS_BYTES,
             default_fp=ti.f32,
             default_ip=ti.i32,
             random_seed=0,

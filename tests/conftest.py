@@ -1,7 +1,8 @@
-"""What makes all tests quick: bytecode that outlives processes, and families of tests that stay together."""
+"""What makes all tests quick: bytecode that outlives processes, kernels found again, families that stay together."""
 
 import os
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,22 @@ import pytest
 FAMILIES = {"cloth": "cloth", "coupling": "fluid", "fluid": "fluid", "rigid": "rigid", "smoke": "smoke"}
 """Folders of tests/sim whose tests share kernels, and a name for those that share them."""
 
+VALIDATION_CASES = "tests/validation/test_validation_cases.py"
+"""Most are of fluids. They begin their family, as those of smoke have the most kernels to find again."""
+
+FILMS = {f"tests/acceptance/test_{name}.py" for name in ("end_to_end", "faults", "interruptions")}
+"""Files that look at one and the same film: made once, where one process runs them all."""
+
 ON_THEIR_OWN = {"tests/acceptance/test_sample_jobs.py"}
 """Files of long tests that share nothing; they fill up whichever process is done first."""
+
+ORDER = ("smoke", "fluid", "cloth", "films", "rigid")
+"""Families that begin before all others, the longest first, so that none is left for the end of one process alone.
+
+The first two hold every test of smoke, whose kernels read fields. Taichi numbers the fields of a process, and looks for
+kept kernels by these numbers: tests that always come first, and in the same order, find theirs again. And a process
+has room for some hundred solvers with fields (`sim.runtime.require_room_for_fields`): they are two families for that.
+"""
 
 
 def bytecode_folder() -> Path:
@@ -36,22 +51,48 @@ if sys.dont_write_bytecode:
 
 
 def family_of(nodeid: str) -> str:
-    """What `pytest -n 2 --dist loadfile` gives to one process: files, but families that compile the same kernels."""
+    """What `pytest -n 2 --dist loadfile` gives to one process: files, but families that share kernels or a film."""
     path = nodeid.partition("::")[0]
     if path in ON_THEIR_OWN:
         return nodeid
+    if path in FILMS:
+        return "films"
+    if path == VALIDATION_CASES:
+        return FAMILIES["fluid"]
     folders = path.split("/")[:-1]
     is_kin = len(folders) == 3 and folders[:2] == ["tests", "sim"] and folders[2] in FAMILIES
     return FAMILIES[folders[2]] if is_kin else path
 
 
+def in_order_of_families(nodeids: list[str]) -> list[str]:
+    """Tests of each family together: those of `ORDER` first, then the others, the largest first."""
+    sizes = Counter(map(family_of, nodeids))
+
+    def place(nodeid: str) -> tuple[int, int, str, bool]:
+        family = family_of(nodeid)
+        rank = ORDER.index(family) if family in ORDER else len(ORDER)
+        return rank, -sizes[family], family, not nodeid.startswith(VALIDATION_CASES)
+
+    return sorted(nodeids, key=place)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Order the tests of every process alike; the scheduler hands out families in the order of their first tests."""
+    if hasattr(config, "workerinput"):
+        by_nodeid = {item.nodeid: item for item in items}
+        items[:] = [by_nodeid[nodeid] for nodeid in in_order_of_families(list(by_nodeid))]
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Keep families in one process, too, where files are asked to be."""
+    """Keep families in one process, too, where files are asked to be, and their order as it was collected."""
     from xdist.scheduler import LoadScopeScheduling
 
     class FamilyScheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             return family_of(nodeid)
 
-    return FamilyScheduling(config, log) if config.getvalue("dist") == "loadfile" else None
+    if config.getvalue("dist") != "loadfile":
+        return None
+    config.option.loadscopereorder = False
+    return FamilyScheduling(config, log)

@@ -23,6 +23,7 @@ from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import SelfCollision, half_range
 from sim.cloth.self_collision_kernels import copy_vectors
+from sim.cloth.short_loops import CONTACT_NS, COPIED_NODE_NS, is_short
 from sim.reductions import LaneReduction
 
 if TYPE_CHECKING:
@@ -137,7 +138,9 @@ class ContinuousContacts:
             if not found:
                 left = 0
                 break
-            copy_vectors(state.displacement, state.vertex_count, self._predicted)
+            copy_vectors(
+                state.displacement, state.vertex_count, self._predicted, is_short(state.vertex_count, COPIED_NODE_NS)
+            )
             self._push(state, found, is_first=True)
             left = self._keep_apart(state, found)
             change, beyond = self._pairs.measure_changes(state, self._predicted)
@@ -168,7 +171,7 @@ class ContinuousContacts:
             count, contacts.vertices, contacts.weights, contacts.floor, contacts.kind, contacts.arm, contacts.mobility,
             contacts.impulse, contacts.pushing, self._counter, n, state.inverse_mass, self._shares, self._touched,
             *self._uses_of(contacts), bodies.count, bodies.inverse_mass, bodies.inverse_inertia, bodies.load,
-            bodies.load_unit, is_first,
+            bodies.load_unit, is_first, self._is_short(count),
         )[:2]  # fmt: skip
         if not pushing:
             return
@@ -179,11 +182,11 @@ class ContinuousContacts:
     def _iterate(self, state: ClothState, count: int, touched: int, iterations: int) -> float:
         """Some steps of the contact iteration; the most that a contact misses then, in its thickness."""
         contacts, bodies = self._contacts, self.rigid.bodies
-        vertices, lanes = (touched, self._touched), self._missing.lanes
+        vertices, lanes, short = (touched, self._touched), self._missing.lanes, self._is_short(count)
         begin_push(
             count, contacts.pushing, contacts.impulse, contacts.impulse_before, contacts.impulse_given, *vertices,
             state.displacement, self._start, self._reached, bodies.count, bodies.motion, bodies.motion_start,
-            bodies.motion_reached,
+            bodies.motion_reached, short,
         )  # fmt: skip
         uses = self._uses_of(contacts)
         for first in range(0, iterations, STEPS):
@@ -193,7 +196,7 @@ class ContinuousContacts:
                 contacts.friction, contacts.mobility, contacts.impulse, contacts.impulse_before, contacts.push,
                 *vertices, state.displacement, self._reached, state.inverse_mass, *uses, bodies.count, bodies.motion,
                 bodies.motion_reached, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered,
-                self._impulse_unit,
+                self._impulse_unit, short,
             )  # fmt: skip
         self._iterations += iterations
         return float(
@@ -203,7 +206,7 @@ class ContinuousContacts:
                 state.displacement, self._start, state.inverse_mass, state.thickness, *uses, bodies.count,
                 bodies.motion, bodies.motion_start, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered,
                 bodies.impulse, self._impulse_unit, lanes.items(count), lanes.lane_step(count), lanes.item_step(),
-                *self._missing.tree,
+                *self._missing.tree, short,
             )
         )  # fmt: skip
 
@@ -236,9 +239,13 @@ class ContinuousContacts:
             repair_crossings(
                 count, contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind,
                 contacts.impulse, state.position, state.displacement, state.inverse_mass, state.thickness, LEAST_GAP,
-                self._crossing, self._crossing_count,
+                self._crossing, self._crossing_count, self._is_short(count),
             )
         )  # fmt: skip
+
+    def _is_short(self, count: int) -> bool:
+        """Whether loops over so many contacts, and over all vertices, are."""
+        return is_short(count, CONTACT_NS) and is_short(self._state.vertex_count, COPIED_NODE_NS)
 
     def _crossing_rows(self, count: int) -> NDArray[np.bool_]:
         return self._crossing.to_numpy()[:count] == 1

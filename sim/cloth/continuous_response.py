@@ -51,7 +51,7 @@ def weigh_contacts(
     vertex_count: ti.i32, inverse_mass: Floats, shares: Integers, touched: Integers,
     uses: Integers, used_by: Integers, use_weight: Floats,
     body_count: ti.i32, body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_load: LongIntegers,
-    load_unit: ti.f32, is_first: ti.template(),
+    load_unit: ti.f32, is_first: ti.template(), is_short: ti.template(),
 ) -> ti.math.ivec2:  # fmt: skip
     """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses.
 
@@ -65,12 +65,16 @@ def weigh_contacts(
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, vertices_end, bodies_end = count, vertex_count, body_count
     counter[0], counter[1], counter[2] = 0, 0, 0
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for i in range(vertices_end):
         shares[i], uses[2 * i], uses[2 * i + 1] = 0, 0, 0
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for b in range(bodies_end):
         body_load[b] = ti.cast(0, ti.i64)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for c in range(contacts_end):
         if floor[c] > 0.5 * INACTIVE:
             free = 0.0
@@ -89,11 +93,15 @@ def weigh_contacts(
                     free = 1.0
             if free >= LEAST_FREE_WEIGHT:
                 pushing[ti.atomic_add(counter[0], 1)] = c
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for i in range(vertices_end):
         if shares[i] > 0:
             touched[ti.atomic_add(counter[1], 1)] = i
             first = ti.atomic_add(counter[2], uses[2 * i + 1])
             uses[2 * i], uses[2 * i + 1] = first, first
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for place in range(counter[0]):
         c = pushing[place]
         if ti.static(is_first):
@@ -176,11 +184,13 @@ def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
 def begin_push(
     count: ti.i32, pushing: Integers, impulse: Vectors, impulse_before: Vectors, impulse_given: Vectors,
     touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, reached: Vectors,
-    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors,
+    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors, is_short: ti.template(),
 ):  # fmt: skip
     """Note where the iteration starts."""
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, touched_end, bodies_end = count, touched_count, 2 * body_count
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for place in range(touched_end):
         i = touched[place]
         start[i] = displacement[i]
@@ -190,6 +200,8 @@ def begin_push(
     for m in range(bodies_end):
         body_start[m] = body_motion[m]
         body_reached[m] = body_motion[m]
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for place in range(contacts_end):
         c = pushing[place]
         impulse_before[c] = impulse[c]
@@ -205,7 +217,7 @@ def push_apart(
     touched_count: ti.i32, touched: Integers, displacement: Vectors, reached: Vectors, inverse_mass: Floats,
     uses: Integers, used_by: Integers, use_weight: Floats,
     body_count: ti.i32, body_motion: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
-    body_inverse_inertia: Matrices, body_gathered: LongIntegers, unit: ti.f32,
+    body_inverse_inertia: Matrices, body_gathered: LongIntegers, unit: ti.f32, is_short: ti.template(),
 ):  # fmt: skip
     """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
 
@@ -215,6 +227,8 @@ def push_apart(
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, touched_end, bodies_end = count, touched_count, body_count
     for step in ti.static(range(STEPS)):
+        if ti.static(is_short):
+            ti.loop_config(serialize=True)
         for place in range(contacts_end):
             c = pushing[place]
             n = normal[c]
@@ -236,6 +250,8 @@ def push_apart(
                 most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
             if most > 0.0:
                 give_body(push[place], b, arm[c], body_gathered)
+        if ti.static(is_short):
+            ti.loop_config(serialize=True)
         for place in range(touched_end):
             i = touched[place]
             u = displacement[i] + (inverse_mass[i] * unit) * given_to(i, uses, used_by, use_weight, push)
@@ -262,7 +278,7 @@ def finish_push(
     body_count: ti.i32, body_motion: Vectors, body_start: Vectors,
     body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_gathered: LongIntegers,
     body_impulse: LongIntegers, unit: ti.f32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
-    lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
+    lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats, is_short: ti.template(),
 ) -> ti.f32:  # fmt: skip
     """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
 
@@ -270,11 +286,15 @@ def finish_push(
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, touched_end, bodies_end, lanes_end = count, touched_count, body_count, lanes
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for place in range(contacts_end):
         c = pushing[place]
         push[place] = (impulse[c] - impulse_given[c]) / unit
         if kind[c] >= 0:
             give_body(push[place], kind[c], arm[c], body_gathered)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for place in range(touched_end):
         i = touched[place]
         displacement[i] = start[i] + (inverse_mass[i] * unit) * given_to(i, uses, used_by, use_weight, push)
@@ -286,6 +306,8 @@ def finish_push(
         body_motion[2 * b] = body_start[2 * b] + (body_inverse_mass[b] * unit) * take(body_gathered, 6 * b)
         twist = unit * take(body_gathered, 6 * b + 3)
         body_motion[2 * b + 1] = body_start[2 * b + 1] + body_inverse_inertia[b] @ twist
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for lane in range(lanes_end):
         missing = 0.0
         for k in range(items):
@@ -304,7 +326,7 @@ def finish_push(
 def repair_crossings(
     count: ti.i32, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers,
     impulse: Vectors, position: Vectors, displacement: Vectors, inverse_mass: Floats, thickness: Floats,
-    least_gap_in_thicknesses: ti.f32, crossing: Integers, counter: Integers,
+    least_gap_in_thicknesses: ti.f32, crossing: Integers, counter: Integers, is_short: ti.template(),
 ) -> ti.i32:  # fmt: skip
     """Count the pairs that are not certainly apart all through the substep, and have their worst vertices pushed.
 
@@ -314,6 +336,8 @@ def repair_crossings(
     `crossing` gets 1 for pairs that fail, else 0. Pairs whose vertices are all pinned are not looked at.
     """
     counter[0] = 0
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for c in range(count):
         crossing[c] = 0
         mobile = 0.0

@@ -12,6 +12,7 @@ from sim.cloth.proximity_contacts import Quadruples
 from sim.cloth.self_collision_kernels import BLOCK, FAR, NONE, Pairs, Triples
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
+from sim.reductions import runs_on_gpu
 
 
 class ElementBlocks:
@@ -97,6 +98,8 @@ def enclose_elements(
                     low, high = ti.min(a, b, c), ti.max(a, b, c)
                 low_x[place], low_y[place], low_z[place] = low[0], low[1], low[2]
                 high_x[place], high_y[place], high_z[place] = high[0], high[1], high[2]
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for k in range(count):
         found[searched[k]][2] = 0
         found_edges[searched[k]][2] = 0

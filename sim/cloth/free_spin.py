@@ -4,9 +4,10 @@ import numpy as np
 import taichi as ti
 
 from sim.arrays import Floats, Vectors
+from sim.cloth.short_loops import NODE_NS, is_short
 from sim.cloth.state import ClothState, Lattice
 from sim.launch import fast_launch
-from sim.reductions import BRANCHES, device_lanes, reduced
+from sim.reductions import BRANCHES, device_lanes, reduced, runs_on_gpu
 
 QUANTITIES = 13
 """Mass, its first moments (3) and second moments (6), and angular momentum that the springs gave (3)."""
@@ -48,7 +49,7 @@ class FreeSpin:
             return_angular_momentum(
                 state.lattice, state.quantum, state.carry, state.velocity, state.inverse_mass, dt, first, count,
                 lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._partial, lanes.count,
-                self._totals, self._turn, state.displacement,
+                self._totals, self._turn, state.displacement, is_short(count, NODE_NS),
             )  # fmt: skip
 
 
@@ -57,12 +58,14 @@ class FreeSpin:
 def return_angular_momentum(
     lattice: Lattice, quantum: ti.f32, carry: Vectors, velocity: Vectors, inverse_mass: Floats, dt: ti.f32,
     first: ti.i32, count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats, lanes: ti.i32,
-    totals: Floats, turn: Vectors, displacement: Vectors,
+    totals: Floats, turn: Vectors, displacement: Vectors, is_short: ti.template(),
 ):  # fmt: skip
     """Rotate the nodes of a cloth so that the corrections of its springs have no angular momentum.
 
     Moments are about the first node; `turn` becomes the rotation, and the centre of mass from there.
     """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for lane in range(lanes):
         mass = 0.0
         moment = ti.math.vec3(0.0)
@@ -88,6 +91,8 @@ def return_angular_momentum(
             partial[(7 + axis) * lanes + lane] = products[axis]
             partial[(10 + axis) * lanes + lane] = spin[axis]
     reduced(partial, lanes, QUANTITIES, 0, totals)
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for _ in range(1):
         step = lanes // BRANCHES
         mass = totals[0]
@@ -107,6 +112,8 @@ def return_angular_momentum(
         )
         turn[0] = -(inertia / whole).inverse() @ (spin / whole)
         turn[1] = centre
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for i in range(first, first + count):
         r_i = quantum * ti.cast(lattice[i] - lattice[first], ti.f32) - turn[1]
         displacement[i] = displacement[i] + turn[0].cross(r_i)

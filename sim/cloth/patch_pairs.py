@@ -21,6 +21,7 @@ from sim.cloth.patch_motion_kernels import (
 )
 from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces, make_room
+from sim.cloth.short_loops import NODE_NS, is_short
 from sim.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
 
 if TYPE_CHECKING:
@@ -196,6 +197,7 @@ class PatchPairs:
         self._maxima = LaneReduction(maxima=MAX_QUANTITIES, sums=0)
         self._astray, self._half_thickness, self._still = 0.0, 0.0, 0.0
         self.count = self.due_count = 0
+        self._is_short = is_short(patches.vertex_count, NODE_NS)
         self._allocate(8 * m)
 
     def _allocate(self, capacity: int) -> None:
@@ -234,7 +236,7 @@ class PatchPairs:
             n, lanes.items(n), lanes.lane_step(n), lanes.item_step(), self._still, state.position,
             state.displacement, self._expected, patches.count, lanes.items(patches.count),
             lanes.lane_step(patches.count), patches.first_corner, patches.corners, *self._fitted, self._motion,
-            self._more, self._spent, self._reach, self._way, partial, lane_count, nodes,
+            self._more, self._spent, self._reach, self._way, partial, lane_count, nodes, self._is_short,
         )  # fmt: skip
         return np.array(ends, dtype=np.float64), beyond <= 0.0
 
@@ -324,4 +326,5 @@ class PatchPairs:
             patches.count, patches.first_corner, patches.corners, *self._fitted, self._motion, self._change,
             int(is_changed), self._astray, negligible, MARGIN * 2.0 * self._half_thickness, self._half_thickness,
             self._margin, self._more, self._spent, self.count, self.pairs, self.approach, self.slack,
+            self._is_short,
         )  # fmt: skip

@@ -9,6 +9,7 @@ from sim.cloth.row_blocks import LANES, load_blocks, row_blocks, store_blocks, s
 from sim.cloth.row_springs import bend_lines, solve_diagonals
 from sim.cloth.row_threads import solve_lines, straighten_lines
 from sim.cloth.sheet import Grid
+from sim.cloth.short_loops import NODE_IN_ROWS_NS, is_short
 from sim.cloth.springs import bend_share, diagonal_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
 from sim.reductions import runs_on_gpu
@@ -46,6 +47,7 @@ class RectangleSprings:
             tuple(ti.ndarray(ti.f32, strips * LANES) for strips in self._strips) for _ in range(2)
         )
         self._diagonal_stiffness = self._bend_damping = 0.0
+        self._is_short = is_short(grid.columns * grid.rows, NODE_IN_ROWS_NS)
 
     def take_parameters(self, cloth: ClothParameters) -> None:
         """Stiffness and damping as they are now; `springs` says how those of a sheet become those of its springs."""
@@ -61,30 +63,31 @@ class RectangleSprings:
 
     def displace(self, dt: float, iterations: int) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go."""
-        state, grid, blocks = self._state, self._grid, self._blocks
+        state, grid, blocks, short = self._state, self._grid, self._blocks, self._is_short
         load_blocks(
             blocks, state.lattice, state.displacement, state.inverse_mass, self._first, grid.columns, grid.rows,
-            *self._strips,
+            *self._strips, short,
         )  # fmt: skip
         for axis in (ALONG_X, ALONG_Y):
             bend_lines(
-                blocks, *self._lines(axis), self._bend_stiffness[axis], state.quantum, dt * dt, self._bend_damping / dt
-            )
+                blocks, *self._lines(axis), self._bend_stiffness[axis], state.quantum, dt * dt, self._bend_damping / dt,
+                short,
+            )  # fmt: skip
         for iteration in range(iterations):
             is_first = int(iteration == 0)
             for parity in range(2):
                 solve_diagonals(
                     blocks, parity, grid.columns, grid.rows, self._strips[ALONG_Y], self._diagonal_stiffness,
-                    float(np.hypot(grid.step_x, grid.step_y)), state.quantum, dt * dt, is_first,
+                    float(np.hypot(grid.step_x, grid.step_y)), state.quantum, dt * dt, is_first, short,
                 )  # fmt: skip
             for axis in (ALONG_X, ALONG_Y):
                 solve_lines(
                     blocks, *self._lines(axis), self._thread_stiffness[axis], self._steps[axis], state.quantum,
-                    dt * dt, is_first,
+                    dt * dt, is_first, short,
                 )  # fmt: skip
         for axis in (ALONG_X, ALONG_Y):
-            straighten_lines(blocks, *self._lines(axis))
-        store_blocks(blocks, self._first, grid.columns, grid.rows, self._strips[ALONG_Y], state.displacement)
+            straighten_lines(blocks, *self._lines(axis), short)
+        store_blocks(blocks, self._first, grid.columns, grid.rows, self._strips[ALONG_Y], state.displacement, short)
 
     def _lines(self, axis: int) -> tuple[int, int, int, int]:
         """Whether lines are turned, how many nodes one has, their strips, and those of the other direction."""

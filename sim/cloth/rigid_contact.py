@@ -14,6 +14,7 @@ from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, Quadruples, Weights, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision_kernels import LANES, Four, Pairs, Triples
+from sim.cloth.short_loops import PATCH_AT_WALLS_NS, is_short
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
 from sim.reductions import runs_on_gpu
@@ -160,6 +161,7 @@ class RigidContact:
             find_wall_contacts(
                 *own, self._largest_half, *cloth, self._wall_count, self._wall_plane, self._wall_low, self._wall_high,
                 self._joined_low, self._joined_high, self._spacing, recovery, *contacts.found_arrays,
+                is_short(patches.count, PATCH_AT_WALLS_NS),
             )  # fmt: skip
         if not self.bodies.count:
             return
@@ -186,13 +188,15 @@ def find_wall_contacts(
     wall_count: ti.i32, plane: Planes, low: Vectors, high: Vectors, joined_low: Vectors, joined_high: Vectors,
     spacing: ti.f32, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
+    friction: Floats, counter: Integers, capacity: ti.i32, is_short: ti.template(),
 ):  # fmt: skip
     """Append the vertices that reach a wall, of the patches that may; walls are flat, so that vertices are enough.
 
     Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
     both.
     """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for item in range(patch_count * lanes):
         m = item // lanes
         reach = shift[m].norm() + (1.0 + turn[m].norm()) * patch_radius[m] + rest[m] + largest_half

@@ -7,6 +7,7 @@ from sim.cloth.air import slowed
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.row_blocks import LANES, Block, row_blocks, strips_of, two_blocks
 from sim.cloth.sheet import Grid
+from sim.cloth.short_loops import NODE_IN_ROWS_NS, is_short
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
 
@@ -30,6 +31,7 @@ class RectangleAir:
         self._strips = strips_of(grid.columns)
         self._drag = self._skin_drag = self._mass = 0.0
         self._wind = ti.math.vec3(0.0)
+        self._is_short = is_short(grid.columns * grid.rows, NODE_IN_ROWS_NS)
 
     def take_parameters(self, cloth: ClothParameters) -> None:
         """Drag and wind as they are now."""
@@ -44,7 +46,7 @@ class RectangleAir:
         predict_in_wind(
             self._blocks, state.position, state.velocity, state.carry, state.inverse_mass, self._share, self._first,
             grid.columns, grid.rows, self._strips, self._drag, self._skin_drag, self._mass, self._wind, gravity, dt,
-            state.displacement,
+            state.displacement, self._is_short,
         )  # fmt: skip
 
 
@@ -74,13 +76,15 @@ def force_on_triangle(
 def predict_in_wind(
     blocks: ti.template(), position: Vectors, velocity: Vectors, carry: Vectors, inverse_mass: Floats, share: Floats,
     first: ti.i32, columns: ti.i32, rows: ti.i32, strips: ti.i32, drag: ti.f32, skin_drag: ti.f32, mass: ti.f32,
-    wind: ti.math.vec3, gravity: ti.math.vec3, dt: ti.f32, displacement: Vectors,
+    wind: ti.math.vec3, gravity: ti.math.vec3, dt: ti.f32, displacement: Vectors, is_short: ti.template(),
 ):  # fmt: skip
     """Forces on both triangles of every cell, then what the nodes around them make of these.
 
     Cells whose two numbers add up to something even have the diagonal from their first node a to c, the others that
     from b to d: triangles (a, b, c) and (a, c, d), or (a, b, d) and (b, c, d).
     """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for j in range(rows):
         for k in range(strips):
             q = j * strips + k
@@ -96,6 +100,8 @@ def predict_in_wind(
             blocks.u_x[q], blocks.u_y[q], blocks.u_z[q] = x, y, z
             blocks.v_x[q], blocks.v_y[q], blocks.v_z[q] = v_x, v_y, v_z
             blocks.share[q], blocks.free_share[q] = shares, free
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for j in range(rows - 1):
         for k in range(strips):
             q = j * strips + k
@@ -152,6 +158,8 @@ def predict_in_wind(
                 upper_z[at] = ti.select(is_cell, upper.z, 0.0)
             blocks.lower_x[q], blocks.lower_y[q], blocks.lower_z[q] = lower_x, lower_y, lower_z
             blocks.upper_x[q], blocks.upper_y[q], blocks.upper_z[q] = upper_x, upper_y, upper_z
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for j in range(rows):
         for k in range(strips):
             q = j * strips + k

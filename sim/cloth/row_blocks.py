@@ -148,9 +148,11 @@ def turn_displacements_back(blocks: ti.template(), strip, strips, turned_strips)
 @ti.kernel
 def load_blocks(
     blocks: ti.template(), lattice: Lattice, displacement: Vectors, inverse_mass: Floats, first: ti.i32,
-    columns: ti.i32, rows: ti.i32, strips: ti.i32, turned_strips: ti.i32,
+    columns: ti.i32, rows: ti.i32, strips: ti.i32, turned_strips: ti.i32, is_short: ti.template(),
 ):  # fmt: skip
     """Fill upright and turned blocks with a cloth whose first node is `first`."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for strip in range(turned_strips):
         for r in range(LANES):
             j = strip * LANES + r
@@ -175,9 +177,12 @@ def load_blocks(
 @fast_launch
 @ti.kernel
 def store_blocks(
-    blocks: ti.template(), first: ti.i32, columns: ti.i32, rows: ti.i32, strips: ti.i32, displacement: Vectors
-):
+    blocks: ti.template(), first: ti.i32, columns: ti.i32, rows: ti.i32, strips: ti.i32, displacement: Vectors,
+    is_short: ti.template(),
+):  # fmt: skip
     """Write the displacements of the upright blocks to the nodes of the cloth."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for j in range(rows):
         for b in range(strips):
             q = j * strips + b

@@ -15,7 +15,7 @@ BEND_COLOURS = 3
 @ti.kernel
 def bend_lines(
     blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32, stiffness: Floats,
-    quantum: ti.f32, dt_squared: ti.f32, gamma: ti.f32,
+    quantum: ti.f32, dt_squared: ti.f32, gamma: ti.f32, is_short: ti.template(),
 ):  # fmt: skip
     """The bend springs of all lines along one direction, colour by colour; `solve_bend` has the formula.
 
@@ -29,7 +29,10 @@ def bend_lines(
         quantum: unit of the lattice [m].
         dt_squared: [s²].
         gamma: damping over stiffness and dt [-].
+        is_short: see `short_loops`.
     """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for strip in range(strips):
         first = 0
         if is_turned:
@@ -92,13 +95,15 @@ def keep_two_blocks(values: ti.template(), block, pair, keeps_both):
 @ti.kernel
 def solve_diagonals(
     blocks: ti.template(), parity: ti.i32, columns: ti.i32, rows: ti.i32, strips: ti.i32, stiffness: ti.f32,
-    rest: ti.f32, quantum: ti.f32, dt_squared: ti.f32, is_first: ti.i32,
+    rest: ti.f32, quantum: ti.f32, dt_squared: ti.f32, is_first: ti.i32, is_short: ti.template(),
 ):  # fmt: skip
     """Both diagonals of all cells in every second row of cells, from row `parity` on; `solve_pairs` has the formula.
 
     In each row first those that lead from node i of the lower line to node i + 1 of the upper one, then the others:
     with the two lines exchanged these are the same.
     """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for pair in range((rows - parity) // 2):
         lower = (2 * pair + parity) * strips
         strength = stiffness * dt_squared

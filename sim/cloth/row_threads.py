@@ -23,12 +23,14 @@ def piece_count(length):
 @ti.kernel
 def solve_lines(
     blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32, stiffness: Floats,
-    rest: ti.f32, quantum: ti.f32, dt_squared: ti.f32, is_first: ti.i32,
+    rest: ti.f32, quantum: ti.f32, dt_squared: ti.f32, is_first: ti.i32, is_short: ti.template(),
 ):  # fmt: skip
     """The threads along one direction, piece by piece, even pieces first; arguments as of `bend_lines`.
 
     `rest` is the length of a spring [m]; multipliers start at 0 if `is_first`.
     """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for strip in range(strips):
         first = 0
         if is_turned:
@@ -129,8 +131,13 @@ def solve_pieces(
 
 @fast_launch
 @ti.kernel
-def straighten_lines(blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32):
+def straighten_lines(
+    blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32,
+    is_short: ti.template(),
+):  # fmt: skip
     """Let tension turn with the threads along one direction, where any piece of a strip has too much of it."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for strip in range(strips):
         first = 0
         if is_turned:

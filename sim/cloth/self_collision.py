@@ -17,6 +17,7 @@ from sim.cloth.self_collision_kernels import (
     pair_vertices_with_triangles,
     range_of_vectors,
 )
+from sim.cloth.short_loops import NODE_NS, is_short
 from sim.reductions import LaneReduction
 
 if TYPE_CHECKING:
@@ -177,8 +178,9 @@ def half_range(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple
     """
     lanes = ends_of.lanes
     numbers = range_of_vectors(
-        vectors, count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), *ends_of.tree
-    )
+        vectors, count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), *ends_of.tree,
+        is_short(count, NODE_NS),
+    )  # fmt: skip
     ends = ends_of.unpack(numbers).astype(np.float64)
     half = 0.5 * np.linalg.norm(ends[:3] + ends[3:])
     return float(half), float(np.linalg.norm(np.maximum(np.abs(ends[:3]), np.abs(ends[3:]))))

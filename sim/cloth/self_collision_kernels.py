@@ -12,7 +12,7 @@ from sim.cloth.proximity import (
 )
 from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, Quadruples, Weights, least_displacement
 from sim.launch import fast_launch
-from sim.reductions import Results, reduced
+from sim.reductions import Results, reduced, runs_on_gpu
 
 Pairs = ti.types.ndarray(dtype=ti.types.vector(2, ti.i32), ndim=1)
 Triples = ti.types.ndarray(dtype=ti.types.vector(3, ti.i32), ndim=1)
@@ -201,6 +201,8 @@ def make_room(count: ti.i32, searched: Integers, pieces: Quadruples, end: Intege
     how many there are.
     """
     end[1] = 0
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for k in range(count):
         p = searched[k]
         found = pieces[p][2]
@@ -323,8 +325,10 @@ def look_at_pair(
 
 @fast_launch
 @ti.kernel
-def copy_vectors(vectors: Vectors, count: ti.i32, copy: Vectors):
+def copy_vectors(vectors: Vectors, count: ti.i32, copy: Vectors, is_short: ti.template()):
     """Keep what vectors are."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for i in range(count):
         copy[i] = vectors[i]
 
@@ -333,9 +337,11 @@ def copy_vectors(vectors: Vectors, count: ti.i32, copy: Vectors):
 @ti.kernel
 def range_of_vectors(
     vectors: Vectors, count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
-    lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
+    lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats, is_short: ti.template(),
 ) -> Results:  # fmt: skip
     """Largest components, then those of the negative vectors, six maxima."""
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for lane in range(lanes):
         most, least = ti.math.vec3(-FAR), ti.math.vec3(FAR)
         for k in range(items):

@@ -99,11 +99,11 @@ GUSTS = {"strength": 3.0, "size": 0.2, "rate": 5.0, "seed": 3}
 @pytest.mark.parametrize(
     ("changes", "moves"),
     [
-        ({}, False),
         ({"open_faces": CLOSED_BOX, "turbulence": GUSTS}, False),
         ({"wind": (0.6, 0.0, 0.0), "turbulence": GUSTS}, True),
     ],
-    ids=["open box", "closed box with gusts", "wind, gusts and a ball that moves"],
+    # Every kernel of an open box of still air, with a ball in it that stands, is in one of these two.
+    ids=["closed box with gusts", "open box with wind, gusts and a ball that moves"],
 )
 def test_a_plume_is_the_same_with_one_thread_a_row_and_with_many(monkeypatch, changes, moves):
     states = []

@@ -1,0 +1,26 @@
+"""Loops of a CPU that the thread which launches them has done before others wake.
+
+To give a loop to threads and wait for them costs 70 us on two cores that otherwise sleep, with one thread as with
+many, and the second one wakes later still; to run it where it is launched costs 1 us. So kernels take `is_short`, and
+leave short loops serial. It depends on sizes and on the device, never on the number of threads: compiled either way, a
+loop may differ in its last bits. Nor may it depend on when lists were made, as results do not: each loop over pairs of
+patches or elements is compiled one way on a device, whatever their number. On a GPU no loop is short: a serial one
+would have one thread.
+"""
+
+from sim.reductions import runs_on_gpu
+
+LONGEST_NS = 250_000.0
+"""Work of a loop up to which two threads should gain nothing, by what waking both costs: an estimate [ns]."""
+
+NODE_NS, NODE_IN_ROWS_NS, COPIED_NODE_NS = 14.0, 12.0, 4.0
+"""Work a node [ns]: in sums and maxima over nodes, in one loop of springs or air in rows, in copies and tests;
+roughly, as are those below, from processor times at 128 x 128 nodes."""
+
+CONTACT_NS, PATCH_AT_WALLS_NS = 25.0, 90.0
+"""Work of one step of the iteration a contact, and of looking for walls a patch [ns]."""
+
+
+def is_short(items: int, item_ns: float) -> bool:
+    """Whether a loop over so many items, of about so much work each [ns], is better left to one thread."""
+    return not runs_on_gpu() and items * item_ns <= LONGEST_NS
