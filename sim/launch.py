@@ -6,7 +6,7 @@ a call once, and from then on hands the arguments of calls with the same types s
 keeps what the runtime has of the arrays of a call, as most calls come again with the same ones. Measurements:
 docs/performance.md.
 
-This is the only place that uses Taichi's internals; the lock file pins the release that they belong to.
+This and `sim.tracing` are what relies on Taichi's internals; the lock file pins the release that they belong to.
 """
 
 import functools
