@@ -54,7 +54,10 @@ def read_poses(path: Path) -> dict[str, Pose]:
         RenderInputError: the file is missing, of another version, or holds something else than poses.
     """
     document = read_document(path, "poses", version=POSES_VERSION)
-    return {name: _pose(path, name, values) for name, values in document["bodies"].items()}
+    bodies = document.get("bodies")
+    if not isinstance(bodies, dict) or not all(isinstance(values, dict) for values in bodies.values()):
+        raise RenderInputError(f"the poses {path} hold no bodies")
+    return {name: _pose(path, name, values) for name, values in bodies.items()}
 
 
 def place(blender_object: Any, pose: Pose, *, frame: int) -> None:

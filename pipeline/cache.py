@@ -16,7 +16,15 @@ import numpy as np
 from blake3 import blake3
 from numpy.typing import NDArray
 
-from pipeline.cached_smoke import SmokeInBox, read_smoke, slabs, stored_box, write_smoke
+from pipeline.cached_smoke import (
+    SmokeInBox,
+    grids_of,
+    read_smoke,
+    require_stored,
+    slabs,
+    stored_box,
+    write_smoke,
+)
 from pipeline.errors import InvalidArtifactError
 from sim.snapshots import Attribute, BodyKind, Snapshot
 from sim.solver import Diagnostics
@@ -30,8 +38,6 @@ COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "sh
 """Every HDF5 build reads gzip; level 1 with byte shuffling gives nearly the size of level 9 at a fifth of the time."""
 
 CHUNK_BYTES = 1 << 20
-MOST_COMPRESSED = 1100
-"""Deflate makes nothing smaller than a thousandth and a bit; what claims more was never written."""
 GROWTH_BYTES = 4 << 20
 """By so much a file that is being made in memory grows at a time."""
 
@@ -207,9 +213,9 @@ def validate_frame(path: Path) -> None:
     with _frame(path) as file:
         _read_diagnostics(file)
         for name, group in file.get("bodies", {}).items():
-            is_smoke = group.attrs["kind"] == "smoke"
+            grids = _grids(group)
             for key, dataset in group.items():
-                for part in slabs(stored_box(dataset)) if is_smoke else [()]:
+                for part in slabs(stored_box(dataset)) if key in grids else [()]:
                     array = dataset[part]
                     if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
                         raise InvalidArtifactError(f'{path}: {key} of "{name}" holds values that are not finite')
@@ -290,14 +296,7 @@ def _write_array(group: h5py.Group, key: str, array: NDArray[np.generic]) -> Non
 
 def _whole(dataset: h5py.Dataset) -> NDArray[Any]:
     """All of a dataset. One that claims to be far larger than what is stored of it is refused before it is read."""
-    if dataset.nbytes > MOST_COMPRESSED * dataset.id.get_storage_size() + CHUNK_BYTES:
-        raise InvalidArtifactError(f"{dataset.name}: claims {dataset.nbytes} bytes, and hardly any are stored")
-    return np.asarray(dataset[()])
-
-
-def _grid(dataset: h5py.Dataset) -> NDArray[Any]:
-    """All of a grid of smoke. It is stored where there is some: that all of it is empty is no reason for suspicion."""
-    stored_box(dataset)
+    require_stored(dataset)
     return np.asarray(dataset[()])
 
 
@@ -307,8 +306,17 @@ def _read_body(group: h5py.Group) -> Snapshot:
         if key != "kind":
             attributes[key] = tuple(float(item) for item in value) if np.ndim(value) else _plain(value)
     kind = cast(BodyKind, str(group.attrs["kind"]))
-    arrays = {key: _grid(dataset) if kind == "smoke" else _whole(dataset) for key, dataset in group.items()}
+    # Grids of smoke are stored where there is some: that all of one is empty is no reason for suspicion.
+    grids = _grids(group)
+    for grid in grids.values():
+        stored_box(grid)
+    arrays = {key: np.asarray(grids[key][()]) if key in grids else _whole(item) for key, item in group.items()}
     return Snapshot(kind, arrays, attributes)
+
+
+def _grids(group: h5py.Group) -> dict[str, h5py.Dataset]:
+    """The grids of a body by name, if it is a smoke; it may have other arrays beside them."""
+    return grids_of(group) if group.attrs["kind"] == "smoke" else {}
 
 
 def _read_kinds(file: h5py.File) -> dict[str, str]:

@@ -33,6 +33,9 @@ DENSITY_FLOOR = 2.0**-20
 """Below this density there is no smoke: a kilometre of it at 1 per metre takes 1e-3 of the light."""
 TEMPERATURE_STEP_K = 0.25
 """Temperatures are multiples of this above the ambient one: at 1000 K wrong by 0.3 % of the light that they emit."""
+SMALL_BYTES = 1 << 20
+MOST_COMPRESSED = 1100
+"""Deflate makes nothing smaller than a thousandth and a bit; what claims more was never written."""
 VELOCITY_STEPS = 64
 """Velocities are multiples of a power of two, such that a cell a frame has as many steps at least: what is drawn is
 out of place by 1/256 of a cell at most."""
@@ -121,17 +124,15 @@ def read_smoke(group: h5py.Group) -> SmokeInBox:
     Raises:
         InvalidArtifactError: its grids are none that `write_smoke` writes.
     """
-    part = stored_box(group["velocity"])
-    for key in ("density", "temperature"):
-        if group[key].shape != group["velocity"].shape[:3]:
-            raise InvalidArtifactError(f"{group.name}: grids of {key} and velocity differ in shape")
+    grids = grids_of(group)
+    part = stored_box(grids["velocity"])
     velocity = np.empty((*(side.stop - side.start for side in part), 3), np.float32)
     for axis in range(3):  # a third faster than all at once, as chunks hold one component each
-        velocity[..., axis] = group["velocity"][(*part, axis)]
+        velocity[..., axis] = grids["velocity"][(*part, axis)]
     x, y, z = (float(value) for value in group.attrs["origin"])
     return SmokeInBox(
-        density=group["density"][part],
-        temperature=group["temperature"][part],
+        density=grids["density"][part],
+        temperature=grids["temperature"][part],
         velocity=velocity,
         first_cell=(part[0].start, part[1].start, part[2].start),
         origin=(x, y, z),
@@ -140,20 +141,53 @@ def read_smoke(group: h5py.Group) -> SmokeInBox:
     )
 
 
-def stored_box(dataset: h5py.Dataset) -> Box:
-    """The cells outside of which a dataset of a smoke holds nothing; all of them where it was stored as it is.
+def grids_of(group: h5py.Group) -> dict[str, h5py.Dataset]:
+    """The grids of a smoke by name, of which nothing has been read yet.
+
+    Empty space is not stored, so a small file may claim any size: what no smoke has is refused here.
 
     Raises:
-        InvalidArtifactError: the dataset has more cells than any smoke, or its box lies outside of them.
+        InvalidArtifactError: one is missing, they differ in shape, or they have more cells than any smoke.
     """
-    shape, components = dataset.shape[:3], (3,) if dataset.name.endswith("/velocity") else ()
-    if len(shape) < 3 or math.prod(shape) > MOST_CELLS or dataset.shape[3:] != components:
-        raise InvalidArtifactError(f"{dataset.name}: no smoke has a grid of shape {dataset.shape}")
-    ends = dataset.attrs.get("box", ((0, 0, 0), shape))
-    x, y, z = (slice(int(low), int(high)) for low, high in zip(*ends, strict=True))
-    if not all(0 <= side.start <= side.stop <= n for side, n in zip((x, y, z), shape, strict=True)):
-        raise InvalidArtifactError(f"{dataset.name}: its box {np.asarray(ends).tolist()} leaves its grid of {shape}")
+    grids = {key: group.get(key) for key in ("density", "temperature", "velocity")}
+    for key, dataset in grids.items():
+        if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+            raise InvalidArtifactError(f"{group.name}: has no grid of {key}")
+    shape = grids["density"].shape
+    if len(shape) != 3 or math.prod(shape) > MOST_CELLS:
+        raise InvalidArtifactError(f"{group.name}: no smoke has a grid of shape {shape}")
+    if grids["temperature"].shape != shape or grids["velocity"].shape != (*shape, 3):
+        raise InvalidArtifactError(f"{group.name}: its grids differ in shape")
+    return grids
+
+
+def stored_box(grid: h5py.Dataset) -> Box:
+    """The cells outside of which a grid of a smoke holds nothing; all of them where it was stored as it is.
+
+    Raises:
+        InvalidArtifactError: the box is none, or not in the grid; or there is none, and hardly anything is stored.
+    """
+    shape = grid.shape[:3]
+    if "box" not in grid.attrs:
+        require_stored(grid)
+        return slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2])
+    ends = np.asarray(grid.attrs["box"])
+    if ends.shape != (2, 3) or not np.issubdtype(ends.dtype, np.integer):
+        raise InvalidArtifactError(f"{grid.name}: {ends} is no box of cells")
+    if (ends[0] < 0).any() or (ends[0] > ends[1]).any() or (ends[1] > shape).any():
+        raise InvalidArtifactError(f"{grid.name}: its box {ends.tolist()} leaves its grid of {shape}")
+    x, y, z = (slice(int(low), int(high)) for low, high in ends.T)
     return x, y, z
+
+
+def require_stored(dataset: h5py.Dataset) -> None:
+    """Refuse a dataset that claims to be far larger than what is stored of it, before it is read.
+
+    Raises:
+        InvalidArtifactError: it does.
+    """
+    if dataset.nbytes > MOST_COMPRESSED * dataset.id.get_storage_size() + SMALL_BYTES:
+        raise InvalidArtifactError(f"{dataset.name}: claims {dataset.nbytes} bytes, and hardly any are stored")
 
 
 def slabs(box: Box) -> Iterator[Box]:

@@ -24,7 +24,7 @@ SUCCEEDED = "succeeded"
 
 
 class ArtifactRow(NamedTuple):
-    """A committed artifact as the manifest knows it; the fields mean what those of `artifacts.Receipt` do."""
+    """A committed artifact as the manifest knows it; the fields mean what those of `receipts.Receipt` do."""
 
     artifact: ArtifactPath
     task: TaskId

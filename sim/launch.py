@@ -6,7 +6,8 @@ a call once, and from then on hands the arguments of calls with the same types s
 keeps what the runtime has of the arrays of a call, as most calls come again with the same ones. Measurements:
 docs/performance.md.
 
-This and `sim.tracing` are what relies on Taichi's internals; the lock file pins the release that they belong to.
+This relies on Taichi's internals, as `sim.tracing`, `sim.runtime` and `sim.reductions` do; the lock file pins the
+release that they belong to.
 """
 
 import functools

@@ -42,7 +42,7 @@ KEPT_KERNELS_BYTES = 2**30
 MOST_FIELD_TREES = 512
 """Taichi's `kMaxNumSnodeTreesLlvm`: it does not count, and what comes after would overwrite its thread pool."""
 FIELD_TREES_OF_A_SOLVER = 12
-"""Fields that are made before any of them is used share a tree; no solver or coupling makes more of these."""
+"""Fields that are made before any of them is used share a tree; a smoke with its couplings makes no more of these."""
 OK = "ok"
 
 _in_use: dict[str, Any] = {}
@@ -129,7 +129,7 @@ def available_devices() -> dict[str, str]:
 
 
 def require_room_for_fields() -> None:
-    """See that a process can hold the fields of one more solver; whoever makes fields asks first.
+    """See that a process can hold the fields of one more smoke, and of what is coupled to it.
 
     Taichi keeps fields until the process ends. Scenes are simulated in processes of their own, so only one that builds
     dozens of them, as tests do, can run out.

@@ -102,13 +102,7 @@ def _check_size(
     layers = np.ceil(extent / smoke.cell_size)
     cells, size_bytes = float(np.prod(layers)), _bytes_of(layers, on_gpu=budget.on_gpu)
     cells_before, bytes_before = before
-    if cells > MOST_CELLS:
-        findings.error(
-            ("smoke", index, "cell_size"),
-            f"{count(cells)} cells are more than a smoke may have, {count(MOST_CELLS)}; "
-            f"use {rounded_up(float(np.cbrt(np.prod(extent) / MOST_CELLS))):g} m or more",
-        )
-    elif size_bytes + bytes_before > budget.bytes:
+    if size_bytes + bytes_before > budget.bytes:
         room = max(0.0, budget.bytes - bytes_before)
         size = _cell_size_that_fits(extent, smoke.cell_size, room, on_gpu=budget.on_gpu)
         beside = f" beside the {count(cells_before)} of other smoke" if cells_before else ""
@@ -117,6 +111,13 @@ def _check_size(
             f"{count(cells)} cells need {gigabytes(size_bytes)}, "
             f"{budget.owner} has {gigabytes(budget.bytes)}; "
             f"at most {count(room // (size_bytes / cells))} fit{beside}: use {rounded_up(size):g} m or more",
+        )
+    elif cells > MOST_CELLS:
+        size = _cell_size_that_fits(extent, smoke.cell_size, float(MOST_CELLS * BYTES_PER_CELL), on_gpu=False)
+        findings.error(
+            ("smoke", index, "cell_size"),
+            f"{count(cells)} cells are more than a smoke may have, {count(MOST_CELLS)}; "
+            f"use {rounded_up(size):g} m or more",
         )
     return int(cells), size_bytes
 

@@ -2,16 +2,17 @@
 
 To give a loop to threads and wait for them costs 70 us on two cores that otherwise sleep, with one thread as with
 many, and the second one wakes later still; to run it where it is launched costs 1 us. So kernels take `is_short`, and
-leave short loops serial. It depends on sizes and on the device, never on the number of threads: compiled either way, a
-loop may differ in its last bits. Nor may it depend on when lists were made, as results do not: each loop over pairs of
-patches or elements is compiled one way on a device, whatever their number. On a GPU no loop is short: a serial one
-would have one thread.
+leave short loops serial. It depends on the device, on sizes, and on the number of contacts, watched ones included, but
+never on the number of threads: compiled either way, a loop may differ in its last bits. Nor may it depend on when lists
+were made, as results do not: contacts are the same whatever the lists, and each loop over pairs of patches or elements
+is compiled one way on a device, whatever their number. On a GPU no loop is short: a serial one would have one thread.
 """
 
 from sim.reductions import runs_on_gpu
 
 LONGEST_NS = 250_000.0
-"""Work of a loop up to which two threads should gain nothing, by what waking both costs: an estimate [ns]."""
+"""Work of a loop up to which two threads should gain nothing, by what waking both costs: an estimate [ns]. With many
+more threads the longest of these loops would be done sooner in parallel."""
 
 NODE_NS, NODE_IN_ROWS_NS, COPIED_NODE_NS = 14.0, 12.0, 4.0
 """Work a node [ns]: in sums and maxima over nodes, in one loop of springs or air in rows, in copies and tests;
@@ -23,4 +24,4 @@ CONTACT_NS, PATCH_AT_WALLS_NS = 25.0, 90.0
 
 def is_short(items: int, item_ns: float) -> bool:
     """Whether a loop over so many items, of about so much work each [ns], is better left to one thread."""
-    return not runs_on_gpu() and items * item_ns <= LONGEST_NS
+    return not runs_on_gpu() and bool(items * item_ns <= LONGEST_NS)

@@ -97,3 +97,25 @@ def test_stripping_removes_what_varies_and_keeps_every_pixel(tmp_path):
     assert (tmp_path / "stamped.png").read_bytes() == (tmp_path / "plain.png").read_bytes()
     with pytest.raises(ValueError, match="truncated"):
         list(iterate_chunks((tmp_path / "plain.png").read_bytes()[:-5]))
+
+
+def test_poses_that_are_none_are_refused_with_their_file(tmp_path):
+    run_python(
+        """
+        import sys
+        from pathlib import Path
+        from blender_scripts.errors import RenderInputError
+        from blender_scripts.poses import read_poses
+
+        path = Path(sys.argv[1]) / "0.json"
+        for text in ('{"version": 1}', '{"version": 1, "bodies": []}', '{"version": 1, "bodies": {"ball": 3}}'):
+            path.write_text(text)
+            try:
+                read_poses(path)
+            except RenderInputError as error:
+                assert str(error) == f"the poses {path} hold no bodies"
+            else:
+                raise AssertionError(text)
+        """,
+        str(tmp_path),
+    )

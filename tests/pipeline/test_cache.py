@@ -37,7 +37,11 @@ def bodies(particles: int = 50_000) -> dict[str, Snapshot]:
     )
     smoke = Snapshot(
         "smoke",
-        {"density": random.random((8, 9, 10), dtype=np.float32)},
+        {
+            "density": random.random((8, 9, 10), dtype=np.float32),
+            "temperature": 293.0 + random.random((8, 9, 10), dtype=np.float32),
+            "velocity": random.random((8, 9, 10, 3), dtype=np.float32),
+        },
         {"origin": (0.0, -0.5, 0.25), "cell_size": 0.02},
     )
     return {"water": fluid, "plume": smoke}

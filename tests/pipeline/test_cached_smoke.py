@@ -197,13 +197,23 @@ def test_volumes_of_the_part_and_of_the_whole_are_the_same_file(tmp_path, where,
     assert (tmp_path / "part.vdb").read_bytes() == (tmp_path / "whole.vdb").read_bytes()
 
 
+def refused_by_all(path: Path, complaint: str) -> None:
+    for read in (read_frame, validate_frame, lambda path: read_smoke_in_box(path, "plume")):
+        with pytest.raises(InvalidArtifactError, match=complaint):
+            read(path)
+
+
 @pytest.mark.parametrize(
     ("shape", "box", "complaint"),
     [
         ((1 << 20, 1 << 20, 64), None, "no smoke has a grid of shape"),
         ((100, 60), None, "no smoke has a grid of shape"),
+        ((1000, 1000, 1000), None, "hardly any are stored"),
         (SHAPE, ((0, 0, 0), (100, 60, 81)), "leaves its grid"),
         (SHAPE, ((0, 20, 0), (100, 10, 80)), "leaves its grid"),
+        (SHAPE, ((0, 0, 0), (100, 60, 80), (100, 60, 80)), "is no box of cells"),
+        (SHAPE, ((0.0, 0.0, 0.0), (100.0, 60.0, float("nan"))), "is no box of cells"),
+        (SHAPE, 3, "is no box of cells"),
     ],
 )
 def test_a_grid_that_no_smoke_has_is_refused_before_it_is_read(tmp_path, shape, box, complaint):
@@ -211,12 +221,35 @@ def test_a_grid_that_no_smoke_has_is_refused_before_it_is_read(tmp_path, shape, 
     path = write(tmp_path / "frame.h5", puff())
     with h5py.File(path, "r+") as file:
         group = file["bodies/plume"]
-        for key in ("density", "velocity"):
+        for key in ("density", "temperature", "velocity"):
             del group[key]
             components = (3,) if key == "velocity" else ()
             dataset = group.create_dataset(key, shape=(*shape, *components), dtype="f4", chunks=True)
             if box is not None:
                 dataset.attrs["box"] = np.array(box)
-    for read in (read_frame, validate_frame, lambda path: read_smoke_in_box(path, "plume")):
-        with pytest.raises(InvalidArtifactError, match=complaint):
-            read(path)
+    refused_by_all(path, complaint)
+
+
+@pytest.mark.parametrize("key", ["density", "temperature", "velocity"])
+def test_a_smoke_lacks_no_grid_and_all_are_of_one_shape(tmp_path, key):
+    path = write(tmp_path / "frame.h5", puff())
+    with h5py.File(path, "r+") as file:
+        group = file["bodies/plume"]
+        smaller = group[key][1:]
+        del group[key]
+    refused_by_all(path, f"no grid of {key}")
+    with h5py.File(path, "r+") as file:
+        file["bodies/plume"][key] = smaller
+    refused_by_all(path, "differ in shape")
+    with h5py.File(path, "r+") as file:
+        del file["bodies/plume"][key]
+        file["bodies/plume"].create_group(key)
+    refused_by_all(path, f"no grid of {key}")
+
+
+def test_a_smoke_may_have_other_arrays_beside_its_grids(tmp_path):
+    path = write(tmp_path / "frame.h5", puff())
+    with h5py.File(path, "r+") as file:
+        file["bodies/plume"]["fuel"] = np.arange(5)
+    validate_frame(path)
+    assert read_frame(path).bodies["plume"].arrays["fuel"].tolist() == [0, 1, 2, 3, 4]

@@ -209,13 +209,24 @@ def test_two_smokes_share_the_memory(tmp_path):
     assert checked(PLUME + coarser, tmp_path / "fire.toml", memory_bytes=room).errors == []
 
 
-def test_a_smoke_has_no_more_cells_than_files_of_it_may_hold_however_much_memory_there_is(tmp_path):
-    def errors(cell_size: str) -> tuple[str, ...]:
-        return tuple(checked(PLUME.replace("0.05", cell_size, 1), tmp_path / "fire.toml", memory_bytes=10**13).errors)
+@pytest.mark.parametrize(
+    ("box", "cell_size"), [("", "0.0009"), ("min = [-50, -50, 0]\nmax = [50, 50, 0.1]\n", "0.003")]
+)
+def test_a_smoke_has_no_more_cells_than_files_of_it_may_hold_however_much_memory_there_is(box, cell_size, tmp_path):
+    domain = "[domain]\nmin = [-50.0, -50.0, 0.0]\nmax = [50.0, 50.0, 1.0]\n" if box else ""
 
-    (error,) = errors("0.0009")
+    def errors(cell_size: str, memory_bytes: float) -> tuple[str, ...]:
+        smoke = SMOKE.replace("0.05", cell_size) + box.replace("50,", "50.0,").replace("0]", "0.0]")
+        text = HEAD + domain + smoke + SOURCE.replace("0.2]", "0.05]")
+        return tuple(checked(text, tmp_path / "fire.toml", memory_bytes=memory_bytes).errors)
+
+    (error,) = errors(cell_size, 10**13)
     assert "cells are more than a smoke may have, 1.07 billion; use " in error
-    assert errors(re.search(r"use ([\d.]+) m or more", error).group(1)) == ()
+    size = re.search(r"use ([\d.]+) m or more", error).group(1)
+    assert errors(size, 10**13) == ()
+    # With less memory than so many cells need, that is what counts.
+    (error,) = errors(cell_size, 10**10)
+    assert "cells need" in error
 
 
 @pytest.mark.parametrize("extent", [0.3, 0.0999, 1.0 / 7.0])

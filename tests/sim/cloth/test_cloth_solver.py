@@ -7,6 +7,7 @@ from cloth_scenes import EARTH, SOFT, VACUUM, WEIGHTLESS, advance, cloth, rectan
 from thread_counts import outputs_by_threads
 
 from sim.build import build_world
+from sim.cloth import short_loops
 from sim.cloth.solver import ClothSolver
 from sim.scene import SceneParameters
 
@@ -183,6 +184,8 @@ STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
+from sim.cloth import short_loops
+short_loops.LONGEST_NS = float(sys.argv[2])
 from cloth_scenes import SOFT, cloth, rectangle, solver_of
 digest = hashlib.sha256()
 for integrator in ("xpbd", "explicit"):
@@ -198,10 +201,20 @@ print(digest.hexdigest())
 """
 
 
-def test_results_do_not_depend_on_the_number_of_threads():
-    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, beside=__file__)
+@pytest.mark.parametrize("longest_ns", [short_loops.LONGEST_NS, 0.0], ids=["short loops serial", "all parallel"])
+def test_results_do_not_depend_on_the_number_of_threads(longest_ns):
+    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, repr(longest_ns), beside=__file__)
     assert len(digests[0].strip()) == 64
     assert digests[0] == digests[1]
+
+
+def test_a_loop_is_short_by_its_work_and_never_on_a_gpu(monkeypatch):
+    items = int(short_loops.LONGEST_NS / 10.0)
+    monkeypatch.setattr(short_loops, "runs_on_gpu", lambda: False)
+    assert short_loops.is_short(items, 10.0)
+    assert not short_loops.is_short(items + 1, 10.0)
+    monkeypatch.setattr(short_loops, "runs_on_gpu", lambda: True)
+    assert not short_loops.is_short(1, 1.0)
 
 
 # --- in the world --------------------------------------------------------------------------------------------------

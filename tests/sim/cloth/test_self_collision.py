@@ -16,6 +16,7 @@ from contact_scenes import (
 from crossing_triangles import crossings, edges_of_triangles
 from thread_counts import outputs_by_threads
 
+from sim.cloth import short_loops
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.self_collision import SelfCollision
 
@@ -356,6 +357,8 @@ STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
+from sim.cloth import short_loops
+short_loops.LONGEST_NS = float(sys.argv[2])
 from contact_scenes import cloth_of, contacts_of, world_of
 from cloth_scenes import rectangle
 sheet = {"shape": rectangle((0.2, 0.2), (11, 11)), "thickness": 4e-3, "rotation_deg": (60.0, 5.0, 0.0)}
@@ -371,7 +374,8 @@ print(digest.hexdigest(), contacts_of(cloth_of(world)).diagnostics()["contacts"]
 
 
 @pytest.mark.slow
-def test_contacts_do_not_depend_on_the_number_of_threads():
-    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, beside=__file__)
+@pytest.mark.parametrize("longest_ns", [short_loops.LONGEST_NS, 0.0], ids=["short loops serial", "all parallel"])
+def test_contacts_do_not_depend_on_the_number_of_threads(longest_ns):
+    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, repr(longest_ns), beside=__file__)
     assert digests[0].split()[1] == "True"
     assert digests[0] == digests[1]
