@@ -1,6 +1,9 @@
 """Commands as a user calls them: what they print, where, and with which exit code."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +11,8 @@ from command_line import pipeline
 
 from pipeline.cli import TEMPLATES, main
 from pipeline.job import starter
+
+PROJECT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -109,10 +114,18 @@ def test_a_device_that_this_machine_lacks_is_refused_before_any_work_but_planned
 
 @pytest.mark.parametrize(("key", "value"), [("fluid.0.particle_radius", "1e-320"), ("smoke.0.cell_size", "1e300")])
 def test_submit_refuses_numbers_that_nothing_can_be_planned_with(in_tmp_path, key, value):
-    job = Path(__file__).resolve().parents[2] / "jobs" / "everything.toml"
-    refused = pipeline("submit", job, "--set", f"{key}={value}")
-    assert refused.exit_code == 2
+    """In a process of its own: where Taichi has run, numbers like 1e-320 count as zero, and are refused as that."""
+    job = PROJECT / "jobs" / "everything.toml"
+    refused = subprocess.run(
+        [sys.executable, "-m", "pipeline", "submit", str(job), "--set", f"{key}={value}"],
+        env={**os.environ, "PYTHONPATH": str(PROJECT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert refused.returncode == 2
     assert "units are SI" in refused.stderr
+    assert "Traceback" not in refused.stderr
     assert [*in_tmp_path.iterdir()] == []
 
 
