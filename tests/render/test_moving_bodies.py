@@ -17,36 +17,21 @@ from blender_scenes import (
     write_mesh,
 )
 from blender_stand_in import write_blender_stand_in
-from drawn_jobs import RED, UPRIGHT, draw_frame
+from drawn_jobs import BALL, draw_frame, job_of_the_ball, pose
 from fresh_python import run_python
 from needed_blender import needs_bpy
 
-from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.stages.render import RenderStage
 from pipeline.task import Task
 from render.blender import open_renderer
 from render.poses import write_poses
-from render.spec import MovingMeshObject
 from sim.snapshots import Snapshot
 
 pytestmark = needs_bpy
 
-BALL = MovingMeshObject(name="ball", file="ball.ply", body="ball", poses="poses/{frame}.json", material=RED)
 ABOUT_Y_90 = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
-CENTRE = (0.0, 0.0, 0.5)
-
-
-def pose(position=CENTRE, orientation=UPRIGHT, velocity=(0, 0, 0), angular_velocity=(0, 0, 0)):
-    arrays = {
-        "position": position,
-        "orientation": orientation,
-        "velocity": velocity,
-        "angular_velocity": angular_velocity,
-    }
-    return {"ball": {key: np.array(value, dtype=np.float64) for key, value in arrays.items()}}
-
 
 POSES = [
     pose(),
@@ -133,47 +118,23 @@ def test_poses_that_are_not_finite_are_not_written(tmp_path):
         write_poses(tmp_path / "0.json", 0, pose(position=(np.nan, 0, 0)))
 
 
-JOB = """
-name = "flight"
-frames = 3
+CAMERA_AND_ROCK = """
 [camera]
 position = [0.0, -2.5, 0.5]
 look_at = [0.0, 0.0, 0.5]
 [[rigid]]
-name = "ball"
-kind = "kinematic"
-shape = {{ type = "sphere", radius = 0.1 }}
-position = [-0.4, 0.0, 0.5]
-velocity = [24.0, 0.0, 0.0]
-[[rigid]]
 name = "rock"
-shape = {{ type = "sphere", radius = 0.05 }}
+shape = { type = "sphere", radius = 0.05 }
 position = [0.0, 0.0, 0.9]
-[material.ball]
-look = "plastic"
-color = [0.8, 0.02, 0.02]
-roughness = 1.0
 [material.rock]
 look = "plastic"
 color = [0.1, 0.3, 0.8]
-[render]
-resolution = [64, 36]
-quality = "draft"
-samples = 32
-denoise = false
-device = "cpu"
-blender = '{blender}'
 """
 
 
 def test_a_job_is_drawn_with_the_poses_of_its_cache(tmp_path):
-    layout = JobLayout(tmp_path / "flight")
-    layout.root.mkdir()
-    layout.job_file.write_text(JOB.format(blender=write_blender_stand_in(tmp_path)))
-    positions, triangles = sphere((0.0, 0.0, 0.0), 0.1)
-    for body in ("ball", "rock"):
-        write_mesh(layout.path(layout.body_mesh(body)), positions, triangles)
-    task = RenderStage().plan(load_job(layout.job_file), layout)[2]
+    job, layout = job_of_the_ball(tmp_path, "flight", CAMERA_AND_ROCK)
+    task = RenderStage().plan(job, layout)[2]
     assert task.inputs == ("meshes/ball.ply", "meshes/rock.ply", "cache/000002.h5")
     ball = Snapshot("rigid", pose(position=(0.4, 0.0, 0.5), velocity=(24.0, 0.0, 0.0))["ball"], {})
     rock = Snapshot("rigid", pose(position=(0.0, 0.0, 0.9))["ball"], {})

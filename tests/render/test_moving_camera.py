@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from blender_scenes import (
     HALF_A_PIXEL,
@@ -17,18 +16,16 @@ from blender_scenes import (
     weight,
     write_mesh,
 )
-from blender_stand_in import write_blender_stand_in
-from drawn_jobs import RED, UPRIGHT, draw_frame
+from drawn_jobs import BALL as MOVING_BALL
+from drawn_jobs import RED, draw_frame, job_of_the_ball, pose
 from fresh_python import run_python
 from needed_blender import needs_bpy
 
-from pipeline.job.loading import load_job
-from pipeline.layout import JobLayout
 from pipeline.stages.render import RenderStage
 from render.camera_path import View, write_views
 from render.parameters import CameraParameters
 from render.poses import write_poses
-from render.spec import MeshObject, MovingMeshObject
+from render.spec import MeshObject
 from sim.snapshots import Snapshot
 
 pytestmark = needs_bpy
@@ -86,18 +83,10 @@ def test_a_flying_camera_blurs_what_it_passes_as_if_that_flew_past_it(pictures):
     assert passed[0] > 1.5 * still[0]
     assert spread(folder, 3) == pytest.approx(still, rel=0.05)
     (folder / "poses").mkdir()
-    pose = {
-        "position": BALL.position,
-        "orientation": UPRIGHT,
-        "velocity": (-2 * WAY_M * 60.0, 0, 0),
-        "angular_velocity": (0, 0, 0),
-    }
-    write_poses(
-        folder / "poses/000002.json", 2, {"ball": {key: np.array(values, float) for key, values in pose.items()}}
-    )
-    ball = MovingMeshObject(name="ball", file="ball.ply", body="ball", poses="poses/{frame}.json", material=RED)
+    passing = pose(position=BALL.position, velocity=(-2.0 * WAY_M * 60.0, 0.0, 0.0))
+    write_poses(folder / "poses/000002.json", 2, passing)
     camera = still_camera(CameraParameters(position=FRONT.position, look_at=FRONT.look_at))
-    spec_of(ball, samples=32).model_copy(update={"camera": camera}).write(folder / "spec.json")
+    spec_of(MOVING_BALL, samples=32).model_copy(update={"camera": camera}).write(folder / "spec.json")
     run_python(RENDER_FRAMES, str(folder), "flown{frame}.png", "2")
     (folder / "flown2.png").rename(folder / "12.png")
     assert passed == pytest.approx(spread(folder, 12), rel=0.05)
@@ -110,47 +99,19 @@ def test_views_that_are_missing_or_unfit_are_refused_with_their_frame(pictures):
     assert "frame 6:" in unfit and "position must be 3 finite numbers" in unfit
 
 
-JOB = """
-name = "chase"
-frames = 3
+FOLLOWING_CAMERA = """
 [camera]
 position = [-0.4, -2.5, 0.5]
 look_at = [-0.4, 0.0, 0.5]
 follow = "ball"
-[[rigid]]
-name = "ball"
-kind = "kinematic"
-shape = {{ type = "sphere", radius = 0.1 }}
-position = [-0.4, 0.0, 0.5]
-velocity = [24.0, 0.0, 0.0]
-[material.ball]
-look = "plastic"
-color = [0.8, 0.02, 0.02]
-roughness = 1.0
-[render]
-resolution = [64, 36]
-quality = "draft"
-samples = 32
-denoise = false
-device = "cpu"
-blender = '{blender}'
 """
 
 
 def test_a_body_that_the_camera_follows_stays_in_the_middle_and_sharp(tmp_path):
-    layout = JobLayout(tmp_path / "chase")
-    layout.root.mkdir()
-    layout.job_file.write_text(JOB.format(blender=write_blender_stand_in(tmp_path)))
-    write_mesh(layout.path(layout.body_mesh("ball")), *sphere((0.0, 0.0, 0.0), 0.1))
-    task = RenderStage().plan(load_job(layout.job_file), layout)[2]
-    pose = {
-        "position": (0.4, 0, 0.5),
-        "orientation": UPRIGHT,
-        "velocity": (24, 0, 0),
-        "angular_velocity": (0, 0, 0),
-    }
-    arrays = {key: np.array(values, dtype=np.float64) for key, values in pose.items()}
-    draw_frame(task, layout, 2, {"ball": Snapshot("rigid", arrays, {})}, picture=tmp_path / "2.png")
+    job, layout = job_of_the_ball(tmp_path, "chase", FOLLOWING_CAMERA)
+    task = RenderStage().plan(job, layout)[2]
+    ball = Snapshot("rigid", pose(position=(0.4, 0.0, 0.5), velocity=(24.0, 0.0, 0.0))["ball"], {})
+    draw_frame(task, layout, 2, {"ball": ball}, picture=tmp_path / "2.png")
     assert centroid(tmp_path, 2) == pytest.approx([0.0, 0.5], abs=HALF_A_PIXEL)
     width, height = spread(tmp_path, 2)
     assert width < 1.25 * height  # its lower half is paler; without following it is twice as wide as high
