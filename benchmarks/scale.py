@@ -137,7 +137,7 @@ def plot(results: list[dict[str, Any]], path: Path) -> None:
     axes.plot(tasks, [1e3 * each["dispatch [ms]"][1] for each in results], "s-", label="dispatch [µs a task that runs]")
     axes.set(xscale="log", yscale="log", xlabel="tasks of the job", ylabel="processor time a task [µs]")
     axes.grid(visible=True, which="major", alpha=0.3)
-    axes.legend(fontsize="small", ncols=2)
+    figure.legend(fontsize="small", ncols=2, loc="outside upper center")
     figure.savefig(path, metadata={"Date": None})
 
 

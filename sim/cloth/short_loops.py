@@ -1,11 +1,12 @@
 """Loops of a CPU that the thread which launches them has done before others wake.
 
-To give a loop to threads and wait for them costs 70 us on two cores that otherwise sleep, with one thread as with
-many, and the second one wakes later still; to run it where it is launched costs 1 us. So kernels take `is_short`, and
-leave short loops serial. It depends on the device, on sizes, and on the number of contacts, watched ones included, but
-never on the number of threads: compiled either way, a loop may differ in its last bits. Nor may it depend on when lists
-were made, as results do not: contacts are the same whatever the lists, and each loop over pairs of patches or elements
-is compiled one way on a device, whatever their number. On a GPU no loop is short: a serial one would have one thread.
+To give a loop to threads and wait for them costs 40 to 70 us on two cores that otherwise sleep, with one thread too,
+and the second one wakes later still; to run it where it is launched costs nothing (`benchmarks.kernel_costs`). So
+kernels take `is_short`, and leave short loops serial. It depends on the device, on sizes, and on the number of
+contacts, watched ones included, but never on the number of threads: compiled either way, a loop may differ in its last
+bits. Nor may it depend on when lists were made, as results do not: contacts are the same whatever the lists, and each
+loop over pairs of patches or elements is compiled one way on a device, whatever their number. On a GPU no loop is
+short: a serial one would have one thread.
 """
 
 from sim.reductions import runs_on_gpu
