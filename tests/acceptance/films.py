@@ -17,6 +17,7 @@ from types import MappingProxyType
 
 import psutil
 from blake3 import blake3
+from processes_seen import lives
 
 from pipeline.errors import ManifestError
 from pipeline.layout import JobLayout
@@ -269,8 +270,7 @@ def family_of(process: subprocess.Popen[str]) -> list[psutil.Process]:
 def assert_all_gone(processes: Iterable[psutil.Process]) -> None:
     """They die with whom they serve; a moment later, as the kernel has to tell them."""
     _, alive = psutil.wait_procs(list(processes), timeout=30.0)
-    living = [process for process in alive if process.status() != psutil.STATUS_ZOMBIE]
-    assert living == []
+    assert [process for process in alive if lives(process)] == []
 
 
 def kill(process: subprocess.Popen[str]) -> None:

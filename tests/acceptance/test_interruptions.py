@@ -25,6 +25,7 @@ from films import (
     stage_of,
     standing_still,
 )
+from processes_seen import words_of
 
 from pipeline.task import FailureKind
 
@@ -188,7 +189,7 @@ def test_an_external_blender_dies_with_its_runner_and_draws_the_same_pixels(
     runner = finished.start("submit", "tiny.toml", *external)
     assert finished.wait_for_attempt(runner, ["render"]) is not None
     until = time.monotonic() + PATIENCE_S
-    while not any(str(blender) in process.cmdline() for process in family_of(runner)):
+    while not any(str(blender) in words_of(process) for process in family_of(runner)):
         assert time.monotonic() < until
         assert runner.poll() is None
         time.sleep(0.01)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -10,6 +11,8 @@ import time
 from collections.abc import Callable
 
 import psutil
+
+from tests.processes_seen import lives, words_of
 
 _PR_SET_CHILD_SUBREAPER = 36
 _PR_CAPBSET_DROP = 24
@@ -60,7 +63,7 @@ class Family:
     def living(self) -> list[psutil.Process]:
         """All that live."""
         self.reap()
-        return [each for each in psutil.Process().children(recursive=True) if _status(each) != psutil.STATUS_ZOMBIE]
+        return [each for each in psutil.Process().children(recursive=True) if lives(each)]
 
     def workers(self) -> list[psutil.Process]:
         """Worker processes, whatever they do."""
@@ -75,26 +78,13 @@ class Family:
         until = time.monotonic() + within_s
         while living := self.living():
             if time.monotonic() > until:
-                told = [" ".join(each.cmdline())[:120] or each.name() for each in living if each.is_running()]
+                told = [" ".join(words_of(each))[:120] or f"process {each.pid}" for each in living]
                 for each in living:
-                    each.send_signal(signal.SIGKILL)
+                    with contextlib.suppress(psutil.NoSuchProcess):  # it ended just now
+                        each.send_signal(signal.SIGKILL)
                 return told
             time.sleep(0.02)
         return []
 
     def _called(self, is_meant: Callable[[str], bool]) -> list[psutil.Process]:
-        found = []
-        for each in self.living():
-            try:
-                if is_meant(" ".join(each.cmdline())):
-                    found.append(each)
-            except psutil.Error:  # it ended just now
-                continue
-        return found
-
-
-def _status(process: psutil.Process) -> str:
-    try:
-        return str(process.status())
-    except psutil.NoSuchProcess:
-        return str(psutil.STATUS_ZOMBIE)
+        return [each for each in self.living() if is_meant(" ".join(words_of(each)))]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from pathlib import Path
 
-import psutil
 import pytest
 import synthetic_stages
+from processes_seen import pid_lives
 from synthetic_stages import write_faults
 
 from pipeline.executors.base import Assignment, Committed, Executor, Failed, Finished, Progress, Started, TaskEvent
@@ -93,10 +92,9 @@ def wait_for_pid(executor: Executor, path: Path) -> int:
 def assert_gone(pid: int) -> None:
     """The kernel delivers a kill in its own time, and a zombie that nobody has collected yet is gone, too."""
     until = time.monotonic() + PATIENCE_S
-    with contextlib.suppress(psutil.NoSuchProcess):
-        while psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
-            assert time.monotonic() < until, f"{pid} is still there"
-            time.sleep(0.02)
+    while pid_lives(pid):
+        assert time.monotonic() < until, f"{pid} is still there"
+        time.sleep(0.02)
 
 
 class ExecutorContract:

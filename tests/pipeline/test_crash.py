@@ -12,6 +12,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from processes_seen import lives
 from synthetic_jobs import contents, job_text, run_synthetic
 from synthetic_stages import write_faults
 
@@ -52,7 +53,7 @@ def workers_of(runner: subprocess.Popen[str]) -> list[psutil.Process]:
 
 def assert_all_gone(processes: list[psutil.Process]) -> None:
     until = time.monotonic() + PATIENCE_S
-    while any(process.is_running() and process.status() != psutil.STATUS_ZOMBIE for process in processes):
+    while any(map(lives, processes)):
         assert time.monotonic() < until, f"still there: {processes}"
         time.sleep(0.01)
 

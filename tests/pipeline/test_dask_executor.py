@@ -25,6 +25,7 @@ from executor_contract import (
     wait_for_commit,
     wait_for_pid,
 )
+from processes_seen import words_of
 from synthetic_jobs import contents, run_synthetic
 from synthetic_stages import write_faults
 
@@ -55,7 +56,7 @@ def cluster() -> Iterator[str]:
 def _dask_workers() -> list[psutil.Process]:
     """The processes of the module's cluster."""
     children = psutil.Process().children(recursive=True)
-    return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+    return [child for child in children if "spawn_main" in " ".join(words_of(child))]
 
 
 def test_a_cluster_of_this_machine_listens_to_this_machine_only(cluster: str) -> None:
