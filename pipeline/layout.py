@@ -96,6 +96,16 @@ class JobLayout:
         return ArtifactPath(f"cache/{frame:06d}.h5")
 
     @staticmethod
+    def frame_bounds(frame: int) -> ArtifactPath:
+        """Boxes around the bodies of one frame."""
+        return ArtifactPath(f"bounds/{frame:06d}.json")
+
+    @staticmethod
+    def film_bounds() -> ArtifactPath:
+        """The box that a camera frames which frames the action."""
+        return ArtifactPath("bounds.json")
+
+    @staticmethod
     def body_mesh(body: str, part: str = "body") -> ArtifactPath:
         """PLY mesh of a rigid body, or of a part of it, in its rest pose."""
         return ArtifactPath(f"meshes/{body}.ply" if part == "body" else f"meshes/{body}.{part}.ply")

@@ -10,6 +10,7 @@ from math import cos, prod, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.cache import read_frame
@@ -19,6 +20,7 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
+from pipeline.stages.bounds import read_framed
 from pipeline.stages.inputs import tool_version
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
 from render.camera_path import CameraPath, write_views
@@ -61,8 +63,11 @@ class RenderStage:
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
         spec = render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
-        if job.camera.moves:
-            spec["camera"]["path"] = job.camera.model_dump(mode="json")
+        if job.camera.frames_action:
+            # Where it is follows from these and from the box that it frames, which is an input.
+            spec["camera"] = {"framing": job.camera.model_dump(mode="json")}
+        elif job.camera.moves:
+            spec["camera"]["path"] = job.camera.model_dump(mode="json", exclude={"framing"})
         parameters = ParameterSet.of(
             spec,
             stage=self.name,
@@ -74,7 +79,9 @@ class RenderStage:
             memory_bytes=WORKER_BYTES + BYTES_PER_PIXEL * prod(job.render.resolution),
             gpus=int(job.render.device == "gpu"),
         )
-        static = tuple(layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type))
+        static = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
+        if job.camera.frames_action:
+            static.append(layout.film_bounds())
         return [
             Task(
                 id=TaskId(f"render/{frame:06d}"),
@@ -123,8 +130,8 @@ class RenderStage:
         context.progress(1, 1)
 
 
-def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
-    """The job as Blender sees it; paths are relative to the job's folder."""
+def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None = None) -> RenderSpec:
+    """The job as Blender sees it; paths are relative to the job's folder. `framed` as in `camera_path`."""
     objects: list[SceneObject] = [
         _body_object(job, layout, body, part) for body in job.rigid for part in parts_of(body.shape.type)
     ]
@@ -167,7 +174,7 @@ def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
         fps=job.fps,
         domain_min=job.domain.min,
         domain_max=job.domain.max,
-        camera=Camera.on(camera_path(job), f_stop=job.camera.f_stop, views=layout.views),
+        camera=Camera.on(camera_path(job, framed), f_stop=job.camera.f_stop, views=layout.views),
         stage=job.stage,
         lights=job.light,
         objects=tuple(objects),
@@ -185,11 +192,16 @@ def _body_object(job: Job, layout: JobLayout, body: RigidBodyParameters, part: s
     return MovingMeshObject(name=name, file=file, body=body.name, poses=layout.poses, material=material)
 
 
-def camera_path(job: Job) -> CameraPath:
-    """Where the camera of a job goes."""
+def camera_path(job: Job, framed: NDArray[np.float64] | None = None) -> CameraPath:
+    """Where the camera of a job goes.
+
+    Args:
+        job: the job.
+        framed: the box that it frames if it frames the action [m], (2, 3); the domain while that is not known.
+    """
     width, height = job.render.resolution
     starts = {body.name: body.position for body in job.rigid}
-    return CameraPath(job.camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts)
+    return CameraPath(job.camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts, framed=framed)
 
 
 @cache
@@ -219,13 +231,20 @@ def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]
     return surfaces + cloths + volumes + points + cached
 
 
+def _framed(context: TaskContext) -> NDArray[np.float64] | None:
+    """The box that the camera frames, where it frames the action."""
+    if not context.job.camera.frames_action:
+        return None
+    return read_framed(context.layout.path(context.layout.film_bounds()))
+
+
 def _write_motion(context: TaskContext, frame: int) -> None:
     """Put where bodies and camera are at a frame where Blender finds it.
 
     These documents are no artifacts, but a form of the cached frame and of the job.
     """
     job, layout = context.job, context.layout
-    bodies, camera = job.moving_bodies, camera_path(job)
+    bodies, camera = job.moving_bodies, camera_path(job, _framed(context))
     cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies if bodies else {}
     poses = {name: cached[name].arrays for name in bodies}
     if bodies:
@@ -274,7 +293,7 @@ _WARM: dict[str, Renderer] = {}
 def _warm_renderer(context: TaskContext) -> Renderer:
     from render.blender import open_renderer
 
-    spec = render_spec(context.job, context.layout)
+    spec = render_spec(context.job, context.layout, _framed(context))
     key = digest_of(f"{context.layout.root} {context.threads} {spec.model_dump_json()}")
     if key not in _WARM:
         _close_renderers()
