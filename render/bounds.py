@@ -72,7 +72,8 @@ def around(boxes: Iterable[Box]) -> Box | None:
     if not stacked:
         return None
     corners = np.array(stacked)
-    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+    box: Box = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+    return box
 
 
 def framed_box(action: Box | None, *, domain: Box, world: Box) -> Box:

@@ -22,6 +22,7 @@ from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
 from pipeline.stages.bounds import read_framed
 from pipeline.stages.inputs import tool_version
+from pipeline.stages.sight import warn_of_sight
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
 from render.camera_path import CameraPath, write_views
 from render.point_clouds import KINDS
@@ -239,7 +240,7 @@ def _framed(context: TaskContext) -> NDArray[np.float64] | None:
 
 
 def _write_motion(context: TaskContext, frame: int) -> None:
-    """Put where bodies and camera are at a frame where Blender finds it.
+    """Put where bodies and camera are at a frame where Blender finds it, and warn of what the camera does not see.
 
     These documents are no artifacts, but a form of the cached frame and of the job.
     """
@@ -258,6 +259,8 @@ def _write_motion(context: TaskContext, frame: int) -> None:
             views[offset] = camera.view((frame + offset) / job.fps, places)
         with _replacing(context, layout.views, frame) as path:
             write_views(path, frame, views)
+    places = {name: _position_after(0.0, poses[name]) for name in camera.bodies}
+    warn_of_sight(context, camera.view(frame / job.fps, places), poses)
 
 
 def _position_after(time_s: float, pose: Mapping[str, NDArray[Any]]) -> list[float]:
