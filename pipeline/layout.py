@@ -84,6 +84,10 @@ class JobLayout:
         """Where a camera that moves is at a frame, for Blender: path relative to the folder, with {frame}."""
         return "views/{frame}.json"
 
+    def rejected_picture(self, frame: int) -> Path:
+        """A picture that failed its checks twice, kept to be looked at."""
+        return self.root / "rejected" / f"{frame:06d}.png"
+
     @property
     def checkpoints(self) -> Path:
         """Folder of the simulation's checkpoints."""

@@ -18,8 +18,8 @@ VISIBLE = 0.01
 """Difference of luma [-], of 1 for black against white, over the whole picture, from which a pop or a jump counts: a
 twentieth of the picture that changes by 0.045, or all of it by two or three grey levels of 255."""
 MOVING = 0.004
-"""Difference from which neighbours count as moving: a grey level. Where a segment of the film begins, a still differs by
-up to 0.0035, as its pictures are encoded anew (crf 16)."""
+"""Difference from which neighbours count as moving: a grey level. Where a segment of the film begins, a still differs
+by up to 0.0035, as its pictures are encoded anew (crf 16)."""
 RETURNS = 0.5
 """A picture pops if those beside it differ from each other by less than this share of what it differs from each ..."""
 POPS = 2.5

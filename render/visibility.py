@@ -19,6 +19,8 @@ CLIP_START, CLIP_END = 1.0e-3, 1.0e3
 GRID = 9
 """Points along each edge of a box that stand for it: what lies between them is an eighth of the box."""
 STRAIGHT_DOWN = 1.0e-9
+MOST_TRIANGLES = 100_000
+"""Of a mesh that are projected; of more, every second, third, ..."""
 
 
 def screen_positions(view: View, points: Array, *, aspect: float) -> Array:
@@ -55,6 +57,42 @@ def points_of_box(lower: Sequence[float], upper: Sequence[float]) -> Array:
     """Points that stand for a box [m], (n, 3)."""
     edges = [np.linspace(low, high, GRID) for low, high in zip(lower, upper, strict=True)]
     return np.array(list(itertools.product(*edges)), dtype=np.float64)
+
+
+def covered_cells(
+    view: View, vertices: NDArray[Any], faces: NDArray[np.int32], *, shape: tuple[int, int], aspect: float
+) -> tuple[NDArray[np.bool_], float]:
+    """Where a mesh is in a picture of few cells, and how much of the picture it covers, about.
+
+    Args:
+        view: of the camera.
+        vertices: [m], (n, 3).
+        faces: triangles, (k, 3).
+        shape: rows and columns of cells.
+        aspect: width over height of the picture.
+
+    Returns:
+        The cells that triangles have their middle or a corner in, and half of the area of all triangles, as a share of
+        the picture: of a closed mesh that is what it covers, and somewhat more where parts of it hide each other.
+    """
+    cells = np.zeros(shape, np.bool_)
+    every = 1 + len(faces) // MOST_TRIANGLES
+    places = screen_positions(view, vertices, aspect=aspect)
+    corners = places[faces[::every]]
+    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
+    middles = corners.mean(axis=1)
+    corners = corners[(np.abs(middles) <= 1.0).all(axis=1)]
+    if not len(corners):
+        return cells, 0.0
+    points = np.concatenate([corners.reshape(-1, 2), corners.mean(axis=1)])
+    points = points[(np.abs(points) < 1.0).all(axis=1)]
+    rows, columns = shape
+    cells[
+        ((1.0 - points[:, 1]) / 2.0 * rows).astype(np.int64), ((1.0 + points[:, 0]) / 2.0 * columns).astype(np.int64)
+    ] = True
+    first, second = (corners[:, corner] - corners[:, 0] for corner in (1, 2))
+    areas = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    return cells, float(every * areas.sum() / 2.0 / 4.0)
 
 
 def clip_range(view: View) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from pipeline.plan import Assessment, Verdict
 from pipeline.progress import ProgressObserver
 from pipeline.run_events import RunStarted
 from pipeline.stages.render import RenderStage, camera_path
-from pipeline.stages.sight import CAMERA_INSIDE, NOTHING_SEEN, warn_of_sight
+from pipeline.stages.sight import CAMERA_INSIDE, NOTHING_SEEN, bodies_at, warn_of_sight
 from render.meshes import write_ply
 
 JOB = """
@@ -59,7 +59,8 @@ def warnings_of(
     events: list[TaskEvent] = []
     assignment = Assignment(task, 1, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES")
     context = AttemptContext(assignment, events.append, lambda: False)
-    warn_of_sight(context, camera_path(job).first(), {"ball": {"position": np.array(ball), "orientation": UPRIGHT}})
+    poses = {"ball": {"position": np.array(ball), "orientation": UPRIGHT}}
+    warn_of_sight(context, camera_path(job).first(), list(bodies_at(job, layout, 2, poses)))
     return [event for event in events if isinstance(event, Warned)]
 
 
