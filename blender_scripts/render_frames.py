@@ -6,6 +6,7 @@
 Both forms write one line per frame to standard output, `FRAME_DONE 12 /path` or `FRAME_FAILED 12 reason`, among the
 lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line,
 after a line `RENDERER_READY version device`; the process ends with its input, so it cannot outlive who started it.
+`stage 12 96x54 /path` asks for the empty stage of that frame, in so many pixels.
 """
 
 from __future__ import annotations
@@ -69,6 +70,7 @@ class SceneRenderer:
         lights.build_stage(spec)
         if spec["stage"]["tank"]:
             tank.add_tank(spec)
+        self._stage = {blender_object.name for blender_object in bpy.data.objects}
         self._sequences: list[tuple[dict[str, Any], Any]] = []
         self._fires: dict[str, volumes.FireLight] = {}
         self._bodies: list[tuple[dict[str, Any], Any]] = []
@@ -82,8 +84,7 @@ class SceneRenderer:
             RenderInputError: a file of this frame is missing or unfit.
             RenderFailedError: Blender did not finish.
         """
-        if SceneRenderer._current is not self:
-            raise RenderFailedError("another scene was opened in this process; this renderer is closed")
+        self._require_current()
         for description, blender_object in self._sequences:
             path = self._folder / description["file"].replace("{frame}", f"{frame:06d}")
             if description["type"] == "volume_sequence":
@@ -96,6 +97,39 @@ class SceneRenderer:
                 geometry.fill_mesh(blender_object.data, geometry.read_ply(path))
         self._place_bodies(frame)
         self._place_camera(frame)
+        self._draw(frame, output_path)
+
+    def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
+        """Draw what a frame shows without any body: ground, backdrop, tank and their light, in a small size.
+
+        Frames that are drawn afterwards are the same as without it.
+
+        Args:
+            frame: whose camera looks.
+            output_path: a PNG file of any name.
+            resolution: width and height [pixels].
+
+        Raises:
+            RenderInputError: a file of this frame is missing or unfit.
+            RenderFailedError: Blender did not finish.
+        """
+        self._require_current()
+        self._place_camera(frame)
+        bodies = [each for each in bpy.data.objects if each.name not in self._stage and not each.hide_render]
+        for body in bodies:
+            body.hide_render = True
+        try:
+            with settings.small_and_clean(resolution):
+                self._draw(frame, output_path)
+        finally:
+            for body in bodies:
+                body.hide_render = False
+
+    def _require_current(self) -> None:
+        if SceneRenderer._current is not self:
+            raise RenderFailedError("another scene was opened in this process; this renderer is closed")
+
+    def _draw(self, frame: int, output_path: Path) -> None:
         bpy.context.scene.frame_set(frame)
         outcome = bpy.ops.render.render()
         if "FINISHED" not in outcome:
@@ -194,9 +228,15 @@ def _report(line: str) -> None:
     sys.stdout.flush()
 
 
-def _render_and_report(renderer: SceneRenderer, frame: int, output_path: Path) -> bool:
+def _render_and_report(
+    renderer: SceneRenderer, frame: int, output_path: Path, *, stage: tuple[int, int] | None = None
+) -> bool:
+    """Draw a frame, or in so many pixels its empty stage, and say how that ended."""
     try:
-        renderer.render(frame, output_path)
+        if stage is None:
+            renderer.render(frame, output_path)
+        else:
+            renderer.render_stage(frame, output_path, resolution=stage)
     except (RenderInputError, RenderFailedError, OSError, RuntimeError) as error:
         _report(f"FRAME_FAILED {frame} {error}")
         return False
@@ -216,8 +256,14 @@ def _serve(renderer: SceneRenderer) -> None:
     threading.Thread(target=_follow, args=(sys.stdin, requests), daemon=True).start()
     _report(f"RENDERER_READY {blender_version()} {renderer.device}")
     while True:
-        frame, _, output_path = requests.get().rstrip("\n").partition(" ")
-        _render_and_report(renderer, int(frame), Path(output_path))
+        request, stage = requests.get().rstrip("\n"), None
+        if request.startswith("stage "):
+            _, frame, size, output_path = request.split(" ", 3)
+            width, _, height = size.partition("x")
+            stage = int(width), int(height)
+        else:
+            frame, _, output_path = request.partition(" ")
+        _render_and_report(renderer, int(frame), Path(output_path), stage=stage)
 
 
 def main(arguments: list[str]) -> int:

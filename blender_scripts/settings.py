@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +46,9 @@ QUALITY_PRESETS = {
     "preview": QualityPreset(48, 0.05, "BALANCED", "ACCURATE", True, 2.0, 1, 10, 2, 10),
     "final": QualityPreset(256, 0.02, "HIGH", "ACCURATE", True, 1.0, 3, 24, 4, 16),
 }
+
+_CLEAN_SAMPLES = 16
+"""Of an empty stage, which is smooth: what is left of the noise after denoising is below a grey level or two."""
 
 _GPU_BACKENDS = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
 """In order of preference."""
@@ -113,6 +118,31 @@ def _apply_cycles_settings(cycles: Any, parameters: dict[str, Any]) -> None:
     cycles.blur_glossy = 1.0
     cycles.sample_clamp_direct = 0.0
     cycles.sample_clamp_indirect = 6.0
+
+
+@contextmanager
+def small_and_clean(resolution: tuple[int, int]) -> Iterator[None]:
+    """Draw in another size, with few samples that are denoised and without blur; then as before.
+
+    Args:
+        resolution: width and height [pixels].
+    """
+    render, cycles = bpy.context.scene.render, bpy.context.scene.cycles
+    changes = [
+        (render, "resolution_x", resolution[0]),
+        (render, "resolution_y", resolution[1]),
+        (render, "use_motion_blur", False),
+        (cycles, "samples", _CLEAN_SAMPLES),
+        (cycles, "use_denoising", True),
+    ]
+    before = [getattr(owner, name) for owner, name, _ in changes]
+    for owner, name, value in changes:
+        setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        for (owner, name, _), value in zip(changes, before, strict=True):
+            setattr(owner, name, value)
 
 
 def choose_device(wanted: str) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pipeline.cached_smoke import (
     SmokeInBox,
     grids_of,
+    read_density,
     read_smoke,
     require_stored,
     slabs,
@@ -156,6 +157,16 @@ def read_smoke_in_box(path: Path, name: str) -> SmokeInBox:
     """
     with _frame(path) as file:
         return read_smoke(file["bodies"][name])
+
+
+def read_smoke_density(path: Path, name: str) -> tuple[NDArray[np.float32], tuple[float, float, float], float]:
+    """Read a smoke's density alone, without the empty space around it: `cached_smoke.read_density`.
+
+    Raises:
+        InvalidArtifactError: the file is truncated, damaged or of another format.
+    """
+    with _frame(path) as file:
+        return read_density(file["bodies"][name])
 
 
 def read_numbers(path: Path, only: Collection[str] | None = None) -> FrameNumbers:

@@ -141,6 +141,22 @@ def read_smoke(group: h5py.Group) -> SmokeInBox:
     )
 
 
+def read_density(group: h5py.Group) -> tuple[Float32Array, tuple[float, float, float], float]:
+    """Read where a smoke is, from the group of its body.
+
+    Returns:
+        Density of the cells that are not empty (nx, ny, nz) [-], lower corner of the first of them [m], and the edge of
+        a cell [m].
+
+    Raises:
+        InvalidArtifactError: its grids are none that `write_smoke` writes.
+    """
+    density = grids_of(group)["density"]
+    part, cell_size = stored_box(density), float(group.attrs["cell_size"])
+    x, y, z = (float(low) + side.start * cell_size for low, side in zip(group.attrs["origin"], part, strict=True))
+    return density[part], (x, y, z), cell_size
+
+
 def grids_of(group: h5py.Group) -> dict[str, h5py.Dataset]:
     """The grids of a smoke by name, of which nothing has been read yet.
 

@@ -84,6 +84,10 @@ class JobLayout:
         """Where a camera that moves is at a frame, for Blender: path relative to the folder, with {frame}."""
         return "views/{frame}.json"
 
+    def rejected_picture(self, frame: int) -> Path:
+        """A picture that failed its checks twice, kept to be looked at."""
+        return self.root / "rejected" / f"{frame:06d}.png"
+
     @property
     def checkpoints(self) -> Path:
         """Folder of the simulation's checkpoints."""
@@ -94,6 +98,16 @@ class JobLayout:
     def frame_cache(frame: int) -> ArtifactPath:
         """HDF5 snapshot of every body at one frame."""
         return ArtifactPath(f"cache/{frame:06d}.h5")
+
+    @staticmethod
+    def frame_bounds(frame: int) -> ArtifactPath:
+        """Boxes around the bodies of one frame."""
+        return ArtifactPath(f"bounds/{frame:06d}.json")
+
+    @staticmethod
+    def film_bounds() -> ArtifactPath:
+        """The box that a camera frames which frames the action."""
+        return ArtifactPath("bounds.json")
 
     @staticmethod
     def body_mesh(body: str, part: str = "body") -> ArtifactPath:

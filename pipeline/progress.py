@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
 from pipeline import wording
-from pipeline.executors.base import Committed, Failed
+from pipeline.executors.base import Committed, Failed, Warned
 from pipeline.executors.base import Progress as TaskProgress
 from pipeline.plan import Assessment, Verdict, summarize
 from pipeline.run_events import Notice, RunEvent, RunStarted, StateChanged
@@ -92,6 +92,7 @@ class ProgressObserver:
     stages: dict[str, StageProgress] = field(default_factory=dict)
     _awaited: dict[TaskId, set[ArtifactPath]] = field(default_factory=dict)
     _stage_of: dict[TaskId, str] = field(default_factory=dict)
+    _warned: set[tuple[str, str]] = field(default_factory=set)
 
     def notify(self, event: RunEvent) -> None:
         """Take note of an event, and show it."""
@@ -109,6 +110,8 @@ class ProgressObserver:
                 self.stages[stage].failed += 1
             case Failed(task_id, attempt, kind, message):
                 self.display.say(f"{task_id} (attempt {attempt}) {kind.value}: {message}", style="red")
+            case Warned(task_id, _, kind, message):
+                self._warn(self._stage_of[task_id], kind, message)
             case Notice(message):
                 self.display.say(message, style="yellow")
             case _:
@@ -129,6 +132,12 @@ class ProgressObserver:
             stage.at_start += done
             self._stage_of[task.id] = task.stage
             self._awaited[task.id] = set(assessment.rebuilds)
+
+    def _warn(self, stage: str, kind: str, message: str) -> None:
+        """The first of each kind; a camera that is lost may be so for thousands of frames."""
+        if (stage, kind) not in self._warned:
+            self._warned.add((stage, kind))
+            self.display.say(f"warning: {message}; more of the kind are in the logs: pipeline logs", style="yellow")
 
     def _count(self, task_id: TaskId, artifacts: set[ArtifactPath], now: float) -> None:
         """These are there now; each counts once, also if a second attempt commits it again."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 
-from pipeline.executors.base import Assignment, Committed, Failed, Finished, TaskEvent
+from pipeline.executors.base import Assignment, Committed, Failed, Finished, TaskEvent, Warned
 from pipeline.fingerprint import task_fingerprint
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -107,6 +107,9 @@ class RunRecord:
         match event:
             case Committed(task_id, _, receipt):
                 return [self._take_receipt(task_id, receipt)]
+            case Warned(task_id, _, _, message):
+                self._manifest.log_event("warning", message, task=task_id)
+                return []
             case Finished():
                 return self._take_end(event, lacking(event.task_id))
             case Failed():

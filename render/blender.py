@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 from collections import deque
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
@@ -73,6 +74,13 @@ class Renderer(Protocol):
     def render(self, frame: int, output_path: Path) -> None:
         """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
 
+    def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
+        """Draw what the camera of a frame sees without any body, so many pixels wide and high.
+
+        Raises:
+            FrameRenderError: it cannot be drawn.
+        """
+
     def close(self) -> None:
         """Let go of Blender; idempotent."""
 
@@ -128,12 +136,13 @@ class ModuleRenderer:
 
     def render(self, frame: int, output_path: Path) -> None:
         """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
-        from blender_scripts.errors import RenderFailedError, RenderInputError
-
-        try:
+        with _told_of(frame):
             self._scene.render(frame, output_path)
-        except (RenderInputError, RenderFailedError, RuntimeError) as error:
-            raise FrameRenderError(frame, str(error)) from error
+
+    def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
+        """Draw what the camera of a frame sees without any body. Raises FrameRenderError."""
+        with _told_of(frame):
+            self._scene.render_stage(frame, output_path, resolution=resolution)
 
     def close(self) -> None:
         """Nothing to do: the module stays loaded, and the next scene replaces this one."""
@@ -176,10 +185,18 @@ class ExecutableRenderer:
             FrameRenderError: this frame cannot be drawn.
             BlenderDiedError: the executable is gone; this renderer is of no more use.
         """
+        self._ask(frame, f"{frame} {output_path.resolve()}")
+
+    def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
+        """Draw what the camera of a frame sees without any body. Raises as `render` does."""
+        width, height = resolution
+        self._ask(frame, f"stage {frame} {width}x{height} {output_path.resolve()}")
+
+    def _ask(self, frame: int, request: str) -> None:
         stdin = self._process.stdin
         assert stdin is not None
         try:
-            stdin.write(f"{frame} {output_path.resolve()}\n")
+            stdin.write(f"{request}\n")
             stdin.flush()
         except (BrokenPipeError, ValueError) as error:
             raise self._died(frame) from error
@@ -228,6 +245,17 @@ class ExecutableRenderer:
 
     def _last_lines(self) -> str:
         return "\n".join(self._log_tail) or "(it wrote nothing)"
+
+
+@contextlib.contextmanager
+def _told_of(frame: int) -> Iterator[None]:
+    """Errors of the scripts in this process as those of a frame."""
+    from blender_scripts.errors import RenderFailedError, RenderInputError
+
+    try:
+        yield
+    except (RenderInputError, RenderFailedError, RuntimeError) as error:
+        raise FrameRenderError(frame, str(error)) from error
 
 
 def build_argv(blender: str, spec_path: Path, *, threads: int) -> list[str]:

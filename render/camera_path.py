@@ -27,6 +27,7 @@ TURNS_FROM_DEG = 45.0
 """A camera that goes farther around the scene than this sees beside a backdrop that stands behind it."""
 
 NEAREST_FOCUS_M = 1.0e-3
+RIM_POINTS = 32
 VIEWS_VERSION = 1
 
 
@@ -57,34 +58,53 @@ def frame_box(
     elevation: float = ELEVATION,
     margin: float = MARGIN,
 ) -> tuple[Vector3, Vector3]:
-    """The closest view from a given direction that shows a whole box, centred.
+    """The closest view from a given direction that shows a whole box, centred; see `frame_points`."""
+    corners = np.array(list(itertools.product(*zip(box_min, box_max, strict=True))), dtype=np.float64)
+    return frame_points(
+        corners,
+        focal_length_mm=focal_length_mm,
+        aspect=aspect,
+        azimuth=azimuth,
+        elevation=elevation,
+        margin=margin,
+    )
 
-    In camera axes (right x, up y, forward z) a corner is inside the frustum of a camera at (a, b, -d) if
+
+def frame_points(
+    points: Array,
+    *,
+    focal_length_mm: float,
+    aspect: float,
+    azimuth: float = AZIMUTH,
+    elevation: float = ELEVATION,
+    margin: float = MARGIN,
+) -> tuple[Vector3, Vector3]:
+    """The closest view from a given direction that shows all points, centred.
+
+    In camera axes (right x, up y, forward z) a point is inside the frustum of a camera at (a, b, -d) if
     |x - a| <= t_x (z + d) and |y - b| <= t_y (z + d), where t is the tangent of half the field of view. For one axis
     alone the smallest d is (max(x/t - z) + max(-x/t - z)) / 2, and a lies in the middle; the larger d of the two
     axes serves both.
 
     Args:
-        box_min: lower corner [m].
-        box_max: upper corner [m].
+        points: that are shown [m], (n, 3).
         focal_length_mm: of the lens, on a 36 mm sensor.
         aspect: width over height of the picture.
-        azimuth: direction from the box to the camera, around z from +x [rad].
+        azimuth: direction from the points to the camera, around z from +x [rad].
         elevation: of the camera above the horizon [rad].
         margin: share of the picture that stays free on each side.
 
     Returns:
         Where the camera stands and what it looks at [m].
     """
-    corners = np.array(list(itertools.product(*zip(box_min, box_max, strict=True))), dtype=np.float64)
-    centre = (np.asarray(box_min, dtype=np.float64) + np.asarray(box_max, dtype=np.float64)) / 2
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
     forward = -np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     )
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     up = np.cross(right, forward)
-    x, y, z = ((corners - centre) @ np.stack([right, up, forward], axis=1)).T
+    x, y, z = ((points - centre) @ np.stack([right, up, forward], axis=1)).T
 
     # Blender's sensor fits the longer side of the picture.
     tangent_long = SENSOR_WIDTH_MM / 2 / focal_length_mm
@@ -99,6 +119,23 @@ def frame_box(
     return _vector(target - max(distances) * forward), _vector(target)
 
 
+def _frame_all_round(box: Array, *, focal_length_mm: float, aspect: float) -> tuple[Vector3, Vector3]:
+    """The closest view from which a whole box stays in the picture on the way around its vertical axis.
+
+    The box turns in a cylinder; its rims are framed. The point looked at is moved along the view onto the axis, which
+    the way leads around.
+    """
+    centre, radius = box.mean(axis=0), float(np.linalg.norm(box[1, :2] - box[0, :2])) / 2
+    angles = AZIMUTH + np.linspace(0.0, 2.0 * math.pi, RIM_POINTS, endpoint=False)
+    # The corners of the polygon around the circle, so that no part of the rim is left out.
+    rim = centre[:2] + radius / math.cos(math.pi / RIM_POINTS) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = np.concatenate([np.column_stack([rim, np.full(RIM_POINTS, z)]) for z in box[:, 2]])
+    position, target = map(np.array, frame_points(points, focal_length_mm=focal_length_mm, aspect=aspect))
+    forward = target - position
+    along = (centre[:2] - target[:2]) @ forward[:2] / (forward[:2] @ forward[:2])
+    return _vector(position), _vector(target + along * forward)
+
+
 class CameraPath:
     """The view of a job's camera at any time.
 
@@ -108,9 +145,11 @@ class CameraPath:
 
     Args:
         camera: as the job describes it; its bodies are all in `starts`.
-        box_min, box_max: corners of the domain, which is what a camera without a position frames [m].
+        box_min, box_max: corners of the domain, which a camera without a position frames if nothing else is named [m].
         aspect: width over height of the picture.
         starts: where bodies are at the start [m].
+        framed: corners of the box that a camera without a position frames instead [m], (2, 3); from all sides if it
+            goes around.
     """
 
     def __init__(
@@ -121,6 +160,7 @@ class CameraPath:
         *,
         aspect: float,
         starts: Mapping[str, Sequence[float]],
+        framed: Array | None = None,
     ) -> None:
         self._camera, self._aimed_at = camera, camera.look_at if isinstance(camera.look_at, str) else None
         named = (camera.follow, camera.focus, self._aimed_at)
@@ -132,10 +172,15 @@ class CameraPath:
         look_at = None if isinstance(camera.look_at, str) else camera.look_at
         if camera.position is None and not camera.keyframe:
             focal_length = camera.focal_length_mm
-            position, framed = frame_box(box_min, box_max, focal_length_mm=focal_length, aspect=aspect)
+            if framed is None:
+                position, middle = frame_box(box_min, box_max, focal_length_mm=focal_length, aspect=aspect)
+            elif camera.orbit_deg_per_s:
+                position, middle = _frame_all_round(framed, focal_length_mm=focal_length, aspect=aspect)
+            else:
+                position, middle = frame_box(*framed, focal_length_mm=focal_length, aspect=aspect)
         else:
-            position, framed = camera.position or camera.keyframe[0].position, _vector(self._centre)
-        self._position, self._look_at = np.array(position), np.array(framed if look_at is None else look_at)
+            position, middle = camera.position or camera.keyframe[0].position, _vector(self._centre)
+        self._position, self._look_at = np.array(position), np.array(middle if look_at is None else look_at)
         self._interpolate = self._through_keyframes() if camera.keyframe else None
 
     def view(self, time_s: float, bodies: Mapping[str, Sequence[float]]) -> View:

@@ -6,7 +6,7 @@ encodes its segment again and nothing else. Colours are BT.709, limited range, c
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,12 +115,13 @@ def join_segments(segments: Sequence[Path], output: Path) -> None:
                     frame_count += 1
 
 
-def validate_movie(path: Path, frames: int) -> None:
+def validate_movie(path: Path, frames: int, *, see: Callable[[NDArray[np.uint8]], None] | None = None) -> None:
     """Decode a film and count its frames.
 
     Args:
         path: an MP4 by `encode_segment` or `join_segments`.
         frames: how many it must have.
+        see: gets the luma of each frame, (height, width), in order.
 
     Raises:
         InvalidFileError: it cannot be decoded, has another number of frames, or they are not evenly spaced.
@@ -140,6 +141,8 @@ def validate_movie(path: Path, frames: int) -> None:
                     raise InvalidFileError(path, f"frame {count} is at {time} s instead of {count * spacing} s")
                 if frame.is_corrupt:
                     raise InvalidFileError(path, f"frame {count} is damaged")
+                if see is not None:
+                    see(frame.to_ndarray(format="gray"))
                 count += 1
         except av.FFmpegError as error:
             raise InvalidFileError(path, f"cannot be decoded after {count} frames: {error}") from error

@@ -50,10 +50,17 @@ class CameraKeyframeParameters(Parameters):
 class CameraParameters(Parameters):
     """The camera: still, along keyframes, around what it looks at, or with a body.
 
-    Without a position it frames the whole domain from the front.
+    Without a position it frames the whole domain, or all that happens, from the front.
     """
 
-    position: Vector3 | None = Field(default=None, description="Where it stands [m]; frames the domain if omitted.")
+    position: Vector3 | None = Field(
+        default=None, description="Where it stands [m]; where it sees all that `framing` names if omitted."
+    )
+    framing: Literal["domain", "action"] = Field(
+        default="domain",
+        description="What it frames without a position. domain: the whole domain; action: all that moves or stands in "
+        "it over the whole film, without a few outlying particles. Then pictures wait for the simulation's end.",
+    )
     look_at: Vector3 | str | None = Field(
         default=None,
         description="What it looks at: a point [m], or a moving body by its name; the domain's middle if omitted.",
@@ -82,8 +89,18 @@ class CameraParameters(Parameters):
         with_body = self.follow is not None or self.focus is not None or isinstance(self.look_at, str)
         return bool(self.keyframe) or self.orbit_deg_per_s != 0.0 or with_body
 
+    @property
+    def frames_action(self) -> bool:
+        """Whether its place depends on what happens in the film."""
+        return self.framing == "action"
+
     @model_validator(mode="after")
     def _is_one_motion(self) -> Self:
+        if "framing" in self.model_fields_set and (self.keyframe or self.position is not None):
+            place = "keyframes" if self.keyframe else "a position"
+            raise ValueError(
+                f"framing has no meaning beside {place}, which say where the camera is; remove one of them"
+            )
         if self.keyframe and self.orbit_deg_per_s:
             raise ValueError("orbit_deg_per_s has no meaning beside keyframes; remove one of them")
         if self.keyframe and self.position is not None:

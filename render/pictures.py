@@ -19,6 +19,16 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 BLACK_LUMINANCE = 1.0e-4
 """Mean luminance of display values [-] below which a picture counts as black: one pixel in 10 000 is white."""
 
+FLAT_LEVELS = 1
+"""Range of each channel in grey levels of 255 up to which a picture has one colour only: rounding, or little noise."""
+
+VISIBLE_LEVELS = 6
+"""Grey levels of 255 by which a part of a picture differs from the empty stage if something is to be seen there; noise
+of a denoised draft, in the mean of a cell of four pixels, reaches 5."""
+SHARE_THAT_SHOWS = 0.05
+"""Of the cells that bodies are in, so many must look otherwise than the empty stage: what is transparent, or coloured
+as the backdrop is, still has edges and a shadow."""
+
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _CHANNELS_OF_COLOR_TYPE = {0: 1, 2: 3, 4: 2, 6: 4}
@@ -114,9 +124,30 @@ def validate_picture(path: Path, resolution: tuple[int, int]) -> PictureStatisti
     if statistics.mean_luminance < BLACK_LUMINANCE:
         raise InvalidFileError(path, f"is black (mean luminance {statistics.mean_luminance:.2g})")
     color = pixels[..., :3] if channels >= 3 else pixels[..., :1]
-    if (color == color[0, 0]).all():
+    spread = np.ptp(color.reshape(-1, color.shape[2]).astype(np.int64), axis=0).max()
+    if spread <= FLAT_LEVELS * scale / 255.0:
         raise InvalidFileError(path, f"has one colour only: {color[0, 0].tolist()}")
     return statistics
+
+
+def require_more_than_stage(path: Path, stage: NDArray[np.uint8], cells: NDArray[np.bool_]) -> None:
+    """Refuse a picture that shows nothing but the empty stage where bodies should be.
+
+    Args:
+        path: the picture.
+        stage: the same view without the bodies, a pixel for each of the cells, (rows, columns, 3).
+        cells: where bodies are, (rows, columns); some of them.
+
+    Raises:
+        InvalidFileError: nearly all of these cells look as they do without the bodies.
+    """
+    rows, columns = cells.shape
+    small = Image.fromarray(read_rgb8(path)).resize((columns, rows), Image.Resampling.BOX)
+    difference = np.abs(np.asarray(small, np.int16) - stage.astype(np.int16)).max(axis=2)
+    if (difference[cells] >= VISIBLE_LEVELS).mean() < SHARE_THAT_SHOWS:
+        raise InvalidFileError(
+            path, f"shows the empty stage, though bodies are in {100 * cells.mean():.0f} % of it: they were not drawn"
+        )
 
 
 def pixel_hash(path: Path) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from pipeline import artifacts, receipts
 from pipeline.errors import PipelineError
-from pipeline.executors.base import Assignment, Committed, Failed, Finished, Progress, Started, TaskEvent
+from pipeline.executors.base import Assignment, Committed, Failed, Finished, Progress, Started, TaskEvent, Warned
 from pipeline.executors.failures import classify, describe
 from pipeline.executors.memory import peak_memory_bytes, reset_peak_memory
 from pipeline.task import ArtifactPath, FailureKind
@@ -93,6 +93,11 @@ class AttemptContext:
             return
         self._progress_told_at = now
         self._emit(Progress(self.task.id, self.attempt, done, total, message))
+
+    def warn(self, kind: str, message: str) -> None:
+        """Tell what is worth a look, in the log and to the runner; the task goes on."""
+        print(f"warning: {message}", flush=True)
+        self._emit(Warned(self.task.id, self.attempt, kind, message))
 
     def stop_requested(self) -> bool:
         """Whether the task should checkpoint and return."""

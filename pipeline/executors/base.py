@@ -120,7 +120,24 @@ class Failed:
     peak_memory_bytes: int = 0
 
 
-TaskEvent = Started | Progress | Committed | Finished | Failed
+@dataclass(frozen=True, slots=True)
+class Warned:
+    """The attempt goes on, but something is worth a look.
+
+    Attributes:
+        task_id: its task.
+        attempt: its number.
+        kind: what it is about, in a word: the same for all tasks that tell the same.
+        message: a sentence for the user.
+    """
+
+    task_id: TaskId
+    attempt: int
+    kind: str
+    message: str
+
+
+TaskEvent = Started | Progress | Committed | Warned | Finished | Failed
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.job.amounts import count, gigabytes, rounded_up
 from pipeline.job.boxes import Box, domain_box, overlap, span, touch
+from pipeline.job.camera_checks import check_camera
 from pipeline.job.cloth_checks import check_cloths
 from pipeline.job.fluid_checks import check_fluids, check_search_cells, emitted_particles, particle_room
 from pipeline.job.memory_budget import MemoryBudget, memory_budget
@@ -22,7 +23,6 @@ from pipeline.job.problems import Findings
 from pipeline.job.rigid_checks import check_ballast, check_rigid_start
 from pipeline.job.smoke_checks import check_smokes, smoke_box
 from pipeline.job.step_checks import check_time_steps
-from render.parameters import Vector3
 from sim.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
 
@@ -53,7 +53,7 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
     _check_rigid_bodies(job, solids, findings)
     check_rigid_start(job, solids, findings)
     check_ballast(job, solids, findings)
-    _check_camera(job, solids, findings)
+    check_camera(job, solids, findings)
     check_fluids(job, solids, findings)
     check_time_steps(job, solids, findings)
     budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
@@ -93,22 +93,6 @@ def _check_rigid_bodies(job: Job, solids: Mapping[KeyPath, Solid], findings: Fin
     for path, solid in solids.items():
         if path[0] == "rigid" and not any(overlap(solid.bounds, region) for region in regions):
             findings.error(path, f"is wholly outside the domain: it spans {span(solid.bounds)}, not {span(domain)}")
-
-
-def _check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    places: dict[KeyPath, Vector3] = {
-        ("camera", "keyframe", number, "position"): key.position for number, key in enumerate(job.camera.keyframe)
-    }
-    if job.camera.position is not None:
-        places["camera", "position"] = job.camera.position
-    for place, position in places.items():
-        eye = np.array([position])
-        for path, solid in solids.items():
-            if path[0] == "smoke" or not touch(solid.bounds, np.repeat(eye, 2, axis=0), margin=0.0):
-                continue
-            if solid.signed_distance(eye)[0] < 0.0:
-                name = getattr(job, str(path[0]))[path[1]].name
-                findings.error(place, f'is inside "{name}"; move it out')
 
 
 # --- fluid ---------------------------------------------------------------------------------------------------------

@@ -30,8 +30,9 @@ name = "studio"                 # or "outdoor"
 resolution = [960, 540]         # even numbers
 quality = "preview"             # draft, preview or final
 
-# [camera]                      # without one, the camera frames the domain
-# position = [1.6, -1.8, 1.0]
+[camera]
+framing = "action"              # closest to all that happens; "domain" shows pictures while it still simulates
+# position = [1.6, -1.8, 1.0]   # or, instead of framing: where it stands
 # look_at = [0.0, 0.0, 0.2]
 # focal_length_mm = 50.0
 """

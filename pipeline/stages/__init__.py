@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pipeline.stages.base import Stage
 from pipeline.stages.bodies import BodiesStage
+from pipeline.stages.bounds import BoundsStage
 from pipeline.stages.cloth import ClothStage
 from pipeline.stages.movie import MovieStage
 from pipeline.stages.render import RenderStage
@@ -19,6 +20,7 @@ STAGES: tuple[Stage, ...] = (
     ClothStage(),
     VolumeStage(),
     WhitewaterStage(),
+    BoundsStage(),
     RenderStage(),
     MovieStage(),
 )

@@ -37,6 +37,9 @@ class TaskContext(Protocol):
     def progress(self, done: float, total: float, message: str = "") -> None:
         """Tell how far the task is; also the sign of life that keeps it from counting as stalled."""
 
+    def warn(self, kind: str, message: str) -> None:
+        """Tell what is worth a look: in the log, on record, and the first of each kind (a word) while it runs."""
+
     def stop_requested(self) -> bool:
         """Whether the task should checkpoint and return."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -58,15 +59,13 @@ class MovieStage:
 
     def run(self, context: TaskContext) -> None:
         """Encode one segment, or join them all."""
+        from render.continuity import Continuity
         from render.movie import encode_segment, join_segments, validate_movie
 
         task, job = context.task, context.job
         inputs = [context.layout.path(artifact) for artifact in task.inputs]
-        frames = job.frame_count if task.frame is None else len(inputs)
-        with context.committing(task.outputs[0], partial(validate_movie, frames=frames)) as path:
-            if task.frame is None:
-                join_segments(inputs, path)
-            else:
+        if task.frame is not None:
+            with context.committing(task.outputs[0], partial(validate_movie, frames=len(inputs))) as path:
                 encode_segment(
                     inputs,
                     path,
@@ -74,4 +73,15 @@ class MovieStage:
                     parameters=job.movie,
                     threads=context.threads,
                 )
+            context.progress(1, 1)
+            return
+        film = Continuity()
+
+        def validate(path: Path) -> None:
+            validate_movie(path, job.frame_count, see=film.see)
+
+        with context.committing(task.outputs[0], validate) as path:
+            join_segments(inputs, path)
+        for found in film.breaks():
+            context.warn(f"{found.kind} in the film", f"{found}; look at it: {context.layout.picture(found.frame)}")
         context.progress(1, 1)

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from math import cos, prod, radians, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.cache import read_frame
-from pipeline.errors import StageUnavailableError
+from pipeline.errors import InvalidArtifactError, StageUnavailableError
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
+from pipeline.stages.bounds import read_framed
 from pipeline.stages.inputs import tool_version
+from pipeline.stages.sight import BodyAtFrame, bodies_at, expected_cells, warn_of_sight
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
-from render.camera_path import CameraPath, write_views
+from render.camera_path import CameraPath, View, write_views
 from render.point_clouds import KINDS
 from render.poses import write_poses
 from render.spec import (
@@ -38,6 +43,13 @@ from sim.rigid.parameters import RigidBodyParameters
 
 if TYPE_CHECKING:
     from render.blender import Renderer
+
+Poses = Mapping[str, Mapping[str, NDArray[Any]]]
+
+STAGE_PIXELS = 96
+"""Along the longer side of the empty stage that pictures are held against: half a percent of it is 25 pixels."""
+
+BAD_PICTURE = "bad picture"
 
 CORES = 2
 """Threads a frame. Cycles with one keeps a second busy waiting: 7.0 s of processor time a frame against 3.7 s with two
@@ -61,8 +73,11 @@ class RenderStage:
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
         spec = render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
-        if job.camera.moves:
-            spec["camera"]["path"] = job.camera.model_dump(mode="json")
+        if job.camera.frames_action:
+            # Where it is follows from these and from the box that it frames, which is an input.
+            spec["camera"] = {"framing": job.camera.model_dump(mode="json")}
+        elif job.camera.moves:
+            spec["camera"]["path"] = job.camera.model_dump(mode="json", exclude={"framing"})
         parameters = ParameterSet.of(
             spec,
             stage=self.name,
@@ -74,7 +89,9 @@ class RenderStage:
             memory_bytes=WORKER_BYTES + BYTES_PER_PIXEL * prod(job.render.resolution),
             gpus=int(job.render.device == "gpu"),
         )
-        static = tuple(layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type))
+        static = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
+        if job.camera.frames_action:
+            static.append(layout.film_bounds())
         return [
             Task(
                 id=TaskId(f"render/{frame:06d}"),
@@ -102,29 +119,35 @@ class RenderStage:
         return []
 
     def run(self, context: TaskContext) -> None:
-        """Draw one frame."""
+        """Draw one frame.
+
+        Raises:
+            InvalidArtifactError: its picture failed the checks twice.
+        """
         from render.blender import BlenderDiedError
         from render.pictures import validate_picture
 
-        task, job = context.task, context.job
+        task, job, layout = context.task, context.job, context.layout
         assert task.frame is not None
-        renderer = _warm_renderer(context)
+        poses, view = _write_motion(context, task.frame)
+        bodies = list(bodies_at(job, layout, task.frame, poses))
+        warn_of_sight(context, view, bodies)
 
         def validate(path: Path) -> None:
             validate_picture(path, job.render.resolution)
 
-        _write_motion(context, task.frame)
         try:
             with context.committing(task.outputs[0], validate) as path:
-                renderer.render(task.frame, path)
+                _draw_until_good(context, path, view, bodies)
         except BlenderDiedError:
             _close_renderers()  # the next attempt, maybe in this process, needs a living one
             raise
+        layout.rejected_picture(task.frame).unlink(missing_ok=True)
         context.progress(1, 1)
 
 
-def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
-    """The job as Blender sees it; paths are relative to the job's folder."""
+def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None = None) -> RenderSpec:
+    """The job as Blender sees it; paths are relative to the job's folder. `framed` as in `camera_path`."""
     objects: list[SceneObject] = [
         _body_object(job, layout, body, part) for body in job.rigid for part in parts_of(body.shape.type)
     ]
@@ -167,7 +190,7 @@ def render_spec(job: Job, layout: JobLayout) -> RenderSpec:
         fps=job.fps,
         domain_min=job.domain.min,
         domain_max=job.domain.max,
-        camera=Camera.on(camera_path(job), f_stop=job.camera.f_stop, views=layout.views),
+        camera=Camera.on(camera_path(job, framed), f_stop=job.camera.f_stop, views=layout.views),
         stage=job.stage,
         lights=job.light,
         objects=tuple(objects),
@@ -185,11 +208,16 @@ def _body_object(job: Job, layout: JobLayout, body: RigidBodyParameters, part: s
     return MovingMeshObject(name=name, file=file, body=body.name, poses=layout.poses, material=material)
 
 
-def camera_path(job: Job) -> CameraPath:
-    """Where the camera of a job goes."""
+def camera_path(job: Job, framed: NDArray[np.float64] | None = None) -> CameraPath:
+    """Where the camera of a job goes.
+
+    Args:
+        job: the job.
+        framed: the box that it frames if it frames the action [m], (2, 3); the domain while that is not known.
+    """
     width, height = job.render.resolution
     starts = {body.name: body.position for body in job.rigid}
-    return CameraPath(job.camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts)
+    return CameraPath(job.camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts, framed=framed)
 
 
 @cache
@@ -219,13 +247,20 @@ def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]
     return surfaces + cloths + volumes + points + cached
 
 
-def _write_motion(context: TaskContext, frame: int) -> None:
-    """Put where bodies and camera are at a frame where Blender finds it.
+def _framed(context: TaskContext) -> NDArray[np.float64] | None:
+    """The box that the camera frames, where it frames the action."""
+    if not context.job.camera.frames_action:
+        return None
+    return read_framed(context.layout.path(context.layout.film_bounds()))
+
+
+def _write_motion(context: TaskContext, frame: int) -> tuple[Poses, View]:
+    """Put where bodies and camera are at a frame where Blender finds it; returns it, too.
 
     These documents are no artifacts, but a form of the cached frame and of the job.
     """
     job, layout = context.job, context.layout
-    bodies, camera = job.moving_bodies, camera_path(job)
+    bodies, camera = job.moving_bodies, camera_path(job, _framed(context))
     cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies if bodies else {}
     poses = {name: cached[name].arrays for name in bodies}
     if bodies:
@@ -239,6 +274,60 @@ def _write_motion(context: TaskContext, frame: int) -> None:
             views[offset] = camera.view((frame + offset) / job.fps, places)
         with _replacing(context, layout.views, frame) as path:
             write_views(path, frame, views)
+    places = {name: _position_after(0.0, poses[name]) for name in camera.bodies}
+    return poses, camera.view(frame / job.fps, places)
+
+
+def _draw_until_good(context: TaskContext, path: Path, view: View, bodies: Sequence[BodyAtFrame]) -> None:
+    """Draw a frame, and once more if its picture fails the checks; a picture that fails again is kept.
+
+    Raises:
+        InvalidArtifactError: it failed again.
+    """
+    from render.errors import InvalidFileError
+
+    frame = context.task.frame
+    assert frame is not None
+    for once_more in (True, False):
+        try:
+            _warm_renderer(context).render(frame, path)
+            _check_picture(context, frame, path, view, bodies)
+        except InvalidFileError as error:
+            if once_more:
+                _close_renderers()  # what went wrong in it may stay so
+                context.warn(BAD_PICTURE, f"frame {frame}: the picture {error.reason}; it is drawn once more")
+                continue
+            rejected = context.layout.rejected_picture(frame)
+            rejected.parent.mkdir(exist_ok=True)
+            shutil.copyfile(path, rejected)
+            raise InvalidArtifactError(
+                f"frame {frame}: the picture {error.reason}; twice; it is kept as {rejected}"
+            ) from error
+        return
+
+
+def _check_picture(context: TaskContext, frame: int, path: Path, view: View, bodies: Sequence[BodyAtFrame]) -> None:
+    """Raise InvalidFileError if a picture is damaged, black, of one colour, or shows the stage without its bodies."""
+    from render.pictures import read_rgb8, require_more_than_stage, validate_picture
+
+    job = context.job
+    validate_picture(path, job.render.resolution)
+    width, height = job.render.resolution
+    scale = min(1.0, STAGE_PIXELS / max(width, height))
+    columns, rows = max(4, round(scale * width)), max(4, round(scale * height))
+    cells = expected_cells(job, view, bodies, (rows, columns))
+    if cells is None:
+        return
+    if job.camera.moves or "still" not in _EMPTY_STAGE:
+        with tempfile.TemporaryDirectory(prefix="stage-") as folder:
+            picture = Path(folder) / "stage.png"
+            _warm_renderer(context).render_stage(frame, picture, resolution=(columns, rows))
+            stage = read_rgb8(picture)
+        if not job.camera.moves:
+            _EMPTY_STAGE["still"] = stage
+    else:
+        stage = _EMPTY_STAGE["still"]
+    require_more_than_stage(path, stage, cells)
 
 
 def _position_after(time_s: float, pose: Mapping[str, NDArray[Any]]) -> list[float]:
@@ -274,7 +363,7 @@ _WARM: dict[str, Renderer] = {}
 def _warm_renderer(context: TaskContext) -> Renderer:
     from render.blender import open_renderer
 
-    spec = render_spec(context.job, context.layout)
+    spec = render_spec(context.job, context.layout, _framed(context))
     key = digest_of(f"{context.layout.root} {context.threads} {spec.model_dump_json()}")
     if key not in _WARM:
         _close_renderers()
@@ -286,7 +375,12 @@ def _warm_renderer(context: TaskContext) -> Renderer:
     return _WARM[key]
 
 
+_EMPTY_STAGE: dict[str, NDArray[np.uint8]] = {}
+"""What the warm renderer draws without any body, (rows, columns, 3); kept for a camera that stands still."""
+
+
 def _close_renderers() -> None:
     for renderer in _WARM.values():
         renderer.close()
     _WARM.clear()
+    _EMPTY_STAGE.clear()

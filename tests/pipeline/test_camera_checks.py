@@ -100,3 +100,47 @@ position = [0.0, 0.0, 0.7]
     assert found.warnings == [
         f"pond.toml:{line} camera.keyframe[{number}].time_s: {after_the_end}" for number, line in ((1, 22), (2, 26))
     ]
+
+
+def warnings_of(camera: str, tmp_path) -> list[str]:
+    domain = "[domain]\nmin = [-0.5, -0.5, 0.0]\nmax = [0.5, 0.5, 1.4]\n"
+    return checked(f"{DUCK}{domain}[camera]\n{camera}\n", tmp_path / "pond.toml").warnings
+
+
+@pytest.mark.parametrize(
+    ("camera", "complaint"),
+    [
+        ("position = [0.0, -2.0, -0.3]", "is below the ground, z = 0 m, at 0 s"),
+        ("position = [0.0, -2.0, 0.5]\nlook_at = [0.0, -9.0, 0.5]", "looks away from everything at the start"),
+        # It ends above the domain and looks up.
+        (
+            "keyframe = [{ time_s = 0, position = [0, -3, 0.5] }, "
+            "{ time_s = 1, position = [0, 0, 3], look_at = [0, 0, 9] }]",
+            "looks away from the domain at 0.992 s and at 1.98 s",
+        ),
+        # The rock is at x = 0.4, as long as the film lasts.
+        (
+            "keyframe = [{ time_s = 0, position = [0.4, -2, 0.5] }, { time_s = 2, position = [0.4, 2, 0.5] }]",
+            'passes through "rock" at ',
+        ),
+        # Less than the way to the far point that it looks at, divided by a thousand.
+        (
+            "position = [0.0, -0.2, 0.5]\nlook_at = [0.0, 200.0, 0.5]",
+            'is 0.1 m from "duck", and draws nothing nearer than 0.2 m',
+        ),
+        ("position = [0.0, -9.0, 0.5]\nlook_at = [0.0, -8.999, 0.5]", "draws nothing farther than 1 m"),
+    ],
+)
+def test_a_camera_that_cannot_see_what_happens_is_told(camera, complaint, tmp_path):
+    found = warnings_of(camera, tmp_path)
+    assert len(found) == 1 and complaint in found[0], found
+
+
+def test_a_good_camera_is_not_complained_about(tmp_path):
+    for camera in ("position = [0.0, -2.0, 0.5]", "orbit_deg_per_s = 90.0", 'framing = "action"'):
+        assert not warnings_of(camera, tmp_path)
+
+
+def test_the_look_away_of_a_camera_that_goes_with_a_body_is_seen_at_the_start(tmp_path):
+    camera = 'position = [0.0, -2.0, 0.5]\nlook_at = [0.0, -9.0, 0.5]\nfollow = "duck"'
+    assert any("looks away from everything at the start" in line for line in warnings_of(camera, tmp_path))

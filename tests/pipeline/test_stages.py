@@ -52,6 +52,7 @@ def test_every_frame_gets_its_surface_volume_and_picture():
         "cloth": 0,
         "volume": 40,
         "whitewater": 0,
+        "bounds": 0,
         "render": 40,
         "movie": 3,
     }

@@ -1,0 +1,152 @@
+"""Pictures that Blender ends well and that show nothing of the film: drawn once more, then told and kept."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blender_scenes import read, spec_of, sphere, still_camera, write_mesh
+from drawn_jobs import RED, job_of_the_ball, pose
+from fresh_python import run_python
+from inline_tasks import run_task
+from needed_blender import needs_bpy
+from PIL import Image
+
+from pipeline.cache import write_frame
+from pipeline.executors.base import Failed, Finished
+from pipeline.job.loading import load_job
+from pipeline.stages import render as render_stage
+from pipeline.stages.render import RenderStage
+from render.camera_path import View, write_views
+from render.errors import InvalidFileError
+from render.parameters import CameraParameters
+from render.pictures import require_more_than_stage, validate_picture
+from render.spec import MeshObject
+from sim.snapshots import Snapshot
+from sim.world import FrameReport
+
+SAME_FRAMES = """
+    import sys
+    from pathlib import Path
+    from render.blender import open_renderer
+    folder, blender = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
+    renderer = open_renderer(folder / "spec.json", threads=1, blender=blender)
+    renderer.render(0, folder / "before.png")
+    renderer.render_stage(0, folder / "stage.png", resolution=(32, 18))
+    renderer.render(0, folder / "after.png")
+    renderer.render_stage(1, folder / "stage1.png", resolution=(32, 18))
+    renderer.close()
+"""
+
+
+@needs_bpy
+def test_the_empty_stage_is_drawn_without_bodies_and_leaves_the_frames_as_they_are(tmp_path):
+    ball = MeshObject(name="ball", file="ball.ply", position=(0.0, 0.0, 0.5), material=RED)
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.3))
+    (tmp_path / "views").mkdir()
+    for frame, x in enumerate((0.0, 1.0)):
+        view = View((x, -2.5, 0.5), (x, 0.0, 0.5), 50.0, 2.5)
+        write_views(tmp_path / f"views/{frame:06d}.json", frame, {-0.25: view, 0.0: view, 0.25: view})
+    camera = still_camera(CameraParameters(position=(0.0, -2.5, 0.5), look_at=(0.0, 0.0, 0.5)))
+    moving = camera.model_copy(update={"views": "views/{frame}.json", "distance_all_round": 2.5})
+    spec_of(ball, denoise=False).model_copy(update={"camera": moving}).write(tmp_path / "spec.json")
+    run_python(SAME_FRAMES, str(tmp_path))
+    assert (tmp_path / "before.png").read_bytes() == (tmp_path / "after.png").read_bytes()
+    stage = read(tmp_path / "stage.png")
+    assert stage.shape == (18, 32, 3)
+    assert (stage[..., 0] <= stage[..., 2]).mean() > 0.95, "nothing red is in it"
+    assert (read(tmp_path / "stage1.png") != stage).any(), "its camera is that of the frame"
+
+
+SIZE = (192, 108)
+"""With a cell of the empty stage for four pixels; noise of single pixels looks like something that is drawn."""
+
+DROPS_BODIES = """
+import blender_scripts.geometry as geometry
+from pathlib import Path
+left = Path({counter!r})
+if left.is_file() and int(left.read_text()) > 0:
+    left.write_text(str(int(left.read_text()) - 1))
+    new = geometry.new_mesh_object
+    def dropped(name, mesh):
+        made = new(name, mesh)
+        made.hide_render = name == "ball"
+        return made
+    geometry.new_mesh_object = dropped
+"""
+"""Put before a Blender: it draws no ball, as often as the counter says, and then does."""
+
+
+def draw_with_faults(folder: Path, faults: int):
+    """Draw a frame of the ball by a Blender that drops it in so many of its processes; how it ended, and the layout."""
+    job, layout = job_of_the_ball(folder, "pond", "")
+    layout.job_file.write_text(
+        layout.job_file.read_text().replace("[64, 36]", f"{[*SIZE]}").replace("denoise = false", "denoise = true")
+    )
+    executable = Path(job.render.blender)
+    counter = folder / "faults"
+    counter.write_text(str(faults))
+    lines = executable.read_text().splitlines()
+    start = next(index for index, line in enumerate(lines) if "runpy.run_path" in line)
+    root = Path(__file__).resolve().parents[2]
+    fault = [f"sys.path.insert(0, {str(root)!r})", *DROPS_BODIES.format(counter=str(counter)).splitlines()]
+    executable.write_text("\n".join([*lines[:start], *fault, *lines[start:]]) + "\n")
+    executable.chmod(executable.stat().st_mode | stat.S_IXUSR)
+    cache = layout.path(layout.frame_cache(1))
+    cache.parent.mkdir()
+    ball = Snapshot("rigid", pose()["ball"], {})
+    write_frame(cache, {"ball": ball}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu")
+    ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
+    render_stage._close_renderers()
+    return ended, layout
+
+
+@needs_bpy
+def test_a_body_that_was_dropped_once_is_drawn_by_a_new_renderer(tmp_path):
+    ended, layout = draw_with_faults(tmp_path, 1)
+    assert isinstance(ended, Finished), ended
+    assert (read(layout.path(layout.picture(1)))[..., 0] > 100).any()
+    assert "shows the empty stage" in layout.log(ended.task_id, 1).read_text()
+    assert (tmp_path / "faults").read_text() == "0"
+    assert not layout.rejected_picture(1).exists()
+
+
+@needs_bpy
+def test_a_body_that_is_dropped_again_fails_the_frame_and_its_picture_is_kept(tmp_path):
+    ended, layout = draw_with_faults(tmp_path, 2)
+    assert isinstance(ended, Failed)
+    assert ended.message.startswith("frame 1: the picture shows the empty stage, though bodies are in ")
+    assert str(layout.rejected_picture(1)) in ended.message
+    validate_picture(layout.rejected_picture(1), SIZE)
+    assert not layout.path(layout.picture(1)).exists()
+
+
+def test_only_cells_that_bodies_are_in_count_against_the_stage(tmp_path):
+    shade = np.linspace(60, 120, 40)[:, None, None] * np.ones((40, 80, 3))
+    stage = shade.reshape(20, 2, 40, 2, 3).mean(axis=(1, 3)).astype(np.uint8)
+    noise = np.random.default_rng(0).normal(0.0, 2.0, shade.shape)
+    cells = np.zeros((20, 40), np.bool_)
+    cells[5:15, 10:20] = True
+    empty, drawn, beside = shade + noise, shade + noise, shade + noise
+    drawn[10:14, 20:40] += 20
+    beside[:, 60:] += 50
+    for name, pixels in (("empty", empty), ("drawn", drawn), ("beside", beside)):
+        Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    require_more_than_stage(tmp_path / "drawn.png", stage, cells)
+    for name in ("empty", "beside"):
+        with pytest.raises(InvalidFileError, match="though bodies are in 12 % of it"):
+            require_more_than_stage(tmp_path / f"{name}.png", stage, cells)
+
+
+def test_a_picture_of_one_colour_and_rounding_is_flat_and_one_with_a_faint_shade_is_not(tmp_path):
+    flat = np.full((30, 40, 3), 90, np.uint8)
+    flat[::2] += 1
+    faint = flat.copy()
+    faint[10:20, 10:20] += 3
+    Image.fromarray(flat).save(tmp_path / "flat.png")
+    Image.fromarray(faint).save(tmp_path / "faint.png")
+    with pytest.raises(InvalidFileError, match="has one colour only"):
+        validate_picture(tmp_path / "flat.png", (40, 30))
+    validate_picture(tmp_path / "faint.png", (40, 30))
