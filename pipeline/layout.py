@@ -70,6 +70,11 @@ class JobLayout:
         return self.root / "report.html"
 
     @property
+    def stills(self) -> Path:
+        """Folder of single frames drawn otherwise than the film's; no artifacts."""
+        return self.root / "stills"
+
+    @property
     def inputs(self) -> Path:
         """Copies of the user's own files, such as meshes."""
         return self.root / "inputs"
