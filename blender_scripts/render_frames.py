@@ -24,7 +24,7 @@ if __package__ in (None, ""):
 
 import bpy
 
-from blender_scripts import camera, geometry, lights, looks, png, points, poses, settings, tank, volumes
+from blender_scripts import camera, geometry, lights, looks, png, points, poses, settings, tank, volumes, workbench
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
@@ -41,7 +41,7 @@ class SceneRenderer:
     Blender has one scene per process, so a second SceneRenderer takes the place of the first.
 
     Attributes:
-        device: what Cycles renders on, e.g. `CPU`.
+        device: what Cycles renders on, e.g. `CPU`; `Workbench` for that engine.
     """
 
     _current: SceneRenderer | None = None
@@ -63,7 +63,7 @@ class SceneRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
-        self.device = settings.choose_device(spec["render"]["device"])
+        self.device: str = settings.choose_device(spec["render"]["device"])
         self._camera = camera.add_camera(spec["camera"])
         self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
         lights.build_stage(spec)
@@ -74,6 +74,9 @@ class SceneRenderer:
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         for description in spec["objects"]:
             self._add_object(description, spec)
+        if spec["engine"] == "workbench":
+            workbench.apply_workbench_settings(spec)
+            self.device = "Workbench"
 
     def render(self, frame: int, output_path: Path) -> None:
         """Draw one frame into a PNG file of any name. The same input gives the same bytes.

@@ -14,7 +14,7 @@ from pipeline.commands.arguments import job_options, print_warnings, require_own
 from pipeline.commands.exporting import export, run_stage
 from pipeline.commands.inspecting import explain, logs, plan, status
 from pipeline.commands.keeping import clean, verify
-from pipeline.commands.previewing import still
+from pipeline.commands.previewing import animatic, still
 from pipeline.commands.queueing import cancel, pause, priority, queue, retry, watch, work
 from pipeline.commands.running import rerun, resume, submit
 from pipeline.commands.showing import report, sheet
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 for command in (
-    *(submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report, still),
+    *(submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report, still, animatic),
     *(queue, watch, pause, cancel, retry, priority, work),
     *(export, run_stage),
 ):

@@ -8,7 +8,7 @@ see nothing of it.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,65 +20,70 @@ from pipeline.fingerprint import task_fingerprint
 from pipeline.job.loading import LoadedJob
 from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
-from pipeline.receipts import Receipt, is_committed, read_receipt
+from pipeline.receipts import Receipt, read_receipt, verify_artifact
 from pipeline.stage_run import run_tasks
-from pipeline.task import ArtifactPath, Resources, Task
+from pipeline.task import ArtifactPath, Resources, Task, TaskId
 
 SIMULATION = "simulate"
 
 
 @dataclass(frozen=True, slots=True)
-class StillPlan:
-    """What a still is made of.
+class Survey:
+    """What frames can be drawn of.
 
     Attributes:
-        task: draws it.
         committed: what the job has of it, by its receipts.
-        todo: what is to be made, makers first; `task` is the last.
-        lacking: a frame of the simulation that is not there as this job has it; None: all are.
+        todo: what can be made now, makers first; those that draw the frames are among them.
+        lacking: frames of the simulation that are not there as this job has it.
     """
 
-    task: Task
     committed: tuple[Receipt, ...]
     todo: tuple[Task, ...]
-    lacking: ArtifactPath | None
+    lacking: tuple[ArtifactPath, ...]
 
 
-def plan_still(loaded: LoadedJob, layout: JobLayout, frame: int, *, stages: str) -> StillPlan:
-    """What has to be made to draw one frame of a job.
+def survey(loaded: LoadedJob, layout: JobLayout, frames: Collection[int], *, stages: str) -> Survey:
+    """What has to be made to draw frames of a job anew.
 
     Args:
-        loaded: the job, changed as the still is to be.
+        loaded: the job, changed as the pictures are to be.
         layout: the folder of the job that was submitted.
-        frame: which frame.
+        frames: which frames.
         stages: where the stages are, as `module:ATTRIBUTE`.
 
     Raises:
         PipelineError: the job has no such frame.
     """
     job = loaded.job
-    if frame >= job.frame_count:
-        raise PipelineError(f"{job.name} has no frame {frame}; its frames are 0-{job.frame_count - 1}")
+    for frame in frames:
+        if frame >= job.frame_count:
+            raise PipelineError(f"{job.name} has no frame {frame}; its frames are 0-{job.frame_count - 1}")
     tasks = plan_job(job, layout, load_stages(stages))
-    task = next(each for each in tasks if each.outputs == (layout.picture(frame),))
-    needed = _ancestors(task, tasks)
+    pictures = {layout.picture(frame) for frame in frames}
+    targets = {each.id for each in tasks if not pictures.isdisjoint(each.outputs)}
+    needed = _ancestors(targets, tasks)
+    read = {artifact for each in needed for artifact in each.inputs}
     receipts: dict[ArtifactPath, Receipt] = {}
     todo: list[Task] = []
-    lacking = None
+    to_make: set[ArtifactPath] = set()
+    lacking: list[ArtifactPath] = []
     for each in needed:
-        found = None if each is task else _committed(each, layout, receipts, needed)
-        if found is not None:
-            receipts.update(found)
-        elif each.stage == SIMULATION:
-            lacking = _needed_outputs(each, needed)[-1]
-        else:
+        wanted = [artifact for artifact in each.outputs if artifact in read]
+        receipts.update({} if each.id in targets else _committed(each, wanted, layout, receipts))
+        missing = [artifact for artifact in wanted if artifact not in receipts]
+        if not missing and each.id not in targets:
+            continue
+        if each.stage == SIMULATION:
+            lacking += missing
+        elif all(artifact in receipts or artifact in to_make for artifact in each.inputs):
             todo.append(each)
-    return StillPlan(task, tuple(receipts.values()), tuple(todo), lacking)
+            to_make.update(each.outputs)
+    return Survey(tuple(receipts.values()), tuple(todo), tuple(lacking))
 
 
 def make_still(
     loaded: LoadedJob,
-    plan: StillPlan,
+    found: Survey,
     layout: JobLayout,
     target: Path,
     *,
@@ -89,8 +94,8 @@ def make_still(
     """Make what is missing of a still, draw it, and put it where it belongs.
 
     Args:
-        loaded: as for `plan_still`.
-        plan: what `plan_still` found; nothing of the simulation is lacking.
+        loaded: as for `survey`.
+        found: what `survey` found for one frame; nothing of the simulation is lacking.
         layout: the folder of the job that was submitted.
         target: the picture to write; replaced if it is there.
         capacity: what a task may use.
@@ -100,8 +105,8 @@ def make_still(
     Raises:
         PipelineError: it could not be made; says why.
     """
-    with _scratch(loaded, plan, layout) as scratch:
-        for task in plan.todo:
+    with scratch_folder(loaded, found, layout) as scratch:
+        for task in found.todo:
             say(task.id)
             outcome = run_tasks(
                 [task],
@@ -116,19 +121,19 @@ def make_still(
         target.parent.mkdir(parents=True, exist_ok=True)
         part = target.with_name(f".{target.name}.part")
         try:
-            shutil.copyfile(scratch.path(plan.task.outputs[0]), part)
+            shutil.copyfile(scratch.path(found.todo[-1].outputs[0]), part)
             part.replace(target)
         finally:
             part.unlink(missing_ok=True)
 
 
 @contextmanager
-def _scratch(loaded: LoadedJob, plan: StillPlan, layout: JobLayout) -> Iterator[JobLayout]:
+def scratch_folder(loaded: LoadedJob, found: Survey, layout: JobLayout) -> Iterator[JobLayout]:
     """A job's folder of its own, in which what is committed is there by link; gone at the end of the block."""
     with TemporaryDirectory(prefix="still-") as folder:
         scratch = JobLayout(Path(folder).resolve())
         scratch.job_file.write_text(loaded.text, encoding="utf-8")
-        for receipt in plan.committed:
+        for receipt in found.committed:
             path, copy = scratch.path(receipt.artifact), scratch.receipt(receipt.artifact)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.symlink_to(layout.path(receipt.artifact).resolve())
@@ -137,10 +142,10 @@ def _scratch(loaded: LoadedJob, plan: StillPlan, layout: JobLayout) -> Iterator[
         yield scratch
 
 
-def _ancestors(task: Task, tasks: list[Task]) -> list[Task]:
-    """The task and all that it is made from, makers first."""
+def _ancestors(targets: Collection[TaskId], tasks: list[Task]) -> list[Task]:
+    """These tasks and all that they are made from, makers first."""
     makers = {output: each for each in tasks for output in each.outputs}
-    needed, waiting = {task.id}, [task]
+    needed, waiting = set(targets), [each for each in tasks if each.id in targets]
     while waiting:
         for artifact in waiting.pop().inputs:
             maker = makers[artifact]
@@ -151,21 +156,15 @@ def _ancestors(task: Task, tasks: list[Task]) -> list[Task]:
 
 
 def _committed(
-    task: Task, layout: JobLayout, receipts: dict[ArtifactPath, Receipt], needed: list[Task]
-) -> dict[ArtifactPath, Receipt] | None:
-    """Receipts of those outputs that are needed; None if one is not there as this task would make it."""
+    task: Task, wanted: list[ArtifactPath], layout: JobLayout, receipts: Mapping[ArtifactPath, Receipt]
+) -> dict[ArtifactPath, Receipt]:
+    """Receipts of those wanted outputs that are there as this task would make them of the inputs that are there."""
     if any(artifact not in receipts for artifact in task.inputs):
-        return None
+        return {}
     fingerprint = task_fingerprint(task, {artifact: receipts[artifact].hash for artifact in task.inputs})
-    found = {}
-    for artifact in _needed_outputs(task, needed):
-        receipt = read_receipt(layout, artifact)
-        if receipt is None or not is_committed(layout, artifact, fingerprint):
-            return None
-        found[artifact] = receipt
-    return found
-
-
-def _needed_outputs(task: Task, needed: list[Task]) -> list[ArtifactPath]:
-    read = {artifact for each in needed for artifact in each.inputs}
-    return [artifact for artifact in task.outputs if artifact in read]
+    found = {artifact: read_receipt(layout, artifact) for artifact in wanted}
+    return {
+        artifact: receipt
+        for artifact, receipt in found.items()
+        if receipt is not None and receipt.fingerprint == fingerprint and verify_artifact(layout, receipt) is None
+    }

@@ -242,7 +242,7 @@ def build_argv(blender: str, spec_path: Path, *, threads: int) -> list[str]:
         "--threads",
         str(threads),
         "--python",
-        str(_render_script()),
+        str(script_path("render_frames.py")),
         "--",
         str(spec_path),
         "--serve",
@@ -282,8 +282,13 @@ def require_supported_executable(blender: str) -> tuple[int, int, int]:
     return version
 
 
-def _render_script() -> Path:
+def script_path(name: str) -> Path:
+    """Where a script of `blender_scripts` lies.
+
+    Raises:
+        BlenderUnavailableError: the project is not on Python's path.
+    """
     package = find_spec("blender_scripts")
     if package is None or package.origin is None:
         raise BlenderUnavailableError("the folder blender_scripts of this project is not on Python's path")
-    return Path(package.origin).with_name("render_frames.py")
+    return Path(package.origin).with_name(name)

@@ -1,4 +1,4 @@
-"""Commands that draw a job's frames otherwise than its film has them: still."""
+"""Commands that draw a job's frames otherwise than its film has them: still, animatic."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.commands.arguments import find_job, require_own_programs, submitted_job_argument
+from pipeline.commands.executing import require_possible
 from pipeline.errors import PipelineError, StageUnavailableError
 from pipeline.layout import JobLayout
 
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
-    from pipeline.stills import StillPlan
+    from pipeline.stills import Survey
+    from pipeline.task import Resources
 
 _QUALITIES = ("draft", "preview", "final")
+_TOLD_FRAMES = 10
+"""One of so many frames of an animatic is told."""
 
 
 @click.command()
@@ -59,29 +63,25 @@ def still(
     pipeline still quickstart --frame 90 --resolution 3840 2160 -o poster.png
     pipeline still quickstart --frame 90 --quality preview --set 'camera.position=[0, -3, 1]'
     """
-    from pipeline.executors.worker_process import THREAD_VARIABLES
     from pipeline.job.loading import read_job
-    from pipeline.resources import machine_capacity
     from pipeline.runner import STAGES_REFERENCE
-    from pipeline.stills import make_still, plan_still
+    from pipeline.stills import make_still, survey
 
     layout = JobLayout(find_job(job, output).root.absolute())
     changes = [f"render.quality={quality}"]
     changes += [] if resolution is None else [f"render.resolution=[{resolution[0]}, {resolution[1]}]"]
     loaded = read_job(layout.job_file, [*changes, *overrides])
     require_own_programs(loaded, overrides)
-    plan = plan_still(loaded, layout, frame, stages=STAGES_REFERENCE)
-    if plan.lacking is not None:
-        raise PipelineError(_why_lacking(plan.lacking, layout, frame))
+    found = survey(loaded, layout, [frame], stages=STAGES_REFERENCE)
+    if found.lacking:
+        raise PipelineError(_why_lacking(found.lacking[-1], layout, frame))
     path = layout.stills / f"{frame:06d}-{_words(loaded)}.png" if target is None else target
     if path.suffix.lower() != ".png":
         raise PipelineError(f'{path}: a still is a PNG, so its name must end in ".png"')
-    _require_possible(loaded, plan)
-    capacity = machine_capacity(gpus=1)
-    capacity = replace(capacity, cores=min(cores or capacity.cores, capacity.cores))
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(capacity.cores)))  # before anything reads them
+    require_possible(loaded.job, {task.stage for task in found.todo})
+    capacity = _capacity(cores)
     width, height = loaded.job.render.resolution
-    made = _made_first(plan)
+    made = _made_first(found)
     click.echo(
         f"frame {frame} of {loaded.job.name}: {f'{made}, then ' if made else ''}"
         f"{width} x {height} pixels, {loaded.job.render.quality} quality",
@@ -90,7 +90,7 @@ def still(
     with redirect_stdout(sys.stderr):  # what the stages print is no output of this command
         make_still(
             loaded,
-            plan,
+            found,
             layout,
             path,
             capacity=capacity,
@@ -105,10 +105,10 @@ def _words(loaded: LoadedJob) -> str:
     return f"{loaded.job.render.quality}-{width}x{height}"
 
 
-def _made_first(plan: StillPlan) -> str:
+def _made_first(found: Survey) -> str:
     """What is made before the frame is drawn, as `surface, 3 of whitewater`; empty if all is there."""
     counts: dict[str, int] = {}
-    for task in plan.todo[:-1]:
+    for task in found.todo[:-1]:
         counts[task.stage] = counts.get(task.stage, 0) + 1
     return ", ".join(stage if count == 1 else f"{count} of {stage}" for stage, count in counts.items())
 
@@ -118,9 +118,9 @@ def _why_lacking(artifact: str, layout: JobLayout, frame: int) -> str:
     from pipeline.job.loading import read_job
     from pipeline.lease import live_holder
     from pipeline.runner import STAGES_REFERENCE
-    from pipeline.stills import plan_still
+    from pipeline.stills import survey
 
-    if plan_still(read_job(layout.job_file), layout, frame, stages=STAGES_REFERENCE).lacking is None:
+    if not survey(read_job(layout.job_file), layout, [frame], stages=STAGES_REFERENCE).lacking:
         return (
             "--set changes what is simulated, and a still shows what this job has simulated; "
             f"submit a job of its own: pipeline submit {shlex.quote(str(layout.job_file))} --set name=... --set ..."
@@ -130,16 +130,95 @@ def _why_lacking(artifact: str, layout: JobLayout, frame: int) -> str:
     return f"{artifact} is not simulated yet; go on with: pipeline resume {shlex.quote(str(layout.root))}"
 
 
-def _require_possible(loaded: LoadedJob, plan: StillPlan) -> None:
-    """Refuse before any work what this machine cannot do."""
-    from pipeline.stages import STAGES
+@click.command()
+@submitted_job_argument
+@click.option("--width", type=click.IntRange(64, 3840), default=640, show_default=True, help="Of the film [pixels].")
+@click.option(
+    "-o",
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Where to write it; JOB/NAME-animatic.mp4 if omitted.",
+)
+@click.option("--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all if omitted.")
+def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: int | None) -> None:
+    """Show how a job moves before it is rendered: its whole film in plain pictures, a fraction of a second each.
 
-    stages = {task.stage for task in plan.todo}
-    obstacles = [
-        f"{stage.name}: {obstacle}"
-        for stage in STAGES
-        if stage.name in stages
-        for obstacle in stage.obstacles(loaded.job)
-    ]
-    if obstacles:
-        raise StageUnavailableError("\n".join(obstacles))
+    Of what is simulated already; surfaces and volumes that are still missing are made, and the job keeps them. Drawn by
+    Blender's Workbench, which needs EGL: on Debian the packages libegl1 and libgl1-mesa-dri.
+
+    \b
+    pipeline animatic quickstart
+    pipeline animatic quickstart --width 1280 -o moves.mp4
+    """
+    from pipeline.animatics import drawable_frames, made_before, make_animatic
+    from pipeline.job.loading import read_job
+    from pipeline.lease import refuse_if_held
+    from pipeline.runner import STAGES_REFERENCE
+    from pipeline.stage_run import run_tasks
+    from pipeline.stills import survey
+    from render.blender import BlenderUnavailableError
+    from render.workbench import require_workbench
+
+    layout = JobLayout(find_job(job, output).root.absolute())
+    submitted = read_job(layout.job_file)
+    size = _fitted(submitted.job.render.resolution, width)
+    loaded = read_job(layout.job_file, [f"render.resolution=[{size[0]}, {size[1]}]"])
+    path = layout.root / f"{submitted.job.name}-animatic.mp4" if target is None else target
+    if path.suffix.lower() != ".mp4":
+        raise PipelineError(f'{path}: an animatic is an MP4, so its name must end in ".mp4"')
+    planned = submitted.job.frame_count
+    found = survey(loaded, layout, range(planned), stages=STAGES_REFERENCE)
+    frames = drawable_frames(found)
+    if frames == 0:
+        raise PipelineError(_why_lacking(found.lacking[0], layout, 0))
+    try:
+        require_workbench(loaded.job.render.blender)
+    except BlenderUnavailableError as error:
+        raise StageUnavailableError(str(error)) from error
+    todo = made_before(found, frames)
+    if todo:
+        refuse_if_held(layout.lease)  # whoever runs the job makes them
+        require_possible(loaded.job, {task.stage for task in todo})
+    capacity = _capacity(cores)
+    shown = f"{frames} frames" if frames == planned else f"the {frames} of {planned} frames that are simulated"
+    click.echo(f"{shown}, {size[0]} x {size[1]} pixels{f'; {len(todo)} files to make first' if todo else ''}", err=True)
+    with redirect_stdout(sys.stderr):  # what the stages print is no output of this command
+        outcome = run_tasks(
+            todo,
+            layout,
+            capacity=capacity,
+            stages=STAGES_REFERENCE,
+            stop_requested=lambda: False,
+            tell=lambda share, sentence: click.echo(f"{100 * share:.0f} %  {sentence}", err=True),
+        )
+    if outcome.failures:
+        failed = outcome.failures[0]
+        raise PipelineError(f"{failed.task_id}: {failed.message}")
+    make_animatic(
+        loaded,
+        layout,
+        frames,
+        path,
+        threads=capacity.cores,
+        stages=STAGES_REFERENCE,
+        drawn=lambda frame: click.echo(f"  frame {frame}", err=True) if frame % _TOLD_FRAMES == 0 else None,
+    )
+    click.echo(path)
+
+
+def _fitted(resolution: tuple[int, int], width: int) -> tuple[int, int]:
+    """A size of the same proportions, so wide; even, as video needs it."""
+    height = width * resolution[1] / resolution[0]
+    return max(16, 2 * round(width / 2)), max(16, 2 * round(height / 2))
+
+
+def _capacity(cores: int | None) -> Resources:
+    """What one task in this process may use; tells the libraries that count cores for themselves."""
+    from pipeline.executors.worker_process import THREAD_VARIABLES
+    from pipeline.resources import machine_capacity
+
+    capacity = machine_capacity(gpus=1)
+    capacity = replace(capacity, cores=min(cores or capacity.cores, capacity.cores))
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(capacity.cores)))  # before anything reads them
+    return capacity

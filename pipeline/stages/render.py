@@ -48,8 +48,9 @@ WORKER_BYTES = 500_000_000
 BYTES_PER_PIXEL = 700
 """Measured peaks of the quickstart with denoising, Blender included: 538 MB at 480 x 270 and 1880 MB at 1920 x 1080."""
 
-_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"blender"}}
-"""The executable counts by its version. The device does count: CPU and GPU round differently."""
+_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "render": {"blender"}}
+"""The film is always of Cycles. The executable counts by its version. The device does count: CPU and GPU round
+differently."""
 
 
 class RenderStage:
@@ -113,7 +114,7 @@ class RenderStage:
         def validate(path: Path) -> None:
             validate_picture(path, job.render.resolution)
 
-        _write_motion(context, task.frame)
+        write_motion(job, context.layout, task.frame, attempt=context.attempt)
         try:
             with context.committing(task.outputs[0], validate) as path:
                 renderer.render(task.frame, path)
@@ -219,17 +220,22 @@ def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]
     return surfaces + cloths + volumes + points + cached
 
 
-def _write_motion(context: TaskContext, frame: int) -> None:
+def write_motion(job: Job, layout: JobLayout, frame: int, *, attempt: int) -> None:
     """Put where bodies and camera are at a frame where Blender finds it.
 
     These documents are no artifacts, but a form of the cached frame and of the job.
+
+    Args:
+        job: the job.
+        layout: the folder that holds the cached frame, and gets the documents.
+        frame: which frame.
+        attempt: names the files that they are written to first.
     """
-    job, layout = context.job, context.layout
     bodies, camera = job.moving_bodies, camera_path(job)
     cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies if bodies else {}
     poses = {name: cached[name].arrays for name in bodies}
     if bodies:
-        with _replacing(context, layout.poses, frame) as path:
+        with _replacing(layout, layout.poses, frame, attempt) as path:
             write_poses(path, frame, poses)
     if camera.moves:
         half_open = 0.5 * job.render.shutter if job.render.motion_blur else 0.0
@@ -237,7 +243,7 @@ def _write_motion(context: TaskContext, frame: int) -> None:
         for offset in sorted({-half_open, 0.0, half_open}):
             places = {name: _position_after(offset / job.fps, poses[name]) for name in camera.bodies}
             views[offset] = camera.view((frame + offset) / job.fps, places)
-        with _replacing(context, layout.views, frame) as path:
+        with _replacing(layout, layout.views, frame, attempt) as path:
             write_views(path, frame, views)
 
 
@@ -247,11 +253,11 @@ def _position_after(time_s: float, pose: Mapping[str, NDArray[Any]]) -> list[flo
 
 
 @contextmanager
-def _replacing(context: TaskContext, document: str, frame: int) -> Iterator[Path]:
+def _replacing(layout: JobLayout, document: str, frame: int, attempt: int) -> Iterator[Path]:
     """A path to write a frame's document to, which then takes the place of what is there."""
-    path = context.layout.root / document.replace("{frame}", f"{frame:06d}")
+    path = layout.root / document.replace("{frame}", f"{frame:06d}")
     path.parent.mkdir(exist_ok=True)
-    part = path.with_name(f".{path.name}.part.{context.attempt}")
+    part = path.with_name(f".{path.name}.part.{attempt}")
     yield part
     part.replace(path)
 
