@@ -131,11 +131,17 @@ class JobLayout:
         return ArtifactPath(f"frames/{frame:06d}.png")
 
     @staticmethod
-    def segment(index: int) -> ArtifactPath:
-        """A piece of the film."""
-        return ArtifactPath(f"movie/{index:04d}.mp4")
+    def segment(index: int, suffix: str = ".mp4") -> ArtifactPath:
+        """A piece of the film; its suffix is that of `MovieParameters`."""
+        return ArtifactPath(f"movie/{index:04d}{suffix}")
 
     @staticmethod
-    def movie() -> ArtifactPath:
-        """The film."""
-        return ArtifactPath("movie.mp4")
+    def movie(suffix: str = ".mp4") -> ArtifactPath:
+        """The film; its suffix is that of `MovieParameters`."""
+        return ArtifactPath(f"movie{suffix}")
+
+    @property
+    def film(self) -> Path:
+        """Where the film lies that was made last, for one who does not know the job."""
+        made = [path for suffix in (".mp4", ".mov") if (path := self.path(self.movie(suffix))).exists()]
+        return max(made, key=lambda path: path.stat().st_mtime, default=self.path(self.movie()))

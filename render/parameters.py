@@ -192,14 +192,58 @@ class RenderParameters(Parameters):
     )
 
 
+Codec = Literal["h264", "h265", "av1", "prores"]
+
+USUAL_CRF = {"h264": 16, "h265": 18, "av1": 20}
+"""Within 2 dB of each other on the quickstart; docs/rendering.md has the table."""
+HIGHEST_CRF = {"h264": 51, "h265": 51, "av1": 63}
+
+
 class MovieParameters(Parameters):
     """How frames become a film."""
 
-    crf: int = Field(default=16, ge=0, le=51, description="H.264 constant rate factor; smaller is better and larger.")
+    codec: Codec = Field(
+        default="h264",
+        description="h264: plays everywhere; h265: 10 bits, smaller; av1: 10 bits, free of licences; prores: 422 HQ, "
+        "10 bits, a large .mov for editing.",
+    )
+    crf: Annotated[int, Field(ge=0, le=63)] | None = Field(
+        default=None,
+        description="Constant rate factor; smaller is better and larger. h264 and h265: up to 51, av1: up to 63; "
+        "16, 18 and 20 if omitted. prores has none.",
+    )
     preset: Literal["ultrafast", "veryfast", "fast", "medium", "slow", "veryslow"] = Field(
-        default="medium", description="H.264 speed against size."
+        default="medium", description="Speed against size; prores has none."
     )
     playback_fps: Positive | None = Field(
         default=None,
         description="Frames a second of the film; the job's fps if omitted (less is slow motion).",
     )
+
+    @property
+    def suffix(self) -> str:
+        """Of the film's file."""
+        return ".mov" if self.codec == "prores" else ".mp4"
+
+    @property
+    def rate_factor(self) -> int | None:
+        """The constant rate factor that counts; None for a codec that has none."""
+        return USUAL_CRF.get(self.codec) if self.crf is None else self.crf
+
+    def deciding(self) -> dict[str, str | int | float | None]:
+        """What decides the film's bytes; for H.264 the keys and values from before there were other codecs."""
+        if self.codec == "prores":
+            return {"codec": self.codec, "playback_fps": self.playback_fps}
+        common: dict[str, str | int | float | None] = {"crf": self.rate_factor, "preset": self.preset}
+        common["playback_fps"] = self.playback_fps
+        return common if self.codec == "h264" else {"codec": self.codec, **common}
+
+    @model_validator(mode="after")
+    def _codec_has_these_keys(self) -> Self:
+        if self.codec == "prores":
+            for key in ("crf", "preset"):
+                if key in self.model_fields_set:
+                    raise ValueError(f"{key} has no meaning for prores, which has one quality; remove it")
+        elif self.crf is not None and self.crf > HIGHEST_CRF[self.codec]:
+            raise ValueError(f"crf of {self.codec} is at most {HIGHEST_CRF[self.codec]}, got {self.crf}")
+        return self

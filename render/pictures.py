@@ -76,13 +76,24 @@ def read_picture(path: Path) -> Pixels:
 
 def read_rgb8(path: Path) -> NDArray[np.uint8]:
     """Pixels as (height, width, 3) uint8; 16-bit channels are rounded, alpha is dropped."""
-    pixels = read_picture(path)
-    if pixels.shape[2] <= 2:
-        pixels = np.repeat(pixels[..., :1], 3, axis=2)
-    color = pixels[..., :3]
+    color = _rgb(path)
     if color.dtype == np.uint16:
         color = ((color.astype(np.uint32) + 128) // 257).astype(np.uint8)
     return np.ascontiguousarray(color, np.uint8)
+
+
+def read_rgb16(path: Path) -> NDArray[np.uint16]:
+    """Pixels as (height, width, 3) uint16; 8-bit channels are spread over the range, alpha is dropped."""
+    color = _rgb(path)
+    if color.dtype == np.uint8:
+        color = color.astype(np.uint16) * np.uint16(257)
+    return np.ascontiguousarray(color, np.uint16)
+
+
+def _rgb(path: Path) -> Pixels:
+    """Colours of a picture, (height, width, 3), grey ones as well."""
+    pixels = read_picture(path)
+    return np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] <= 2 else pixels[..., :3]
 
 
 def validate_picture(path: Path, resolution: tuple[int, int]) -> PictureStatistics:

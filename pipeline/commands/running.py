@@ -326,7 +326,7 @@ def _end_if_at_rest(state: JobAssessment | None, layout: JobLayout, text: str | 
         and (text is None or text == _text_of(layout.job_file))
         and spool.find(layout.root.absolute().name) is None
     ):
-        click.echo(f"up to date: {layout.path(layout.movie())}")
+        click.echo(f"up to date: {layout.film}")
         sys.exit(0)
 
 
