@@ -4,8 +4,9 @@
     blender --background --factory-startup --python render_frames.py -- SPEC --serve
 
 Both forms write one line per frame to standard output, `FRAME_DONE 12 /path` or `FRAME_FAILED 12 reason`, among the
-lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line,
-after a line `RENDERER_READY version device`; the process ends with its input, so it cannot outlive who started it.
+lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line
+(after a tab, the path of the EXR that is wanted too), after a line `RENDERER_READY version device`; the process ends
+with its input, so it cannot outlive who started it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ if __package__ in (None, ""):
 
 import bpy
 
-from blender_scripts import camera, geometry, lights, looks, png, points, poses, settings, tank, volumes, workbench
+from blender_scripts import camera, exr, geometry, lights, looks, png, points, poses, settings, tank, volumes, workbench
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
@@ -65,6 +66,7 @@ class SceneRenderer:
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
         self.device: str = settings.choose_device(spec["render"]["device"])
         self._camera = camera.add_camera(spec["camera"])
+        self._format, self._passes = spec["render"]["format"], spec["render"]["passes"]
         self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
         lights.build_stage(spec)
         if spec["stage"]["tank"]:
@@ -74,12 +76,17 @@ class SceneRenderer:
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         for description in spec["objects"]:
             self._add_object(description, spec)
-        if spec["engine"] == "workbench":
+        if spec.get("engine") == "workbench":
             workbench.apply_workbench_settings(spec)
             self.device = "Workbench"
 
-    def render(self, frame: int, output_path: Path) -> None:
+    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
         """Draw one frame into a PNG file of any name. The same input gives the same bytes.
+
+        Args:
+            frame: which frame.
+            output_path: the PNG.
+            master_path: gets the same frame as an EXR with its passes.
 
         Raises:
             RenderInputError: a file of this frame is missing or unfit.
@@ -104,8 +111,14 @@ class SceneRenderer:
         if "FINISHED" not in outcome:
             raise RenderFailedError(f"Blender ended the render with {sorted(outcome)}")
         # save_render writes to exactly this path; the scene's own output path would expand '#', '{' and add suffixes.
-        bpy.data.images["Render Result"].save_render(str(output_path.resolve()), scene=bpy.context.scene)
+        result = bpy.data.images["Render Result"]
+        settings.choose_png(self._format)
+        result.save_render(str(output_path.resolve()), scene=bpy.context.scene)
         png.strip_metadata(output_path)
+        if master_path is not None:
+            settings.choose_exr(with_passes=bool(self._passes))
+            result.save_render(str(master_path.resolve()), scene=bpy.context.scene)
+            exr.strip_metadata(master_path)
 
     def _place_bodies(self, frame: int) -> None:
         of_file: dict[Path, dict[str, poses.Pose]] = {}
@@ -197,10 +210,10 @@ def _report(line: str) -> None:
     sys.stdout.flush()
 
 
-def _render_and_report(renderer: SceneRenderer, frame: int, output_path: Path) -> bool:
+def _render_and_report(renderer: SceneRenderer, frame: int, output_path: Path, master_path: Path | None = None) -> bool:
     try:
-        renderer.render(frame, output_path)
-    except (RenderInputError, RenderFailedError, OSError, RuntimeError) as error:
+        renderer.render(frame, output_path, master_path)
+    except (RenderInputError, RenderFailedError, OSError, RuntimeError, ValueError) as error:
         _report(f"FRAME_FAILED {frame} {error}")
         return False
     _report(f"FRAME_DONE {frame} {output_path}")
@@ -219,8 +232,9 @@ def _serve(renderer: SceneRenderer) -> None:
     threading.Thread(target=_follow, args=(sys.stdin, requests), daemon=True).start()
     _report(f"RENDERER_READY {blender_version()} {renderer.device}")
     while True:
-        frame, _, output_path = requests.get().rstrip("\n").partition(" ")
-        _render_and_report(renderer, int(frame), Path(output_path))
+        frame, _, paths = requests.get().rstrip("\n").partition(" ")
+        output_path, _, master_path = paths.partition("\t")
+        _render_and_report(renderer, int(frame), Path(output_path), Path(master_path) if master_path else None)
 
 
 def main(arguments: list[str]) -> int:

@@ -131,6 +131,11 @@ class JobLayout:
         return ArtifactPath(f"frames/{frame:06d}.png")
 
     @staticmethod
+    def master(frame: int) -> ArtifactPath:
+        """Rendered frame in linear light, with its passes."""
+        return ArtifactPath(f"frames/{frame:06d}.exr")
+
+    @staticmethod
     def segment(index: int, suffix: str = ".mp4") -> ArtifactPath:
         """A piece of the film; its suffix is that of `MovieParameters`."""
         return ArtifactPath(f"movie/{index:04d}{suffix}")

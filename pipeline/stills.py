@@ -119,12 +119,14 @@ def make_still(
             for failed in outcome.failures:
                 raise PipelineError(f"{failed.task_id}: {failed.message}")
         target.parent.mkdir(parents=True, exist_ok=True)
-        part = target.with_name(f".{target.name}.part")
-        try:
-            shutil.copyfile(scratch.path(found.todo[-1].outputs[0]), part)
-            part.replace(target)
-        finally:
-            part.unlink(missing_ok=True)
+        for output in found.todo[-1].outputs:
+            path = target.with_suffix(Path(output).suffix)  # an EXR lies beside its PNG
+            part = path.with_name(f".{path.name}.part")
+            try:
+                shutil.copyfile(scratch.path(output), part)
+                part.replace(path)
+            finally:
+                part.unlink(missing_ok=True)
 
 
 @contextmanager

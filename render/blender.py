@@ -70,8 +70,8 @@ class Renderer(Protocol):
     device: str
     """What Cycles renders on, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`."""
 
-    def render(self, frame: int, output_path: Path) -> None:
-        """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
+    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
+        """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
 
     def close(self) -> None:
         """Let go of Blender; idempotent."""
@@ -126,13 +126,13 @@ class ModuleRenderer:
             raise BlenderUnavailableError(str(error)) from error
         self.device: str = self._scene.device
 
-    def render(self, frame: int, output_path: Path) -> None:
-        """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
+    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
+        """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
         from blender_scripts.errors import RenderFailedError, RenderInputError
 
         try:
-            self._scene.render(frame, output_path)
-        except (RenderInputError, RenderFailedError, RuntimeError) as error:
+            self._scene.render(frame, output_path, master_path)
+        except (RenderInputError, RenderFailedError, RuntimeError, ValueError) as error:
             raise FrameRenderError(frame, str(error)) from error
 
     def close(self) -> None:
@@ -169,8 +169,8 @@ class ExecutableRenderer:
             raise
         _, self.version, self.device = answer.split(" ", 2)
 
-    def render(self, frame: int, output_path: Path) -> None:
-        """Draw a frame into a PNG file of any name.
+    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
+        """Draw a frame into a PNG file of any name, and into an EXR if one is named.
 
         Raises:
             FrameRenderError: this frame cannot be drawn.
@@ -179,7 +179,8 @@ class ExecutableRenderer:
         stdin = self._process.stdin
         assert stdin is not None
         try:
-            stdin.write(f"{frame} {output_path.resolve()}\n")
+            master = "" if master_path is None else f"\t{master_path.resolve()}"
+            stdin.write(f"{frame} {output_path.resolve()}{master}\n")
             stdin.flush()
         except (BrokenPipeError, ValueError) as error:
             raise self._died(frame) from error

@@ -169,6 +169,9 @@ class MaterialParameters(Parameters):
     )
 
 
+RenderPass = Literal["depth", "vector", "normal", "cryptomatte", "denoising"]
+
+
 class RenderParameters(Parameters):
     """How frames are made."""
 
@@ -185,11 +188,36 @@ class RenderParameters(Parameters):
     exposure: float = Field(default=0.0, description="Exposure [stops].")
     seed: int = Field(default=0, ge=0, description="Seed of the sampling pattern.")
     device: Literal["auto", "cpu", "gpu"] = Field(default="auto", description="What Cycles renders on.")
+    format: Literal["png", "png16", "exr"] = Field(
+        default="png",
+        description="png: 8 bits a channel, as the display shows them; png16: the same in 16 bits; exr: an OpenEXR "
+        "master of half floats, linear light without the view's transform, beside the PNG that the film is made of.",
+    )
+    passes: tuple[RenderPass, ...] = Field(
+        default=(),
+        description="Of the EXR: depth [m], vector: motion to the frames before and after [pixels], normal, "
+        "cryptomatte of objects and materials, denoising: the noisy picture, its albedo and normals.",
+    )
     blender: str | None = Field(
         default=None,
         description="Path of a Blender executable; the bpy module if omitted. Counts only with --set or "
         "PIPELINE_BLENDER, as a job file runs no program.",
     )
+
+    @property
+    def has_master(self) -> bool:
+        """Whether there is an EXR beside each PNG."""
+        return self.format == "exr"
+
+    @model_validator(mode="after")
+    def _passes_have_a_place(self) -> Self:
+        if self.passes and not self.has_master:
+            raise ValueError('passes need format = "exr"; a PNG holds the picture alone')
+        if len(set(self.passes)) < len(self.passes):
+            raise ValueError("passes names one of them twice")
+        if "vector" in self.passes and self.motion_blur:
+            raise ValueError('the pass "vector" needs motion_blur = false: what is blurred moves in many ways at once')
+        return self
 
 
 Codec = Literal["h264", "h265", "av1", "prores"]

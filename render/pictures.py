@@ -130,6 +130,53 @@ def validate_picture(path: Path, resolution: tuple[int, int]) -> PictureStatisti
     return statistics
 
 
+def validate_exr(path: Path, resolution: tuple[int, int], *, layer: str = "") -> None:
+    """Decode an EXR and check that it shows something. All layers of a part are compressed together, so all are read.
+
+    Args:
+        path: an EXR in one part.
+        resolution: expected width and height [pixels].
+        layer: the layer that is the picture; empty where there is nothing else.
+
+    Raises:
+        InvalidFileError: it is damaged, of another size, black, or has values that are not finite.
+        OSError: it cannot be read.
+    """
+    import av
+
+    from blender_scripts.exr import require_whole
+
+    content = path.read_bytes()
+    try:
+        require_whole(content)  # FFmpeg leaves out what it cannot decode
+    except ValueError as error:
+        raise InvalidFileError(path, str(error)) from error
+    decoder = av.CodecContext.create("exr", "r")
+    decoder.options = {"layer": layer} if layer else {}
+    try:
+        frames = [*decoder.decode(av.Packet(content)), *decoder.decode(None)]
+    except av.FFmpegError as error:
+        raise InvalidFileError(path, f"cannot be decoded: {error}") from error
+    if len(frames) != 1:
+        raise InvalidFileError(path, "is not an EXR of one picture")
+    frame = frames[0]
+    if (frame.width, frame.height) != tuple(resolution):
+        raise InvalidFileError(
+            path, f"is {frame.width}x{frame.height} pixels, but {resolution[0]}x{resolution[1]} were asked for"
+        )
+    planes = [
+        np.frombuffer(memoryview(plane), np.float16 if "f16" in frame.format.name else np.float32)
+        .reshape(frame.height, -1)[:, : frame.width]
+        .astype(np.float32)
+        for plane in list(frame.planes)[:3]
+    ]
+    if not all(np.isfinite(plane).all() for plane in planes):
+        raise InvalidFileError(path, "has values that are not finite")
+    brightest = max(float(plane.max()) for plane in planes)
+    if brightest < BLACK_LUMINANCE:
+        raise InvalidFileError(path, f"is black (brightest value {brightest:.2g})")
+
+
 def pixel_hash(path: Path) -> str:
     """blake3 of the size, the depth and every pixel; the same for pictures that differ in metadata or compression."""
     pixels = np.ascontiguousarray(read_picture(path))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from math import cos, prod, radians, sin
 from pathlib import Path
@@ -48,13 +48,22 @@ WORKER_BYTES = 500_000_000
 BYTES_PER_PIXEL = 700
 """Measured peaks of the quickstart with denoising, Blender included: 538 MB at 480 x 270 and 1880 MB at 1920 x 1080."""
 
+COMBINED = "ViewLayer.Combined"
+"""Blender's name for the picture's layer among passes."""
+
+BYTES_PER_PIXEL_AND_PASS = 200
+"""The largest, cryptomatte, has 24 floats a pixel, in Cycles and in what is saved."""
+
 _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "render": {"blender"}}
 """The film is always of Cycles. The executable counts by its version. The device does count: CPU and GPU round
 differently."""
 
+_LATER_KEYS: dict[str, Any] = {"format": "png", "passes": []}
+"""Keys that jobs of earlier versions had not: where they say what was always so, those jobs' frames stay up to date."""
+
 
 class RenderStage:
-    """One PNG a frame. A worker keeps Blender and the scene warm from frame to frame."""
+    """One PNG a frame, and an EXR if the job asks for one. A worker keeps Blender and the scene warm between frames."""
 
     name = "render"
     version = 3
@@ -62,6 +71,9 @@ class RenderStage:
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
         spec = render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
+        for key, usual in _LATER_KEYS.items():
+            if spec["render"][key] == usual:
+                del spec["render"][key]
         if job.camera.moves:
             spec["camera"]["path"] = job.camera.model_dump(mode="json")
         parameters = ParameterSet.of(
@@ -70,9 +82,10 @@ class RenderStage:
             version=self.version,
             tools={"blender": _blender_version(job.render.blender)},
         )
+        bytes_per_pixel = BYTES_PER_PIXEL + BYTES_PER_PIXEL_AND_PASS * len(job.render.passes)
         resources = Resources(
             cores=CORES,
-            memory_bytes=WORKER_BYTES + BYTES_PER_PIXEL * prod(job.render.resolution),
+            memory_bytes=WORKER_BYTES + bytes_per_pixel * prod(job.render.resolution),
             gpus=int(job.render.device == "gpu"),
         )
         static = tuple(layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type))
@@ -81,7 +94,7 @@ class RenderStage:
                 id=TaskId(f"render/{frame:06d}"),
                 stage=self.name,
                 inputs=(*static, *_frame_inputs(job, layout, frame)),
-                outputs=(layout.picture(frame),),
+                outputs=(layout.picture(frame), *((layout.master(frame),) if job.render.has_master else ())),
                 parameters=parameters,
                 frame=frame,
                 resources=resources,
@@ -105,7 +118,7 @@ class RenderStage:
     def run(self, context: TaskContext) -> None:
         """Draw one frame."""
         from render.blender import BlenderDiedError
-        from render.pictures import validate_picture
+        from render.pictures import validate_exr, validate_picture
 
         task, job = context.task, context.job
         assert task.frame is not None
@@ -115,9 +128,17 @@ class RenderStage:
             validate_picture(path, job.render.resolution)
 
         write_motion(job, context.layout, task.frame, attempt=context.attempt)
+
+        def validate_master(path: Path) -> None:
+            validate_exr(path, job.render.resolution, layer=COMBINED if job.render.passes else "")
+
         try:
-            with context.committing(task.outputs[0], validate) as path:
-                renderer.render(task.frame, path)
+            with ExitStack() as stack:
+                masters = [
+                    stack.enter_context(context.committing(output, validate_master)) for output in task.outputs[1:]
+                ]
+                path = stack.enter_context(context.committing(task.outputs[0], validate))
+                renderer.render(task.frame, path, *masters)
         except BlenderDiedError:
             _close_renderers()  # the next attempt, maybe in this process, needs a living one
             raise

@@ -76,6 +76,30 @@ def test_the_film_is_cut_every_half_second():
     assert tasks["movie/film"].inputs == ("movie/0000.mp4", "movie/0001.mp4")
 
 
+def test_a_job_with_masters_has_an_exr_beside_each_picture_of_its_film():
+    tasks = {task.id: task for task in plan_job(job(render={"format": "exr"}), LAYOUT, STAGES)}
+    assert tasks["render/000007"].outputs == ("frames/000007.png", "frames/000007.exr")
+    assert tasks["movie/segment-0000"].inputs[7] == "frames/000007.png"
+
+
+def test_frames_of_jobs_from_before_there_were_formats_stay_up_to_date():
+    drawn = next(task for task in plan_job(job(), LAYOUT, STAGES) if task.stage == "render")
+    assert not {"format", "passes", "order"} & set(json.loads(drawn.parameters.canonical)["render"])
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"passes": ["depth"]}, 'passes need format = "exr"'),
+        ({"format": "exr", "passes": ["vector"]}, '"vector" needs motion_blur = false'),
+        ({"format": "exr", "passes": ["depth", "depth"]}, "one of them twice"),
+    ],
+)
+def test_passes_without_a_place_are_refused(table, sentence):
+    with pytest.raises(ValidationError, match=sentence):
+        job(render=table)
+
+
 def test_a_film_for_editing_is_a_quicktime_film():
     tasks = {task.id: task for task in plan_job(job(movie={"codec": "prores"}), LAYOUT, STAGES)}
     assert tasks["movie/film"].inputs == ("movie/0000.mov", "movie/0001.mov")
@@ -115,6 +139,8 @@ def test_keys_that_a_codec_has_not_are_refused(table, sentence):
         ({"movie": {"crf": 20}}, {"movie"}),
         ({"movie": {"crf": 16}}, set()),
         ({"movie": {"codec": "h265"}}, {"movie"}),
+        ({"render": {"format": "exr"}}, {"render"}),
+        ({"render": {"format": "png"}}, set()),
         ({"surface": {"threshold": 0.5}}, {"surface"}),
         ({"gravity": [0, 0, -1.62]}, {"simulate"}),
         ({"frames": 80}, set()),

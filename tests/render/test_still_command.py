@@ -10,6 +10,7 @@ from PIL import Image
 
 from pipeline.layout import JobLayout
 from pipeline.stages import render as render_stage
+from render.pictures import validate_exr, validate_picture
 
 
 @pytest.fixture
@@ -53,6 +54,16 @@ def test_a_still_goes_where_it_is_wanted_and_replaces_what_is_there(job, tmp_pat
         assert picture.size == (64, 36)
     assert [path.name for path in target.parent.iterdir()] == ["poster.png"]
     assert not job.stills.exists()
+
+
+@needs_bpy
+def test_a_still_with_a_master_has_both_files(job, tmp_path):
+    arguments = ("--set", 'render.format="exr"', "--set", "render.samples=1", "-o", tmp_path / "poster.png")
+    result = pipeline("still", job.root, "--frame", 0, "--quality", "draft", *arguments)
+    render_stage._close_renderers()
+    assert result.exit_code == 0, result.output
+    validate_exr(tmp_path / "poster.exr", (64, 36))
+    validate_picture(tmp_path / "poster.png", (64, 36))
 
 
 def test_a_frame_that_is_not_simulated_yet_is_told_with_the_command_that_makes_it(job):
