@@ -198,6 +198,11 @@ class RenderParameters(Parameters):
         description="Of the EXR: depth [m], vector: motion to the frames before and after [pixels], normal, "
         "cryptomatte of objects and materials, denoising: the noisy picture, its albedo and normals.",
     )
+    order: Literal["film", "spread"] = Field(
+        default="film",
+        description="Which frames go first. film: from the first to the last; spread: the first, the last, the middle, "
+        "then between these, to see all of a film early. Changes no frame.",
+    )
     blender: str | None = Field(
         default=None,
         description="Path of a Blender executable; the bpy module if omitted. Counts only with --set or "

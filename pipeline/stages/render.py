@@ -54,7 +54,7 @@ COMBINED = "ViewLayer.Combined"
 BYTES_PER_PIXEL_AND_PASS = 200
 """The largest, cryptomatte, has 24 floats a pixel, in Cycles and in what is saved."""
 
-_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "render": {"blender"}}
+_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "render": {"blender", "order"}}
 """The film is always of Cycles. The executable counts by its version. The device does count: CPU and GPU round
 differently."""
 

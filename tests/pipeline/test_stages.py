@@ -141,6 +141,7 @@ def test_keys_that_a_codec_has_not_are_refused(table, sentence):
         ({"movie": {"codec": "h265"}}, {"movie"}),
         ({"render": {"format": "exr"}}, {"render"}),
         ({"render": {"format": "png"}}, set()),
+        ({"render": {"order": "spread"}}, set()),
         ({"surface": {"threshold": 0.5}}, {"surface"}),
         ({"gravity": [0, 0, -1.62]}, {"simulate"}),
         ({"frames": 80}, set()),
