@@ -9,7 +9,7 @@ encodes its segment again and nothing else. Colours are BT.709, limited range, c
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -105,23 +105,49 @@ def encode_segment(
         InvalidFileError: a picture is damaged, of another size than the first, or of an odd size.
         ValueError: there are no pictures.
     """
-    import av
-
     if not pictures:
         raise ValueError("a segment needs at least one picture")
-    rate = frame_rate(fps)
-    encoder_of = _ENCODERS[parameters.codec]
-    read = read_rgb8 if encoder_of.bits == 8 else read_rgb16
+    read = read_rgb8 if _ENCODERS[parameters.codec].bits == 8 else read_rgb16
     first = read(pictures[0])
     height, width, _ = first.shape
     if width % 2 or height % 2:
         raise InvalidFileError(
             pictures[0],
-            f"is {width}x{height} pixels, but {encoder_of.label} needs an even width and height: change the resolution",
+            f"is {width}x{height} pixels, but {_ENCODERS[parameters.codec].label} needs an even width and height: "
+            "change the resolution",
         )
+    encode_frames(
+        _pixels(pictures, first, read), (width, height), output, fps=fps, parameters=parameters, threads=threads
+    )
+
+
+def encode_frames(
+    frames: Iterable[Pixels],
+    size: tuple[int, int],
+    output: Path,
+    *,
+    fps: float,
+    parameters: MovieParameters,
+    threads: int = 1,
+) -> None:
+    """Encode frames as they come, so that their number takes no memory.
+
+    Args:
+        frames: pixels of each frame, (height, width, 3), uint8 or uint16; at least one.
+        size: even width and height [pixels].
+        output: the MP4 to write, or the QuickTime film for ProRes.
+        fps: frames a second [1/s].
+        parameters: codec, quality and speed.
+        threads: of H.264's encoder; part of what decides the bytes.
+    """
+    import av
+
+    rate = frame_rate(fps)
+    encoder_of = _ENCODERS[parameters.codec]
     with av.open(str(output), "w", format=encoder_of.container, options={"movflags": "+faststart"}) as container:
         stream: Any = container.add_stream(encoder_of.name, rate=rate, options=_options(parameters))
-        stream.width, stream.height, stream.pix_fmt = width, height, encoder_of.pixels
+        stream.width, stream.height = size
+        stream.pix_fmt = encoder_of.pixels
         encoder = stream.codec_context
         if encoder_of.tag is not None:
             encoder.codec_tag = encoder_of.tag
@@ -130,7 +156,7 @@ def encode_segment(
         encoder.thread_count = threads if parameters.codec == "h264" else 1
         _tag_bt709(encoder)
         clock = _DecodingClock(_X265_REORDERED if parameters.codec == "h265" else None)
-        for index, pixels in enumerate(_pixels(pictures, first, read)):
+        for index, pixels in enumerate(frames):
             frame = _to_yuv(pixels, encoder_of.pixels)
             frame.pts, frame.time_base = index, 1 / rate
             container.mux(clock.timed(stream.encode(frame)))
