@@ -30,6 +30,18 @@ def require_supported_version() -> None:
         raise RuntimeError(f"Blender {blender_version()} is too old; {needed} LTS or newer is needed")
 
 
+def set_file_format(image_settings: Any, file_format: str) -> None:
+    """Choose a file format: since 5.0 the kind of medium comes first, and layers would go to parts of their own.
+
+    In one part they are as earlier versions and most other programs have them.
+    """
+    if hasattr(image_settings, "media_type"):
+        image_settings.media_type = "MULTI_LAYER_IMAGE" if file_format == "OPEN_EXR_MULTILAYER" else "IMAGE"
+    image_settings.file_format = file_format
+    if hasattr(image_settings, "use_exr_interleave"):
+        image_settings.use_exr_interleave = True
+
+
 def import_openvdb() -> ModuleType:
     """Blender's own binding of OpenVDB. An executable has it on its path; the bpy wheel brings it and leaves it off.
 

@@ -4,9 +4,10 @@
     blender --background --factory-startup --python render_frames.py -- SPEC --serve
 
 Both forms write one line per frame to standard output, `FRAME_DONE 12 /path` or `FRAME_FAILED 12 reason`, among the
-lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line,
-after a line `RENDERER_READY version device`; the process ends with its input, so it cannot outlive who started it.
-`stage 12 96x54 /path` asks for the empty stage of that frame, in so many pixels.
+lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line
+(after a tab, the path of the EXR that is wanted too), after a line `RENDERER_READY version device`; the process ends
+with its input, so it cannot outlive who started it. `stage 12 96x54 /path` asks for the empty stage of that frame, in
+so many pixels.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ if __package__ in (None, ""):
 
 import bpy
 
-from blender_scripts import camera, geometry, lights, looks, png, points, poses, settings, tank, volumes
+from blender_scripts import camera, exr, geometry, lights, looks, png, points, poses, settings, tank, volumes, workbench
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
@@ -42,7 +43,7 @@ class SceneRenderer:
     Blender has one scene per process, so a second SceneRenderer takes the place of the first.
 
     Attributes:
-        device: what Cycles renders on, e.g. `CPU`.
+        device: what Cycles renders on, e.g. `CPU`; `Workbench` for that engine.
     """
 
     _current: SceneRenderer | None = None
@@ -64,8 +65,9 @@ class SceneRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
-        self.device = settings.choose_device(spec["render"]["device"])
+        self.device: str = settings.choose_device(spec["render"]["device"])
         self._camera = camera.add_camera(spec["camera"])
+        self._format, self._passes = spec["render"]["format"], spec["render"]["passes"]
         self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
         lights.build_stage(spec)
         if spec["stage"]["tank"]:
@@ -76,9 +78,17 @@ class SceneRenderer:
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         for description in spec["objects"]:
             self._add_object(description, spec)
+        if spec.get("engine") == "workbench":
+            workbench.apply_workbench_settings(spec)
+            self.device = "Workbench"
 
-    def render(self, frame: int, output_path: Path) -> None:
+    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
         """Draw one frame into a PNG file of any name. The same input gives the same bytes.
+
+        Args:
+            frame: which frame.
+            output_path: the PNG.
+            master_path: gets the same frame as an EXR with its passes.
 
         Raises:
             RenderInputError: a file of this frame is missing or unfit.
@@ -97,7 +107,7 @@ class SceneRenderer:
                 geometry.fill_mesh(blender_object.data, geometry.read_ply(path))
         self._place_bodies(frame)
         self._place_camera(frame)
-        self._draw(frame, output_path)
+        self._draw(frame, output_path, master_path)
 
     def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
         """Draw what a frame shows without any body: ground, backdrop, tank and their light, in a small size.
@@ -129,14 +139,20 @@ class SceneRenderer:
         if SceneRenderer._current is not self:
             raise RenderFailedError("another scene was opened in this process; this renderer is closed")
 
-    def _draw(self, frame: int, output_path: Path) -> None:
+    def _draw(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
         bpy.context.scene.frame_set(frame)
         outcome = bpy.ops.render.render()
         if "FINISHED" not in outcome:
             raise RenderFailedError(f"Blender ended the render with {sorted(outcome)}")
         # save_render writes to exactly this path; the scene's own output path would expand '#', '{' and add suffixes.
-        bpy.data.images["Render Result"].save_render(str(output_path.resolve()), scene=bpy.context.scene)
+        result = bpy.data.images["Render Result"]
+        settings.choose_png(self._format)
+        result.save_render(str(output_path.resolve()), scene=bpy.context.scene)
         png.strip_metadata(output_path)
+        if master_path is not None:
+            settings.choose_exr(with_passes=bool(self._passes))
+            result.save_render(str(master_path.resolve()), scene=bpy.context.scene)
+            exr.strip_metadata(master_path)
 
     def _place_bodies(self, frame: int) -> None:
         of_file: dict[Path, dict[str, poses.Pose]] = {}
@@ -229,15 +245,20 @@ def _report(line: str) -> None:
 
 
 def _render_and_report(
-    renderer: SceneRenderer, frame: int, output_path: Path, *, stage: tuple[int, int] | None = None
+    renderer: SceneRenderer,
+    frame: int,
+    output_path: Path,
+    master_path: Path | None = None,
+    *,
+    stage: tuple[int, int] | None = None,
 ) -> bool:
     """Draw a frame, or in so many pixels its empty stage, and say how that ended."""
     try:
         if stage is None:
-            renderer.render(frame, output_path)
+            renderer.render(frame, output_path, master_path)
         else:
             renderer.render_stage(frame, output_path, resolution=stage)
-    except (RenderInputError, RenderFailedError, OSError, RuntimeError) as error:
+    except (RenderInputError, RenderFailedError, OSError, RuntimeError, ValueError) as error:
         _report(f"FRAME_FAILED {frame} {error}")
         return False
     _report(f"FRAME_DONE {frame} {output_path}")
@@ -256,14 +277,15 @@ def _serve(renderer: SceneRenderer) -> None:
     threading.Thread(target=_follow, args=(sys.stdin, requests), daemon=True).start()
     _report(f"RENDERER_READY {blender_version()} {renderer.device}")
     while True:
-        request, stage = requests.get().rstrip("\n"), None
+        request = requests.get().rstrip("\n")
         if request.startswith("stage "):
             _, frame, size, output_path = request.split(" ", 3)
             width, _, height = size.partition("x")
-            stage = int(width), int(height)
+            _render_and_report(renderer, int(frame), Path(output_path), stage=(int(width), int(height)))
         else:
-            frame, _, output_path = request.partition(" ")
-        _render_and_report(renderer, int(frame), Path(output_path), stage=stage)
+            frame, _, paths = request.partition(" ")
+            output_path, _, master_path = paths.partition("\t")
+            _render_and_report(renderer, int(frame), Path(output_path), Path(master_path) if master_path else None)
 
 
 def main(arguments: list[str]) -> int:

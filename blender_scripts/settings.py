@@ -10,6 +10,8 @@ from typing import Any
 
 import bpy
 
+from blender_scripts.compatibility import set_file_format
+
 
 @dataclass(frozen=True)
 class QualityPreset:
@@ -77,15 +79,48 @@ def apply_render_settings(parameters: dict[str, Any], *, fps: float, threads: in
     render.motion_blur_position = "CENTER"
     render.use_compositing = False
     render.use_sequencer = False
-    render.image_settings.file_format = "PNG"
-    render.image_settings.color_mode = "RGB"
-    render.image_settings.color_depth = "8"
-    render.image_settings.compression = 15
+    choose_png(parameters["format"])
+    _enable_passes(bpy.context.view_layer, frozenset(parameters["passes"]))
     scene.display_settings.display_device = "sRGB"
     scene.view_settings.view_transform = "AgX"
     scene.view_settings.look = "AgX - Medium High Contrast"
     scene.view_settings.exposure = parameters["exposure"]
     _apply_cycles_settings(scene.cycles, parameters)
+
+
+def choose_png(picture_format: str) -> None:
+    """What is saved next is a PNG as the display shows it.
+
+    Args:
+        picture_format: `render.format`; what an EXR accompanies has 8 bits.
+    """
+    image = bpy.context.scene.render.image_settings
+    set_file_format(image, "PNG")
+    image.color_mode = "RGB"
+    image.color_depth = "16" if picture_format == "png16" else "8"
+    image.compression = 15
+
+
+def choose_exr(*, with_passes: bool) -> None:
+    """What is saved next is an EXR of half floats; passes are in it as layers, in full precision where they are data.
+
+    DWAA is made for pictures: of normals and vectors it would change the Y alone, so passes are kept without loss.
+    """
+    image = bpy.context.scene.render.image_settings
+    set_file_format(image, "OPEN_EXR_MULTILAYER" if with_passes else "OPEN_EXR")
+    if not with_passes:
+        image.color_mode = "RGB"
+    image.color_depth = "16"
+    image.exr_codec = "ZIP" if with_passes else "DWAA"
+
+
+def _enable_passes(view_layer: Any, passes: frozenset[str]) -> None:
+    view_layer.use_pass_z = "depth" in passes
+    view_layer.use_pass_vector = "vector" in passes
+    view_layer.use_pass_normal = "normal" in passes
+    view_layer.use_pass_cryptomatte_object = "cryptomatte" in passes
+    view_layer.use_pass_cryptomatte_material = "cryptomatte" in passes
+    view_layer.cycles.denoising_store_passes = "denoising" in passes
 
 
 def _apply_cycles_settings(cycles: Any, parameters: dict[str, Any]) -> None:

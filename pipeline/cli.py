@@ -14,9 +14,10 @@ from pipeline.commands.arguments import job_options, print_warnings, require_own
 from pipeline.commands.exporting import export, run_stage
 from pipeline.commands.inspecting import explain, logs, plan, status
 from pipeline.commands.keeping import clean, verify
+from pipeline.commands.previewing import animatic, still
 from pipeline.commands.queueing import cancel, pause, priority, queue, retry, watch, work
 from pipeline.commands.running import rerun, resume, submit
-from pipeline.commands.showing import report, sheet
+from pipeline.commands.showing import compare, loop, report, sheet
 from pipeline.errors import PLACE_TROUBLES, DiskFullError, PipelineError
 from pipeline.executors.failures import is_disk_full
 
@@ -54,7 +55,7 @@ def main() -> None:
 
 
 for command in (
-    *(submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report),
+    *(submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report, still, animatic, compare, loop),
     *(queue, watch, pause, cancel, retry, priority, work),
     *(export, run_stage),
 ):

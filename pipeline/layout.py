@@ -70,6 +70,11 @@ class JobLayout:
         return self.root / "report.html"
 
     @property
+    def stills(self) -> Path:
+        """Folder of single frames drawn otherwise than the film's; no artifacts."""
+        return self.root / "stills"
+
+    @property
     def inputs(self) -> Path:
         """Copies of the user's own files, such as meshes."""
         return self.root / "inputs"
@@ -140,11 +145,22 @@ class JobLayout:
         return ArtifactPath(f"frames/{frame:06d}.png")
 
     @staticmethod
-    def segment(index: int) -> ArtifactPath:
-        """A piece of the film."""
-        return ArtifactPath(f"movie/{index:04d}.mp4")
+    def master(frame: int) -> ArtifactPath:
+        """Rendered frame in linear light, with its passes."""
+        return ArtifactPath(f"frames/{frame:06d}.exr")
 
     @staticmethod
-    def movie() -> ArtifactPath:
-        """The film."""
-        return ArtifactPath("movie.mp4")
+    def segment(index: int, suffix: str = ".mp4") -> ArtifactPath:
+        """A piece of the film; its suffix is that of `MovieParameters`."""
+        return ArtifactPath(f"movie/{index:04d}{suffix}")
+
+    @staticmethod
+    def movie(suffix: str = ".mp4") -> ArtifactPath:
+        """The film; its suffix is that of `MovieParameters`."""
+        return ArtifactPath(f"movie{suffix}")
+
+    @property
+    def film(self) -> Path:
+        """Where the film lies that was made last, for one who does not know the job."""
+        made = [path for suffix in (".mp4", ".mov") if (path := self.path(self.movie(suffix))).exists()]
+        return max(made, key=lambda path: path.stat().st_mtime, default=self.path(self.movie()))

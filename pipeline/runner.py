@@ -18,6 +18,7 @@ from pipeline.executors.attempt import load_stages
 from pipeline.executors.base import Assignment, CapacityChanged, Executor, ExecutorEvent
 from pipeline.executors.failures import is_disk_full
 from pipeline.files import replace_durably
+from pipeline.frame_order import frame_turns
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.lease import Lease
@@ -185,6 +186,7 @@ class _Run:
                 machine=machine,
                 policy=policy,
                 policies={stage: limits.policy(policy or Policy()) for stage, limits in job.limits.items()},
+                turns=frame_turns(job),
             )
         except ValueError as error:  # a GPU that is nowhere, for instance
             raise PlanError(str(error)) from error

@@ -79,9 +79,10 @@ class _Entry:
 class Scheduler:
     """Decides what runs next.
 
-    Lower frames go first, and of one frame the later stage, so that the film shows early and few intermediate files
-    wait for their reader. Tasks about the whole job go before any frame, and of these the earlier stage: the small ones
-    that prepare something are not kept waiting by a simulation that takes the whole machine.
+    Lower frames go first, or those whose turn is earlier, and of one frame the later stage, so that the film shows
+    early and few intermediate files wait for their reader. Tasks about the whole job go before any frame, and of these
+    the earlier stage: the small ones that prepare something are not kept waiting by a simulation that takes the whole
+    machine.
 
     Args:
         tasks: all tasks of the job; stages in the order of their first task.
@@ -91,6 +92,7 @@ class Scheduler:
         machine: the most that one task can be given, where `capacity` is that of several machines.
         policy: when tasks are tried again, and when the job gives up.
         policies: the same by stage, where it is another.
+        turns: place of each frame in the order; None: as they are numbered.
 
     Raises:
         ValueError: a task needs what nobody makes, or more GPUs than there are.
@@ -106,6 +108,7 @@ class Scheduler:
         machine: Resources | None = None,
         policy: Policy | None = None,
         policies: Mapping[str, Policy] | None = None,
+        turns: Sequence[int] | None = None,
     ) -> None:
         self._packing = Packing(machine=machine or capacity, capacity=capacity)
         self._policy = policy or Policy()
@@ -127,7 +130,10 @@ class Scheduler:
                 need = claim(task.resources, self._packing.machine)
             except ValueError as error:
                 raise ValueError(f"{task.id} {error}") from None
-            priority = (-1, rank, index) if task.frame is None else (task.frame, -rank, index)
+            if task.frame is None:
+                priority = (-1, rank, index)
+            else:
+                priority = (task.frame if turns is None else turns[task.frame], -rank, index)
             entry = _Entry(task, need, priority)
             self._entries[task.id] = entry
             self._counts[task.stage, TaskState.PENDING] += 1

@@ -7,7 +7,7 @@ the same job folder at once. `pipeline resume` later takes all of it over into t
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -65,7 +65,38 @@ def run_stage(
     """
     tasks = plan_job(job, layout, load_stages(stages))
     chosen = Selection(frozenset({stage}), frames).of(tasks)
-    todo = [task for task in tasks if task.id in chosen]
+    return run_tasks(
+        [task for task in tasks if task.id in chosen],
+        layout,
+        capacity=capacity,
+        stages=stages,
+        stop_requested=stop_requested,
+        tell=tell,
+    )
+
+
+def run_tasks(
+    todo: Sequence[Task],
+    layout: JobLayout,
+    *,
+    capacity: Resources,
+    stages: str,
+    stop_requested: Callable[[], bool],
+    tell: Callable[[float, str], None],
+) -> StageOutcome:
+    """Run those of these tasks that are not done, one after another, in this process.
+
+    Args:
+        todo: the tasks, makers before users; what else they read is there.
+        layout: the job's folder, with its job file.
+        capacity: what a task may use.
+        stages: where the stages are, as `module:ATTRIBUTE`.
+        stop_requested: whether to write a checkpoint and return.
+        tell: takes the share that is done, 0 to 1, and a sentence.
+
+    Raises:
+        PipelineError: an input is not there.
+    """
     ran, up_to_date, failures = 0, 0, list[Failed]()
     for index, task in enumerate(todo):
         assignment = _assignment(task, layout, capacity=capacity, stages=stages)

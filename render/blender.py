@@ -71,8 +71,8 @@ class Renderer(Protocol):
     device: str
     """What Cycles renders on, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`."""
 
-    def render(self, frame: int, output_path: Path) -> None:
-        """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
+    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
+        """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
 
     def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
         """Draw what the camera of a frame sees without any body, so many pixels wide and high.
@@ -134,10 +134,10 @@ class ModuleRenderer:
             raise BlenderUnavailableError(str(error)) from error
         self.device: str = self._scene.device
 
-    def render(self, frame: int, output_path: Path) -> None:
-        """Draw a frame into a PNG file of any name. Raises FrameRenderError."""
+    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
+        """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
         with _told_of(frame):
-            self._scene.render(frame, output_path)
+            self._scene.render(frame, output_path, master_path)
 
     def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
         """Draw what the camera of a frame sees without any body. Raises FrameRenderError."""
@@ -178,14 +178,15 @@ class ExecutableRenderer:
             raise
         _, self.version, self.device = answer.split(" ", 2)
 
-    def render(self, frame: int, output_path: Path) -> None:
-        """Draw a frame into a PNG file of any name.
+    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
+        """Draw a frame into a PNG file of any name, and into an EXR if one is named.
 
         Raises:
             FrameRenderError: this frame cannot be drawn.
             BlenderDiedError: the executable is gone; this renderer is of no more use.
         """
-        self._ask(frame, f"{frame} {output_path.resolve()}")
+        master = "" if master_path is None else f"\t{master_path.resolve()}"
+        self._ask(frame, f"{frame} {output_path.resolve()}{master}")
 
     def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
         """Draw what the camera of a frame sees without any body. Raises as `render` does."""
@@ -254,7 +255,7 @@ def _told_of(frame: int) -> Iterator[None]:
 
     try:
         yield
-    except (RenderInputError, RenderFailedError, RuntimeError) as error:
+    except (RenderInputError, RenderFailedError, RuntimeError, ValueError) as error:
         raise FrameRenderError(frame, str(error)) from error
 
 
@@ -270,7 +271,7 @@ def build_argv(blender: str, spec_path: Path, *, threads: int) -> list[str]:
         "--threads",
         str(threads),
         "--python",
-        str(_render_script()),
+        str(script_path("render_frames.py")),
         "--",
         str(spec_path),
         "--serve",
@@ -310,8 +311,13 @@ def require_supported_executable(blender: str) -> tuple[int, int, int]:
     return version
 
 
-def _render_script() -> Path:
+def script_path(name: str) -> Path:
+    """Where a script of `blender_scripts` lies.
+
+    Raises:
+        BlenderUnavailableError: the project is not on Python's path.
+    """
     package = find_spec("blender_scripts")
     if package is None or package.origin is None:
         raise BlenderUnavailableError("the folder blender_scripts of this project is not on Python's path")
-    return Path(package.origin).with_name("render_frames.py")
+    return Path(package.origin).with_name(name)

@@ -1,4 +1,6 @@
-"""Films: pictures become H.264 segments, and segments one MP4 without encoding again.
+"""Films: pictures become segments, and segments one file without encoding again.
+
+H.264, H.265 and AV1 in MP4, ProRes in QuickTime.
 
 A segment depends on its own pictures only (closed groups of pictures, constant rate factor), so a changed picture
 encodes its segment again and nothing else. Colours are BT.709, limited range, converted as such and tagged as such.
@@ -6,7 +8,10 @@ encodes its segment again and nothing else. Colours are BT.709, limited range, c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +21,7 @@ from numpy.typing import NDArray
 
 from render.errors import InvalidFileError
 from render.parameters import MovieParameters
-from render.pictures import read_rgb8
+from render.pictures import Pixels, read_rgb8, read_rgb16
 
 if TYPE_CHECKING:
     import av
@@ -27,9 +32,62 @@ SEGMENT_FRAMES = 30
 _LARGEST_RATE_DENOMINATOR = 1001
 """Of the frame rates in use, 24000/1001 and its kin have the largest denominator."""
 
+_X265_PARAMETERS = f"open-gop=0:keyint={SEGMENT_FRAMES}:info=0:pools=none:frame-threads=1:log-level=error"
+"""info=0: no version and options in the stream. One thread, as what several make may depend on their timing."""
+
+_X265_REORDERED = 2
+"""By how many frames decoding may run ahead of showing, with B-frames that refer to B-frames."""
+
+_SVT_AV1_PARAMETERS = "lp=1:enable-overlays=0"
+"""lp=1: one thread, as for x265."""
+
+_SVT_AV1_SPEEDS = {"ultrafast": 12, "veryfast": 10, "fast": 9, "medium": 8, "slow": 6, "veryslow": 4}
+
 _X264_PARAMETERS = "open-gop=0:cpu-independent=1"
 """cpu-independent: the same bits on every processor, and on one: the SIMD code of macroblock-tree rate control reads
 memory past the end of narrow pictures, whose content is random."""
+
+
+@dataclass(frozen=True)
+class _Encoder:
+    """How a codec is written.
+
+    Attributes:
+        name: of FFmpeg's encoder.
+        label: for people.
+        pixels: FFmpeg's pixel format.
+        bits: a channel.
+        container: FFmpeg's muxer.
+        tag: four characters by which players know the codec; None: the muxer's own.
+    """
+
+    name: str
+    label: str
+    pixels: str
+    bits: int
+    container: str
+    tag: str | None = None
+
+
+_ENCODERS = {
+    "h264": _Encoder("libx264", "H.264", "yuv420p", 8, "mp4"),
+    # Players by Apple know H.265 in an MP4 by this tag alone.
+    "h265": _Encoder("libx265", "H.265", "yuv420p10le", 10, "mp4", tag="hvc1"),
+    "av1": _Encoder("libsvtav1", "AV1", "yuv420p10le", 10, "mp4"),
+    "prores": _Encoder("prores_ks", "ProRes", "yuv422p10le", 10, "mov"),
+}
+
+
+def missing_encoder(codec: str) -> str | None:
+    """The encoder that a codec needs and this FFmpeg lacks; None if it is there."""
+    import av
+
+    name = _ENCODERS[codec].name
+    try:
+        av.codec.Codec(name, "w")
+    except av.codec.codec.UnknownCodecError:
+        return name
+    return None
 
 
 def encode_segment(
@@ -39,48 +97,79 @@ def encode_segment(
 
     Args:
         pictures: PNG files of one even size, in order.
-        output: the MP4 to write.
+        output: the MP4 to write, or the QuickTime film for ProRes.
         fps: frames a second [1/s].
-        parameters: quality and speed.
-        threads: of the encoder; part of what decides the bytes.
+        parameters: codec, quality and speed.
+        threads: of H.264's encoder; part of what decides the bytes.
 
     Raises:
         InvalidFileError: a picture is damaged, of another size than the first, or of an odd size.
         ValueError: there are no pictures.
     """
-    import av
-
     if not pictures:
         raise ValueError("a segment needs at least one picture")
-    rate = frame_rate(fps)
-    first = read_rgb8(pictures[0])
+    read = read_rgb8 if _ENCODERS[parameters.codec].bits == 8 else read_rgb16
+    first = read(pictures[0])
     height, width, _ = first.shape
     if width % 2 or height % 2:
         raise InvalidFileError(
-            pictures[0], f"is {width}x{height} pixels, but H.264 needs an even width and height: change the resolution"
+            pictures[0],
+            f"is {width}x{height} pixels, but {_ENCODERS[parameters.codec].label} needs an even width and height: "
+            "change the resolution",
         )
-    with av.open(str(output), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-        options = {"crf": str(parameters.crf), "preset": parameters.preset, "x264-params": _X264_PARAMETERS}
-        stream = container.add_stream("libx264", rate=rate, options=options)
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    encode_frames(
+        _pixels(pictures, first, read), (width, height), output, fps=fps, parameters=parameters, threads=threads
+    )
+
+
+def encode_frames(
+    frames: Iterable[Pixels],
+    size: tuple[int, int],
+    output: Path,
+    *,
+    fps: float,
+    parameters: MovieParameters,
+    threads: int = 1,
+) -> None:
+    """Encode frames as they come, so that their number takes no memory.
+
+    Args:
+        frames: pixels of each frame, (height, width, 3), uint8 or uint16; at least one.
+        size: even width and height [pixels].
+        output: the MP4 to write, or the QuickTime film for ProRes.
+        fps: frames a second [1/s].
+        parameters: codec, quality and speed.
+        threads: of H.264's encoder; part of what decides the bytes.
+    """
+    import av
+
+    rate = frame_rate(fps)
+    encoder_of = _ENCODERS[parameters.codec]
+    with av.open(str(output), "w", format=encoder_of.container, options={"movflags": "+faststart"}) as container:
+        stream: Any = container.add_stream(encoder_of.name, rate=rate, options=_options(parameters))
+        stream.width, stream.height = size
+        stream.pix_fmt = encoder_of.pixels
         encoder = stream.codec_context
+        if encoder_of.tag is not None:
+            encoder.codec_tag = encoder_of.tag
         encoder.time_base = 1 / rate
         encoder.gop_size = SEGMENT_FRAMES
-        encoder.thread_count = threads
+        encoder.thread_count = threads if parameters.codec == "h264" else 1
         _tag_bt709(encoder)
-        for index, pixels in enumerate(_pixels(pictures, first)):
-            frame = _to_yuv(pixels)
+        clock = _DecodingClock(_X265_REORDERED if parameters.codec == "h265" else None)
+        for index, pixels in enumerate(frames):
+            frame = _to_yuv(pixels, encoder_of.pixels)
             frame.pts, frame.time_base = index, 1 / rate
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+            container.mux(clock.timed(stream.encode(frame)))
+        container.mux(clock.timed(stream.encode(None)))
 
 
 def join_segments(segments: Sequence[Path], output: Path) -> None:
     """Put segments behind each other by copying their packets; frame n of the film is at n / fps exactly.
 
     Args:
-        segments: MP4 files by `encode_segment` with the same parameters, in order.
-        output: the MP4 to write.
+        segments: files by `encode_segment` with the same parameters, in order.
+        output: the film to write, of the same kind.
 
     Raises:
         InvalidFileError: a segment is damaged, or was encoded with other parameters than the first.
@@ -91,13 +180,18 @@ def join_segments(segments: Sequence[Path], output: Path) -> None:
     if not segments:
         raise ValueError("a film needs at least one segment")
     delay = max(_reorder_delay(segment) for segment in segments)
-    with (
-        av.open(str(output), "w", format="mp4", options={"movflags": "+faststart"}) as film,
-        _opened(segments[0]) as first,
-    ):
+    with ExitStack() as stack:
+        first = stack.enter_context(_opened(segments[0]))
         template = first.streams.video[0]
-        stream = film.add_stream_from_template(template)
+        container_format = "mov" if template.codec_context.name == "prores" else "mp4"
+        film = stack.enter_context(
+            av.open(str(output), "w", format=container_format, options={"movflags": "+faststart"})
+        )
+        # Opaque: without an encoder of the decoder's name, which the decoder of AV1 has none of.
+        stream = film.add_stream_from_template(template, opaque=template.codec_context.name == "libdav1d")
         stream.time_base = template.time_base
+        if template.codec_context.name == "hevc":
+            stream.codec_context.codec_tag = template.codec_context.codec_tag
         ticks = _ticks_per_frame(segments[0], template)
         frame_count = 0
         for segment in segments:
@@ -119,7 +213,7 @@ def validate_movie(path: Path, frames: int, *, see: Callable[[NDArray[np.uint8]]
     """Decode a film and count its frames.
 
     Args:
-        path: an MP4 by `encode_segment` or `join_segments`.
+        path: a film by `encode_segment` or `join_segments`.
         frames: how many it must have.
         see: gets the luma of each frame, (height, width), in order.
 
@@ -155,10 +249,44 @@ def frame_rate(fps: float) -> Fraction:
     return Fraction(fps).limit_denominator(_LARGEST_RATE_DENOMINATOR)
 
 
-def _pixels(pictures: Sequence[Path], first: NDArray[np.uint8]) -> Iterator[NDArray[np.uint8]]:
+def _options(parameters: MovieParameters) -> dict[str, str]:
+    """Of FFmpeg's encoder."""
+    rate, preset = {"crf": str(parameters.rate_factor)}, parameters.preset
+    match parameters.codec:
+        case "h264":
+            return {**rate, "preset": preset, "x264-params": _X264_PARAMETERS}
+        case "h265":
+            return {**rate, "preset": preset, "x265-params": _X265_PARAMETERS}
+        case "av1":
+            os.environ["SVT_LOG"] = "1"  # errors only; it would tell its settings for every segment
+            return {**rate, "preset": str(_SVT_AV1_SPEEDS[preset]), "svtav1-params": _SVT_AV1_PARAMETERS}
+    return {"profile": "3"}  # 422 HQ
+
+
+class _DecodingClock:
+    """Sets the times at which packets are decoded; x265 leaves them to chance in a segment of a frame or two.
+
+    Args:
+        reordered: by how many frames decoding runs ahead of showing; None: leave the times as they are.
+    """
+
+    def __init__(self, reordered: int | None) -> None:
+        self._reordered = reordered
+        self._count = 0
+
+    def timed(self, packets: list[Any]) -> list[Any]:
+        """The packets, which come in decoding order."""
+        if self._reordered is not None:
+            for number, packet in enumerate(packets, start=self._count):
+                packet.dts = number - self._reordered
+            self._count += len(packets)
+        return packets
+
+
+def _pixels(pictures: Sequence[Path], first: Pixels, read: Callable[[Path], Pixels]) -> Iterator[Pixels]:
     yield first
     for path in pictures[1:]:
-        pixels = read_rgb8(path)
+        pixels = read(path)
         if pixels.shape != first.shape:
             (height, width, _), (first_height, first_width, _) = pixels.shape, first.shape
             raise InvalidFileError(
@@ -167,13 +295,19 @@ def _pixels(pictures: Sequence[Path], first: NDArray[np.uint8]) -> Iterator[NDAr
         yield pixels
 
 
-def _to_yuv(pixels: NDArray[np.uint8]) -> av.VideoFrame:
+def _to_yuv(pixels: Pixels, pixel_format: str) -> av.VideoFrame:
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, Interpolation
 
+    if pixels.dtype == np.uint8:
+        picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+    else:
+        # FFmpeg takes 65280 of 16 bits for white, 255 of 8 bits and 8 more; white would be 943 instead of 940.
+        scaled = (pixels.astype(np.uint32) * 65280 + 32767) // 65535
+        picture = av.VideoFrame.from_ndarray(scaled.astype(np.uint16), format="rgb48le")
     # Without a destination the conversion is BT.601. BITEXACT: the same pixels on every processor.
-    return av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(
-        format="yuv420p",
+    return picture.reformat(
+        format=pixel_format,
         dst_colorspace=Colorspace.ITU709,
         dst_color_range=ColorRange.MPEG,
         dst_color_primaries=ColorPrimaries.BT709,
@@ -200,7 +334,7 @@ def _opened(path: Path) -> Any:
     except av.FFmpegError as error:
         if isinstance(error, FileNotFoundError | PermissionError):
             raise
-        raise InvalidFileError(path, f"is not an MP4 film: {error}") from error
+        raise InvalidFileError(path, f"is not an MP4 or QuickTime film: {error}") from error
     if len(container.streams.video) != 1:
         container.close()
         raise InvalidFileError(path, "has no picture track")

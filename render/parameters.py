@@ -186,6 +186,9 @@ class MaterialParameters(Parameters):
     )
 
 
+RenderPass = Literal["depth", "vector", "normal", "cryptomatte", "denoising"]
+
+
 class RenderParameters(Parameters):
     """How frames are made."""
 
@@ -202,21 +205,95 @@ class RenderParameters(Parameters):
     exposure: float = Field(default=0.0, description="Exposure [stops].")
     seed: int = Field(default=0, ge=0, description="Seed of the sampling pattern.")
     device: Literal["auto", "cpu", "gpu"] = Field(default="auto", description="What Cycles renders on.")
+    format: Literal["png", "png16", "exr"] = Field(
+        default="png",
+        description="png: 8 bits a channel, as the display shows them; png16: the same in 16 bits; exr: an OpenEXR "
+        "master of half floats, linear light without the view's transform, beside the PNG that the film is made of.",
+    )
+    passes: tuple[RenderPass, ...] = Field(
+        default=(),
+        description="Of the EXR: depth [m], vector: motion to the frames before and after [pixels], normal, "
+        "cryptomatte of objects and materials, denoising: the noisy picture, its albedo and normals.",
+    )
+    order: Literal["film", "spread"] = Field(
+        default="film",
+        description="Which frames go first. film: from the first to the last; spread: the first, the last, the middle, "
+        "then between these, to see all of a film early. Changes no frame.",
+    )
     blender: str | None = Field(
         default=None,
         description="Path of a Blender executable; the bpy module if omitted. Counts only with --set or "
         "PIPELINE_BLENDER, as a job file runs no program.",
     )
 
+    @property
+    def has_master(self) -> bool:
+        """Whether there is an EXR beside each PNG."""
+        return self.format == "exr"
+
+    @model_validator(mode="after")
+    def _passes_have_a_place(self) -> Self:
+        if self.passes and not self.has_master:
+            raise ValueError('passes need format = "exr"; a PNG holds the picture alone')
+        if len(set(self.passes)) < len(self.passes):
+            raise ValueError("passes names one of them twice")
+        if "vector" in self.passes and self.motion_blur:
+            raise ValueError('the pass "vector" needs motion_blur = false: what is blurred moves in many ways at once')
+        return self
+
+
+Codec = Literal["h264", "h265", "av1", "prores"]
+
+USUAL_CRF = {"h264": 16, "h265": 18, "av1": 20}
+"""Within 2 dB of each other on the quickstart; docs/rendering.md has the table."""
+HIGHEST_CRF = {"h264": 51, "h265": 51, "av1": 63}
+
 
 class MovieParameters(Parameters):
     """How frames become a film."""
 
-    crf: int = Field(default=16, ge=0, le=51, description="H.264 constant rate factor; smaller is better and larger.")
+    codec: Codec = Field(
+        default="h264",
+        description="h264: plays everywhere; h265: 10 bits, smaller; av1: 10 bits, free of licences; prores: 422 HQ, "
+        "10 bits, a large .mov for editing.",
+    )
+    crf: Annotated[int, Field(ge=0, le=63)] | None = Field(
+        default=None,
+        description="Constant rate factor; smaller is better and larger. h264 and h265: up to 51, av1: up to 63; "
+        "16, 18 and 20 if omitted. prores has none.",
+    )
     preset: Literal["ultrafast", "veryfast", "fast", "medium", "slow", "veryslow"] = Field(
-        default="medium", description="H.264 speed against size."
+        default="medium", description="Speed against size; prores has none."
     )
     playback_fps: Positive | None = Field(
         default=None,
         description="Frames a second of the film; the job's fps if omitted (less is slow motion).",
     )
+
+    @property
+    def suffix(self) -> str:
+        """Of the film's file."""
+        return ".mov" if self.codec == "prores" else ".mp4"
+
+    @property
+    def rate_factor(self) -> int | None:
+        """The constant rate factor that counts; None for a codec that has none."""
+        return USUAL_CRF.get(self.codec) if self.crf is None else self.crf
+
+    def deciding(self) -> dict[str, str | int | float | None]:
+        """What decides the film's bytes; for H.264 the keys and values from before there were other codecs."""
+        if self.codec == "prores":
+            return {"codec": self.codec, "playback_fps": self.playback_fps}
+        common: dict[str, str | int | float | None] = {"crf": self.rate_factor, "preset": self.preset}
+        common["playback_fps"] = self.playback_fps
+        return common if self.codec == "h264" else {"codec": self.codec, **common}
+
+    @model_validator(mode="after")
+    def _codec_has_these_keys(self) -> Self:
+        if self.codec == "prores":
+            for key in ("crf", "preset"):
+                if key in self.model_fields_set:
+                    raise ValueError(f"{key} has no meaning for prores, which has one quality; remove it")
+        elif self.crf is not None and self.crf > HIGHEST_CRF[self.codec]:
+            raise ValueError(f"crf of {self.codec} is at most {HIGHEST_CRF[self.codec]}, got {self.crf}")
+        return self

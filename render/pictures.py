@@ -86,13 +86,24 @@ def read_picture(path: Path) -> Pixels:
 
 def read_rgb8(path: Path) -> NDArray[np.uint8]:
     """Pixels as (height, width, 3) uint8; 16-bit channels are rounded, alpha is dropped."""
-    pixels = read_picture(path)
-    if pixels.shape[2] <= 2:
-        pixels = np.repeat(pixels[..., :1], 3, axis=2)
-    color = pixels[..., :3]
+    color = _rgb(path)
     if color.dtype == np.uint16:
         color = ((color.astype(np.uint32) + 128) // 257).astype(np.uint8)
     return np.ascontiguousarray(color, np.uint8)
+
+
+def read_rgb16(path: Path) -> NDArray[np.uint16]:
+    """Pixels as (height, width, 3) uint16; 8-bit channels are spread over the range, alpha is dropped."""
+    color = _rgb(path)
+    if color.dtype == np.uint8:
+        color = color.astype(np.uint16) * np.uint16(257)
+    return np.ascontiguousarray(color, np.uint16)
+
+
+def _rgb(path: Path) -> Pixels:
+    """Colours of a picture, (height, width, 3), grey ones as well."""
+    pixels = read_picture(path)
+    return np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] <= 2 else pixels[..., :3]
 
 
 def validate_picture(path: Path, resolution: tuple[int, int]) -> PictureStatistics:
@@ -148,6 +159,53 @@ def require_more_than_stage(path: Path, stage: NDArray[np.uint8], cells: NDArray
         raise InvalidFileError(
             path, f"shows the empty stage, though bodies are in {100 * cells.mean():.0f} % of it: they were not drawn"
         )
+
+
+def validate_exr(path: Path, resolution: tuple[int, int], *, layer: str = "") -> None:
+    """Decode an EXR and check that it shows something. All layers of a part are compressed together, so all are read.
+
+    Args:
+        path: an EXR in one part.
+        resolution: expected width and height [pixels].
+        layer: the layer that is the picture; empty where there is nothing else.
+
+    Raises:
+        InvalidFileError: it is damaged, of another size, black, or has values that are not finite.
+        OSError: it cannot be read.
+    """
+    import av
+
+    from blender_scripts.exr import require_whole
+
+    content = path.read_bytes()
+    try:
+        require_whole(content)  # FFmpeg leaves out what it cannot decode
+    except ValueError as error:
+        raise InvalidFileError(path, str(error)) from error
+    decoder = av.CodecContext.create("exr", "r")
+    decoder.options = {"layer": layer} if layer else {}
+    try:
+        frames = [*decoder.decode(av.Packet(content)), *decoder.decode(None)]
+    except av.FFmpegError as error:
+        raise InvalidFileError(path, f"cannot be decoded: {error}") from error
+    if len(frames) != 1:
+        raise InvalidFileError(path, "is not an EXR of one picture")
+    frame = frames[0]
+    if (frame.width, frame.height) != tuple(resolution):
+        raise InvalidFileError(
+            path, f"is {frame.width}x{frame.height} pixels, but {resolution[0]}x{resolution[1]} were asked for"
+        )
+    planes = [
+        np.frombuffer(memoryview(plane), np.float16 if "f16" in frame.format.name else np.float32)
+        .reshape(frame.height, -1)[:, : frame.width]
+        .astype(np.float32)
+        for plane in list(frame.planes)[:3]
+    ]
+    if not all(np.isfinite(plane).all() for plane in planes):
+        raise InvalidFileError(path, "has values that are not finite")
+    brightest = max(float(plane.max()) for plane in planes)
+    if brightest < BLACK_LUMINANCE:
+        raise InvalidFileError(path, f"is black (brightest value {brightest:.2g})")
 
 
 def pixel_hash(path: Path) -> str:

@@ -139,6 +139,9 @@ class RenderSpec(Parameters):
     lights: tuple[LightParameters, ...] = ()
     objects: tuple[SceneObject, ...]
     render: RenderParameters
+    engine: Literal["cycles", "workbench"] = Field(
+        default="cycles", description="workbench: plain pictures at once, for animatics."
+    )
 
     def write(self, path: Path) -> None:
         """Write the document; the same specification gives the same bytes."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, StageUnavailableError
 
 if TYPE_CHECKING:
     from pipeline.executors.base import Executor
@@ -155,6 +155,25 @@ def require_named_devices(job: Job, stages: Collection[str]) -> None:
             f"{' and '.join(names)} = auto, but machines may differ: choose for all of them, as with "
             f"{' '.join(f'--set {name}=cpu' for name in names)} (on GPUs: device=cuda, render.device=gpu)"
         )
+
+
+def require_possible(job: Job, stages: Collection[str]) -> None:
+    """Refuse before any work what has to be done and cannot be done here.
+
+    Args:
+        job: the job.
+        stages: the stages that are to run.
+
+    Raises:
+        StageUnavailableError: one of these cannot run on this machine.
+    """
+    from pipeline.stages import STAGES
+
+    obstacles = [
+        f"{stage.name}: {obstacle}" for stage in STAGES if stage.name in stages for obstacle in stage.obstacles(job)
+    ]
+    if obstacles:
+        raise StageUnavailableError("\n".join(obstacles))
 
 
 def scheduler_address(named: str) -> str:

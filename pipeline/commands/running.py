@@ -24,13 +24,12 @@ from pipeline.commands.arguments import (
     require_plannable,
     submitted_job_argument,
 )
-from pipeline.commands.executing import ExecutorChoice, executor_options, require_named_devices
+from pipeline.commands.executing import ExecutorChoice, executor_options, require_named_devices, require_possible
 from pipeline.errors import (
     DiskFullError,
     MissingInputError,
     OutdatedManifestError,
     PipelineError,
-    StageUnavailableError,
 )
 from pipeline.executors.failures import is_disk_full
 from pipeline.layout import JobLayout
@@ -227,7 +226,7 @@ def run(
     if paused is not None and options.executor is None and not choice.settings:
         choice = ExecutorChoice.from_settings(paused.settings)
     if choice.scheduler is None:
-        _require_possible(job, todo)
+        require_possible(job, todo)
     else:  # it is not this machine that has to be able to
         if options.cores is not None:
             raise click.UsageError("--cores is for this machine; on a cluster the workers' tags say what they offer")
@@ -327,7 +326,7 @@ def _end_if_at_rest(state: JobAssessment | None, layout: JobLayout, text: str | 
         and (text is None or text == _text_of(layout.job_file))
         and spool.find(layout.root.absolute().name) is None
     ):
-        click.echo(f"up to date: {layout.path(layout.movie())}")
+        click.echo(f"up to date: {layout.film}")
         sys.exit(0)
 
 
@@ -339,17 +338,6 @@ def _job_in(layout: JobLayout) -> Job:
     from pipeline.job.loading import load_job
 
     return load_job(layout.job_file)
-
-
-def _require_possible(job: Job, todo: frozenset[str]) -> None:
-    """Refuse before any work what has to be done and cannot be done here."""
-    from pipeline.stages import STAGES
-
-    obstacles = [
-        f"{stage.name}: {obstacle}" for stage in STAGES if stage.name in todo for obstacle in stage.obstacles(job)
-    ]
-    if obstacles:
-        raise StageUnavailableError("\n".join(obstacles))
 
 
 def _keep(submitted: LoadedJob, layout: JobLayout) -> tuple[Job, str]:

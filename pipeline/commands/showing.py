@@ -1,4 +1,4 @@
-"""Commands that show what a job has made: sheet, report."""
+"""Commands that show what a job has made: sheet, report, compare, loop."""
 
 from __future__ import annotations
 
@@ -76,3 +76,103 @@ def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
     except OSError as error:
         raise PipelineError(f"cannot write {path}: {error.strerror}") from error
     click.echo(path)
+
+
+@click.command()
+@click.argument("jobs", metavar="JOB JOB...", nargs=-1, required=True)
+@output_option
+@click.option("--width", type=click.IntRange(128, 7680), default=1920, show_default=True, help="Most pixels across.")
+@click.option(
+    "-o",
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    help="Where to write it: an MP4.",
+)
+def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> None:
+    """Put the films of jobs side by side into one, each with its name under it.
+
+    Of the frames that are finished; as long as the shortest. Frames of the same time stand beside each other.
+
+    \b
+    pipeline compare bunny-wcsph bunny-dfsph -o solvers.mp4
+    """
+    from pipeline.committed_pictures import frames_without_gap
+    from pipeline.job.loading import load_job
+    from pipeline.resources import machine_capacity
+    from render.errors import InvalidFileError
+    from render.side_by_side import Film, compare_films
+
+    if len(jobs) < 2:
+        raise click.UsageError("name two jobs at least")
+    if target.suffix.lower() != ".mp4":
+        raise PipelineError(f'{target}: a comparison is an MP4, so its name must end in ".mp4"')
+    films = []
+    for layout in (find_job(job, output) for job in jobs):
+        submitted, pictures = load_job(layout.job_file), frames_without_gap(layout)
+        if not pictures:
+            raise PipelineError(f"the first frame of {layout.root} has not been rendered yet")
+        films.append(Film(submitted.name, pictures, submitted.movie.playback_fps or submitted.fps))
+        if len(pictures) < submitted.frame_count:
+            click.echo(f"{submitted.name}: {len(pictures)} of {submitted.frame_count} frames are there", err=True)
+    part = target.with_name(f".{target.name}.part")
+    try:
+        count = compare_films(films, part, width=width, threads=machine_capacity().cores)
+        part.replace(target)
+    except (InvalidFileError, ValueError, OSError) as error:
+        raise PipelineError(f"cannot make {target}: {error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    click.echo(f"{target}: {count} frames")
+
+
+@click.command()
+@submitted_job_argument
+@click.option("--width", type=click.IntRange(16, 3840), default=480, show_default=True, help="Most pixels across.")
+@click.option("--fps", type=click.FloatRange(1.0, 120.0), default=15.0, show_default=True, help="Of the loop.")
+@click.option("--from", "first", type=click.IntRange(min=0), default=0, show_default=True, help="Its first frame.")
+@click.option("--until", "last", type=click.IntRange(min=0), help="Its last frame; the job's if omitted.")
+@click.option(
+    "-o",
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    help="Where to write it: .webp or .gif.",
+)
+def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: int | None, target: Path) -> None:
+    """Make a small film that starts again, for a README or a web page: an animated WebP or GIF.
+
+    \b
+    pipeline loop quickstart -o quickstart.webp
+    pipeline loop quickstart --width 320 --fps 12 --from 20 --until 59 -o splash.gif
+    """
+    from pipeline.committed_pictures import frames_without_gap
+    from pipeline.job.loading import load_job
+    from render.errors import InvalidFileError
+    from render.loop import FORMATS, write_loop
+
+    if target.suffix.lower() not in FORMATS:
+        raise PipelineError(f'{target}: "{target.suffix}" is no loop; use {" or ".join(FORMATS)}')
+    layout = find_job(job, output)
+    submitted, pictures = load_job(layout.job_file), frames_without_gap(layout)
+    last = submitted.frame_count - 1 if last is None else last
+    if not first <= last < submitted.frame_count:
+        raise PipelineError(f"{submitted.name} has the frames 0-{submitted.frame_count - 1}, not {first}-{last}")
+    if last >= len(pictures):
+        there = f"only 0-{len(pictures) - 1}" if pictures else "none"
+        raise PipelineError(
+            f"of the frames {first}-{last} of {submitted.name} {there} are rendered; choose with --until"
+        )
+    try:
+        count = write_loop(
+            pictures[first : last + 1],
+            target,
+            fps=submitted.movie.playback_fps or submitted.fps,
+            width=width,
+            loop_fps=fps,
+        )
+    except (InvalidFileError, ValueError, OSError) as error:
+        raise PipelineError(f"cannot make {target}: {error}") from error
+    click.echo(f"{target}: {count} frames, {target.stat().st_size / 1e6:.2g} MB")

@@ -202,7 +202,7 @@ def _run_once(
 
 def _report(job: Job, layout: JobLayout, outcome: Outcome, *, aside: bool = False) -> None:
     """Say how a run ended; of a job that is not this command's own, on standard error."""
-    film = layout.path(layout.movie())
+    film = layout.path(layout.movie(job.movie.suffix))
     if outcome.kind is not JobOutcome.SUCCEEDED:
         click.secho(f"{job.name}: {outcome.kind.value} after {wording.duration(outcome.seconds)}", err=True, fg="red")
         for failed in outcome.failures[:5]:

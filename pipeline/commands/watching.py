@@ -155,7 +155,7 @@ class Follower:
 def _say_how_it_ended(display: Display, layout: JobLayout, summary: list[StageSummary], ended_as: str | None) -> int:
     """Counts alone do not tell: a run that is killed before it has planned leaves those of the run before it."""
     if ended_as == JobOutcome.SUCCEEDED:
-        display.say(f"{layout.path(layout.movie())} is done")
+        display.say(f"{layout.film} is done")
         return 0
     done, total = sum(map(_done, summary)), sum(stage.total for stage in summary)
     how = "was cut short" if ended_as is None else f"ended ({ended_as})"

@@ -15,6 +15,7 @@ from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.scene_checks import check_scene
 from pipeline.stages import STAGES
+from pipeline.stages.movie import MovieStage
 
 MANY_FRAMES = 100_000
 
@@ -164,8 +165,10 @@ def _check_pictures(job: Job, findings: Findings) -> None:
     if width % 2 or height % 2:
         even = f"{width + width % 2} x {height + height % 2}"
         findings.error(
-            ("render", "resolution"), f"must be even numbers, as H.264 needs them, got {width} x {height}; use {even}"
+            ("render", "resolution"), f"must be even numbers, as video needs them, got {width} x {height}; use {even}"
         )
+    for obstacle in MovieStage().obstacles(job):
+        findings.error(("movie", "codec"), obstacle)
     if job.render.blender is not None and not Path(job.render.blender).is_file():
         findings.error(("render", "blender"), f"no such file: {job.render.blender}; omit it to use the bpy module")
     if job.camera.position is not None and job.camera.position == job.camera.look_at:

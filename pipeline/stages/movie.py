@@ -15,7 +15,7 @@ from render.movie import SEGMENT_FRAMES
 
 
 class MovieStage:
-    """H.264 segments of closed groups of pictures, joined without encoding again."""
+    """Segments of closed groups of pictures, joined without encoding again."""
 
     name = "movie"
     version = 1
@@ -26,7 +26,7 @@ class MovieStage:
             stage=self.name,
             version=self.version,
             tools={"av": tool_version("av")},
-            movie=job.movie,
+            movie=job.movie.deciding(),
             fps=job.movie.playback_fps or job.fps,
         )
         starts = range(0, job.frame_count, SEGMENT_FRAMES)
@@ -37,7 +37,7 @@ class MovieStage:
                 inputs=tuple(
                     layout.picture(frame) for frame in range(start, min(start + SEGMENT_FRAMES, job.frame_count))
                 ),
-                outputs=(layout.segment(index),),
+                outputs=(layout.segment(index, job.movie.suffix),),
                 parameters=parameters,
                 subject="segment",
                 frame=start,
@@ -48,14 +48,22 @@ class MovieStage:
             id=TaskId("movie/film"),
             stage=self.name,
             inputs=tuple(output for segment in segments for output in segment.outputs),
-            outputs=(layout.movie(),),
+            outputs=(layout.movie(job.movie.suffix),),
             parameters=parameters,
         )
         return [*segments, film]
 
-    def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
-        """None: its packages are always there."""
-        return []
+    def obstacles(self, job: Job) -> list[str]:
+        """An encoder that this build of FFmpeg lacks."""
+        from render.movie import missing_encoder
+
+        name = missing_encoder(job.movie.codec)
+        if name is None:
+            return []
+        return [
+            f'"{job.movie.codec}" needs the encoder {name}, which the FFmpeg of the package av lacks here; '
+            "install its wheel (pip install --only-binary av av) or choose another codec"
+        ]
 
     def run(self, context: TaskContext) -> None:
         """Encode one segment, or join them all."""

@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from math import cos, prod, radians, sin
 from pathlib import Path
@@ -60,12 +60,22 @@ WORKER_BYTES = 500_000_000
 BYTES_PER_PIXEL = 700
 """Measured peaks of the quickstart with denoising, Blender included: 538 MB at 480 x 270 and 1880 MB at 1920 x 1080."""
 
-_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"blender"}}
-"""The executable counts by its version. The device does count: CPU and GPU round differently."""
+COMBINED = "ViewLayer.Combined"
+"""Blender's name for the picture's layer among passes."""
+
+BYTES_PER_PIXEL_AND_PASS = 200
+"""The largest, cryptomatte, has 24 floats a pixel, in Cycles and in what is saved."""
+
+_WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "render": {"blender", "order"}}
+"""The film is always of Cycles. The executable counts by its version. The device does count: CPU and GPU round
+differently."""
+
+_LATER_KEYS: dict[str, Any] = {"format": "png", "passes": []}
+"""Keys that jobs of earlier versions had not: where they say what was always so, those jobs' frames stay up to date."""
 
 
 class RenderStage:
-    """One PNG a frame. A worker keeps Blender and the scene warm from frame to frame."""
+    """One PNG a frame, and an EXR if the job asks for one. A worker keeps Blender and the scene warm between frames."""
 
     name = "render"
     version = 3
@@ -73,6 +83,9 @@ class RenderStage:
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
         spec = render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
+        for key, usual in _LATER_KEYS.items():
+            if spec["render"][key] == usual:
+                del spec["render"][key]
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
             spec["camera"] = {"framing": job.camera.model_dump(mode="json")}
@@ -84,9 +97,10 @@ class RenderStage:
             version=self.version,
             tools={"blender": _blender_version(job.render.blender)},
         )
+        bytes_per_pixel = BYTES_PER_PIXEL + BYTES_PER_PIXEL_AND_PASS * len(job.render.passes)
         resources = Resources(
             cores=CORES,
-            memory_bytes=WORKER_BYTES + BYTES_PER_PIXEL * prod(job.render.resolution),
+            memory_bytes=WORKER_BYTES + bytes_per_pixel * prod(job.render.resolution),
             gpus=int(job.render.device == "gpu"),
         )
         static = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
@@ -97,7 +111,7 @@ class RenderStage:
                 id=TaskId(f"render/{frame:06d}"),
                 stage=self.name,
                 inputs=(*static, *_frame_inputs(job, layout, frame)),
-                outputs=(layout.picture(frame),),
+                outputs=(layout.picture(frame), *((layout.master(frame),) if job.render.has_master else ())),
                 parameters=parameters,
                 frame=frame,
                 resources=resources,
@@ -125,20 +139,27 @@ class RenderStage:
             InvalidArtifactError: its picture failed the checks twice.
         """
         from render.blender import BlenderDiedError
-        from render.pictures import validate_picture
+        from render.pictures import validate_exr, validate_picture
 
         task, job, layout = context.task, context.job, context.layout
         assert task.frame is not None
-        poses, view = _write_motion(context, task.frame)
+        poses, view = write_motion(job, layout, task.frame, attempt=context.attempt)
         bodies = list(bodies_at(job, layout, task.frame, poses))
         warn_of_sight(context, view, bodies)
 
         def validate(path: Path) -> None:
             validate_picture(path, job.render.resolution)
 
+        def validate_master(path: Path) -> None:
+            validate_exr(path, job.render.resolution, layer=COMBINED if job.render.passes else "")
+
         try:
-            with context.committing(task.outputs[0], validate) as path:
-                _draw_until_good(context, path, view, bodies)
+            with ExitStack() as stack:
+                masters = [
+                    stack.enter_context(context.committing(output, validate_master)) for output in task.outputs[1:]
+                ]
+                path = stack.enter_context(context.committing(task.outputs[0], validate))
+                _draw_until_good(context, [path, *masters], view, bodies)
         except BlenderDiedError:
             _close_renderers()  # the next attempt, maybe in this process, needs a living one
             raise
@@ -247,24 +268,27 @@ def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]
     return surfaces + cloths + volumes + points + cached
 
 
-def _framed(context: TaskContext) -> NDArray[np.float64] | None:
-    """The box that the camera frames, where it frames the action."""
-    if not context.job.camera.frames_action:
-        return None
-    return read_framed(context.layout.path(context.layout.film_bounds()))
+def framed_box(job: Job, layout: JobLayout) -> NDArray[np.float64] | None:
+    """The box that the camera frames [m], (2, 3), where it frames the action, which a file of the job's folder says."""
+    return read_framed(layout.path(layout.film_bounds())) if job.camera.frames_action else None
 
 
-def _write_motion(context: TaskContext, frame: int) -> tuple[Poses, View]:
+def write_motion(job: Job, layout: JobLayout, frame: int, *, attempt: int) -> tuple[Poses, View]:
     """Put where bodies and camera are at a frame where Blender finds it; returns it, too.
 
     These documents are no artifacts, but a form of the cached frame and of the job.
+
+    Args:
+        job: the job.
+        layout: the folder that holds the cached frame, and gets the documents.
+        frame: which frame.
+        attempt: names the files that they are written to first.
     """
-    job, layout = context.job, context.layout
-    bodies, camera = job.moving_bodies, camera_path(job, _framed(context))
+    bodies, camera = job.moving_bodies, camera_path(job, framed_box(job, layout))
     cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies if bodies else {}
     poses = {name: cached[name].arrays for name in bodies}
     if bodies:
-        with _replacing(context, layout.poses, frame) as path:
+        with _replacing(layout, layout.poses, frame, attempt) as path:
             write_poses(path, frame, poses)
     if camera.moves:
         half_open = 0.5 * job.render.shutter if job.render.motion_blur else 0.0
@@ -272,14 +296,20 @@ def _write_motion(context: TaskContext, frame: int) -> tuple[Poses, View]:
         for offset in sorted({-half_open, 0.0, half_open}):
             places = {name: _position_after(offset / job.fps, poses[name]) for name in camera.bodies}
             views[offset] = camera.view((frame + offset) / job.fps, places)
-        with _replacing(context, layout.views, frame) as path:
+        with _replacing(layout, layout.views, frame, attempt) as path:
             write_views(path, frame, views)
     places = {name: _position_after(0.0, poses[name]) for name in camera.bodies}
     return poses, camera.view(frame / job.fps, places)
 
 
-def _draw_until_good(context: TaskContext, path: Path, view: View, bodies: Sequence[BodyAtFrame]) -> None:
+def _draw_until_good(context: TaskContext, paths: list[Path], view: View, bodies: Sequence[BodyAtFrame]) -> None:
     """Draw a frame, and once more if its picture fails the checks; a picture that fails again is kept.
+
+    Args:
+        context: of the frame's task.
+        paths: of the picture, and of the EXR if the job asks for one.
+        view: of the camera at the frame.
+        bodies: what is to be seen.
 
     Raises:
         InvalidArtifactError: it failed again.
@@ -290,8 +320,8 @@ def _draw_until_good(context: TaskContext, path: Path, view: View, bodies: Seque
     assert frame is not None
     for once_more in (True, False):
         try:
-            _warm_renderer(context).render(frame, path)
-            _check_picture(context, frame, path, view, bodies)
+            _warm_renderer(context).render(frame, *paths)
+            _check_picture(context, frame, paths[0], view, bodies)
         except InvalidFileError as error:
             if once_more:
                 _close_renderers()  # what went wrong in it may stay so
@@ -299,7 +329,7 @@ def _draw_until_good(context: TaskContext, path: Path, view: View, bodies: Seque
                 continue
             rejected = context.layout.rejected_picture(frame)
             rejected.parent.mkdir(exist_ok=True)
-            shutil.copyfile(path, rejected)
+            shutil.copyfile(paths[0], rejected)
             raise InvalidArtifactError(
                 f"frame {frame}: the picture {error.reason}; twice; it is kept as {rejected}"
             ) from error
@@ -336,11 +366,11 @@ def _position_after(time_s: float, pose: Mapping[str, NDArray[Any]]) -> list[flo
 
 
 @contextmanager
-def _replacing(context: TaskContext, document: str, frame: int) -> Iterator[Path]:
+def _replacing(layout: JobLayout, document: str, frame: int, attempt: int) -> Iterator[Path]:
     """A path to write a frame's document to, which then takes the place of what is there."""
-    path = context.layout.root / document.replace("{frame}", f"{frame:06d}")
+    path = layout.root / document.replace("{frame}", f"{frame:06d}")
     path.parent.mkdir(exist_ok=True)
-    part = path.with_name(f".{path.name}.part.{context.attempt}")
+    part = path.with_name(f".{path.name}.part.{attempt}")
     yield part
     part.replace(path)
 
@@ -363,7 +393,7 @@ _WARM: dict[str, Renderer] = {}
 def _warm_renderer(context: TaskContext) -> Renderer:
     from render.blender import open_renderer
 
-    spec = render_spec(context.job, context.layout, _framed(context))
+    spec = render_spec(context.job, context.layout, framed_box(context.job, context.layout))
     key = digest_of(f"{context.layout.root} {context.threads} {spec.model_dump_json()}")
     if key not in _WARM:
         _close_renderers()

@@ -90,7 +90,7 @@ def test_a_job_of_a_cluster_is_not_held_against_this_machine(tmp_path: Path, mon
     def refuse(*_: object) -> None:
         raise AssertionError("this machine was asked")
 
-    monkeypatch.setattr(running, "_require_possible", refuse)
+    monkeypatch.setattr(running, "require_possible", refuse)
     job, paused = job_of_text(job_text(), tmp_path / "job.toml"), submission("job", settings=FARM.settings)
     assert queued(job, tmp_path / "job", monkeypatch, options=QueueOptions(), paused=paused).settings == FARM.settings
 

@@ -84,7 +84,7 @@ def test_starter_passes_every_check_without_a_warning(template, preview, tmp_pat
         ),
         (
             HEAD + WATER + "[render]\nresolution = [481, 270]",
-            "dam.toml:11 render.resolution: must be even numbers, as H.264 needs them, got 481 x 270; use 482 x 270",
+            "dam.toml:11 render.resolution: must be even numbers, as video needs them, got 481 x 270; use 482 x 270",
         ),
         (
             HEAD + WATER + '[render]\nblender = "/nowhere/blender"',

@@ -44,6 +44,12 @@ def test_lower_frames_go_first_and_of_one_frame_the_later_stage() -> None:
     assert started(scheduler.start()) == ["render/0", "surface/0", "render/1", "surface/1"]
 
 
+def test_frames_go_by_their_turns_and_of_one_frame_the_later_stage() -> None:
+    tasks = [task(f"{stage}/{k}", frame=k) for stage in ("surface", "render") for k in range(3)]
+    scheduler = Scheduler(tasks, capacity=Resources(cores=6), turns=[0, 2, 1])
+    assert started(scheduler.start()) == ["render/0", "surface/0", "render/2", "surface/2", "render/1", "surface/1"]
+
+
 def test_of_tasks_about_the_whole_job_the_earlier_stage_goes_first() -> None:
     """Meshing bodies takes a moment; after a simulation on all cores, rendering would begin that much later."""
     tasks = [task(f"bodies/{name}") for name in "abc"] + film(1, simulation=Resources(cores=0))

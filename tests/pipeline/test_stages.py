@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from pipeline.commands.turns import GPU_TASKS
@@ -17,6 +19,7 @@ from pipeline.scheduler import Scheduler
 from pipeline.scheduler_events import Start
 from pipeline.stages import STAGES
 from pipeline.stages.inputs import tool_version
+from pipeline.stages.movie import MovieStage
 from pipeline.stages.render import render_spec
 from pipeline.task import Resources
 from sim.shapes import build_solid
@@ -74,12 +77,72 @@ def test_the_film_is_cut_every_half_second():
     assert tasks["movie/film"].inputs == ("movie/0000.mp4", "movie/0001.mp4")
 
 
+def test_a_job_with_masters_has_an_exr_beside_each_picture_of_its_film():
+    tasks = {task.id: task for task in plan_job(job(render={"format": "exr"}), LAYOUT, STAGES)}
+    assert tasks["render/000007"].outputs == ("frames/000007.png", "frames/000007.exr")
+    assert tasks["movie/segment-0000"].inputs[7] == "frames/000007.png"
+
+
+def test_frames_of_jobs_from_before_there_were_formats_stay_up_to_date():
+    drawn = next(task for task in plan_job(job(), LAYOUT, STAGES) if task.stage == "render")
+    assert not {"format", "passes", "order"} & set(json.loads(drawn.parameters.canonical)["render"])
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"passes": ["depth"]}, 'passes need format = "exr"'),
+        ({"format": "exr", "passes": ["vector"]}, '"vector" needs motion_blur = false'),
+        ({"format": "exr", "passes": ["depth", "depth"]}, "one of them twice"),
+    ],
+)
+def test_passes_without_a_place_are_refused(table, sentence):
+    with pytest.raises(ValidationError, match=sentence):
+        job(render=table)
+
+
+def test_a_film_for_editing_is_a_quicktime_film():
+    tasks = {task.id: task for task in plan_job(job(movie={"codec": "prores"}), LAYOUT, STAGES)}
+    assert tasks["movie/film"].inputs == ("movie/0000.mov", "movie/0001.mov")
+    assert tasks["movie/film"].outputs == ("movie.mov",)
+
+
+def test_films_of_jobs_from_before_there_were_other_codecs_stay_up_to_date():
+    (film,) = (task for task in plan_job(job(), LAYOUT, STAGES) if task.id == "movie/film")
+    parameters = json.loads(film.parameters.canonical)
+    assert parameters["movie"] == {"crf": 16, "preset": "medium", "playback_fps": None}
+
+
+def test_an_encoder_that_is_not_there_is_told_before_any_work(monkeypatch):
+    monkeypatch.setattr("render.movie.missing_encoder", lambda _codec: "libx265")
+    (told,) = MovieStage().obstacles(job(movie={"codec": "h265"}))
+    assert told.startswith('"h265" needs the encoder libx265')
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"codec": "prores", "crf": 10}, "crf has no meaning for prores"),
+        ({"codec": "prores", "preset": "slow"}, "preset has no meaning for prores"),
+        ({"codec": "h265", "crf": 52}, "crf of h265 is at most 51, got 52"),
+    ],
+)
+def test_keys_that_a_codec_has_not_are_refused(table, sentence):
+    with pytest.raises(ValidationError, match=sentence):
+        job(movie=table)
+
+
 @pytest.mark.parametrize(
     ("change", "concerned"),
     [
         ({"camera": {"position": [0, -3, 1]}}, {"render"}),
         ({"material": {"ball": {"look": "metal"}}}, {"render"}),
         ({"movie": {"crf": 20}}, {"movie"}),
+        ({"movie": {"crf": 16}}, set()),
+        ({"movie": {"codec": "h265"}}, {"movie"}),
+        ({"render": {"format": "exr"}}, {"render"}),
+        ({"render": {"format": "png"}}, set()),
+        ({"render": {"order": "spread"}}, set()),
         ({"surface": {"threshold": 0.5}}, {"surface"}),
         ({"gravity": [0, 0, -1.62]}, {"simulate"}),
         ({"frames": 80}, set()),

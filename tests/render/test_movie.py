@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from render import movie
 from render.errors import InvalidFileError
-from render.movie import encode_segment, frame_rate, join_segments, validate_movie
+from render.movie import encode_segment, frame_rate, join_segments, missing_encoder, validate_movie
 from render.parameters import MovieParameters
 
 PARAMETERS = MovieParameters(preset="veryfast")
@@ -41,6 +43,15 @@ def encode(path: Path, pictures: list[Path], fps: float = 60, **changes) -> Path
 def encode_all(folder: Path, pictures: list[Path], fps: float = 60) -> list[Path]:
     starts = range(0, len(pictures), 30)
     return [encode(folder / f"{start:04d}.mp4", pictures[start : start + 30], fps) for start in starts]
+
+
+def luma_of(path: Path) -> np.ndarray:
+    """Luma of a film's first frame in its own bits, (height, width)."""
+    with av.open(str(path)) as container:
+        frame = next(container.decode(video=0))
+        plane = frame.planes[0]
+        values = np.frombuffer(plane, np.uint16 if "10" in frame.format.name else np.uint8)
+        return values.reshape(frame.height, -1)[:, : frame.width].astype(int)
 
 
 def decode(path: Path) -> tuple[list[np.ndarray], list[Fraction]]:
@@ -81,6 +92,87 @@ def test_colours_are_converted_by_bt709(tmp_path, color, luma):
     Image.new("RGB", (32, 32), color).save(plain)
     planes, _ = decode(encode(tmp_path / "segment.mp4", [plain]))
     np.testing.assert_array_equal(planes[0][:32, :32], luma)
+
+
+CODECS = ("h265", "av1", "prores")
+
+
+def codec_parameters(codec: str) -> MovieParameters:
+    return MovieParameters(codec=codec) if codec == "prores" else MovieParameters(codec=codec, preset="veryfast")
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize(
+    ("color", "luma"),
+    # Y' = 64 + 876 (0.2126 R' + 0.7152 G' + 0.0722 B') in 10 bits after ITU-R BT.709-6: red 250.2, green 690.5.
+    [((255, 0, 0), 250), ((0, 255, 0), 691), ((0, 0, 255), 127), ((255, 255, 255), 940), ((0, 0, 0), 64)],
+)
+def test_colours_of_ten_bits_are_converted_by_bt709(tmp_path, codec, color, luma):
+    plain = tmp_path / "000000.png"
+    Image.new("RGB", (64, 64), color).save(plain)
+    parameters = codec_parameters(codec)
+    shown = luma_of(encode(tmp_path / f"film{parameters.suffix}", [plain], parameters=parameters))
+    # A lossy encoder may miss a plain area by one level of 1023.
+    assert abs(shown - luma).max() <= 1
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_films_of_other_codecs_are_joined_tagged_and_reproducible(tmp_path, pictures, codec):
+    parameters = codec_parameters(codec)
+    segments = [
+        encode(tmp_path / f"{start}{parameters.suffix}", pictures[start : start + 30], parameters=parameters)
+        for start in (0, 30, 60)
+    ]
+    film = tmp_path / f"film{parameters.suffix}"
+    join_segments(segments, film)
+    validate_movie(film, 62)
+    frames, times = decode(film)
+    assert times == [Fraction(index, 60) for index in range(62)]
+    expected = [frame for segment in segments for frame in decode(segment)[0]]
+    np.testing.assert_array_equal(frames, expected)
+    with av.open(str(film)) as container:
+        context = container.streams.video[0].codec_context
+        frame = next(container.decode(video=0))
+        for tagged in (context, frame):
+            tags = (tagged.color_primaries, tagged.color_trc, tagged.colorspace, tagged.color_range)
+            assert tags == (1, 1, 1, 1)
+        assert context.codec_tag == {"h265": "hvc1", "av1": "av01", "prores": "apch"}[codec]
+        assert context.pix_fmt == ("yuv422p10le" if codec == "prores" else "yuv420p10le")
+    again = encode(tmp_path / f"again{parameters.suffix}", pictures[:30], parameters=parameters, threads=2)
+    assert again.read_bytes() == segments[0].read_bytes()
+    with pytest.raises(InvalidFileError, match="has 62 frames, expected 61"):
+        validate_movie(film, 61)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("lengths", [(1,), (2, 30), (1, 2, 3)])
+def test_short_segments_of_other_codecs_join(tmp_path, pictures, codec, lengths):
+    parameters = codec_parameters(codec)
+    segments = [
+        encode(tmp_path / f"{index}{parameters.suffix}", pictures[:length], parameters=parameters)
+        for index, length in enumerate(lengths)
+    ]
+    film = tmp_path / f"film{parameters.suffix}"
+    join_segments(segments, film)
+    validate_movie(film, sum(lengths))
+
+
+def test_ten_bits_of_a_deep_picture_reach_the_film(tmp_path):
+    """A ramp of 16 bits between two neighbouring levels of 8: a film of 8 bits has a step where this one has four."""
+    row = np.linspace(100 * 257, 102 * 257, 64).round().astype(np.uint16)
+    frame = av.VideoFrame.from_ndarray(np.repeat(np.tile(row, (64, 1))[..., None], 3, axis=2), format="rgb48le")
+    encoder = av.CodecContext.create("png", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = 64, 64, "rgb48be", Fraction(1, 60)
+    packets = [*encoder.encode(frame.reformat(format="rgb48be")), *encoder.encode(None)]
+    (tmp_path / "000000.png").write_bytes(b"".join(bytes(packet) for packet in packets))
+    film = encode(tmp_path / "film.mov", [tmp_path / "000000.png"], parameters=MovieParameters(codec="prores"))
+    assert len(np.unique(luma_of(film).mean(axis=0).round())) >= 6
+
+
+def test_an_unknown_encoder_is_named(monkeypatch):
+    assert missing_encoder("av1") is None
+    monkeypatch.setitem(movie._ENCODERS, "av1", replace(movie._ENCODERS["av1"], name="libno_such_encoder"))
+    assert missing_encoder("av1") == "libno_such_encoder"
 
 
 def test_colours_are_tagged_as_bt709_in_the_film_and_its_frames(tmp_path, pictures):

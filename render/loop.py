@@ -1,0 +1,86 @@
+"""Short films for web pages and READMEs: animated WebP and GIF that start again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from PIL import Image
+
+from render.pictures import read_rgb8
+
+FORMATS = (".webp", ".gif")
+_GIF_TICK_MS = 10
+"""A GIF counts time in hundredths of a second, and browsers show less than two of them as ten."""
+_LARGEST_GIF_FPS = 50.0
+_WEBP_QUALITY = 80
+
+
+def write_loop(pictures: Sequence[Path], output: Path, *, fps: float, width: int, loop_fps: float) -> int:
+    """Write a film that starts again.
+
+    Args:
+        pictures: PNG files, one a frame.
+        output: the file to write, .webp or .gif.
+        fps: at which the pictures follow each other [1/s].
+        width: of the loop at most [pixels]: pictures are never enlarged.
+        loop_fps: frames a second of the loop [1/s]; no more than there are pictures for.
+
+    Returns:
+        The number of its frames.
+
+    Raises:
+        InvalidFileError: a picture is damaged.
+        ValueError: there are no pictures, or a GIF is to be faster than it can be.
+        OSError: it cannot be written.
+    """
+    suffix = output.suffix.lower()
+    if not pictures:
+        raise ValueError("a loop needs at least one picture")
+    loop_fps = min(loop_fps, fps)
+    if suffix == ".gif" and loop_fps > _LARGEST_GIF_FPS:
+        raise ValueError(f"a GIF has at most {_LARGEST_GIF_FPS:g} frames a second, not {loop_fps:g}")
+    count = max(1, round(len(pictures) / fps * loop_fps))
+    chosen = [pictures[min(int(number * fps / loop_fps + 1e-6), len(pictures) - 1)] for number in range(count)]
+    frames = [_fitted(path, width) for path in chosen]
+    tick = _GIF_TICK_MS if suffix == ".gif" else 1
+    ends = [tick * round(1000.0 * (number + 1) / loop_fps / tick) for number in range(count)]
+    durations = [end - start for start, end in zip([0, *ends], ends, strict=False)]
+    options = {"quality": _WEBP_QUALITY, "method": 5} if suffix == ".webp" else {"optimize": True}
+    if suffix == ".gif":
+        # One palette for all: with one a frame, still backgrounds would flicker.
+        palette = _palette_of(frames)
+        frames = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in frames]
+    part = output.with_name(f".{output.name}.part")
+    try:
+        with part.open("wb") as file:
+            frames[0].save(
+                file,
+                format=suffix[1:],
+                save_all=True,
+                append_images=frames[1:],
+                duration=durations,
+                loop=0,
+                **options,
+            )
+        part.replace(output)
+    finally:
+        part.unlink(missing_ok=True)
+    return count
+
+
+def _fitted(path: Path, width: int) -> Image.Image:
+    picture = Image.fromarray(read_rgb8(path))
+    if picture.width > width:
+        height = max(1, round(picture.height * width / picture.width))
+        picture = picture.resize((width, height), Image.Resampling.LANCZOS)
+    return picture
+
+
+def _palette_of(frames: Sequence[Image.Image]) -> Image.Image:
+    """256 colours for all frames, from a strip of some of them."""
+    chosen = frames[:: max(1, len(frames) // 12)]
+    strip = Image.new("RGB", (frames[0].width, frames[0].height * len(chosen)))
+    for row, frame in enumerate(chosen):
+        strip.paste(frame, (0, row * frames[0].height))
+    return strip.quantize(256, method=Image.Quantize.MAXCOVERAGE)

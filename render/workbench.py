@@ -1,0 +1,107 @@
+"""Plain pictures by Blender's Workbench engine, in a child process: it ends the process where it cannot draw."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from render.blender import BlenderUnavailableError, FrameRenderError, require_bpy, script_path
+from render.system_libraries import install_line, missing_libraries
+
+EGL_PACKAGES = {"libEGL.so.1": "libegl1"}
+"""Library -> Debian package: how OpenGL draws without a screen."""
+_DRIVERS = "libgl1-mesa-dri"
+"""Mesa's drivers, among them one that draws with the processor; they are loaded by libEGL alone."""
+_PROBE_TIMEOUT_S = 120.0
+_READY = "WORKBENCH_READY"
+
+
+def require_workbench(blender: str | None) -> None:
+    """Make sure that Workbench can draw here, by letting it draw a few pixels in a child process.
+
+    Args:
+        blender: path of a Blender executable, or None for the bpy module.
+
+    Raises:
+        BlenderUnavailableError: it cannot; names the packages that are missing.
+    """
+    if blender is None:
+        require_bpy()
+    install = install_line([*EGL_PACKAGES.values(), _DRIVERS])
+    if missing := missing_libraries(EGL_PACKAGES):
+        raise BlenderUnavailableError(
+            f"Workbench draws through EGL, and this system lacks {', '.join(missing)}; install it: {install}"
+        )
+    argv = build_workbench_argv(blender, "workbench.py", [])
+    try:
+        completed = subprocess.run(argv, capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S, check=False)
+    except OSError as error:
+        raise BlenderUnavailableError(f"cannot start {argv[0]}: {error.strerror}") from error
+    except subprocess.TimeoutExpired as error:
+        raise BlenderUnavailableError(f"Workbench drew nothing in {error.timeout:g} s") from error
+    if _READY not in completed.stdout:
+        last = "\n".join((completed.stdout + completed.stderr).splitlines()[-5:])
+        raise BlenderUnavailableError(
+            f"Workbench cannot draw here (exit code {completed.returncode}); it needs a driver for OpenGL: {install}\n"
+            f"{last}"
+        )
+
+
+def draw_frames(
+    spec_path: Path,
+    frames: Sequence[int],
+    folder: Path,
+    *,
+    threads: int,
+    blender: str | None,
+    drawn: Callable[[int], None],
+) -> list[Path]:
+    """Draw frames of a specification whose engine is Workbench.
+
+    Args:
+        spec_path: the RenderSpec document.
+        frames: which frames, in order.
+        folder: gets the pictures, `000042.png`.
+        threads: CPU threads to draw with.
+        blender: path of a Blender executable, or None for the bpy module.
+        drawn: is told each frame that is there.
+
+    Returns:
+        The pictures, in the order of the frames.
+
+    Raises:
+        FrameRenderError: a frame could not be drawn.
+    """
+    output = str(folder / "{frame:06d}.png")
+    wanted = ",".join(map(str, frames))
+    options = [str(spec_path), "--frames", wanted, "--output", output, "--threads", str(threads)]
+    argv = build_workbench_argv(blender, "render_frames.py", options)
+    done, last = 0, ""
+    with subprocess.Popen(
+        argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8", errors="replace"
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if line.startswith(f"FRAME_DONE {frames[done] if done < len(frames) else ''} "):
+                    drawn(frames[done])
+                    done += 1
+                elif line.startswith(("FRAME_FAILED", "RENDERER_FAILED")):
+                    raise FrameRenderError(frames[min(done, len(frames) - 1)], line.split(" ", 2)[-1].strip())
+                else:
+                    last = line.strip() or last
+        finally:
+            process.terminate()
+    if done < len(frames):
+        raise FrameRenderError(frames[done], f"Blender ended with exit code {process.returncode}: {last}")
+    return [folder / f"{frame:06d}.png" for frame in frames]
+
+
+def build_workbench_argv(blender: str | None, script: str, options: Sequence[str]) -> list[str]:
+    """Arguments that run a script of `blender_scripts` with the bpy module or in a Blender executable. Pure."""
+    path = str(script_path(script))
+    if blender is None:
+        return [sys.executable, path, *options]
+    return [blender, "--background", "--factory-startup", "--python", path, "--", *options]

@@ -1,0 +1,137 @@
+"""`pipeline compare` and `pipeline loop`: films side by side, and small films that start again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from command_line import pipeline
+from PIL import Image
+
+SIZE = (96, 64)
+SCENE = '[[rigid]]\nname = "ball"\nshape = { type = "sphere", radius = 0.1 }\n'
+
+
+def film(
+    folder: Path, color: tuple[int, int, int], *, frames: int = 12, fps: int = 60, planned: int = 12, step: int = 4
+) -> Path:
+    """A job's folder whose frames are plain, brighter by so many levels each."""
+    (folder / "frames").mkdir(parents=True)
+    (folder / ".receipts" / "frames").mkdir(parents=True)
+    (folder / "job.toml").write_text(f'name = "{folder.name}"\nframes = {planned}\nfps = {fps}\n{SCENE}')
+    for frame in range(frames):
+        shade = tuple(level + step * frame for level in color)
+        Image.new("RGB", SIZE, shade).save(folder / "frames" / f"{frame:06d}.png")
+        (folder / ".receipts" / "frames" / f"{frame:06d}.png.json").write_text("{}")
+    return folder
+
+
+def decode(path: Path) -> tuple[list[np.ndarray], float]:
+    with av.open(str(path)) as container:
+        rate = float(container.streams.video[0].average_rate)
+        frames = [
+            frame.reformat(format="rgb24", src_colorspace=1, dst_colorspace=1).to_ndarray().astype(int)
+            for frame in container.decode(video=0)
+        ]
+    return frames, rate
+
+
+def test_films_stand_side_by_side_with_their_names_under_them(tmp_path):
+    red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
+    result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"{tmp_path / 'both.mp4'}: 12 frames\n"
+    frames, rate = decode(tmp_path / "both.mp4")
+    assert (len(frames), rate) == (12, 60.0)
+    for number, frame in enumerate(frames):
+        assert frame.shape[1] == 2 * SIZE[0] + 8
+        # A lossy codec of 8 bits, and chroma of half the size, which plain areas do not suffer from.
+        np.testing.assert_allclose(frame[32, 48], (160 + 4 * number, 20 + 4 * number, 20 + 4 * number), atol=4)
+        np.testing.assert_allclose(frame[32, 152], (20 + 4 * number, 20 + 4 * number, 160 + 4 * number), atol=4)
+    for left in (0, SIZE[0] + 8):
+        caption = frames[0][SIZE[1] + 2 :, left : left + SIZE[0]]
+        assert caption.max() > 150 and np.median(caption) < 60  # light letters on a dark ground
+
+
+def test_films_of_other_rates_show_equal_times_and_end_with_the_shortest(tmp_path):
+    fast = film(tmp_path / "fast", (100, 20, 20), frames=12)
+    slow = film(tmp_path / "slow", (20, 20, 100), frames=5, fps=30, planned=6, step=20)
+    result = pipeline("compare", fast, slow, "-o", tmp_path / "both.mp4")
+    assert result.exit_code == 0, result.output
+    assert "slow: 5 of 6 frames are there" in result.stderr
+    frames, rate = decode(tmp_path / "both.mp4")
+    assert (len(frames), rate) == (10, 60.0)
+    shown = [round((frame[32, 152, 2] - 100) / 20) for frame in frames]
+    assert shown == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+
+
+def test_a_frame_behind_a_gap_is_not_shown(tmp_path):
+    red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
+    (blue / ".receipts" / "frames" / "000007.png.json").unlink()
+    result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
+    assert result.exit_code == 0, result.output
+    assert len(decode(tmp_path / "both.mp4")[0]) == 7
+
+
+@pytest.mark.parametrize(
+    ("jobs", "target", "sentence"),
+    [
+        (["red"], "both.mp4", "name two jobs at least"),
+        (["red", "red"], "both.avi", 'must end in ".mp4"'),
+        (["red", "bare"], "both.mp4", "has not been rendered yet"),
+    ],
+)
+def test_what_cannot_be_compared_is_told(tmp_path, jobs, target, sentence):
+    film(tmp_path / "red", (160, 20, 20))
+    film(tmp_path / "bare", (0, 0, 0), frames=0)
+    result = pipeline("compare", *(tmp_path / job for job in jobs), "-o", tmp_path / target)
+    assert result.exit_code in (1, 2)
+    assert sentence in result.stderr
+    assert not (tmp_path / target).exists()
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_a_loop_shows_frames_at_its_own_rate_for_ever(tmp_path, suffix):
+    red = film(tmp_path / "red", (160, 20, 20))
+    target = tmp_path / f"red{suffix}"
+    result = pipeline("loop", red, "--fps", 20, "--width", 48, "-o", target)
+    assert result.exit_code == 0, result.output
+    with Image.open(target) as loop:
+        assert (loop.n_frames, loop.size, loop.info["loop"]) == (4, (48, 32), 0)
+        reds, durations = [], []
+        for number in range(4):
+            loop.seek(number)
+            loop.load()
+            reds.append(loop.convert("RGB").getpixel((24, 16))[0])
+            durations.append(loop.info["duration"])
+    # Frames 0, 3, 6 and 9 of the film, 12 levels apart; WebP is lossy, and a GIF has 256 colours.
+    assert reds == pytest.approx([160, 172, 184, 196], abs=6)
+    assert sum(durations) == 200
+
+
+def test_a_part_of_a_film_can_be_looped(tmp_path):
+    red = film(tmp_path / "red", (100, 20, 20), frames=8, step=16)
+    arguments = ("--from", 4, "--until", 6, "--fps", 60, "-o", tmp_path / "red.webp")
+    assert pipeline("loop", red, *arguments).exit_code == 0
+    with Image.open(tmp_path / "red.webp") as loop:
+        assert (loop.n_frames, loop.size) == (3, SIZE)
+        assert loop.convert("RGB").getpixel((24, 16))[0] == pytest.approx(164, abs=6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name", "sentence"),
+    [
+        ((), "red.mov", '".mov" is no loop; use .webp or .gif'),
+        ((), "red.gif", "of the frames 0-11 of red only 0-7 are rendered; choose with --until"),
+        (("--from", 3, "--until", 2), "red.gif", "red has the frames 0-11, not 3-2"),
+        (("--until", 7, "--fps", 60), "red.gif", "a GIF has at most 50 frames a second, not 60"),
+    ],
+)
+def test_what_cannot_be_looped_is_told(tmp_path, arguments, name, sentence):
+    red = film(tmp_path / "red", (160, 20, 20), frames=8)
+    result = pipeline("loop", red, *arguments, "-o", tmp_path / name)
+    assert result.exit_code == 1
+    assert sentence in result.stderr
+    assert not (tmp_path / name).exists()

@@ -1,0 +1,164 @@
+"""EXR masters by the real Cycles: linear, with their passes, the same bytes in every process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from blender_scenes import RESOLUTION, read, redness, spec_of, sphere, write_mesh
+from blender_stand_in import write_blender_stand_in
+from fresh_python import run_python
+from needed_blender import needs_bpy
+
+from render.blender import open_renderer
+from render.errors import InvalidFileError
+from render.parameters import MaterialParameters
+from render.pictures import validate_exr, validate_picture
+from render.spec import MeshSequenceObject
+
+pytestmark = needs_bpy
+
+BALL = MeshSequenceObject(
+    name="ball",
+    file="ball/{frame}.ply",
+    material=MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0),
+)
+PASSES = ("depth", "vector", "normal", "cryptomatte", "denoising")
+LAYER = "ViewLayer.Combined"
+
+RENDER_MASTER = """
+    import sys
+    from pathlib import Path
+    from render.blender import open_renderer
+    folder, name, threads = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+    renderer = open_renderer(folder / "spec.json", threads=threads, blender=None)
+    renderer.render(0, folder / f"{name}.png", folder / f"{name}.exr")
+    renderer.close()
+"""
+
+
+def channels(path: Path, layer: str = "") -> np.ndarray:
+    """Red, green and blue of a layer, (height, width, 3)."""
+    decoder = av.CodecContext.create("exr", "r")
+    decoder.options = {"layer": layer} if layer else {}
+    (frame,) = [*decoder.decode(av.Packet(path.read_bytes())), *decoder.decode(None)]
+    kind = np.float16 if "f16" in frame.format.name else np.float32
+    green, blue, red = (
+        np.frombuffer(memoryview(plane), kind).reshape(frame.height, -1)[:, : frame.width]
+        for plane in list(frame.planes)[:3]
+    )
+    return np.stack([red, green, blue], axis=-1).astype(float)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A ball that flies along x at 6 m/s, drawn with all passes by the module, and again with two threads."""
+    folder = tmp_path_factory.mktemp("exr")
+    positions, triangles = sphere((0.0, 0.0, 0.5), 0.3)
+    write_mesh(folder / "ball/000000.ply", positions, triangles, velocity=(6.0, 0.0, 0.0))
+    render = {"format": "exr", "passes": PASSES, "motion_blur": False, "denoise": True}
+    spec_of(BALL, **render).write(folder / "spec.json")
+    for name, threads in (("first", 1), ("second", 2)):
+        run_python(RENDER_MASTER, str(folder), name, str(threads))
+    return folder
+
+
+def test_another_process_with_other_threads_writes_the_same_bytes(folder):
+    assert (folder / "first.exr").read_bytes() == (folder / "second.exr").read_bytes()
+    assert (folder / "first.png").read_bytes() == (folder / "second.png").read_bytes()
+
+
+def test_an_executable_writes_the_same_bytes_as_the_module(folder, tmp_path):
+    renderer = open_renderer(folder / "spec.json", threads=1, blender=str(write_blender_stand_in(tmp_path)))
+    try:
+        renderer.render(0, tmp_path / "a picture.png", tmp_path / "a master.exr")
+    finally:
+        renderer.close()
+    assert (tmp_path / "a master.exr").read_bytes() == (folder / "first.exr").read_bytes()
+    assert (tmp_path / "a picture.png").read_bytes() == (folder / "first.png").read_bytes()
+
+
+def test_the_master_shows_in_linear_light_what_the_picture_shows(folder):
+    validate_exr(folder / "first.exr", RESOLUTION, layer=LAYER)
+    validate_picture(folder / "first.png", RESOLUTION)
+    master, picture = channels(folder / "first.exr", LAYER), read(folder / "first.png")
+    # The ball alone is mostly red; its rim mixes with the grey stage, in linear light a little otherwise.
+    in_master, in_picture = redness(1000.0 * master) > 0.6, redness(picture) > 0.45
+    assert in_picture.sum() > 100
+    assert (in_master != in_picture).sum() < 0.15 * in_picture.sum()
+    # A view's transform keeps order: where the stage is brighter in the one, it is in the other.
+    stage = ~(in_master | in_picture)
+    luminance = [each[stage] @ (0.2126, 0.7152, 0.0722) for each in (master, picture)]
+    assert np.corrcoef(np.argsort(np.argsort(luminance)))[0, 1] > 0.95
+
+
+def test_passes_hold_what_they_promise(folder):
+    """FFmpeg reads layers of R, G, B only; Blender itself reads the others."""
+    values = run_python(
+        """
+        import sys
+        import bpy
+        import numpy as np
+        python = "/python/lib/python%d.%d/site-packages" % sys.version_info[:2]
+        sys.path.insert(0, bpy.utils.resource_path("LOCAL") + python)
+        import OpenImageIO
+        picture = OpenImageIO.ImageInput.open(sys.argv[1])
+        names, pixels = picture.spec().channelnames, picture.read_image()
+        middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
+        for name, value in zip(names, middle):
+            print("CHANNEL", name.replace(" ", "_"), float(value))
+        """,
+        str(folder / "first.exr"),
+    )
+    middle = {
+        name: float(value) for _, name, value in (line.split() for line in values.splitlines() if "CHANNEL" in line)
+    }
+    # The camera is 2.5 m from the ball's middle, whose radius is 0.3 m. A sphere of 48 segments is 0.2 % flatter.
+    assert middle["ViewLayer.Depth.Z"] == pytest.approx(2.2, abs=0.01)
+    assert middle["ViewLayer.Normal.Y"] == pytest.approx(-1.0, abs=0.05)
+    # 0.1 m a frame in a plane 2.2 m away: 64 pixels x 50 mm / 36 mm / 2.2 m = 40.4 pixels a metre.
+    assert abs(middle["ViewLayer.Vector.X"]) == pytest.approx(4.04, abs=0.15)
+    assert abs(middle["ViewLayer.Vector.Y"]) < 0.1
+    assert middle["ViewLayer.CryptoObject00.g"] == pytest.approx(1.0, abs=0.01)
+    assert "ViewLayer.Noisy_Image.R" in middle
+
+
+def test_without_passes_the_master_is_one_picture(tmp_path):
+    positions, triangles = sphere((0.0, 0.0, 0.5), 0.3)
+    write_mesh(tmp_path / "ball/000000.ply", positions, triangles, velocity=(0.0, 0.0, 0.0))
+    spec_of(BALL, format="exr").write(tmp_path / "spec.json")
+    run_python(RENDER_MASTER, str(tmp_path), "plain", "1")
+    validate_exr(tmp_path / "plain.exr", RESOLUTION)
+    assert (redness(1000.0 * channels(tmp_path / "plain.exr")) > 0.6).sum() > 100
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.02, 0.5, 0.99])
+def test_a_truncated_master_is_refused(folder, tmp_path, kept):
+    content = (folder / "first.exr").read_bytes()
+    (tmp_path / "cut.exr").write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(InvalidFileError):
+        validate_exr(tmp_path / "cut.exr", RESOLUTION, layer=LAYER)
+
+
+@pytest.mark.parametrize("place", [0.3, 0.6, 0.9])
+def test_a_flipped_byte_of_a_master_with_passes_is_seen(folder, tmp_path, place):
+    content = bytearray((folder / "first.exr").read_bytes())
+    content[int(place * len(content))] ^= 0x10
+    (tmp_path / "flipped.exr").write_bytes(content)
+    with pytest.raises(InvalidFileError, match="damaged EXR file"):
+        validate_exr(tmp_path / "flipped.exr", RESOLUTION, layer=LAYER)
+
+
+def test_a_master_of_another_size_is_refused(folder):
+    with pytest.raises(InvalidFileError, match="is 64x36 pixels, but 64x48 were asked for"):
+        validate_exr(folder / "first.exr", (64, 48), layer=LAYER)
+
+
+def test_a_png_of_sixteen_bits_has_them(tmp_path):
+    positions, triangles = sphere((0.0, 0.0, 0.5), 0.3)
+    write_mesh(tmp_path / "ball/000000.ply", positions, triangles, velocity=(0.0, 0.0, 0.0))
+    spec_of(BALL, format="png16").write(tmp_path / "spec.json")
+    run_python(RENDER_MASTER.replace(', folder / f"{name}.exr"', ""), str(tmp_path), "deep", "1")
+    assert validate_picture(tmp_path / "deep.png", RESOLUTION).bit_depth == 16

@@ -1,0 +1,93 @@
+"""`pipeline still`: one frame in another quality, beside the job's own."""
+
+from __future__ import annotations
+
+import pytest
+from command_line import pipeline
+from half_simulated_jobs import half_simulated_job
+from needed_blender import needs_bpy
+from PIL import Image
+
+from pipeline.layout import JobLayout
+from pipeline.stages import render as render_stage
+from render.pictures import validate_exr, validate_picture
+
+
+@pytest.fixture
+def job(tmp_path) -> JobLayout:
+    return half_simulated_job(tmp_path)
+
+
+def contents(layout: JobLayout) -> dict[str, bytes]:
+    return {
+        path.relative_to(layout.root).as_posix(): path.read_bytes()
+        for path in sorted(layout.root.rglob("*"))
+        if path.is_file() and layout.stills not in path.parents
+    }
+
+
+@needs_bpy
+def test_a_still_is_drawn_beside_the_jobs_frames_and_touches_nothing_else(job):
+    before = contents(job)
+    result = pipeline(
+        "still", job.root, "--frame", 1, "--quality", "preview", "--resolution", 48, 32, "--set", "render.samples=2"
+    )
+    render_stage._close_renderers()
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"{job.stills}/000001-preview-48x32.png\n"
+    assert "frame 1 of flight: 48 x 32 pixels, preview quality" in result.stderr
+    with Image.open(job.stills / "000001-preview-48x32.png") as picture:
+        assert picture.size == (48, 32)
+    assert contents(job) == before
+
+
+@needs_bpy
+def test_a_still_goes_where_it_is_wanted_and_replaces_what_is_there(job, tmp_path):
+    target = tmp_path / "pictures" / "poster.png"
+    target.parent.mkdir()
+    target.write_bytes(b"an older poster")
+    arguments = ("--set", "render.samples=1", "--set", "stage.color=[0.5, 0.1, 0.1]", "-o", target)
+    result = pipeline("still", job.root, "--frame", 0, "--quality", "draft", *arguments)
+    render_stage._close_renderers()
+    assert result.exit_code == 0, result.output
+    with Image.open(target) as picture:
+        assert picture.size == (64, 36)
+    assert [path.name for path in target.parent.iterdir()] == ["poster.png"]
+    assert not job.stills.exists()
+
+
+@needs_bpy
+def test_a_still_with_a_master_has_both_files(job, tmp_path):
+    arguments = ("--set", 'render.format="exr"', "--set", "render.samples=1", "-o", tmp_path / "poster.png")
+    result = pipeline("still", job.root, "--frame", 0, "--quality", "draft", *arguments)
+    render_stage._close_renderers()
+    assert result.exit_code == 0, result.output
+    validate_exr(tmp_path / "poster.exr", (64, 36))
+    validate_picture(tmp_path / "poster.png", (64, 36))
+
+
+def test_a_frame_that_is_not_simulated_yet_is_told_with_the_command_that_makes_it(job):
+    result = pipeline("still", job.root, "--frame", 2)
+    assert result.exit_code == 1
+    assert f"cache/000002.h5 is not simulated yet; go on with: pipeline resume {job.root}" in result.stderr
+
+
+def test_options_that_change_the_simulation_are_refused(job):
+    result = pipeline("still", job.root, "--frame", 1, "--set", "rigid.ball.velocity=[1.0, 0.0, 0.0]")
+    assert result.exit_code == 1
+    assert "--set changes what is simulated" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--frame", 3), "flight has no frame 3; its frames are 0-2"),
+        (("--frame", 1, "-o", "still.jpg"), 'a still is a PNG, so its name must end in ".png"'),
+        (("--frame", 1, "--resolution", 4, 4), "render.resolution"),
+        (("--frame", 1, "--set", "render.qualty=final"), 'did you mean "quality"'),
+    ],
+)
+def test_what_cannot_be_drawn_is_told(job, arguments, sentence):
+    result = pipeline("still", job.root, *arguments)
+    assert result.exit_code in (1, 2)
+    assert sentence in result.stderr
