@@ -22,7 +22,7 @@ DRAW = """
     from pathlib import Path
     import bpy
     import numpy as np
-    from blender_scripts import png
+    from blender_scripts import png, settings
     from blender_scripts.compatibility import node_tree_of
     from render.blender import open_renderer
 
@@ -38,8 +38,9 @@ DRAW = """
     background.inputs["Strength"].default_value = float(world_radiance)
     tree.links.new(background.outputs[0], tree.nodes.new("ShaderNodeOutputWorld").inputs["Surface"])
     scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", float(width)
-    settings = scene.render.image_settings
-    settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGB", "32"
+    image_settings = scene.render.image_settings
+    image_settings.file_format, image_settings.color_mode, image_settings.color_depth = "OPEN_EXR", "RGB", "32"
+    settings.choose_png = lambda picture_format: None
     png.strip_metadata = lambda path: None
     exec(changes)
     for frame in map(int, frames.split(",")):
