@@ -6,8 +6,8 @@ import trimesh
 from cloth_scenes import EARTH, SOFT, VACUUM, WEIGHTLESS, advance, cloth, rectangle, solver_of
 from thread_counts import outputs_by_threads
 
+from sim import short_loops
 from sim.build import build_world
-from sim.cloth import short_loops
 from sim.cloth.solver import ClothSolver
 from sim.scene import SceneParameters
 
@@ -184,7 +184,7 @@ STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim.cloth import short_loops
+from sim import short_loops
 short_loops.LONGEST_NS = float(sys.argv[2])
 from cloth_scenes import SOFT, cloth, rectangle, solver_of
 digest = hashlib.sha256()

@@ -25,7 +25,7 @@ def on_gpu(request, monkeypatch) -> bool:
 
 
 def choose_lanes(monkeypatch, *, on_gpu: bool) -> None:
-    for module in ("sim.reductions", "sim.smoke.lanes"):
+    for module in ("sim.reductions", "sim.short_loops", "sim.smoke.lanes"):
         monkeypatch.setattr(f"{module}.runs_on_gpu", lambda: on_gpu)
 
 
