@@ -12,6 +12,7 @@ from sim.smoke.balance import CorrectionBalance
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import (
     RUN,
+    has_runs,
     lane_count,
     lane_items,
     lane_place,
@@ -60,7 +61,7 @@ class Advection:
         self._predicted_x, self._predicted_y, self._predicted_z, self._result_x, self._result_y, self._result_z = work
         self._cells_per_metre = 1.0 / grid.cell_size
         self._maccormack, self._wind, self._balance = maccormack, wind, balance
-        self._lanes = lane_count()
+        self._lanes, self._in_runs = lane_count(), has_runs(grid.cells)
         # From these centres on outside air mixes in; walls keep smoke in, so theirs are out of reach.
         far = 1.0e9
         self._low = tuple(1.0 if grid.lets_in(axis, 0) else -far for axis in range(3))
@@ -200,16 +201,17 @@ class Advection:
     def _predict_cells(self, step: ti.f32):
         for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = self._row(i, j, 0)
-            for run in range(lane_runs(self._nz)):
-                first = run_start(run)
-                densities, excesses = new_run(), new_run()
-                for m in range(RUN):
-                    densities[m], excesses[m] = self._predicted_cell(i, j, first + m, step)
-                for m in range(RUN):
-                    self._predicted_x[row + first + m] = densities[m]
-                    self._predicted_y[row + first + m] = excesses[m]
-            for n in range(rest_items(self._nz, lane)):
-                k = rest_place(self._nz, n, lane)
+            if ti.static(self._in_runs):
+                for run in range(lane_runs(self._nz)):
+                    first = run_start(run)
+                    densities, excesses = new_run(), new_run()
+                    for m in range(RUN):
+                        densities[m], excesses[m] = self._predicted_cell(i, j, first + m, step)
+                    for m in range(RUN):
+                        self._predicted_x[row + first + m] = densities[m]
+                        self._predicted_y[row + first + m] = excesses[m]
+            for n in range(rest_items(self._nz, lane, self._in_runs)):
+                k = rest_place(self._nz, n, lane, self._in_runs)
                 self._predicted_x[row + k], self._predicted_y[row + k] = self._predicted_cell(i, j, k, step)
 
     @ti.func
@@ -224,16 +226,17 @@ class Advection:
     def _correct_cells(self, step: ti.f32):
         for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = self._row(i, j, 0)
-            for run in range(lane_runs(self._nz)):
-                first = run_start(run)
-                densities, excesses = new_run(), new_run()
-                for m in range(RUN):
-                    densities[m], excesses[m] = self._corrected_cell(i, j, first + m, step)
-                for m in range(RUN):
-                    self._result_x[row + first + m] = densities[m]
-                    self._result_y[row + first + m] = excesses[m]
-            for n in range(rest_items(self._nz, lane)):
-                k = rest_place(self._nz, n, lane)
+            if ti.static(self._in_runs):
+                for run in range(lane_runs(self._nz)):
+                    first = run_start(run)
+                    densities, excesses = new_run(), new_run()
+                    for m in range(RUN):
+                        densities[m], excesses[m] = self._corrected_cell(i, j, first + m, step)
+                    for m in range(RUN):
+                        self._result_x[row + first + m] = densities[m]
+                        self._result_y[row + first + m] = excesses[m]
+            for n in range(rest_items(self._nz, lane, self._in_runs)):
+                k = rest_place(self._nz, n, lane, self._in_runs)
                 self._result_x[row + k], self._result_y[row + k] = self._corrected_cell(i, j, k, step)
 
     @ti.func
@@ -260,15 +263,16 @@ class Advection:
     def _predict_faces(self, axis: ti.template(), field: ti.template(), predicted: ti.template(), step: ti.f32):
         for i, j, lane in ti.ndrange((1, self._nx + 1 + (axis == 0)), (1, self._ny + 1 + (axis == 1)), self._lanes):
             row, nz = self._row(i, j, 0), self._nz + (axis == 2)
-            for run in range(lane_runs(nz)):
-                first = run_start(run)
-                values = new_run()
-                for m in range(RUN):
-                    values[m] = self._predicted_face(axis, field, i, j, first + m, step)
-                for m in range(RUN):
-                    predicted[row + first + m] = values[m]
-            for n in range(rest_items(nz, lane)):
-                k = rest_place(nz, n, lane)
+            if ti.static(self._in_runs):
+                for run in range(lane_runs(nz)):
+                    first = run_start(run)
+                    values = new_run()
+                    for m in range(RUN):
+                        values[m] = self._predicted_face(axis, field, i, j, first + m, step)
+                    for m in range(RUN):
+                        predicted[row + first + m] = values[m]
+            for n in range(rest_items(nz, lane, self._in_runs)):
+                k = rest_place(nz, n, lane, self._in_runs)
                 predicted[row + k] = self._predicted_face(axis, field, i, j, k, step)
 
     @ti.func
@@ -289,15 +293,16 @@ class Advection:
     ):
         for i, j, lane in ti.ndrange((1, self._nx + 1 + (axis == 0)), (1, self._ny + 1 + (axis == 1)), self._lanes):
             row, nz = self._row(i, j, 0), self._nz + (axis == 2)
-            for run in range(lane_runs(nz)):
-                first = run_start(run)
-                values = new_run()
-                for m in range(RUN):
-                    values[m] = self._corrected_face(axis, field, predicted, i, j, first + m, step)
-                for m in range(RUN):
-                    result[row + first + m] = values[m]
-            for n in range(rest_items(nz, lane)):
-                k = rest_place(nz, n, lane)
+            if ti.static(self._in_runs):
+                for run in range(lane_runs(nz)):
+                    first = run_start(run)
+                    values = new_run()
+                    for m in range(RUN):
+                        values[m] = self._corrected_face(axis, field, predicted, i, j, first + m, step)
+                    for m in range(RUN):
+                        result[row + first + m] = values[m]
+            for n in range(rest_items(nz, lane, self._in_runs)):
+                k = rest_place(nz, n, lane, self._in_runs)
                 result[row + k] = self._corrected_face(axis, field, predicted, i, j, k, step)
 
     @ti.func

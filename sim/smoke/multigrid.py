@@ -16,6 +16,7 @@ from sim.launch import fast_launch
 from sim.short_loops import is_short
 from sim.smoke.lanes import (
     RUN,
+    has_runs,
     lane_count,
     lane_items,
     lane_place,
@@ -75,7 +76,7 @@ class MultigridVCycle:
         self.coefficients = Coefficients(obstacles)
         self._coarsest_conductance = self.coefficients.coarsest_conductance()
         self._invert_coarsest()
-        self._lanes = lane_count()
+        self._lanes, self._in_runs = lane_count(), has_runs(obstacles.grid.cells)
         self._first_weight, self._second_weight = chebyshev_weights(2, SMOOTHED_SPECTRUM)
 
     def update(self) -> None:
@@ -230,15 +231,16 @@ class MultigridVCycle:
     def _smooth_row_from_zero(
         self, row: ti.i32, nz: ti.i32, lane: ti.i32, step_x: ti.i32, step_y: ti.i32, first_weight, second_weight
     ):
-        for run in range(lane_runs(nz)):
-            first = row + run_start(run)
-            values = new_run()
-            for m in range(RUN):
-                values[m] = self._smoothed_from_zero(first + m, step_x, step_y, first_weight, second_weight)
-            for m in range(RUN):
-                self.solution[first + m] = values[m]
-        for n in range(rest_items(nz, lane)):
-            at = row + rest_place(nz, n, lane)
+        if ti.static(self._in_runs):
+            for run in range(lane_runs(nz)):
+                first = row + run_start(run)
+                values = new_run()
+                for m in range(RUN):
+                    values[m] = self._smoothed_from_zero(first + m, step_x, step_y, first_weight, second_weight)
+                for m in range(RUN):
+                    self.solution[first + m] = values[m]
+        for n in range(rest_items(nz, lane, self._in_runs)):
+            at = row + rest_place(nz, n, lane, self._in_runs)
             self.solution[at] = self._smoothed_from_zero(at, step_x, step_y, first_weight, second_weight)
 
     @ti.func
@@ -250,15 +252,16 @@ class MultigridVCycle:
 
     @ti.func
     def _find_residual_of_row(self, row: ti.i32, nz: ti.i32, lane: ti.i32, step_x: ti.i32, step_y: ti.i32):
-        for run in range(lane_runs(nz)):
-            first = row + run_start(run)
-            values = new_run()
-            for m in range(RUN):
-                values[m] = self._residual(self.solution, first + m, step_x, step_y)
-            for m in range(RUN):
-                self.spare[first + m] = values[m]
-        for n in range(rest_items(nz, lane)):
-            at = row + rest_place(nz, n, lane)
+        if ti.static(self._in_runs):
+            for run in range(lane_runs(nz)):
+                first = row + run_start(run)
+                values = new_run()
+                for m in range(RUN):
+                    values[m] = self._residual(self.solution, first + m, step_x, step_y)
+                for m in range(RUN):
+                    self.spare[first + m] = values[m]
+        for n in range(rest_items(nz, lane, self._in_runs)):
+            at = row + rest_place(nz, n, lane, self._in_runs)
             self.spare[at] = self._residual(self.solution, at, step_x, step_y)
 
     @ti.func
@@ -292,17 +295,18 @@ class MultigridVCycle:
         beside_y = ti.select(fine_j % 2 == 1, -coarse_step_y, coarse_step_y)
         # The upper child of the last cell beyond an odd end is a ghost, and stays 0: so that cell is none of a run.
         whole = nz // 2
-        for run in range(lane_runs(whole)):
-            first = run_start(run)
-            lower, upper = new_run(), new_run()
-            for m in range(RUN):
-                lower[m], upper[m] = self._interpolated(row + first + m, beside_x, beside_y)
-            child = fine_row + 2 * first - 1
-            for m in range(RUN):
-                self.solution[child + 2 * m] += lower[m]
-                self.solution[child + 2 * m + 1] += upper[m]
-        for n in range(rest_items(whole, lane)):
-            k = rest_place(whole, n, lane)
+        if ti.static(self._in_runs):
+            for run in range(lane_runs(whole)):
+                first = run_start(run)
+                lower, upper = new_run(), new_run()
+                for m in range(RUN):
+                    lower[m], upper[m] = self._interpolated(row + first + m, beside_x, beside_y)
+                child = fine_row + 2 * first - 1
+                for m in range(RUN):
+                    self.solution[child + 2 * m] += lower[m]
+                    self.solution[child + 2 * m + 1] += upper[m]
+        for n in range(rest_items(whole, lane, self._in_runs)):
+            k = rest_place(whole, n, lane, self._in_runs)
             lower, upper = self._interpolated(row + k, beside_x, beside_y)
             child = fine_row + 2 * k - 1
             self.solution[child] += lower
@@ -339,15 +343,16 @@ class MultigridVCycle:
         self, x: ti.template(), improved: ti.template(), row: ti.i32, nz: ti.i32, lane: ti.i32, step_x: ti.i32,
         step_y: ti.i32, weight,
     ):  # fmt: skip
-        for run in range(lane_runs(nz)):
-            first = row + run_start(run)
-            values = new_run()
-            for m in range(RUN):
-                values[m] = self._smoothed(x, first + m, step_x, step_y, weight)
-            for m in range(RUN):
-                improved[first + m] = values[m]
-        for n in range(rest_items(nz, lane)):
-            at = row + rest_place(nz, n, lane)
+        if ti.static(self._in_runs):
+            for run in range(lane_runs(nz)):
+                first = row + run_start(run)
+                values = new_run()
+                for m in range(RUN):
+                    values[m] = self._smoothed(x, first + m, step_x, step_y, weight)
+                for m in range(RUN):
+                    improved[first + m] = values[m]
+        for n in range(rest_items(nz, lane, self._in_runs)):
+            at = row + rest_place(nz, n, lane, self._in_runs)
             improved[at] = self._smoothed(x, at, step_x, step_y, weight)
 
     @ti.func
