@@ -19,12 +19,13 @@ from sim.cloth.continuous_response import (
     weigh_contacts,
 )
 from sim.cloth.continuous_zones import ImpactZones
+from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import SelfCollision, half_range
 from sim.cloth.self_collision_kernels import copy_vectors
-from sim.cloth.short_loops import CONTACT_NS, COPIED_NODE_NS, is_short
 from sim.reductions import LaneReduction
+from sim.short_loops import is_short
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState

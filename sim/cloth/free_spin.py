@@ -4,10 +4,11 @@ import numpy as np
 import taichi as ti
 
 from sim.arrays import Floats, Vectors
-from sim.cloth.short_loops import NODE_NS, is_short
+from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.state import ClothState, Lattice
 from sim.launch import fast_launch
 from sim.reductions import BRANCHES, device_lanes, reduced, runs_on_gpu
+from sim.short_loops import is_short
 
 QUANTITIES = 13
 """Mass, its first moments (3) and second moments (6), and angular momentum that the springs gave (3)."""

@@ -9,6 +9,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_motion_kernels import (
     age_pairs,
     finish_patches,
@@ -21,8 +22,8 @@ from sim.cloth.patch_motion_kernels import (
 )
 from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces, make_room
-from sim.cloth.short_loops import NODE_NS, is_short
 from sim.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
+from sim.short_loops import is_short
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState

@@ -4,15 +4,16 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.cloth.loop_costs import NODE_IN_ROWS_NS
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.row_blocks import LANES, load_blocks, row_blocks, store_blocks, strips_of
 from sim.cloth.row_springs import bend_lines, solve_diagonals
 from sim.cloth.row_threads import solve_lines, straighten_lines
 from sim.cloth.sheet import Grid
-from sim.cloth.short_loops import NODE_IN_ROWS_NS, is_short
 from sim.cloth.springs import bend_share, diagonal_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
 from sim.reductions import runs_on_gpu
+from sim.short_loops import is_short
 
 ALONG_Y, ALONG_X = 0, 1
 """Directions of lines: upright blocks, then turned ones."""

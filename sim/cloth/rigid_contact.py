@@ -9,12 +9,12 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.arrays import Floats, Integers, Matrices, Vectors
+from sim.cloth.loop_costs import PATCH_AT_WALLS_NS
 from sim.cloth.patch_pairs import PatchPairs
 from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, Quadruples, Weights, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
 from sim.cloth.self_collision_kernels import LANES, Four, Pairs, Triples
-from sim.cloth.short_loops import PATCH_AT_WALLS_NS, is_short
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
 from sim.reductions import runs_on_gpu
@@ -22,6 +22,7 @@ from sim.rigid.contacts import Poses
 from sim.rigid.geometry import BodyGeometry
 from sim.rigid.shape_distances import CountTriples, distance_at
 from sim.rigid.walls import Wall
+from sim.short_loops import is_short
 
 Array = NDArray[np.float64]
 Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)

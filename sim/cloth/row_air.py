@@ -4,12 +4,13 @@ import taichi as ti
 
 from sim.arrays import Floats, Vectors
 from sim.cloth.air import slowed
+from sim.cloth.loop_costs import NODE_IN_ROWS_NS
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.row_blocks import LANES, Block, row_blocks, strips_of, two_blocks
 from sim.cloth.sheet import Grid
-from sim.cloth.short_loops import NODE_IN_ROWS_NS, is_short
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
+from sim.short_loops import is_short
 
 LEAST_SQUARE = 1.0e-30
 """Smaller squares, of twice the area of a triangle [m^4] or a speed [m²/s²], have no direction."""

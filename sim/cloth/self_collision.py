@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 
 from sim.cloth.element_blocks import ElementBlocks
+from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
@@ -17,8 +18,8 @@ from sim.cloth.self_collision_kernels import (
     pair_vertices_with_triangles,
     range_of_vectors,
 )
-from sim.cloth.short_loops import NODE_NS, is_short
 from sim.reductions import LaneReduction
+from sim.short_loops import is_short
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState

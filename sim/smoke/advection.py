@@ -10,7 +10,18 @@ import taichi as ti
 from sim.parameters import Vector3
 from sim.smoke.balance import CorrectionBalance
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.lanes import lane_count, lane_items, lane_place
+from sim.smoke.lanes import (
+    RUN,
+    has_runs,
+    lane_count,
+    lane_items,
+    lane_place,
+    lane_runs,
+    new_run,
+    rest_items,
+    rest_place,
+    run_start,
+)
 
 
 @ti.data_oriented
@@ -50,7 +61,7 @@ class Advection:
         self._predicted_x, self._predicted_y, self._predicted_z, self._result_x, self._result_y, self._result_z = work
         self._cells_per_metre = 1.0 / grid.cell_size
         self._maccormack, self._wind, self._balance = maccormack, wind, balance
-        self._lanes = lane_count()
+        self._lanes, self._in_runs = lane_count(), has_runs(grid.cells)
         # From these centres on outside air mixes in; walls keep smoke in, so theirs are out of reach.
         far = 1.0e9
         self._low = tuple(1.0 if grid.lets_in(axis, 0) else -far for axis in range(3))
@@ -189,47 +200,87 @@ class Advection:
     @ti.kernel
     def _predict_cells(self, step: ti.f32):
         for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            for n in range(lane_items(self._nz, lane)):
-                k = lane_place(n, lane)
-                at = self._row(i, j, k)
-                departure = ti.Vector([float(i), float(j), float(k)]) - step * self._velocity_at_cell(at)
-                there, offset = self._locate(departure, 3)
-                kept = self._kept(departure, 3)
-                self._predicted_x[at] = kept * self._interpolate(self._density, there, offset)
-                self._predicted_y[at] = kept * self._interpolate(self._excess, there, offset)
+            row = self._row(i, j, 0)
+            if ti.static(self._in_runs):
+                for run in range(lane_runs(self._nz)):
+                    first = run_start(run)
+                    densities, excesses = new_run(), new_run()
+                    for m in range(RUN):
+                        densities[m], excesses[m] = self._predicted_cell(i, j, first + m, step)
+                    for m in range(RUN):
+                        self._predicted_x[row + first + m] = densities[m]
+                        self._predicted_y[row + first + m] = excesses[m]
+            for n in range(rest_items(self._nz, lane, self._in_runs)):
+                k = rest_place(self._nz, n, lane, self._in_runs)
+                self._predicted_x[row + k], self._predicted_y[row + k] = self._predicted_cell(i, j, k, step)
+
+    @ti.func
+    def _predicted_cell(self, i: ti.i32, j: ti.i32, k: ti.i32, step: ti.f32):
+        departure = ti.Vector([float(i), float(j), float(k)]) - step * self._velocity_at_cell(self._row(i, j, k))
+        there, offset = self._locate(departure, 3)
+        kept = self._kept(departure, 3)
+        density = kept * self._interpolate(self._density, there, offset)
+        return density, kept * self._interpolate(self._excess, there, offset)
 
     @ti.kernel
     def _correct_cells(self, step: ti.f32):
-        """phi = phi^ + (phi_n - phi_) / 2, where phi_ is phi^ carried back (Selle et al. 2008, eq. 5)."""
         for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            for n in range(lane_items(self._nz, lane)):
-                k = lane_place(n, lane)
-                at = self._row(i, j, k)
-                here = ti.Vector([float(i), float(j), float(k)])
-                shift = step * self._velocity_at_cell(at)
-                density, excess = self._predicted_x[at], self._predicted_y[at]
-                # Outside air has no past to compare with: there the first-order value stands.
-                if not (self._has_no_past(here - shift, 3) or self._has_no_past(here + shift, 3)):
-                    there, offset = self._locate(here + shift, 3)
-                    density += 0.5 * (self._density[at] - self._interpolate(self._predicted_x, there, offset))
-                    excess += 0.5 * (self._excess[at] - self._interpolate(self._predicted_y, there, offset))
-                    origin, _ = self._locate(here - shift, 3)
-                    density = self._clamp_to_corners(density, self._density, origin)
-                    excess = self._clamp_to_corners(excess, self._excess, origin)
-                self._result_x[at] = density
-                self._result_y[at] = excess
+            row = self._row(i, j, 0)
+            if ti.static(self._in_runs):
+                for run in range(lane_runs(self._nz)):
+                    first = run_start(run)
+                    densities, excesses = new_run(), new_run()
+                    for m in range(RUN):
+                        densities[m], excesses[m] = self._corrected_cell(i, j, first + m, step)
+                    for m in range(RUN):
+                        self._result_x[row + first + m] = densities[m]
+                        self._result_y[row + first + m] = excesses[m]
+            for n in range(rest_items(self._nz, lane, self._in_runs)):
+                k = rest_place(self._nz, n, lane, self._in_runs)
+                self._result_x[row + k], self._result_y[row + k] = self._corrected_cell(i, j, k, step)
+
+    @ti.func
+    def _corrected_cell(self, i: ti.i32, j: ti.i32, k: ti.i32, step: ti.f32):
+        """phi = phi^ + (phi_n - phi_) / 2, where phi_ is phi^ carried back (Selle et al. 2008, eq. 5)."""
+        at = self._row(i, j, k)
+        here = ti.Vector([float(i), float(j), float(k)])
+        shift = step * self._velocity_at_cell(at)
+        there, offset = self._locate(here + shift, 3)
+        density = self._predicted_x[at]
+        excess = self._predicted_y[at]
+        density += 0.5 * (self._density[at] - self._interpolate(self._predicted_x, there, offset))
+        excess += 0.5 * (self._excess[at] - self._interpolate(self._predicted_y, there, offset))
+        origin, _ = self._locate(here - shift, 3)
+        density = self._clamp_to_corners(density, self._density, origin)
+        excess = self._clamp_to_corners(excess, self._excess, origin)
+        # Outside air has no past to compare with: there the first-order value stands. Selected, not branched over, so
+        # that the loop can be vectorized.
+        has_past = not (self._has_no_past(here - shift, 3) or self._has_no_past(here + shift, 3))
+        density = ti.select(has_past, density, self._predicted_x[at])
+        return density, ti.select(has_past, excess, self._predicted_y[at])
 
     @ti.kernel
     def _predict_faces(self, axis: ti.template(), field: ti.template(), predicted: ti.template(), step: ti.f32):
         for i, j, lane in ti.ndrange((1, self._nx + 1 + (axis == 0)), (1, self._ny + 1 + (axis == 1)), self._lanes):
-            for n in range(lane_items(self._nz + (axis == 2), lane)):
-                k = lane_place(n, lane)
-                velocity = self._velocity_at_face(axis, i, j, k)
-                departure = ti.Vector([float(i), float(j), float(k)]) - step * velocity
-                there, offset = self._locate(departure, axis)
-                kept = self._kept(departure, axis)
-                inside = self._interpolate(field, there, offset)
-                predicted[self._row(i, j, k)] = kept * inside + (1.0 - kept) * self._wind[axis]
+            row, nz = self._row(i, j, 0), self._nz + (axis == 2)
+            if ti.static(self._in_runs):
+                for run in range(lane_runs(nz)):
+                    first = run_start(run)
+                    values = new_run()
+                    for m in range(RUN):
+                        values[m] = self._predicted_face(axis, field, i, j, first + m, step)
+                    for m in range(RUN):
+                        predicted[row + first + m] = values[m]
+            for n in range(rest_items(nz, lane, self._in_runs)):
+                k = rest_place(nz, n, lane, self._in_runs)
+                predicted[row + k] = self._predicted_face(axis, field, i, j, k, step)
+
+    @ti.func
+    def _predicted_face(self, axis: ti.template(), field: ti.template(), i: ti.i32, j: ti.i32, k: ti.i32, step: ti.f32):
+        departure = ti.Vector([float(i), float(j), float(k)]) - step * self._velocity_at_face(axis, i, j, k)
+        there, offset = self._locate(departure, axis)
+        kept = self._kept(departure, axis)
+        return kept * self._interpolate(field, there, offset) + (1.0 - kept) * self._wind[axis]
 
     @ti.kernel
     def _correct_faces(
@@ -241,18 +292,39 @@ class Advection:
         step: ti.f32,
     ):
         for i, j, lane in ti.ndrange((1, self._nx + 1 + (axis == 0)), (1, self._ny + 1 + (axis == 1)), self._lanes):
-            for n in range(lane_items(self._nz + (axis == 2), lane)):
-                k = lane_place(n, lane)
-                at = self._row(i, j, k)
-                here = ti.Vector([float(i), float(j), float(k)])
-                shift = step * self._velocity_at_face(axis, i, j, k)
-                value = predicted[at]
-                if not (self._has_no_past(here - shift, axis) or self._has_no_past(here + shift, axis)):
-                    there, offset = self._locate(here + shift, axis)
-                    value += 0.5 * (field[at] - self._interpolate(predicted, there, offset))
-                    origin, _ = self._locate(here - shift, axis)
-                    value = self._clamp_to_corners(value, field, origin)
-                result[at] = value
+            row, nz = self._row(i, j, 0), self._nz + (axis == 2)
+            if ti.static(self._in_runs):
+                for run in range(lane_runs(nz)):
+                    first = run_start(run)
+                    values = new_run()
+                    for m in range(RUN):
+                        values[m] = self._corrected_face(axis, field, predicted, i, j, first + m, step)
+                    for m in range(RUN):
+                        result[row + first + m] = values[m]
+            for n in range(rest_items(nz, lane, self._in_runs)):
+                k = rest_place(nz, n, lane, self._in_runs)
+                result[row + k] = self._corrected_face(axis, field, predicted, i, j, k, step)
+
+    @ti.func
+    def _corrected_face(
+        self,
+        axis: ti.template(),
+        field: ti.template(),
+        predicted: ti.template(),
+        i: ti.i32,
+        j: ti.i32,
+        k: ti.i32,
+        step: ti.f32,
+    ):
+        at = self._row(i, j, k)
+        here = ti.Vector([float(i), float(j), float(k)])
+        shift = step * self._velocity_at_face(axis, i, j, k)
+        there, offset = self._locate(here + shift, axis)
+        value = predicted[at] + 0.5 * (field[at] - self._interpolate(predicted, there, offset))
+        origin, _ = self._locate(here - shift, axis)
+        value = self._clamp_to_corners(value, field, origin)
+        has_past = not (self._has_no_past(here - shift, axis) or self._has_no_past(here + shift, axis))
+        return ti.select(has_past, value, predicted[at])
 
     @ti.kernel
     def _store_cells(self, density: ti.template(), excess: ti.template()):

@@ -6,8 +6,8 @@ import trimesh
 from cloth_scenes import EARTH, SOFT, VACUUM, WEIGHTLESS, advance, cloth, rectangle, solver_of
 from thread_counts import outputs_by_threads
 
+from sim import short_loops
 from sim.build import build_world
-from sim.cloth import short_loops
 from sim.cloth.solver import ClothSolver
 from sim.scene import SceneParameters
 
@@ -184,7 +184,7 @@ STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim.cloth import short_loops
+from sim import short_loops
 short_loops.LONGEST_NS = float(sys.argv[2])
 from cloth_scenes import SOFT, cloth, rectangle, solver_of
 digest = hashlib.sha256()
@@ -206,15 +206,6 @@ def test_results_do_not_depend_on_the_number_of_threads(longest_ns):
     digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, repr(longest_ns), beside=__file__)
     assert len(digests[0].strip()) == 64
     assert digests[0] == digests[1]
-
-
-def test_a_loop_is_short_by_its_work_and_never_on_a_gpu(monkeypatch):
-    items = int(short_loops.LONGEST_NS / 10.0)
-    monkeypatch.setattr(short_loops, "runs_on_gpu", lambda: False)
-    assert short_loops.is_short(items, 10.0)
-    assert not short_loops.is_short(items + 1, 10.0)
-    monkeypatch.setattr(short_loops, "runs_on_gpu", lambda: True)
-    assert not short_loops.is_short(1, 1.0)
 
 
 # --- in the world --------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from contact_scenes import (
 from crossing_triangles import crossings, edges_of_triangles
 from thread_counts import outputs_by_threads
 
-from sim.cloth import short_loops
+from sim import short_loops
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.self_collision import SelfCollision
 
@@ -357,7 +357,7 @@ STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim.cloth import short_loops
+from sim import short_loops
 short_loops.LONGEST_NS = float(sys.argv[2])
 from contact_scenes import cloth_of, contacts_of, world_of
 from cloth_scenes import rectangle

@@ -5,10 +5,12 @@ import pytest
 import taichi as ti
 from smoke_scenes import CLOSED_BOX, mark
 
+from sim import short_loops
 from sim.domain import DomainParameters
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
-from sim.smoke.lanes import lane_count, lane_items, lane_place
+from sim.smoke import lanes
+from sim.smoke.lanes import has_runs, lane_count, lane_items, lane_place
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.reductions import Pair, RowReductions
 from sim.smoke.solver import SmokeSolver
@@ -25,7 +27,7 @@ def on_gpu(request, monkeypatch) -> bool:
 
 
 def choose_lanes(monkeypatch, *, on_gpu: bool) -> None:
-    for module in ("sim.reductions", "sim.smoke.lanes"):
+    for module in ("sim.reductions", "sim.short_loops", "sim.smoke.lanes"):
         monkeypatch.setattr(f"{module}.runs_on_gpu", lambda: on_gpu)
 
 
@@ -139,3 +141,44 @@ def test_a_plume_is_the_same_with_one_thread_a_row_and_with_many(monkeypatch, ch
         # The same arithmetic, but for the order of the sums in the projection. Measured: 2e-7.
         difference = np.abs(many[name].astype(np.float64) - array.astype(np.float64)).max()
         assert difference <= 5.0e-6 * np.abs(array).max(), name
+
+
+def test_a_grid_has_runs_by_its_size_and_never_on_a_gpu(monkeypatch):
+    choose_lanes(monkeypatch, on_gpu=False)
+    assert has_runs((48, 48, 48))
+    assert not has_runs((48, 48, 47))
+    choose_lanes(monkeypatch, on_gpu=True)
+    assert not has_runs((512, 512, 512))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("open_faces", [("x-", "x+", "z+"), CLOSED_BOX], ids=["open", "closed"])
+def test_a_plume_is_the_same_in_runs_of_cells_and_one_by_one(monkeypatch, open_faces):
+    # 37 cells: two runs of 16 and five cells, on the next level one and two, and an odd end without a second child.
+    tall = DomainParameters(min=(-0.25, -0.25, 0.0), max=(0.25, 0.25, 37 / 18))
+    states = []
+    # Every loop by all threads and nothing in runs; runs, and all of the V-cycle or its coarse levels by one thread.
+    for longest_ns, least_cells in ((0.0, 1_000_000), (1.0e9, 0), (2.0e3, 0)):
+        monkeypatch.setattr(short_loops, "LONGEST_NS", longest_ns)
+        monkeypatch.setattr(lanes, "LEAST_CELLS_IN_RUNS", least_cells)
+        parameters = SmokeParameters.model_validate(
+            {
+                "name": "plume",
+                "cell_size": 1 / 18,
+                "source": [{"shape": {"type": "sphere", "radius": 0.12}, "position": (0.0, 0.0, 0.2)}],
+                "open_faces": open_faces,
+            }
+        )
+        ball = build_solid(Placement(shape={"type": "sphere", "radius": 0.15}, position=(0.0, 0.0, 0.6)))
+        solver = SmokeSolver(parameters, domain=tall, gravity=(0.0, 0.0, -9.81), solids=[ball])
+        assert solver.grid.cells == (9, 9, 37)
+        for _ in range(5):
+            solver.substep(1 / 60)
+        assert solver.diagnostics()["not_converged"] == 0.0
+        states.append(solver.checkpoint())
+    one_by_one, *others = states
+    for state in others:
+        for name, array in one_by_one.items():
+            # The same arithmetic, but for products that are contracted otherwise.
+            difference = np.abs(state[name].astype(np.float64) - array.astype(np.float64)).max()
+            assert difference <= 5.0e-6 * np.abs(array).max(), name

@@ -6,9 +6,11 @@ import taichi as ti
 from smoke_scenes import OPEN_BOX
 from thread_counts import outputs_by_threads
 
+from sim import short_loops
 from sim.domain import DomainParameters
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
+from sim.smoke import lanes
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
@@ -229,6 +231,9 @@ CHILD = """
 import hashlib, sys
 from sim.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
+from sim import short_loops
+from sim.smoke import lanes
+short_loops.LONGEST_NS, lanes.LEAST_CELLS_IN_RUNS = map(float, sys.argv[2:])
 from test_smoke_solver import advance, build_plume, digest
 solver = build_plume()
 advance(solver, 6)
@@ -272,7 +277,12 @@ def test_memory_that_it_tells_is_what_it_allocates(monkeypatch, moving):
 
 
 @pytest.mark.slow
-def test_one_thread_and_two_give_the_same_bits():
-    digests = outputs_by_threads(CHILD, beside=__file__)
+@pytest.mark.parametrize(
+    ("longest_ns", "least_cells"),
+    [(short_loops.LONGEST_NS, lanes.LEAST_CELLS_IN_RUNS), (2.0e4, 0.0)],
+    ids=["as a small grid", "as a large one: runs of cells, and coarse levels alone by one thread"],
+)
+def test_one_thread_and_two_give_the_same_bits(longest_ns, least_cells):
+    digests = outputs_by_threads(CHILD, repr(longest_ns), repr(least_cells), beside=__file__)
     assert len(digests[0].split()[-1]) == 64
     assert digests[0] == digests[1]
