@@ -19,6 +19,7 @@ from sim.cloth.self_collision_kernels import (
 )
 from sim.cloth.short_loops import NODE_NS, is_short
 from sim.reductions import LaneReduction
+from sim.work_sharing import workers_for
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -139,14 +140,14 @@ class SelfCollision:
             recovery: share of a missing distance that the substep gives back [-].
         """
         met = self._met
-        for pairs, are_edges in ((self.with_triangles, False), (self.of_edges, True)):
-            if met.due_count:
-                find_near_pairs(
-                    met.due_count, pairs.lanes, met.due, pairs.pieces, pairs.piece_due, pairs.vertices, pairs.wanted,
-                    pairs.due, met.slack, met.left, met.approach, met.allowed, are_edges, state.position,
-                    state.displacement, self._rest, state.body, state.thickness, state.friction, recovery,
-                    *contacts.found_arrays,
-                )  # fmt: skip
+        if met.due_count:
+            count, lanes = met.due_count, self.with_triangles.lanes
+            find_near_pairs(
+                count, lanes, workers_for(2 * count * lanes), self.with_triangles.taken, met.due,
+                *self.with_triangles.arrays, *self.of_edges.arrays, met.slack, met.left, met.approach, met.allowed,
+                state.position, state.displacement, self._rest, state.body, state.thickness, state.friction, recovery,
+                *contacts.found_arrays,
+            )  # fmt: skip
 
     @property
     def patches(self) -> PatchPairs:
