@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +19,7 @@ from sim.cloth.patch_motion_kernels import (
     sort_known,
 )
 from sim.cloth.patches import Patches
-from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces, make_room
+from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces
 from sim.cloth.short_loops import NODE_NS, is_short
 from sim.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
 from sim.work_sharing import workers_for
@@ -58,6 +57,8 @@ class PairList:
         due: they are looked at when `PatchPairs.left` is not above it [m], (capacity,).
         pieces: first place of each piece, places, and how many of them are taken, (pairs of patches,) ivec4.
         piece_due: the largest `due` of each piece [m]; `NEVER` where nothing is listed.
+        taken: see `sim.work_sharing`.
+        again: numbers of the pieces that `make_room` found too short.
 
     Args:
         capacity: pairs of elements to start with.
@@ -69,10 +70,6 @@ class PairList:
         self._end, self.taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 1)
         self._allocate(capacity)
         self.set_pieces(pieces)
-
-    def shared_by(self, count: int) -> tuple[int, int, ti.Ndarray]:
-        """Lanes that share one of so many pairs of patches, workers that share all of these, and what is taken."""
-        return self.lanes, workers_for(count * self.lanes), self.taken
 
     @property
     def arrays(self) -> tuple[ti.Ndarray, ...]:
@@ -87,7 +84,7 @@ class PairList:
         """Make room for the pieces of so many pairs of patches, all empty."""
         self.end = 0
         self._end.fill(0)
-        self.pieces, self.piece_due, self._again = _room_for_pieces(capacity)
+        self.pieces, self.piece_due, self.again = _room_for_pieces(capacity)
         self._spare_pieces = _room_for_pieces(capacity)
 
     def carry(self, count: int, carried: ti.Ndarray, capacity: int) -> None:
@@ -99,12 +96,12 @@ class PairList:
             capacity: most of them.
         """
         # Two sets of arrays in turn: new ones would have all launches prepared anew.
-        pieces, listed = (self.pieces, self.piece_due, self._again), self._listed
+        pieces, listed = (self.pieces, self.piece_due, self.again), self._listed
         if self._spare_pieces[0].shape[0] < capacity:
             self._spare_pieces = _room_for_pieces(capacity)
         if self._spare[0].shape[0] < self._capacity:
             self._spare = _room_for_pairs(self._capacity)
-        self.pieces, self.piece_due, self._again = self._spare_pieces
+        self.pieces, self.piece_due, self.again = self._spare_pieces
         self.vertices, self.wanted, self.due = self._spare
         self._spare_pieces, self._spare = pieces, listed
         self.end = int(
@@ -114,22 +111,22 @@ class PairList:
             )
         )  # fmt: skip
 
-    def fill(self, search: Callable[..., None], searched: ti.Ndarray, count: int, *arguments: object) -> None:
-        """Have a search list the elements of some pairs of patches, in empty pieces; the pieces of all others stay.
+    @property
+    def room_arrays(self) -> tuple[ti.Ndarray, ...]:
+        """What `make_room` takes: pieces, the end, and numbers of pieces to be searched again."""
+        return self.pieces, self._end, self.again
+
+    def reach_to(self, end: int) -> None:
+        """There are pieces up to this place now.
 
         Raises:
             OverflowError: more pairs than any useful step has.
         """
-        search(count, *self.shared_by(count), searched, *arguments, *self.arrays)
-        short, end = make_room(count, searched, self.pieces, self._end, self._again)[:2]
         if end < 0 or end > MAX_PAIRS:
             raise OverflowError(TOO_MANY)
         if end > self._capacity:
             self._grow(int(GROWTH * end))
-        self.end = int(end)
-        if short:
-            short = int(short)
-            search(short, *self.shared_by(short), self._again, *arguments, *self.arrays)
+        self.end = end
 
     def _allocate(self, capacity: int) -> None:
         self._capacity = capacity
