@@ -4,6 +4,7 @@ Sums of floating-point numbers depend on their order, so they are done in a fixe
 on the kind of device alone, each with its own share of the numbers, and a tree over the lanes. No float atomics.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +76,7 @@ class LaneReduction:
         """The maxima, then the sums, (maxima + sums,); waits for the device."""
         return self.unpack(reduce_lanes(*self.tree))
 
-    def unpack(self, results: ti.Vector) -> NDArray[np.float32]:
+    def unpack(self, results: Sequence[float]) -> NDArray[np.float32]:
         """The maxima, then the sums, (maxima + sums,), of what a kernel returned from `reduced`."""
         return np.array(results[: self._quantities], dtype=np.float32)
 

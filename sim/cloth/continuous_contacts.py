@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from sim.cloth.continuous_response import (
     STEPS,
-    begin_push,
     finish_push,
     push_apart,
     repair_crossings,
@@ -23,7 +22,6 @@ from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import SelfCollision, half_range
-from sim.cloth.self_collision_kernels import copy_vectors
 from sim.reductions import LaneReduction
 from sim.short_loops import is_short
 
@@ -139,9 +137,6 @@ class ContinuousContacts:
             if not found:
                 left = 0
                 break
-            copy_vectors(
-                state.displacement, state.vertex_count, self._predicted, is_short(state.vertex_count, COPIED_NODE_NS)
-            )
             self._push(state, found, is_first=True)
             left = self._keep_apart(state, found)
             change, beyond = self._pairs.measure_changes(state, self._predicted)
@@ -170,7 +165,8 @@ class ContinuousContacts:
         contacts, bodies, n = self._contacts, self.rigid.bodies, state.vertex_count
         pushing, touched = weigh_contacts(
             count, contacts.vertices, contacts.weights, contacts.floor, contacts.kind, contacts.arm, contacts.mobility,
-            contacts.impulse, contacts.pushing, self._counter, n, state.inverse_mass, self._shares, self._touched,
+            contacts.impulse, contacts.pushing, self._counter, n, state.displacement,
+            self._predicted, state.inverse_mass, self._shares, self._touched,
             *self._uses_of(contacts), bodies.count, bodies.inverse_mass, bodies.inverse_inertia, bodies.load,
             bodies.load_unit, is_first, self._is_short(count),
         )[:2]  # fmt: skip
@@ -184,18 +180,14 @@ class ContinuousContacts:
         """Some steps of the contact iteration; the most that a contact misses then, in its thickness."""
         contacts, bodies = self._contacts, self.rigid.bodies
         vertices, lanes, short = (touched, self._touched), self._missing.lanes, self._is_short(count)
-        begin_push(
-            count, contacts.pushing, contacts.impulse, contacts.impulse_before, contacts.impulse_given, *vertices,
-            state.displacement, self._start, self._reached, bodies.count, bodies.motion, bodies.motion_start,
-            bodies.motion_reached, short,
-        )  # fmt: skip
         uses = self._uses_of(contacts)
         for first in range(0, iterations, STEPS):
             push_apart(
-                tuple(k / (k + 3.0) for k in range(first, first + STEPS + 1)), count, contacts.pushing,
-                contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind, contacts.arm,
-                contacts.friction, contacts.mobility, contacts.impulse, contacts.impulse_before, contacts.push,
-                *vertices, state.displacement, self._reached, state.inverse_mass, *uses, bodies.count, bodies.motion,
+                tuple(k / (k + 3.0) for k in range(first, first + STEPS + 1)), int(first == 0), count,
+                contacts.pushing, contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind,
+                contacts.arm, contacts.friction, contacts.mobility, contacts.impulse, contacts.impulse_before,
+                contacts.impulse_given, contacts.push, *vertices, state.displacement, self._start, self._reached,
+                state.inverse_mass, *uses, bodies.count, bodies.motion, bodies.motion_start,
                 bodies.motion_reached, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered,
                 self._impulse_unit, short,
             )  # fmt: skip

@@ -34,8 +34,8 @@ LARGEST_SHARE = 0.9
 KEPT_BY_REPAIR = 0.3
 """Share of its separation that a pair keeps which would have crossed: above 1 - `LARGEST_SHARE`."""
 
-STEPS = 4
-"""Steps of the iteration in one launch."""
+STEPS = 8
+"""Steps of the iteration in one launch: what all iterations have at least."""
 
 Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
@@ -48,12 +48,13 @@ ROUNDING = 1.0e-6
 def weigh_contacts(
     count: ti.i32, vertices: Quadruples, weights: Weights, floor: Floats, kind: Integers, arm: Vectors,
     mobility: Floats, impulse: Vectors, pushing: Integers, counter: Integers,
-    vertex_count: ti.i32, inverse_mass: Floats, shares: Integers, touched: Integers,
-    uses: Integers, used_by: Integers, use_weight: Floats,
+    vertex_count: ti.i32, displacement: Vectors, predicted: Vectors, inverse_mass: Floats, shares: Integers,
+    touched: Integers, uses: Integers, used_by: Integers, use_weight: Floats,
     body_count: ti.i32, body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_load: LongIntegers,
     load_unit: ti.f32, is_first: ti.template(), is_short: ti.template(),
 ) -> ti.math.ivec2:  # fmt: skip
-    """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses.
+    """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses, and
+    keep what displacements were `predicted` without contacts.
 
     Returns how many there are, and how many vertices they push, which are listed too. Contacts whose free vertices
     weigh less than `LEAST_FREE_WEIGHT` do not push.
@@ -69,6 +70,8 @@ def weigh_contacts(
         ti.loop_config(serialize=True)
     for i in range(vertices_end):
         shares[i], uses[2 * i], uses[2 * i + 1] = 0, 0, 0
+        if ti.static(is_first):
+            predicted[i] = displacement[i]
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for b in range(bodies_end):
@@ -181,51 +184,42 @@ def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
 
 @fast_launch
 @ti.kernel
-def begin_push(
-    count: ti.i32, pushing: Integers, impulse: Vectors, impulse_before: Vectors, impulse_given: Vectors,
-    touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, reached: Vectors,
-    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors, is_short: ti.template(),
-):  # fmt: skip
-    """Note where the iteration starts."""
-    # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, touched_end, bodies_end = count, touched_count, 2 * body_count
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for place in range(touched_end):
-        i = touched[place]
-        start[i] = displacement[i]
-        reached[i] = displacement[i]
-    if ti.static(not runs_on_gpu()):
-        ti.loop_config(serialize=True)
-    for m in range(bodies_end):
-        body_start[m] = body_motion[m]
-        body_reached[m] = body_motion[m]
-    if ti.static(is_short):
-        ti.loop_config(serialize=True)
-    for place in range(contacts_end):
-        c = pushing[place]
-        impulse_before[c] = impulse[c]
-        impulse_given[c] = impulse[c]
-
-
-@fast_launch
-@ti.kernel
 def push_apart(
-    momenta: Momenta, count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights,
+    momenta: Momenta, starts: ti.i32, count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights,
     normal: Vectors, floor: Floats, kind: Integers, arm: Vectors, friction: Floats, mobility: Floats,
-    impulse: Vectors, impulse_before: Vectors, push: Vectors,
-    touched_count: ti.i32, touched: Integers, displacement: Vectors, reached: Vectors, inverse_mass: Floats,
-    uses: Integers, used_by: Integers, use_weight: Floats,
-    body_count: ti.i32, body_motion: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
+    impulse: Vectors, impulse_before: Vectors, impulse_given: Vectors, push: Vectors,
+    touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, reached: Vectors,
+    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats,
+    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
     body_inverse_inertia: Matrices, body_gathered: LongIntegers, unit: ti.f32, is_short: ti.template(),
 ):  # fmt: skip
     """Some steps of the iteration, `STEPS` in one launch; momenta are their beta_k, and that of the step after them.
+
+    The first launch of an iteration, which `starts` it, notes where that is.
 
     A step starts from impulses p_k + beta_k (p_k - p_{k-1}) and the displacements that belong to them. It leaves the
     displacements of the next, ahead by beta_{k+1} of those that it has `reached`.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     contacts_end, touched_end, bodies_end = count, touched_count, body_count
+    new_contacts_end, new_touched_end, new_bodies_end = starts * count, starts * touched_count, starts * 2 * body_count
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for place in range(new_touched_end):
+        i = touched[place]
+        start[i] = displacement[i]
+        reached[i] = displacement[i]
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    for m in range(new_bodies_end):
+        body_start[m] = body_motion[m]
+        body_reached[m] = body_motion[m]
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for place in range(new_contacts_end):
+        c = pushing[place]
+        impulse_before[c] = impulse[c]
+        impulse_given[c] = impulse[c]
     for step in ti.static(range(STEPS)):
         if ti.static(is_short):
             ti.loop_config(serialize=True)

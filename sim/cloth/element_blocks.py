@@ -13,6 +13,10 @@ from sim.cloth.self_collision_kernels import BLOCK, FAR, NONE, Pairs, Triples
 from sim.cloth.state import ClothState
 from sim.launch import fast_launch
 from sim.reductions import runs_on_gpu
+from sim.work_sharing import begin_sharing, next_item, workers_for
+
+PATCHES_AT_A_TIME = 8
+"""Patches that a thread takes at a time: most of them are not needed."""
 
 
 class ElementBlocks:
@@ -33,6 +37,7 @@ class ElementBlocks:
 
     def __init__(self, patches: Patches) -> None:
         self._patches = patches
+        self._taken = ti.ndarray(ti.i32, 1)
         self.edges = _blocks(patches.edges, patches.first_edge, patches.count)
         self.triangles = _blocks(patches.triangles, patches.first_triangle, patches.count)
 
@@ -48,8 +53,8 @@ class ElementBlocks:
             needed: by patch, whether a pair of it is searched; 0 after.
         """
         enclose_elements(
-            self._patches.count, needed, state.position, *self.edges, *self.triangles, count, searched, found,
-            found_edges,
+            self._patches.count, workers_for(self._patches.count), self._taken, needed, state.position, *self.edges,
+            *self.triangles, count, searched, found, found_edges,
         )  # fmt: skip
 
 
@@ -71,7 +76,7 @@ def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Nda
 @fast_launch
 @ti.kernel
 def enclose_elements(
-    patch_count: ti.i32, needed: Integers, position: Vectors,
+    patch_count: ti.i32, workers: ti.i32, taken: Integers, needed: Integers, position: Vectors,
     first_edges: Integers, edges: Pairs, mid_x: Floats, mid_y: Floats, mid_z: Floats,
     half_x: Floats, half_y: Floats, half_z: Floats,
     first_triangles: Integers, triangles: Triples, low_x: Floats, low_y: Floats, low_z: Floats,
@@ -79,25 +84,29 @@ def enclose_elements(
     count: ti.i32, searched: Integers, found: Quadruples, found_edges: Quadruples,
 ):  # fmt: skip
     """Midpoints of edges and half the vectors along them, and boxes of triangles, of the patches that are needed."""
-    for m in range(patch_count):
-        if needed[m] == 1:
-            needed[m] = 0
-            for place in range(first_edges[m] * BLOCK, first_edges[m + 1] * BLOCK):
-                middle, half = ti.math.vec3(FAR), ti.math.vec3(0.0)
-                if edges[place][0] != NONE:
-                    a, b = position[edges[place][0]], position[edges[place][1]]
-                    middle, half = 0.5 * (a + b), 0.5 * (b - a)
-                mid_x[place], mid_y[place], mid_z[place] = middle[0], middle[1], middle[2]
-                half_x[place], half_y[place], half_z[place] = half[0], half[1], half[2]
-            for place in range(first_triangles[m] * BLOCK, first_triangles[m + 1] * BLOCK):
-                low, high = ti.math.vec3(FAR), ti.math.vec3(-FAR)
-                if triangles[place][0] != NONE:
-                    a, b, c = (
-                        position[triangles[place][0]], position[triangles[place][1]], position[triangles[place][2]]
-                    )  # fmt: skip
-                    low, high = ti.min(a, b, c), ti.max(a, b, c)
-                low_x[place], low_y[place], low_z[place] = low[0], low[1], low[2]
-                high_x[place], high_y[place], high_z[place] = high[0], high[1], high[2]
+    begin_sharing(taken, 0)
+    for worker in range(workers):
+        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while m < patch_count:
+            if needed[m] == 1:
+                needed[m] = 0
+                for place in range(first_edges[m] * BLOCK, first_edges[m + 1] * BLOCK):
+                    middle, half = ti.math.vec3(FAR), ti.math.vec3(0.0)
+                    if edges[place][0] != NONE:
+                        a, b = position[edges[place][0]], position[edges[place][1]]
+                        middle, half = 0.5 * (a + b), 0.5 * (b - a)
+                    mid_x[place], mid_y[place], mid_z[place] = middle[0], middle[1], middle[2]
+                    half_x[place], half_y[place], half_z[place] = half[0], half[1], half[2]
+                for place in range(first_triangles[m] * BLOCK, first_triangles[m + 1] * BLOCK):
+                    low, high = ti.math.vec3(FAR), ti.math.vec3(-FAR)
+                    if triangles[place][0] != NONE:
+                        a, b, c = (
+                            position[triangles[place][0]], position[triangles[place][1]], position[triangles[place][2]]
+                        )  # fmt: skip
+                        low, high = ti.min(a, b, c), ti.max(a, b, c)
+                    low_x[place], low_y[place], low_z[place] = low[0], low[1], low[2]
+                    high_x[place], high_y[place], high_z[place] = high[0], high[1], high[2]
+            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for k in range(count):

@@ -6,6 +6,7 @@ from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE, Pairs
 from sim.launch import fast_launch
 from sim.reductions import Results, reduced, runs_on_gpu
+from sim.work_sharing import begin_sharing, next_item
 
 FAR = 1.0e30
 
@@ -20,6 +21,9 @@ has met unseen. What positions do besides their displacements, as they are round
 REGULARIZATION = 1.0e-5
 """Part of the inertia of a patch that is added to it, so that it has an inverse."""
 
+PATCHES_AT_A_TIME, PAIRS_AT_A_TIME, LANES_AT_A_TIME = 16, 256, 4
+"""Patches, pairs of them, and lanes of a reduction over them that a thread takes at a time."""
+
 SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
@@ -27,7 +31,8 @@ SKIN_IN_MOTIONS = 2.0
 @fast_launch
 @ti.kernel
 def look_at_patches(
-    vertex_count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, still: ti.f32,
+    vertex_count: ti.i32, workers: ti.i32, taken: Integers, items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
+    still: ti.f32,
     position: Vectors, displacement: Vectors, expected: Vectors,
     count: ti.i32, patch_items: ti.i32, patch_step: ti.i32, first_corner: Integers, corners: Integers,
     low: Vectors, high: Vectors, centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
@@ -45,6 +50,7 @@ def look_at_patches(
     where its last displacement should have led it; and how far the motion of a patch, with what was spent before
     and may come besides, passes the reach of the list of pairs of patches at most.
     """
+    workers_end = workers
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for lane in range(lanes):
@@ -61,19 +67,23 @@ def look_at_patches(
     ends = reduced(partial, lanes, 7, 7, nodes)
     middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
     astray = ti.sqrt(ends[6])
-    for lane in range(lanes):
-        beyond = -FAR
-        for k in range(patch_items):
-            m = lane * patch_step + k * item_step
-            if m < count:
-                fit_motion(
-                    m, still, first_corner, corners, position, displacement, low, high, centre, shift, turn, radius,
-                    rest,
-                )  # fmt: skip
-                motion[m] = (1.0 + SAFETY) * ((shift[m] - middle).norm() + turn[m].norm() * radius[m] + rest[m])
-                way[m] = spent[m] + astray + motion[m] + more[m]
-                beyond = ti.max(beyond, way[m] - reach[m])
-        partial[lane] = beyond
+    begin_sharing(taken, 0)
+    for worker in range(workers_end):
+        lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
+        while lane < lanes:
+            beyond = -FAR
+            for k in range(patch_items):
+                m = lane * patch_step + k * item_step
+                if m < count:
+                    fit_motion(
+                        m, still, first_corner, corners, position, displacement, low, high, centre, shift, turn, radius,
+                        rest,
+                    )  # fmt: skip
+                    motion[m] = (1.0 + SAFETY) * ((shift[m] - middle).norm() + turn[m].norm() * radius[m] + rest[m])
+                    way[m] = spent[m] + astray + motion[m] + more[m]
+                    beyond = ti.max(beyond, way[m] - reach[m])
+            partial[lane] = beyond
+            lane = next_item(lane, worker, taken, 0, LANES_AT_A_TIME)
     worst = reduced(partial, lanes, 1, 1, nodes)
     return Results(ends[0], ends[1], ends[2], ends[3], ends[4], ends[5], astray, worst[0])
 
@@ -185,8 +195,9 @@ def sort_known(
 @fast_launch
 @ti.kernel
 def pair_patches(
-    count: ti.i32, leaves: ti.i32, tree_low: Vectors, tree_high: Vectors, cloth: Integers, collides: Integers,
-    first_known: Integers, known: Integers, pairs_before: Pairs, slack_before: Floats,
+    count: ti.i32, workers: ti.i32, taken: Integers, leaves: ti.i32, tree_low: Vectors, tree_high: Vectors,
+    cloth: Integers, collides: Integers, first_known: Integers, known: Integers, pairs_before: Pairs,
+    slack_before: Floats,
     pairs: Pairs, carried: Integers, wake: Floats, slack: Floats, left: Floats, approach: Floats, allowed: Floats,
     counter: Integers, capacity: ti.i32,
 ) -> ti.i32:  # fmt: skip
@@ -196,35 +207,39 @@ def pair_patches(
     What was known before about a pair holds (`sort_known`): `carried` is its number there, or -1.
     """
     counter[0] = 0
-    for m in range(count):
-        least, most = tree_low[leaves + m], tree_high[leaves + m]
-        node = 1
-        while node > 0:
-            # The last leaf below a node: pairs are listed by the smaller of their numbers.
-            last = node
-            while last < leaves:
-                last = 2 * last + 1
-            is_near = (tree_low[node] <= most).all() and (tree_high[node] >= least).all()
-            if is_near and last - leaves >= m and node < leaves:
-                node = 2 * node
-            else:
-                other = node - leaves
-                if is_near and other >= m and (cloth[m] != cloth[other] or collides[cloth[m]] == 1):
-                    slot = ti.atomic_add(counter[0], 1)
-                    if slot < capacity:
-                        before = -1
-                        for place in range(first_known[2 * m], first_known[2 * m + 1]):
-                            if pairs_before[known[place]][1] == other:
-                                before = known[place]
-                        pairs[slot], carried[slot] = ti.Vector([m, other]), before
-                        wake[slot], left[slot], approach[slot], allowed[slot] = -1.0, FAR, 0.0, 0.0
-                        slack[slot] = -1.0
-                        if before >= 0:
-                            slack[slot] = slack_before[before]
-                # On to the next node that is not below this one; 0 after the last.
-                while node % 2 == 1:
-                    node = node // 2
-                node += ti.cast(node > 0, ti.i32)
+    begin_sharing(taken, 0)
+    for worker in range(workers):
+        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while m < count:
+            least, most = tree_low[leaves + m], tree_high[leaves + m]
+            node = 1
+            while node > 0:
+                # The last leaf below a node: pairs are listed by the smaller of their numbers.
+                last = node
+                while last < leaves:
+                    last = 2 * last + 1
+                is_near = (tree_low[node] <= most).all() and (tree_high[node] >= least).all()
+                if is_near and last - leaves >= m and node < leaves:
+                    node = 2 * node
+                else:
+                    other = node - leaves
+                    if is_near and other >= m and (cloth[m] != cloth[other] or collides[cloth[m]] == 1):
+                        slot = ti.atomic_add(counter[0], 1)
+                        if slot < capacity:
+                            before = -1
+                            for place in range(first_known[2 * m], first_known[2 * m + 1]):
+                                if pairs_before[known[place]][1] == other:
+                                    before = known[place]
+                            pairs[slot], carried[slot] = ti.Vector([m, other]), before
+                            wake[slot], left[slot], approach[slot], allowed[slot] = -1.0, FAR, 0.0, 0.0
+                            slack[slot] = -1.0
+                            if before >= 0:
+                                slack[slot] = slack_before[before]
+                    # On to the next node that is not below this one; 0 after the last.
+                    while node % 2 == 1:
+                        node = node // 2
+                    node += ti.cast(node > 0, ti.i32)
+            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
     return counter[0]
 
 
@@ -253,9 +268,10 @@ def approach_of(
 @fast_launch
 @ti.kernel
 def age_pairs(
-    count: ti.i32, pairs: Pairs, low: Vectors, high: Vectors, centre: Vectors, shift: Vectors, turn: Vectors,
-    radius: Floats, rest: Floats, motion: Floats, margin: Floats, more: Floats, spent: Floats, way: Floats,
-    thickness: ti.f32, least_skin: ti.f32, astray: ti.f32, wake: Floats, slack: Floats, left: Floats,
+    count: ti.i32, workers: ti.i32, taken: Integers, pairs: Pairs, low: Vectors, high: Vectors, centre: Vectors,
+    shift: Vectors, turn: Vectors, radius: Floats, rest: Floats, motion: Floats, margin: Floats, more: Floats,
+    spent: Floats,
+    way: Floats, thickness: ti.f32, least_skin: ti.f32, astray: ti.f32, wake: Floats, slack: Floats, left: Floats,
     approach: Floats, allowed: Floats, reach: Floats, first_due: Floats, first_due_of_edges: Floats,
     due: Integers, expired: Integers, needed: Integers, counter: Integers,
 ) -> ti.math.ivec2:  # fmt: skip
@@ -282,38 +298,43 @@ def age_pairs(
         reach: how far to search for elements, so that the list lasts for some substeps [m].
     """
     counter[0], counter[1] = 0, 0
-    for p in range(count):
-        m, other = pairs[p][0], pairs[p][1]
-        if way[m] + way[other] > wake[p]:
-            whole, besides = motion[m] + motion[other], more[m] + more[other]
-            nearer = ti.min(approach_of(m, other, centre, shift, turn, radius, rest), whole)
-            approach[p], allowed[p] = nearer, margin[m] + margin[other]
-            slack[p] -= 2.0 * astray
-            is_searched = False
-            if slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
-                gap = gap_of_boxes(m, other, low, high) - (1.0 + SAFETY_OF_DUE) * thickness
-                if gap > whole + besides:
-                    wake[p], slack[p] = spent[m] + spent[other] + 2.0 * astray + gap, -1.0
-                    approach[p], allowed[p], left[p] = 0.0, 0.0, FAR
-                else:
-                    skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
-                    wake[p], slack[p], reach[p] = -1.0, skin, thickness + skin
-                    is_searched = True
-                    expired[ti.atomic_add(counter[0], 1)] = p
-                    needed[m], needed[other] = 1, 1
-            if wake[p] < 0.0:
-                left[p] = slack[p] - ti.max(thickness, nearer + allowed[p]) - SAFETY_OF_DUE * thickness
-                if is_searched or first_due[p] >= left[p] or first_due_of_edges[p] >= left[p]:
-                    due[ti.atomic_add(counter[1], 1)] = p
-                    first_due[p], first_due_of_edges[p] = NEVER, NEVER
+    begin_sharing(taken, 0)
+    for worker in range(workers):
+        p = next_item(-1, worker, taken, 0, PAIRS_AT_A_TIME)
+        while p < count:
+            m, other = pairs[p][0], pairs[p][1]
+            if way[m] + way[other] > wake[p]:
+                whole, besides = motion[m] + motion[other], more[m] + more[other]
+                nearer = ti.min(approach_of(m, other, centre, shift, turn, radius, rest), whole)
+                approach[p], allowed[p] = nearer, margin[m] + margin[other]
+                slack[p] -= 2.0 * astray
+                is_searched = False
+                if slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
+                    gap = gap_of_boxes(m, other, low, high) - (1.0 + SAFETY_OF_DUE) * thickness
+                    if gap > whole + besides:
+                        wake[p], slack[p] = spent[m] + spent[other] + 2.0 * astray + gap, -1.0
+                        approach[p], allowed[p], left[p] = 0.0, 0.0, FAR
+                    else:
+                        skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
+                        wake[p], slack[p], reach[p] = -1.0, skin, thickness + skin
+                        is_searched = True
+                        expired[ti.atomic_add(counter[0], 1)] = p
+                        needed[m], needed[other] = 1, 1
+                if wake[p] < 0.0:
+                    left[p] = slack[p] - ti.max(thickness, nearer + allowed[p]) - SAFETY_OF_DUE * thickness
+                    if is_searched or first_due[p] >= left[p] or first_due_of_edges[p] >= left[p]:
+                        due[ti.atomic_add(counter[1], 1)] = p
+                        first_due[p], first_due_of_edges[p] = NEVER, NEVER
+            p = next_item(p, worker, taken, 0, PAIRS_AT_A_TIME)
     return ti.math.ivec2(counter[0], counter[1])
 
 
 @fast_launch
 @ti.kernel
 def measure_changes(
-    count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, first_corner: Integers, corners: Integers,
-    displacement: Vectors, predicted: Vectors, half_thickness: ti.f32, change: Floats, margin: Floats, more: Floats,
+    count: ti.i32, workers: ti.i32, taken: Integers, items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
+    first_corner: Integers, corners: Integers, displacement: Vectors, predicted: Vectors, half_thickness: ti.f32,
+    change: Floats, margin: Floats, more: Floats,
     partial: Floats, lanes: ti.i32, nodes: Floats,
 ) -> ti.math.vec2:  # fmt: skip
     """How far contacts displaced the vertices of each patch, `change` [m]; where that is beyond the `margin` that was
@@ -321,22 +342,26 @@ def measure_changes(
 
     Returns the largest change, and the largest that is beyond its margin, or 0.
     """
-    for lane in range(lanes):
-        largest, largest_beyond = 0.0, 0.0
-        for k in range(items):
-            m = lane * lane_step + k * item_step
-            if m < count:
-                squared = 0.0
-                for place in range(first_corner[m], first_corner[m + 1]):
-                    i = corners[place]
-                    squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
-                change[m] = ti.sqrt(squared)
-                largest = ti.max(largest, change[m])
-                if change[m] > margin[m]:
-                    largest_beyond = ti.max(largest_beyond, change[m])
-                    margin[m] = 1.5 * change[m]
-                    more[m] = margin[m] - half_thickness
-        partial[lane], partial[lanes + lane] = largest, largest_beyond
+    begin_sharing(taken, 0)
+    for worker in range(workers):
+        lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
+        while lane < lanes:
+            largest, largest_beyond = 0.0, 0.0
+            for k in range(items):
+                m = lane * lane_step + k * item_step
+                if m < count:
+                    squared = 0.0
+                    for place in range(first_corner[m], first_corner[m + 1]):
+                        i = corners[place]
+                        squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
+                    change[m] = ti.sqrt(squared)
+                    largest = ti.max(largest, change[m])
+                    if change[m] > margin[m]:
+                        largest_beyond = ti.max(largest_beyond, change[m])
+                        margin[m] = 1.5 * change[m]
+                        more[m] = margin[m] - half_thickness
+            partial[lane], partial[lanes + lane] = largest, largest_beyond
+            lane = next_item(lane, worker, taken, 0, LANES_AT_A_TIME)
     results = reduced(partial, lanes, 2, 2, nodes)
     return ti.math.vec2(results[0], results[1])
 
@@ -345,7 +370,8 @@ def measure_changes(
 @ti.kernel
 def finish_patches(
     vertex_count: ti.i32, still: ti.f32, position: Vectors, displacement: Vectors, expected: Vectors,
-    count: ti.i32, first_corner: Integers, corners: Integers, low: Vectors, high: Vectors,
+    count: ti.i32, patch_workers: ti.i32, pair_workers: ti.i32, taken: Integers, first_corner: Integers,
+    corners: Integers, low: Vectors, high: Vectors,
     centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
     motion: Floats, change: Floats, is_changed: ti.i32, astray: ti.f32, negligible: ti.f32, least_margin: ti.f32,
     half_thickness: ti.f32, margin: Floats, more: Floats, spent: Floats,
@@ -358,26 +384,36 @@ def finish_patches(
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     vertices_end, patches_end, pairs_end = vertex_count, count, pair_count
+    first_end, second_end = patch_workers, pair_workers
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for i in range(vertices_end):
         expected[i] = position[i] + displacement[i]
-    for m in range(patches_end):
-        change[m] = ti.select(is_changed == 1, change[m], 0.0)
-        spent[m] += motion[m] + change[m] + astray
-        margin[m] = ti.max(least_margin, 1.25 * change[m])
-        more[m] = ti.max(margin[m] - half_thickness, 0.0)
-        if change[m] > negligible:
-            fit_motion(
-                m, still, first_corner, corners, position, displacement, low, high, centre, shift, turn, radius, rest
-            )  # fmt: skip
-    for p in range(pairs_end):
-        if slack[p] > 0.0:
-            m, other = pairs[p][0], pairs[p][1]
-            nearer = approach[p] + change[m] + change[other]
-            if ti.max(change[m], change[other]) > negligible:
-                nearer = approach_of(m, other, centre, shift, turn, radius, rest)
-                # A patch that was not fitted anew moves as noted, but for its change.
-                nearer += ti.select(change[m] > negligible, 0.0, change[m])
-                nearer += ti.select(change[other] > negligible, 0.0, change[other])
-            slack[p] -= nearer
+    begin_sharing(taken, 0)
+    for worker in range(first_end):
+        m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while m < patches_end:
+            change[m] = ti.select(is_changed == 1, change[m], 0.0)
+            spent[m] += motion[m] + change[m] + astray
+            margin[m] = ti.max(least_margin, 1.25 * change[m])
+            more[m] = ti.max(margin[m] - half_thickness, 0.0)
+            if change[m] > negligible:
+                fit_motion(
+                    m, still, first_corner, corners, position, displacement, low, high, centre, shift, turn, radius,
+                    rest,
+                )  # fmt: skip
+            m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
+    begin_sharing(taken, 1)
+    for worker in range(second_end):
+        p = next_item(-1, worker, taken, 1, PAIRS_AT_A_TIME)
+        while p < pairs_end:
+            if slack[p] > 0.0:
+                m, other = pairs[p][0], pairs[p][1]
+                nearer = approach[p] + change[m] + change[other]
+                if ti.max(change[m], change[other]) > negligible:
+                    nearer = approach_of(m, other, centre, shift, turn, radius, rest)
+                    # A patch that was not fitted anew moves as noted, but for its change.
+                    nearer += ti.select(change[m] > negligible, 0.0, change[m])
+                    nearer += ti.select(change[other] > negligible, 0.0, change[other])
+                slack[p] -= nearer
+            p = next_item(p, worker, taken, 1, PAIRS_AT_A_TIME)

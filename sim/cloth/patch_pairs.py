@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,9 +20,10 @@ from sim.cloth.patch_motion_kernels import (
     sort_known,
 )
 from sim.cloth.patches import Patches
-from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces, make_room
+from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces
 from sim.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
 from sim.short_loops import is_short
+from sim.work_sharing import workers_for
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -58,6 +58,8 @@ class PairList:
         due: they are looked at when `PatchPairs.left` is not above it [m], (capacity,).
         pieces: first place of each piece, places, and how many of them are taken, (pairs of patches,) ivec4.
         piece_due: the largest `due` of each piece [m]; `NEVER` where nothing is listed.
+        taken: see `sim.work_sharing`.
+        again: numbers of the pieces that `make_room` found too short.
 
     Args:
         capacity: pairs of elements to start with.
@@ -66,9 +68,14 @@ class PairList:
 
     def __init__(self, *, capacity: int, pieces: int) -> None:
         self.lanes = LANES if runs_on_gpu() else 1
-        self._end = ti.ndarray(ti.i32, 2)
+        self._end, self.taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 1)
         self._allocate(capacity)
         self.set_pieces(pieces)
+
+    @property
+    def arrays(self) -> tuple[ti.Ndarray, ...]:
+        """What a kernel takes that looks at the pairs: pieces, when they are due, and `_listed`."""
+        return self.pieces, self.piece_due, *self._listed
 
     @property
     def _listed(self) -> tuple[ti.Ndarray, ...]:
@@ -78,7 +85,7 @@ class PairList:
         """Make room for the pieces of so many pairs of patches, all empty."""
         self.end = 0
         self._end.fill(0)
-        self.pieces, self.piece_due, self._again = _room_for_pieces(capacity)
+        self.pieces, self.piece_due, self.again = _room_for_pieces(capacity)
         self._spare_pieces = _room_for_pieces(capacity)
 
     def carry(self, count: int, carried: ti.Ndarray, capacity: int) -> None:
@@ -90,33 +97,37 @@ class PairList:
             capacity: most of them.
         """
         # Two sets of arrays in turn: new ones would have all launches prepared anew.
-        pieces, listed = (self.pieces, self.piece_due, self._again), self._listed
+        pieces, listed = (self.pieces, self.piece_due, self.again), self._listed
         if self._spare_pieces[0].shape[0] < capacity:
             self._spare_pieces = _room_for_pieces(capacity)
         if self._spare[0].shape[0] < self._capacity:
             self._spare = _room_for_pairs(self._capacity)
-        self.pieces, self.piece_due, self._again = self._spare_pieces
+        self.pieces, self.piece_due, self.again = self._spare_pieces
         self.vertices, self.wanted, self.due = self._spare
         self._spare_pieces, self._spare = pieces, listed
         self.end = int(
-            carry_pieces(count, carried, *pieces[:2], *listed, self.pieces, self.piece_due, *self._listed, self._end)
-        )
+            carry_pieces(
+                count, workers_for(count), self.taken, carried, *pieces[:2], *listed, self.pieces, self.piece_due,
+                *self._listed, self._end,
+            )
+        )  # fmt: skip
 
-    def fill(self, search: Callable[..., None], searched: ti.Ndarray, count: int, *arguments: object) -> None:
-        """Have a search list the elements of some pairs of patches, in empty pieces; the pieces of all others stay.
+    @property
+    def room_arrays(self) -> tuple[ti.Ndarray, ...]:
+        """What `make_room` takes: pieces, the end, and numbers of pieces to be searched again."""
+        return self.pieces, self._end, self.again
+
+    def reach_to(self, end: int) -> None:
+        """There are pieces up to this place now.
 
         Raises:
             OverflowError: more pairs than any useful step has.
         """
-        search(count, self.lanes, searched, *arguments, self.pieces, self.piece_due, *self._listed)
-        short, end = make_room(count, searched, self.pieces, self._end, self._again)[:2]
         if end < 0 or end > MAX_PAIRS:
             raise OverflowError(TOO_MANY)
         if end > self._capacity:
             self._grow(int(GROWTH * end))
-        self.end = int(end)
-        if short:
-            search(int(short), self.lanes, self._again, *arguments, self.pieces, self.piece_due, *self._listed)
+        self.end = end
 
     def _allocate(self, capacity: int) -> None:
         self._capacity = capacity
@@ -191,7 +202,7 @@ class PatchPairs:
         ) = (ti.ndarray(ti.f32, m) for _ in range(9))
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
         self._tree_low, self._tree_high = (ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2))
-        self._counter = ti.ndarray(ti.i32, 2)
+        self._counter, self._taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 2)
         self._first_known = ti.ndarray(ti.i32, 2 * m)
         self.needed = ti.ndarray(ti.i32, m)
         self.needed.fill(0)
@@ -234,9 +245,10 @@ class PatchPairs:
         patches, lanes, n = self.patches, self._maxima.lanes, self.patches.vertex_count
         partial, lane_count, *_, nodes = self._maxima.tree
         *ends, self._astray, beyond = look_at_patches(
-            n, lanes.items(n), lanes.lane_step(n), lanes.item_step(), self._still, state.position,
-            state.displacement, self._expected, patches.count, lanes.items(patches.count),
-            lanes.lane_step(patches.count), patches.first_corner, patches.corners, *self._fitted, self._motion,
+            n, workers_for(lanes.count), self._taken, lanes.items(n), lanes.lane_step(n), lanes.item_step(),
+            self._still, state.position, state.displacement, self._expected, patches.count,
+            lanes.items(patches.count), lanes.lane_step(patches.count), patches.first_corner, patches.corners,
+            *self._fitted, self._motion,
             self._more, self._spent, self._reach, self._way, partial, lane_count, nodes, self._is_short,
         )  # fmt: skip
         return np.array(ends, dtype=np.float64), beyond <= 0.0
@@ -271,8 +283,9 @@ class PatchPairs:
         self._spare = before
         while True:
             found = pair_patches(
-                patches.count, patches.leaves, *tree, patches.cloth, collides, *known, *before, self.pairs,
-                self.carried, self._wake, self.slack, self.left, self.approach, self.allowed, self._counter,
+                patches.count, workers_for(patches.count), self._taken, patches.leaves, *tree, patches.cloth,
+                collides, *known, *before, self.pairs, self.carried, self._wake, self.slack, self.left, self.approach,
+                self.allowed, self._counter,
                 self.capacity,
             )  # fmt: skip
             if found < 0 or found > MAX_PAIRS:
@@ -292,9 +305,9 @@ class PatchPairs:
             first_due: `PairList.piece_due` of both lists; `NEVER` after this where a pair is due.
         """
         expired, due = age_pairs(
-            self.count, self.pairs, *self._fitted, self._motion, self._margin, self._more, self._spent, self._way,
-            thickness, least_skin, self._astray, self._wake, self.slack, self.left, self.approach, self.allowed,
-            self.reach, *first_due, self.due, self.expired, self.needed, self._counter,
+            self.count, workers_for(self.count), self._taken, self.pairs, *self._fitted, self._motion, self._margin,
+            self._more, self._spent, self._way, thickness, least_skin, self._astray, self._wake, self.slack, self.left,
+            self.approach, self.allowed, self.reach, *first_due, self.due, self.expired, self.needed, self._counter,
         )[:2]  # fmt: skip
         self.due_count = int(due)
         return int(expired)
@@ -307,9 +320,10 @@ class PatchPairs:
         patches, lanes = self.patches, self._maxima.lanes
         partial, lane_count, *_, nodes = self._maxima.tree
         largest, beyond = measure_changes(
-            patches.count, lanes.items(patches.count), lanes.lane_step(patches.count), lanes.item_step(),
-            patches.first_corner, patches.corners, state.displacement, predicted, self._half_thickness, self._change,
-            self._margin, self._more, partial, lane_count, nodes,
+            patches.count, workers_for(lanes.count), self._taken, lanes.items(patches.count),
+            lanes.lane_step(patches.count), lanes.item_step(), patches.first_corner, patches.corners,
+            state.displacement, predicted,
+            self._half_thickness, self._change, self._margin, self._more, partial, lane_count, nodes,
         )  # fmt: skip
         return float(largest), float(beyond)
 
@@ -324,8 +338,9 @@ class PatchPairs:
         patches = self.patches
         finish_patches(
             patches.vertex_count, self._still, state.position, state.displacement, self._expected,
-            patches.count, patches.first_corner, patches.corners, *self._fitted, self._motion, self._change,
-            int(is_changed), self._astray, negligible, MARGIN * 2.0 * self._half_thickness, self._half_thickness,
-            self._margin, self._more, self._spent, self.count, self.pairs, self.approach, self.slack,
+            patches.count, workers_for(patches.count), workers_for(self.count), self._taken, patches.first_corner,
+            patches.corners, *self._fitted, self._motion, self._change, int(is_changed), self._astray, negligible,
+            MARGIN * 2.0 * self._half_thickness, self._half_thickness, self._margin, self._more, self._spent,
+            self.count, self.pairs, self.approach, self.slack,
             self._is_short,
         )  # fmt: skip

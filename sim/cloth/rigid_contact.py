@@ -23,9 +23,13 @@ from sim.rigid.geometry import BodyGeometry
 from sim.rigid.shape_distances import CountTriples, distance_at
 from sim.rigid.walls import Wall
 from sim.short_loops import is_short
+from sim.work_sharing import begin_sharing, next_item, workers_for
 
 Array = NDArray[np.float64]
 Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
+
+PATCHES_AT_A_TIME = 4
+"""Patches that a thread takes at a time: those that touch a body take some microseconds each."""
 
 LARGEST_ADVANCE = 0.25
 """How far cloth and bodies may move against each other in a step, in half shortest edges of the smallest body."""
@@ -83,6 +87,7 @@ class RigidContact:
         self._surface_speed = 0.0
         self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
         self._spacing, self._largest_half = 0.0, 0.0
+        self._taken = ti.ndarray(ti.i32, 1)
         self._wall_count = len(walls)
         room = max(len(walls), 1)
         self._wall_plane = ti.Vector.ndarray(4, ti.f32, room)
@@ -172,11 +177,15 @@ class RigidContact:
             each.friction, each.grid_values, each.grid_first, each.grid_origin, each.grid_spacing, each.grid_shape,
             each.position, each.rotation, each.motion,
         )  # fmt: skip
-        find_body_contacts_of_vertices(*own, self._largest_half, *cloth, *bodies, recovery, *contacts.found_arrays)
+        workers = workers_for(patches.count * lanes), self._taken
+        find_body_contacts_of_vertices(
+            *own[:2], *workers, *own[2:], self._largest_half, *cloth, *bodies, recovery, *contacts.found_arrays
+        )  # fmt: skip
         if self._has_edges:
             find_body_contacts_between_vertices(
-                patches.count, lanes, patches.first_edge, patches.edges, patches.first_triangle, patches.triangles,
-                *moved.motion_arrays, self._largest_half, *cloth, *bodies, recovery, *contacts.found_arrays,
+                patches.count, lanes, *workers, patches.first_edge, patches.edges, patches.first_triangle,
+                patches.triangles, *moved.motion_arrays, self._largest_half, *cloth, *bodies, recovery,
+                *contacts.found_arrays,
             )  # fmt: skip
 
 
@@ -303,8 +312,9 @@ def touch_bodies(
 @fast_launch
 @ti.kernel
 def find_body_contacts_of_vertices(
-    patch_count: ti.i32, lanes: ti.i32, first_vertex: Integers, patch_vertices: Integers,
-    centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats, largest_half: ti.f32,
+    patch_count: ti.i32, lanes: ti.i32, workers: ti.i32, taken: Integers, first_vertex: Integers,
+    patch_vertices: Integers, centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats,
+    largest_half: ti.f32,
     position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
     body_count: ti.i32, shape_kind: Integers, size: Vectors, has_edges: Integers, centre_of_mass: Vectors,
     radius: Floats, step: Floats, body_friction: Floats, grid_values: Floats, grid_first: Integers,
@@ -314,29 +324,33 @@ def find_body_contacts_of_vertices(
     friction: Floats, counter: Integers, capacity: ti.i32,
 ):  # fmt: skip
     """Append the contacts of vertices with bodies."""
-    for item in range(patch_count * lanes):
-        m = item // lanes
-        may_touch = may_touch_bodies(
-            m, centre, shift, turn, patch_radius, rest, largest_half, body_count, radius, body_position, motion
-        )
-        place = ti.select(may_touch == 1, first_vertex[m], first_vertex[m + 1]) + item % lanes
-        while place < first_vertex[m + 1]:
-            i = patch_vertices[place]
-            touch_bodies(
-                position[i], displacement[i], 0.5 * thickness[i], vertex_friction[i],
-                Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0), False, recovery,
-                body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-                grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-                vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-            )  # fmt: skip
-            place += lanes
+    begin_sharing(taken, 0)
+    for worker in range(workers):
+        item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while item < patch_count * lanes:
+            m = item // lanes
+            may_touch = may_touch_bodies(
+                m, centre, shift, turn, patch_radius, rest, largest_half, body_count, radius, body_position, motion
+            )
+            place = ti.select(may_touch == 1, first_vertex[m], first_vertex[m + 1]) + item % lanes
+            while place < first_vertex[m + 1]:
+                i = patch_vertices[place]
+                touch_bodies(
+                    position[i], displacement[i], 0.5 * thickness[i], vertex_friction[i],
+                    Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0), False, recovery,
+                    body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
+                    grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
+                    vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
+                )  # fmt: skip
+                place += lanes
+            item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
 
 
 @fast_launch
 @ti.kernel
 def find_body_contacts_between_vertices(
-    patch_count: ti.i32, lanes: ti.i32, first_edge: Integers, edges: Pairs, first_triangle: Integers,
-    triangles: Triples,
+    patch_count: ti.i32, lanes: ti.i32, workers: ti.i32, taken: Integers, first_edge: Integers,
+    edges: Pairs, first_triangle: Integers, triangles: Triples,
     centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats, largest_half: ti.f32,
     position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
     body_count: ti.i32, shape_kind: Integers, size: Vectors, has_edges: Integers, centre_of_mass: Vectors,
@@ -347,32 +361,36 @@ def find_body_contacts_between_vertices(
     friction: Floats, counter: Integers, capacity: ti.i32,
 ):  # fmt: skip
     """Append the contacts of midpoints of edges and triangles with bodies that have edges of their own."""
-    for item in range(patch_count * lanes):
-        m = item // lanes
-        may_touch = may_touch_bodies(
-            m, centre, shift, turn, patch_radius, rest, largest_half, body_count, radius, body_position, motion
-        )
-        place = ti.select(may_touch == 1, first_edge[m], first_edge[m + 1]) + item % lanes
-        while place < first_edge[m + 1]:
-            a, b = edges[place][0], edges[place][1]
-            touch_bodies(
-                0.5 * (position[a] + position[b]), 0.5 * (displacement[a] + displacement[b]), 0.5 * thickness[a],
-                vertex_friction[a], Four(a, b, a, a), ti.math.vec4(0.5, 0.5, 0.0, 0.0), True, recovery,
-                body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-                grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-                vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-            )  # fmt: skip
-            place += lanes
-        place = ti.select(may_touch == 1, first_triangle[m], first_triangle[m + 1]) + item % lanes
-        while place < first_triangle[m + 1]:
-            a, b, c = triangles[place][0], triangles[place][1], triangles[place][2]
-            third = 1.0 / 3.0
-            touch_bodies(
-                third * (position[a] + position[b] + position[c]),
-                third * (displacement[a] + displacement[b] + displacement[c]), 0.5 * thickness[a],
-                vertex_friction[a], Four(a, b, c, a), ti.math.vec4(third, third, third, 0.0), True, recovery,
-                body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-                grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-                vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-            )  # fmt: skip
-            place += lanes
+    begin_sharing(taken, 0)
+    for worker in range(workers):
+        item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
+        while item < patch_count * lanes:
+            m = item // lanes
+            may_touch = may_touch_bodies(
+                m, centre, shift, turn, patch_radius, rest, largest_half, body_count, radius, body_position, motion
+            )
+            place = ti.select(may_touch == 1, first_edge[m], first_edge[m + 1]) + item % lanes
+            while place < first_edge[m + 1]:
+                a, b = edges[place][0], edges[place][1]
+                touch_bodies(
+                    0.5 * (position[a] + position[b]), 0.5 * (displacement[a] + displacement[b]), 0.5 * thickness[a],
+                    vertex_friction[a], Four(a, b, a, a), ti.math.vec4(0.5, 0.5, 0.0, 0.0), True, recovery,
+                    body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
+                    grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
+                    vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
+                )  # fmt: skip
+                place += lanes
+            place = ti.select(may_touch == 1, first_triangle[m], first_triangle[m + 1]) + item % lanes
+            while place < first_triangle[m + 1]:
+                a, b, c = triangles[place][0], triangles[place][1], triangles[place][2]
+                third = 1.0 / 3.0
+                touch_bodies(
+                    third * (position[a] + position[b] + position[c]),
+                    third * (displacement[a] + displacement[b] + displacement[c]), 0.5 * thickness[a],
+                    vertex_friction[a], Four(a, b, c, a), ti.math.vec4(third, third, third, 0.0), True, recovery,
+                    body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
+                    grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
+                    vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
+                )  # fmt: skip
+                place += lanes
+            item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)

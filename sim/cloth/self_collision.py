@@ -14,12 +14,13 @@ from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.self_collision_kernels import (
     find_near_pairs,
-    pair_edges,
-    pair_vertices_with_triangles,
+    make_room,
     range_of_vectors,
+    search_patches,
 )
 from sim.reductions import LaneReduction
 from sim.short_loops import is_short
+from sim.work_sharing import workers_for
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -140,14 +141,14 @@ class SelfCollision:
             recovery: share of a missing distance that the substep gives back [-].
         """
         met = self._met
-        for pairs, are_edges in ((self.with_triangles, False), (self.of_edges, True)):
-            if met.due_count:
-                find_near_pairs(
-                    met.due_count, pairs.lanes, met.due, pairs.pieces, pairs.piece_due, pairs.vertices, pairs.wanted,
-                    pairs.due, met.slack, met.left, met.approach, met.allowed, are_edges, state.position,
-                    state.displacement, self._rest, state.body, state.thickness, state.friction, recovery,
-                    *contacts.found_arrays,
-                )  # fmt: skip
+        if met.due_count:
+            count, lanes = met.due_count, self.with_triangles.lanes
+            find_near_pairs(
+                count, lanes, workers_for(2 * count * lanes), self.with_triangles.taken, met.due,
+                *self.with_triangles.arrays, *self.of_edges.arrays, met.slack, met.left, met.approach, met.allowed,
+                state.position, state.displacement, self._rest, state.body, state.thickness, state.friction, recovery,
+                *contacts.found_arrays,
+            )  # fmt: skip
 
     @property
     def patches(self) -> PatchPairs:
@@ -156,15 +157,29 @@ class SelfCollision:
 
     def _search(self, state: ClothState, count: int) -> None:
         """Search the pairs of patches that have to be."""
-        met, patches = self._met, self._patches
+        met = self._met
         self._searched += count
-        where = (met.pairs, met.low, met.high, met.reach)
         self._blocks.enclose(state, met.expired, count, self.with_triangles.pieces, self.of_edges.pieces, met.needed)
-        vertices = (state.position, patches.first_vertex, patches.vertices)
-        self.with_triangles.fill(
-            pair_vertices_with_triangles, met.expired, count, *where, *vertices, *self._blocks.triangles, met.slack
+        self._list(state, count, met.expired, count, met.expired)
+        short, end, short_edges, end_of_edges = make_room(
+            count, met.expired, *self.with_triangles.room_arrays, *self.of_edges.room_arrays
         )
-        self.of_edges.fill(pair_edges, met.expired, count, *where, *self._blocks.edges, met.slack)
+        self.with_triangles.reach_to(int(end))
+        self.of_edges.reach_to(int(end_of_edges))
+        if short or short_edges:
+            self._list(state, int(short), self.with_triangles.again, int(short_edges), self.of_edges.again)
+
+    def _list(
+        self, state: ClothState, count: int, searched: ti.Ndarray, edge_count: int, edge_searched: ti.Ndarray
+    ) -> None:
+        """List the elements of some pairs of patches in empty pieces, vertices and edges; all other pieces stay."""
+        met, patches, lanes = self._met, self._patches, self.with_triangles.lanes
+        search_patches(
+            count, searched, edge_count, edge_searched, lanes, workers_for((count + edge_count) * lanes),
+            self.with_triangles.taken, met.pairs, met.low, met.high, met.reach, state.position, patches.first_vertex,
+            patches.vertices, *self._blocks.triangles, *self._blocks.edges, met.slack, *self.with_triangles.arrays,
+            *self.of_edges.arrays,
+        )  # fmt: skip
 
 
 def half_range(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple[float, float]:
