@@ -124,15 +124,18 @@ class SceneRenderer:
     def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> None:
         name, kind = description["name"], description["type"]
         look = description["material"]["look"]
+        at_rest = geometry.read_ply(self._folder / description["file"]) if kind in ("mesh", "moving_mesh") else None
         context = LookContext.of(
             description["material"],
             domain_size=_domain_size(spec),
             pixel_angle=camera.pixel_angle(spec),
             smoke_box=_smoke_box(description) if kind == "volume_sequence" else None,
+            surface="sheet" if kind == "mesh_sequence" else "body",
+            edges=None if at_rest is None else at_rest.edges(),
         )
         material = looks.new_material(name, look, context)
-        if kind in ("mesh", "moving_mesh"):
-            blender_object = geometry.new_mesh_object(name, geometry.read_ply(self._folder / description["file"]))
+        if at_rest is not None:
+            blender_object = geometry.new_mesh_object(name, at_rest)
             blender_object.rotation_mode = "QUATERNION"
             if kind == "mesh":
                 blender_object.location = description["position"]

@@ -130,8 +130,8 @@ class StageParameters(Parameters):
 
 
 Look = Literal[
-    "water", "smoke", "fire", "rubber", "ceramic", "plastic", "metal", "stone", "glass", "spray", "foam", "bubbles",
-    "cotton", "silk", "denim",
+    "water", "honey", "milk", "smoke", "fire", "rubber", "ceramic", "plastic", "metal", "stone", "wood", "glass",
+    "spray", "foam", "bubbles", "cotton", "silk", "denim",
 ]  # fmt: skip
 
 
@@ -143,7 +143,8 @@ class MaterialParameters(Parameters):
     roughness: Fraction | None = Field(default=None, description="Roughness [-]; the look's own if omitted.")
     density: Positive | None = Field(
         default=None,
-        description="Smoke and fire: extinction per metre at density 1 [1/m]. Water: factor on its absorption [-].",
+        description="Smoke and fire: extinction per metre at density 1 [1/m]. Water and honey: factor on their "
+        "absorption, milk: on its scattering [-].",
     )
     thread_spacing: Positive | None = Field(
         default=None, description="Woven cloth: distance of its threads [m]; the look's own if omitted."

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import JobFileError
 from pipeline.job.loading import LoadedJob, read_job
-from pipeline.job.looks import BODY, GLOWING_K, VOLUME_LOOKS, WHITEWATER, WOVEN_LOOKS, parts_of
+from pipeline.job.looks import BODY, GLOWING_K, TEXTURED_LOOKS, VOLUME_LOOKS, WHITEWATER, WOVEN_LOOKS, parts_of
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
@@ -108,10 +108,14 @@ def _check_materials(job: Job, findings: Findings) -> None:
             findings.error(
                 (*path, "look"), f'"{material.look}" is a look for [[cloth]]; "{name}" is in [[{kinds[name]}]]'
             )
+        elif kinds[name] not in TEXTURED_LOOKS.get(material.look, kinds.values()):
+            findings.warn(
+                (*path, "look"), f'is "{material.look}", whose texture hangs on nothing in [[{kinds[name]}]]: it swims'
+            )
         if material.thread_spacing is not None and material.look not in WOVEN_LOOKS:
             findings.warn((*path, "thread_spacing"), f'has no effect on the look "{material.look}"')
         for key, looks in (
-            ("density", (*VOLUME_LOOKS, "water")),
+            ("density", (*VOLUME_LOOKS, "water", "honey", "milk")),
             ("anisotropy", VOLUME_LOOKS),
             ("edge_fade", VOLUME_LOOKS),
             ("emission", ("fire",)),

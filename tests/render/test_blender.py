@@ -274,7 +274,7 @@ def test_smoke_is_drawn_where_it_is_and_unfit_volumes_are_refused(tmp_path):
 def test_every_look_and_stage_builds_and_draws(tmp_path):
     positions, triangles = sphere((0.0, 0.0, 0.0), 0.12, rings=8, segments=12)
     write_mesh(tmp_path / "ball.ply", positions, triangles)
-    looks = ("water", "rubber", "ceramic", "plastic", "metal", "stone", "glass")
+    looks = ("water", "honey", "milk", "rubber", "ceramic", "plastic", "metal", "stone", "wood", "glass")
     objects = tuple(
         MeshObject(
             name=look,
