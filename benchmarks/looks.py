@@ -34,6 +34,10 @@ STAGES = {
     "studio": StageParameters(),
     "outdoor": StageParameters(name="outdoor"),
     "night": StageParameters(name="night", strength=4.0),
+    "window": StageParameters(name="window"),
+    "window-wood": StageParameters(name="window", ground="wood"),
+    "studio-stone": StageParameters(ground="stone"),
+    "plain": StageParameters(background="plain", color=(0.9, 0.9, 0.9)),
 }
 
 

@@ -155,9 +155,12 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
     """Grey rock: mottled colour and a rough surface from noise in the body's own coordinates, so it does not swim."""
     base = or_default(context.color, (0.32, 0.30, 0.28))
     coordinates = builder.node("ShaderNodeTexCoord")
-    # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box.
-    noise = builder.node("ShaderNodeTexNoise", Scale=7.0, Detail=6.0, Roughness=0.62)
-    builder.link(coordinates.outputs["Generated"], noise.inputs["Vector"])
+    # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box. Ground
+    # that reaches to the horizon has as many in the domain's size.
+    is_ground = context.surface == "ground"
+    scale = 7.0 / context.domain_size if is_ground else 7.0
+    noise = builder.node("ShaderNodeTexNoise", Scale=scale, Detail=6.0, Roughness=0.62)
+    builder.link(coordinates.outputs["Object" if is_ground else "Generated"], noise.inputs["Vector"])
     ramp = builder.node("ShaderNodeValToRGB")
     ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.3, 0.72
     ramp.color_ramp.elements[0].color = (*(0.55 * channel for channel in base), 1.0)

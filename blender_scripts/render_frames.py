@@ -24,7 +24,7 @@ if __package__ in (None, ""):
 
 import bpy
 
-from blender_scripts import camera, geometry, lights, looks, png, points, poses, settings, tank, volumes
+from blender_scripts import camera, flattening, geometry, lights, looks, png, points, poses, settings, tank, volumes
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
@@ -63,10 +63,13 @@ class SceneRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
+        if spec["stage"]["background"] != "stage":
+            settings.leave_out_background()
+        self._behind = lights.plain_background(spec["stage"])
         self.device = settings.choose_device(spec["render"]["device"])
         self._camera = camera.add_camera(spec["camera"])
         self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
-        lights.build_stage(spec)
+        lights.build_stage(spec, self._folder)
         if spec["stage"]["tank"]:
             tank.add_tank(spec)
         self._sequences: list[tuple[dict[str, Any], Any]] = []
@@ -102,7 +105,10 @@ class SceneRenderer:
             raise RenderFailedError(f"Blender ended the render with {sorted(outcome)}")
         # save_render writes to exactly this path; the scene's own output path would expand '#', '{' and add suffixes.
         bpy.data.images["Render Result"].save_render(str(output_path.resolve()), scene=bpy.context.scene)
-        png.strip_metadata(output_path)
+        if self._behind is None:
+            png.strip_metadata(output_path)
+        else:
+            flattening.lay_over(output_path, self._behind)
 
     def _place_bodies(self, frame: int) -> None:
         of_file: dict[Path, dict[str, poses.Pose]] = {}

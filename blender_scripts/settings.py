@@ -115,6 +115,13 @@ def _apply_cycles_settings(cycles: Any, parameters: dict[str, Any]) -> None:
     cycles.sample_clamp_indirect = 6.0
 
 
+def leave_out_background() -> None:
+    """Give pictures an alpha channel, 0 where nothing of the scene is seen."""
+    render = bpy.context.scene.render
+    render.film_transparent = True
+    render.image_settings.color_mode = "RGBA"
+
+
 def choose_device(wanted: str) -> str:
     """Select what Cycles renders on, and say what it is, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`.
 

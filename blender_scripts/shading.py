@@ -100,6 +100,7 @@ class NodeBuilder:
     """A material's node tree, with the steps that looks take made short."""
 
     def __init__(self, material: Any) -> None:
+        self.material = material
         self.tree = node_tree_of(material)
         self.output = self.tree.nodes.new("ShaderNodeOutputMaterial")
 

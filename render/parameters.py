@@ -119,13 +119,34 @@ class LightParameters(Parameters):
 class StageParameters(Parameters):
     """Ground, background and the lights that come with them."""
 
-    name: Literal["studio", "outdoor", "night"] = Field(
+    name: Literal["studio", "outdoor", "night", "window"] = Field(
         default="studio",
         description="studio: cyclorama with key, fill and rim lights; outdoor: ground, sky and sun; night: ground, "
-        "a dark sky and a moon behind the domain.",
+        "a dark sky and a moon behind the domain; window: a room with soft light from a large window at the left.",
     )
     strength: Positive = Field(default=1.0, description="Factor on all of its lights [-].")
-    color: Color = Field(default=(0.22, 0.25, 0.29), description="Colour of the ground and backdrop, linear RGB.")
+    color: Color | None = Field(
+        default=None,
+        description="Colour of the ground and backdrop, linear RGB; the stage's own if omitted, or that of the look in "
+        "ground.",
+    )
+    ground: Literal["rubber", "ceramic", "plastic", "metal", "stone", "wood"] | None = Field(
+        default=None, description="Look of the ground, and of a backdrop that it curves up into; matt if omitted."
+    )
+    background: Literal["stage", "plain", "transparent"] = Field(
+        default="stage",
+        description="stage: as it is; plain: exactly the stage's colour behind everything; transparent: frames have an "
+        "alpha channel, and the film, which can have none, is laid over black. Of the ground only the shadows on it "
+        "are seen in the last two.",
+    )
+    hdri: str | None = Field(
+        default=None,
+        description="Picture of the whole sphere around the scene, .hdr or .exr, relative to the job file: light and "
+        "sky come from it, above the ground, in place of those of name.",
+    )
+    rotation_deg: float = Field(
+        default=0.0, description="How far the hdri is turned, counter-clockwise from above [degrees]."
+    )
     tank: bool = Field(default=False, description="Show the domain's walls as a glass tank.")
 
 

@@ -75,13 +75,14 @@ def read_picture(path: Path) -> Pixels:
 
 
 def read_rgb8(path: Path) -> NDArray[np.uint8]:
-    """Pixels as (height, width, 3) uint8; 16-bit channels are rounded, alpha is dropped."""
+    """Pixels as (height, width, 3) uint8; 16-bit channels are rounded, what has alpha is laid over black."""
     pixels = read_picture(path)
-    if pixels.shape[2] <= 2:
-        pixels = np.repeat(pixels[..., :1], 3, axis=2)
-    color = pixels[..., :3]
-    if color.dtype == np.uint16:
-        color = ((color.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if pixels.dtype == np.uint16:
+        pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    channels = pixels.shape[2]
+    color = np.repeat(pixels[..., :1], 3, axis=2) if channels <= 2 else pixels[..., :3]
+    if channels in (2, 4):
+        color = (color.astype(np.uint16) * pixels[..., -1:] + 127) // 255
     return np.ascontiguousarray(color, np.uint8)
 
 

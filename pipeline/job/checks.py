@@ -14,6 +14,7 @@ from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.scene_checks import check_scene
+from pipeline.job.stage_checks import check_stage
 from pipeline.stages import STAGES
 
 MANY_FRAMES = 100_000
@@ -36,6 +37,7 @@ def check_job(job: Job, *, memory_bytes: int | None = None) -> Findings:
     _check_faces(job, findings)
     _check_time(job, findings)
     _check_pictures(job, findings)
+    check_stage(job, findings)
     _check_limits(job, findings)
     if check_magnitudes(job, findings):
         check_scene(job, findings, memory_bytes)

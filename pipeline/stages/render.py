@@ -19,7 +19,7 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import tool_version
+from pipeline.stages.inputs import content_name, tool_version
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
 from render.camera_path import CameraPath, write_views
 from render.point_clouds import KINDS
@@ -51,6 +51,12 @@ BYTES_PER_PIXEL = 700
 _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"blender"}}
 """The executable counts by its version. The device does count: CPU and GPU round differently."""
 
+_LATER_STAGE_KEYS: dict[str, Any] = {"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0}
+"""Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
+
+_FORMER_COLOR = [0.22, 0.25, 0.29]
+"""What stood for a stage's colour where the job gives none, in those versions."""
+
 
 class RenderStage:
     """One PNG a frame. A worker keeps Blender and the scene warm from frame to frame."""
@@ -60,7 +66,7 @@ class RenderStage:
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
-        spec = render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
+        spec = _decisive(render_spec(job, layout))
         if job.camera.moves:
             spec["camera"]["path"] = job.camera.model_dump(mode="json")
         parameters = ParameterSet.of(
@@ -121,6 +127,25 @@ class RenderStage:
             _close_renderers()  # the next attempt, maybe in this process, needs a living one
             raise
         context.progress(1, 1)
+
+
+def _decisive(spec: RenderSpec) -> dict[str, Any]:
+    """What of a specification decides pixels: files by their content, and keys of later versions only where used.
+
+    Raises:
+        MissingInputError: a file cannot be read.
+    """
+    document = spec.model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
+    stage = document["stage"]
+    for key, unused in _LATER_STAGE_KEYS.items():
+        if stage[key] == unused:
+            del stage[key]
+    if spec.stage.hdri is not None:
+        stage["hdri"] = content_name(spec.stage.hdri, "picture")
+        stage["name"] = None  # its light and sky are not there
+    if stage["color"] is None and "ground" not in stage and stage["name"] != "window":
+        stage["color"] = _FORMER_COLOR
+    return document
 
 
 def render_spec(job: Job, layout: JobLayout) -> RenderSpec:

@@ -285,8 +285,9 @@ def test_every_look_and_stage_builds_and_draws(tmp_path):
         for index, look in enumerate(looks)
     )
     night = StageParameters(name="night", strength=30.0)
+    window = StageParameters(name="window", ground="stone")
     camera = still_camera(CameraParameters())
-    for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor"), night):
+    for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor"), night, window):
         spec = spec_of(*objects, samples=2).model_copy(update={"stage": stage, "camera": camera})
         spec.write(tmp_path / "spec.json")
         run_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")

@@ -1,0 +1,98 @@
+"""What `check` says of a job's stage and of the picture around the scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from checked_jobs import checked
+from radiance_pictures import write_hdr
+
+from pipeline.job.inputs import keep_inputs
+from pipeline.job.loading import load_job, read_job
+from pipeline.layout import JobLayout
+
+BALL = """
+name = "film"
+frames = 1
+[[rigid]]
+name = "ball"
+kind = "kinematic"
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.5]
+[stage]
+"""
+
+
+def problems(folder: Path, stage: str) -> tuple[list[str], list[str]]:
+    """Errors and warnings of a ball on a stage."""
+    result = checked(BALL + stage, folder / "film.toml")
+    return result.errors, result.warnings
+
+
+def test_a_picture_around_the_scene_passes_and_is_found_beside_the_job(tmp_path):
+    write_hdr(tmp_path / "noon.hdr", np.ones((8, 16, 3)))
+    assert problems(tmp_path, 'hdri = "noon.hdr"\nrotation_deg = 30') == ([], [])
+    assert read_job(tmp_path / "film.toml").job.stage.hdri == str(tmp_path / "noon.hdr")
+
+
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [
+        ("non.hdr", 'no such file: {folder}/non.hdr; did you mean "noon.hdr"?'),
+        ("folder.hdr", "{folder}/folder.hdr is a folder, not a picture"),
+        ("text.hdr", "{folder}/text.hdr: cannot be decoded"),
+        ("short.hdr", "{folder}/short.hdr: cannot be decoded"),
+        ("film.toml", "{folder}/film.toml: is no .hdr or .exr picture"),
+    ],
+)
+def test_a_picture_that_cannot_be_read_is_refused_before_any_work(tmp_path, written, expected):
+    whole = write_hdr(tmp_path / "noon.hdr", np.random.default_rng(1).random((32, 64, 3)))
+    (tmp_path / "text.hdr").write_text("this is no picture")
+    (tmp_path / "short.hdr").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "folder.hdr").mkdir()
+    (error,), _ = problems(tmp_path, f'hdri = "{written}"')
+    assert error.startswith(f"film.toml:10 stage.hdri: {expected.format(folder=tmp_path)}")
+
+
+@pytest.mark.parametrize(
+    ("stage", "expected"),
+    [
+        ('hdri = "noon.hdr"\nname = "outdoor"', "11 stage.name: has no effect beside hdri"),
+        ("rotation_deg = 20", "10 stage.rotation_deg: has no effect without hdri"),
+        ('hdri = "square.hdr"', "10 stage.hdri: is 8 x 8 pixels; a picture of the whole sphere is twice as wide"),
+        (
+            'background = "plain"\nground = "wood"',
+            '11 stage.ground: is seen in reflections only, as background = "plain" leaves it out',
+        ),
+    ],
+)
+def test_keys_of_a_stage_without_effect_are_warned_of(tmp_path, stage, expected):
+    write_hdr(tmp_path / "noon.hdr", np.ones((8, 16, 3)))
+    write_hdr(tmp_path / "square.hdr", np.ones((8, 8, 3)))
+    errors, (warning,) = problems(tmp_path, stage)
+    assert errors == []
+    assert f"film.toml:{expected}" in warning
+
+
+@pytest.mark.parametrize(
+    ("stage", "meant"),
+    [('name = "windw"', "window"), ('ground = "wod"', "wood"), ('background = "transparant"', "transparent")],
+)
+def test_misspelt_stages_get_a_suggestion(tmp_path, stage, meant):
+    with pytest.raises(Exception, match=f'did you mean "{meant}"') as error:
+        problems(tmp_path, stage)
+    assert "film.toml:10 stage." in str(error.value)
+
+
+def test_the_picture_is_kept_with_the_job(tmp_path):
+    content = write_hdr(tmp_path / "noon.hdr", np.ones((8, 16, 3)))
+    (tmp_path / "film.toml").write_text(BALL + 'hdri = "noon.hdr"')
+    layout = JobLayout(tmp_path / "renders" / "film")
+    _, text = keep_inputs(read_job(tmp_path / "film.toml"), layout)
+    layout.job_file.write_text(text)
+    (tmp_path / "noon.hdr").unlink()
+    kept = load_job(layout.root.rename(tmp_path / "elsewhere") / "job.toml").stage.hdri
+    assert kept is not None
+    assert Path(kept).read_bytes() == content
