@@ -24,7 +24,20 @@ if __package__ in (None, ""):
 
 import bpy
 
-from blender_scripts import camera, flattening, geometry, lights, looks, png, points, poses, settings, tank, volumes
+from blender_scripts import (
+    blend_materials,
+    camera,
+    flattening,
+    geometry,
+    lights,
+    looks,
+    png,
+    points,
+    poses,
+    settings,
+    tank,
+    volumes,
+)
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
@@ -139,7 +152,11 @@ class SceneRenderer:
             surface="sheet" if kind == "mesh_sequence" else "body",
             edges=None if at_rest is None else at_rest.edges(),
         )
-        material = looks.new_material(name, look, context)
+        if description["material"]["blend"] is None:
+            material = looks.new_material(name, look, context)
+        else:
+            file, inside = blend_materials.split_reference(description["material"]["blend"])
+            material = blend_materials.append_material(self._folder / file, inside)
         if at_rest is not None:
             blender_object = geometry.new_mesh_object(name, at_rest)
             blender_object.rotation_mode = "QUATERNION"

@@ -157,9 +157,15 @@ Look = Literal[
 
 
 class MaterialParameters(Parameters):
-    """What a body looks like."""
+    """What a body looks like: a look, or a material of one's own."""
 
-    look: Look = Field(description="Name of the look.")
+    look: Look | None = Field(default=None, description="Name of the look; give this or blend.")
+    blend: str | None = Field(
+        default=None,
+        pattern=r"(?s)^.*[^/]\.blend:.+$",
+        description='Material of a .blend file, relative to the job file: "materials.blend:Old gold". Its pictures '
+        "must be packed into the file; drivers and key frames of it are left out.",
+    )
     color: Color | None = Field(default=None, description="Base colour or tint, linear RGB; the look's own if omitted.")
     roughness: Fraction | None = Field(default=None, description="Roughness [-]; the look's own if omitted.")
     density: Positive | None = Field(
@@ -189,6 +195,12 @@ class MaterialParameters(Parameters):
         description="Fire: temperature that glows as emission says [K]; 1500 if omitted. What is hotter or colder "
         "glows more or less as a black body does.",
     )
+
+    @model_validator(mode="after")
+    def _is_one_material(self) -> Self:
+        if (self.look is None) == (self.blend is None):
+            raise ValueError('give look, such as look = "metal", or blend, one of them')
+        return self
 
 
 class RenderParameters(Parameters):

@@ -14,8 +14,9 @@ from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.scene_checks import check_scene
-from pipeline.job.stage_checks import check_stage
+from pipeline.job.stage_checks import check_blend, check_stage
 from pipeline.stages import STAGES
+from render.parameters import MaterialParameters
 
 MANY_FRAMES = 100_000
 
@@ -97,10 +98,12 @@ def _check_materials(job: Job, findings: Findings) -> None:
     kinds |= {f"{fluid}.{part}": "fluid" for fluid in job.whitewater for part in WHITEWATER}
     for name, material in job.material.items():
         path: KeyPath = ("material", name)
+        if material.blend is not None:
+            check_blend(material, path, kinds.get(name), findings)
         if name not in kinds:
             hint = suggestion(name, kinds) or (f"; bodies are {', '.join(kinds)}" if kinds else "")
             findings.error(path, f'no body is named "{name}"{hint}')
-        elif kinds[name] == "smoke" and material.look not in VOLUME_LOOKS:
+        elif kinds[name] == "smoke" and material.look not in VOLUME_LOOKS and material.look is not None:
             findings.error((*path, "look"), f'smoke can only look like "smoke" or "fire", got "{material.look}"')
         elif kinds[name] != "smoke" and material.look in VOLUME_LOOKS:
             findings.error(
@@ -110,23 +113,28 @@ def _check_materials(job: Job, findings: Findings) -> None:
             findings.error(
                 (*path, "look"), f'"{material.look}" is a look for [[cloth]]; "{name}" is in [[{kinds[name]}]]'
             )
-        elif kinds[name] not in TEXTURED_LOOKS.get(material.look, kinds.values()):
+        elif material.look in TEXTURED_LOOKS and kinds[name] not in TEXTURED_LOOKS[material.look]:
             findings.warn(
                 (*path, "look"), f'is "{material.look}", whose texture hangs on nothing in [[{kinds[name]}]]: it swims'
             )
-        if material.thread_spacing is not None and material.look not in WOVEN_LOOKS:
-            findings.warn((*path, "thread_spacing"), f'has no effect on the look "{material.look}"')
-        for key, looks in (
-            ("density", (*VOLUME_LOOKS, "water", "honey", "milk")),
-            ("anisotropy", VOLUME_LOOKS),
-            ("edge_fade", VOLUME_LOOKS),
-            ("emission", ("fire",)),
-            ("flame_temperature", ("fire",)),
-        ):
-            if getattr(material, key) is not None and material.look not in looks:
-                findings.warn((*path, key), f'has no effect on the look "{material.look}"')
+        if material.look is not None:
+            _check_keys(material, path, findings)
         if material.look == "fire":
             _check_glow(job, name, findings)
+
+
+def _check_keys(material: MaterialParameters, path: KeyPath, findings: Findings) -> None:
+    if material.thread_spacing is not None and material.look not in WOVEN_LOOKS:
+        findings.warn((*path, "thread_spacing"), f'has no effect on the look "{material.look}"')
+    for key, looks in (
+        ("density", (*VOLUME_LOOKS, "water", "honey", "milk")),
+        ("anisotropy", VOLUME_LOOKS),
+        ("edge_fade", VOLUME_LOOKS),
+        ("emission", ("fire",)),
+        ("flame_temperature", ("fire",)),
+    ):
+        if getattr(material, key) is not None and material.look not in looks:
+            findings.warn((*path, key), f'has no effect on the look "{material.look}"')
 
 
 def _check_glow(job: Job, name: str, findings: Findings) -> None:

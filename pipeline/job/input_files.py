@@ -18,15 +18,17 @@ class InputFile:
         place: of the key that names it.
         path: as the job names it.
         kind: what it is, for messages: "mesh".
+        rest: what the key's value says after the path.
     """
 
     place: KeyPath
     path: str
     kind: str
+    rest: str = ""
 
     def written(self, path: str) -> str:
         """The key's value with the file under another path."""
-        return path
+        return path + self.rest
 
 
 def input_files(job: Job) -> Iterator[InputFile]:
@@ -35,3 +37,13 @@ def input_files(job: Job) -> Iterator[InputFile]:
         yield InputFile((*place, "file"), shape.file, "mesh")
     if job.stage.hdri is not None:
         yield InputFile(("stage", "hdri"), job.stage.hdri, "picture")
+    for name, material in job.material.items():
+        if material.blend is not None:
+            file, inside = split_blend(material.blend)
+            yield InputFile(("material", name, "blend"), file, ".blend file", f":{inside}")
+
+
+def split_blend(reference: str) -> tuple[str, str]:
+    """File and name of a material: `file.blend:Name`."""
+    stem, _, name = reference.partition(".blend:")
+    return f"{stem}.blend", name

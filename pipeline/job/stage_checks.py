@@ -1,12 +1,15 @@
-"""What a valid job may have wrong about the stage that it is drawn on."""
+"""What a valid job may have wrong about the stage that it is drawn on, and about materials of .blend files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from pipeline.job.input_files import split_blend
 from pipeline.job.mesh_checks import file_exists
 from pipeline.job.models import Job
+from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
+from render.parameters import MaterialParameters
 
 _SPHERE_ASPECT = 2.0
 """A picture of the whole sphere is 360 degrees wide and 180 high."""
@@ -25,6 +28,23 @@ def check_stage(job: Job, findings: Findings) -> None:
         findings.warn(
             ("stage", "ground"), f'is seen in reflections only, as background = "{stage.background}" leaves it out'
         )
+
+
+def check_blend(material: MaterialParameters, path: KeyPath, kind: str | None, findings: Findings) -> None:
+    """Note what is wrong with a material that comes from a .blend file.
+
+    Args:
+        material: the material.
+        path: of its table.
+        kind: of the body that has it: "rigid"; None where there is none.
+        findings: where problems go.
+    """
+    assert material.blend is not None
+    file_exists(split_blend(material.blend)[0], ".blend file", (*path, "blend"), findings)
+    if kind == "smoke":
+        findings.error((*path, "blend"), 'is for surfaces; smoke can only look like "smoke" or "fire"')
+    for key in sorted(material.model_fields_set - {"blend"}):
+        findings.warn((*path, key), "has no effect beside blend, whose material says all")
 
 
 def _check_hdri(name: str, findings: Findings) -> None:

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from pipeline.cache import read_frame
 from pipeline.errors import StageUnavailableError
+from pipeline.job.input_files import split_blend
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
+from pipeline.job.problems import suggestion
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
@@ -52,6 +54,7 @@ _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"blende
 """The executable counts by its version. The device does count: CPU and GPU round differently."""
 
 _LATER_STAGE_KEYS: dict[str, Any] = {"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0}
+_LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None}
 """Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
 
 _FORMER_COLOR = [0.22, 0.25, 0.29]
@@ -103,9 +106,9 @@ class RenderStage:
                 require_bpy()
             else:
                 require_supported_executable(job.render.blender)
+            return list(_missing_materials(job))
         except BlenderUnavailableError as error:
             return [str(error)]
-        return []
 
     def run(self, context: TaskContext) -> None:
         """Draw one frame."""
@@ -129,6 +132,33 @@ class RenderStage:
         context.progress(1, 1)
 
 
+def _missing_materials(job: Job) -> Iterator[str]:
+    """Materials of .blend files that are not there: told before hours of simulation, not after.
+
+    Raises:
+        BlenderUnavailableError: Blender does not answer.
+    """
+    from render.blend_file import read_material_names
+    from render.errors import InvalidFileError
+
+    wanted: dict[str, dict[str, str]] = {}
+    for body, material in job.material.items():
+        if material.blend is not None:
+            file, name = split_blend(material.blend)
+            wanted.setdefault(file, {})[body] = name
+    for file, names in wanted.items():
+        try:
+            there = read_material_names(Path(file), job.render.blender)
+        except InvalidFileError as error:
+            yield str(error)
+            continue
+        known = f"there are {', '.join(sorted(there))}" if there else "it has none"
+        for body, name in names.items():
+            if name not in there:
+                hint = suggestion(name, there)
+                yield f'material.{body}.blend: {file} has no material "{name}"{hint}; {known}'
+
+
 def _decisive(spec: RenderSpec) -> dict[str, Any]:
     """What of a specification decides pixels: files by their content, and keys of later versions only where used.
 
@@ -145,6 +175,14 @@ def _decisive(spec: RenderSpec) -> dict[str, Any]:
         stage["name"] = None  # its light and sky are not there
     if stage["color"] is None and "ground" not in stage and stage["name"] != "window":
         stage["color"] = _FORMER_COLOR
+    for drawn in document["objects"]:
+        material = drawn["material"]
+        for key, unused in _LATER_MATERIAL_KEYS.items():
+            if material[key] == unused:
+                del material[key]
+        if "blend" in material:
+            file, name = split_blend(material["blend"])
+            drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
     return document
 
 

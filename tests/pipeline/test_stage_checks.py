@@ -9,6 +9,8 @@ import pytest
 from checked_jobs import checked
 from radiance_pictures import write_hdr
 
+from pipeline.errors import JobFileError
+from pipeline.job.input_files import split_blend
 from pipeline.job.inputs import keep_inputs
 from pipeline.job.loading import load_job, read_job
 from pipeline.layout import JobLayout
@@ -96,3 +98,47 @@ def test_the_picture_is_kept_with_the_job(tmp_path):
     kept = load_job(layout.root.rename(tmp_path / "elsewhere") / "job.toml").stage.hdri
     assert kept is not None
     assert Path(kept).read_bytes() == content
+
+
+BLEND = BALL.replace("[stage]", "[material.ball]")
+
+
+def test_a_material_of_a_blend_file_is_found_beside_the_job_and_kept_with_it(tmp_path):
+    (tmp_path / "own.blend").write_bytes(b"BLENDER")
+    assert checked(BLEND + 'blend = "own.blend:Old gold"', tmp_path / "film.toml")[:2] == ([], [])
+    layout = JobLayout(tmp_path / "renders" / "film")
+    _, text = keep_inputs(read_job(tmp_path / "film.toml"), layout)
+    layout.job_file.write_text(text)
+    blend = load_job(layout.job_file).material["ball"].blend
+    assert blend is not None
+    file, name = split_blend(blend)
+    assert (Path(file).read_bytes(), name) == (b"BLENDER", "Old gold")
+    assert Path(file).parent.samefile(layout.inputs)
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ('blend = "on.blend:Gold"', 'no such file: {folder}/on.blend; did you mean "own.blend"?'),
+        ('blend = "own.blend"', "film.toml:10 material.ball.blend: "),
+        ('blend = "own.blend:Gold"\nlook = "metal"', "give look, such as look ="),
+        ("roughness = 0.3", 'give look, such as look = "metal", or blend, one of them'),
+    ],
+)
+def test_a_material_that_is_not_one_is_refused(tmp_path, keys, expected):
+    (tmp_path / "own.blend").write_bytes(b"BLENDER")
+    try:
+        errors = checked(BLEND + keys, tmp_path / "film.toml").errors
+    except JobFileError as error:
+        errors = error.problems
+    (problem,) = errors
+    assert expected.format(folder=tmp_path) in problem
+
+
+def test_keys_beside_a_material_of_a_file_are_warned_of(tmp_path):
+    (tmp_path / "own.blend").write_bytes(b"BLENDER")
+    result = checked(BLEND + 'blend = "own.blend:Gold"\nroughness = 0.3', tmp_path / "film.toml")
+    assert result.errors == []
+    assert result.warnings == [
+        "film.toml:11 material.ball.roughness: has no effect beside blend, whose material says all"
+    ]

@@ -88,3 +88,18 @@ def test_a_picture_around_the_scene_counts_by_what_is_in_it(tmp_path: Path) -> N
 def test_a_picture_that_is_gone_is_told_when_the_job_is_planned(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError, match=r"cannot read the picture .*gone\.hdr: No such file"):
         frame_digest(hdri=str(tmp_path / "gone.hdr"))
+
+
+def test_a_material_of_a_file_counts_by_what_is_in_the_file_and_by_its_name(tmp_path: Path) -> None:
+    def digest(blend: str) -> str:
+        ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.1}}
+        job = Job.model_validate(
+            {"name": "film", "rigid": [ball], "frames": 1, "material": {"ball": {"blend": f"{tmp_path}/{blend}"}}}
+        )
+        tasks = plan_job(job, JobLayout(Path("renders/film")), STAGES)
+        return next(task.parameters.digest for task in tasks if task.stage == "render")
+
+    for name, content in (("a.blend", b"one"), ("b.blend", b"one"), ("c.blend", b"two")):
+        (tmp_path / name).write_bytes(content)
+    assert digest("a.blend:Gold") == digest("b.blend:Gold")
+    assert len({digest("a.blend:Gold"), digest("c.blend:Gold"), digest("a.blend:Tin")}) == 3
