@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 Vector3 = tuple[float, float, float]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -162,7 +162,6 @@ class MaterialParameters(Parameters):
     look: Look | None = Field(default=None, description="Name of the look; give this or blend.")
     blend: str | None = Field(
         default=None,
-        pattern=r"(?s)^.*[^/]\.blend:.+$",
         description='Material of a .blend file, relative to the job file: "materials.blend:Old gold". Its pictures '
         "must be packed into the file; drivers and key frames of it are left out.",
     )
@@ -195,6 +194,14 @@ class MaterialParameters(Parameters):
         description="Fire: temperature that glows as emission says [K]; 1500 if omitted. What is hotter or colder "
         "glows more or less as a black body does.",
     )
+
+    @field_validator("blend")
+    @classmethod
+    def _names_a_material(cls, blend: str | None) -> str | None:
+        file, separator, name = (blend or "").partition(".blend:")
+        if blend is not None and not (file and separator and name):
+            raise ValueError('must name a file and a material in it, such as "materials.blend:Old gold"')
+        return blend
 
     @model_validator(mode="after")
     def _is_one_material(self) -> Self:
