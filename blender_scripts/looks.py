@@ -55,7 +55,7 @@ def _water(builder: NodeBuilder, context: LookContext) -> None:
         IOR=WATER_IOR,
         Transmission_Weight=1.0,
     )
-    builder.surface(_with_clear_shadow(builder, shader, tint=(0.94, 0.975, 1.0)))
+    builder.surface(_refracting(builder, context, shader, tint=(0.94, 0.975, 1.0)))
     # Given explicitly, the factor is on the real absorption; by default a small tank is as blue as a deep pool.
     factor = or_default(context.density, _WATER_ABSORPTION_BY_SIZE / context.domain_size)
     coefficients = WATER_ABSORPTION_PER_M if context.color is None else _absorption_of_tint(context.color)
@@ -71,7 +71,7 @@ def _honey(builder: NodeBuilder, context: LookContext) -> None:
         IOR=HONEY_IOR,
         Transmission_Weight=1.0,
     )
-    builder.surface(_with_clear_shadow(builder, shader, tint=(1.0, 0.97, 0.9)))
+    builder.surface(_refracting(builder, context, shader, tint=(1.0, 0.97, 0.9)))
     factor = or_default(context.density, _HONEY_SIZE / context.domain_size)
     tint = or_default(context.color, HONEY_TINT)
     per_metre = tuple(-100.0 * factor * math.log(min(max(channel, 1e-3), 0.999)) for channel in tint)
@@ -103,7 +103,7 @@ def _glass(builder: NodeBuilder, context: LookContext) -> None:
         IOR=1.5,
         Transmission_Weight=1.0,
     )
-    builder.surface(_with_clear_shadow(builder, shader, tint=or_default(context.color, (0.90, 0.93, 0.92))))
+    builder.surface(_refracting(builder, context, shader, tint=or_default(context.color, (0.90, 0.93, 0.92))))
 
 
 def _rubber(builder: NodeBuilder, context: LookContext) -> None:
@@ -261,6 +261,11 @@ def _scattering(builder: NodeBuilder, color: Color) -> Any:
     back = builder.node("ShaderNodeBsdfDiffuse", Color=color)
     forth = builder.node("ShaderNodeBsdfTranslucent", Color=color)
     return mix_shaders(builder, half.outputs[0], back, forth)
+
+
+def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint: Color) -> Any:
+    """What a clear body is drawn with: as `_with_clear_shadow`, unless its caustics are to be found."""
+    return shader if context.caustics else _with_clear_shadow(builder, shader, tint=tint)
 
 
 def _with_clear_shadow(builder: NodeBuilder, shader: Any, *, tint: Color) -> Any:

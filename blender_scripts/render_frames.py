@@ -90,6 +90,9 @@ class SceneRenderer:
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         for description in spec["objects"]:
             self._add_object(description, spec)
+        casters = {each["name"] for each in spec["objects"] if each["material"]["caustics"]}
+        if casters:
+            settings.cast_caustics(casters, domain_size=_domain_size(spec))
 
     def render(self, frame: int, output_path: Path) -> None:
         """Draw one frame into a PNG file of any name. The same input gives the same bytes.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import bpy
+from mathutils import Vector
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ QUALITY_PRESETS = {
     "preview": QualityPreset(48, 0.05, "BALANCED", "ACCURATE", True, 2.0, 1, 10, 2, 10),
     "final": QualityPreset(256, 0.02, "HIGH", "ACCURATE", True, 1.0, 3, 24, 4, 16),
 }
+
+_FAR_DISC = 300.0
+"""Distance of what stands for a sun, in diagonals of the domain: its light falls off by 1 % across two of them."""
 
 _GPU_BACKENDS = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
 """In order of preference."""
@@ -113,6 +117,37 @@ def _apply_cycles_settings(cycles: Any, parameters: dict[str, Any]) -> None:
     cycles.blur_glossy = 1.0
     cycles.sample_clamp_direct = 0.0
     cycles.sample_clamp_indirect = 6.0
+
+
+def cast_caustics(caster_names: set[str], *, domain_size: float) -> None:
+    """Let bodies bend the light of all lamps onto everything else in the scene.
+
+    Cycles walks from what is lit to a lamp through surfaces that are marked (manifold next event estimation, Hanika et
+    al. 2015), from lamps and not from the world. Through a single surface it does not reach a lamp at infinity, so what
+    lies in water would be black under a sun: a far disc of the same light takes the sun's place.
+    """
+    scene = bpy.context.scene
+    scene.cycles.caustics_refractive = True
+    for each in scene.objects:
+        if each.type == "LIGHT":
+            if each.data.type == "SUN":
+                _become_far_disc(each, _FAR_DISC * domain_size)
+            each.data.cycles.is_caustics_light = True
+        elif each.name in caster_names:
+            each.cycles.is_caustics_caster = True
+        else:
+            each.cycles.is_caustics_receiver = True
+
+
+def _become_far_disc(sun: Any, distance: float) -> None:
+    """Replace a sun by a disc of its direction, size and light, at this distance from the origin [m]."""
+    disc = bpy.data.lights.new(sun.name, "AREA")
+    disc.shape, disc.size = "DISK", 2.0 * distance * math.tan(0.5 * max(sun.data.angle, 1e-3))
+    disc.color = sun.data.color
+    # A lamp of power P that shines as Lambert's law says gives P / (pi d²) in front of it; a sun says what it gives.
+    disc.energy = sun.data.energy * math.pi * distance**2
+    sun.data = disc
+    sun.location = distance * (sun.rotation_quaternion @ Vector((0.0, 0.0, 1.0)))
 
 
 def leave_out_background() -> None:

@@ -43,6 +43,7 @@ class LookContext:
         edges: of the box around a body at rest, in its own axes [m]; None for what is no body.
         color: base colour or tint from the job, linear RGB.
         roughness: from the job [-].
+        caustics: whether light of lamps is bent, from the job.
         density: from the job; see `render.parameters.MaterialParameters`.
         thread_spacing: of woven cloth, from the job [m].
         anisotropy: of smoke, from the job [-].
@@ -58,6 +59,7 @@ class LookContext:
     edges: tuple[float, float, float] | None
     color: Color | None
     roughness: float | None
+    caustics: bool | None
     density: float | None
     thread_spacing: float | None
     anisotropy: float | None
@@ -91,7 +93,7 @@ class LookContext:
 
 
 _FROM_THE_JOB = (
-    *("color", "roughness", "density", "thread_spacing"),
+    *("color", "roughness", "caustics", "density", "thread_spacing"),
     *("anisotropy", "edge_fade", "emission", "flame_temperature"),
 )
 

@@ -172,6 +172,11 @@ class MaterialParameters(Parameters):
         description="Smoke and fire: extinction per metre at density 1 [1/m]. Water and honey: factor on their "
         "absorption, milk: on its scattering [-].",
     )
+    caustics: bool = Field(
+        default=False,
+        description="Water, honey and glass: bend the light of lamps onto what lies around, instead of letting it "
+        "straight through; docs/rendering.md has what it costs.",
+    )
     thread_spacing: Positive | None = Field(
         default=None, description="Woven cloth: distance of its threads [m]; the look's own if omitted."
     )

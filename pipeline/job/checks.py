@@ -8,7 +8,16 @@ from pathlib import Path
 
 from pipeline.errors import JobFileError
 from pipeline.job.loading import LoadedJob, read_job
-from pipeline.job.looks import BODY, GLOWING_K, TEXTURED_LOOKS, VOLUME_LOOKS, WHITEWATER, WOVEN_LOOKS, parts_of
+from pipeline.job.looks import (
+    BODY,
+    GLOWING_K,
+    REFRACTING_LOOKS,
+    TEXTURED_LOOKS,
+    VOLUME_LOOKS,
+    WHITEWATER,
+    WOVEN_LOOKS,
+    parts_of,
+)
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
@@ -126,6 +135,8 @@ def _check_materials(job: Job, findings: Findings) -> None:
 def _check_keys(material: MaterialParameters, path: KeyPath, findings: Findings) -> None:
     if material.thread_spacing is not None and material.look not in WOVEN_LOOKS:
         findings.warn((*path, "thread_spacing"), f'has no effect on the look "{material.look}"')
+    if material.caustics and material.look not in REFRACTING_LOOKS:
+        findings.warn((*path, "caustics"), f'has no effect on the look "{material.look}"')
     for key, looks in (
         ("density", (*VOLUME_LOOKS, "water", "honey", "milk")),
         ("anisotropy", VOLUME_LOOKS),

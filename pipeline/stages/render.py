@@ -54,7 +54,7 @@ _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "render": {"blende
 """The executable counts by its version. The device does count: CPU and GPU round differently."""
 
 _LATER_STAGE_KEYS: dict[str, Any] = {"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0}
-_LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None}
+_LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None, "caustics": False}
 """Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
 
 _FORMER_COLOR = [0.22, 0.25, 0.29]

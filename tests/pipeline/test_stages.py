@@ -89,6 +89,8 @@ def test_the_film_is_cut_every_half_second():
         ({"fps": 30}, {"simulate", "volume", "render", "movie"}),
         ({"stage": {"color": [0.22, 0.25, 0.29], "background": "stage", "rotation_deg": 0.0}}, set()),
         ({"stage": {"name": "window"}}, {"render"}),
+        ({"material": {"water": {"look": "water", "caustics": True}}}, {"render"}),
+        ({"material": {"water": {"look": "water", "caustics": False}}}, set()),
         ({"stage": {"ground": "wood"}}, {"render"}),
         ({"stage": {"background": "plain"}}, {"render"}),
         ({"stage": {"background": "transparent"}}, {"render"}),
