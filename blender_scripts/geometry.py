@@ -43,6 +43,13 @@ class TriangleMesh:
     velocities: np.ndarray | None = None
     uv: np.ndarray | None = None
 
+    def edges(self) -> tuple[float, float, float] | None:
+        """Edges of the box around it, along the axes [m]; None without vertices."""
+        if not len(self.positions):
+            return None
+        x, y, z = (float(edge) for edge in np.ptp(self.positions, axis=0))
+        return x, y, z
+
 
 def read_ply(path: Path) -> TriangleMesh:
     """Read and check a mesh. A mesh without any vertex is legal: nothing is drawn.

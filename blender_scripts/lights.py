@@ -5,21 +5,38 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import bpy
 import numpy as np
 from mathutils import Vector
 
-from blender_scripts.camera import aim
+from blender_scripts.camera import aim, pixel_angle
 from blender_scripts.compatibility import node_tree_of, set_physical_sky
+from blender_scripts.errors import RenderInputError
 from blender_scripts.geometry import TriangleMesh, new_mesh_object
+from blender_scripts.looks import new_material
+from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
 
 _REFERENCE_SIZE_M = math.sqrt(3.0)
 """Diagonal of the domain that the lights' powers are written for."""
 
 _SKY_MAP_PIXELS = 256
 """Across the map by which light samples choose their way into the sky: 1.4 degrees each."""
+_HDRI_MAP_PIXELS = 1024
+"""The same for an HDRI, where a sun of half a degree may be: 0.35 degrees each."""
+
+GREY: Color = (0.22, 0.25, 0.29)
+"""Of the ground and backdrop of a stage that has no colour of its own."""
+_CATCHER_REACH = 2.1
+"""How far shadows are caught where there is no background, in diagonals of the domain."""
+
+_WINDOW_DISTANCE = 1.7
+"""Of the window of a room, from the domain's middle, in diagonals of the domain."""
+
+PLASTER: Color = (0.56, 0.52, 0.46)
+"""Of the walls and the floor of the room."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +49,7 @@ class StageGeometry:
         size: diagonal of the domain [m].
         to_camera: horizontal unit vector from the domain towards the camera.
         camera_circle: how far from the domain's middle the camera gets, if it goes around it [m].
+        pixel_angle: width of a pixel at a distance of 1 m [m/m].
     """
 
     centre: Vector
@@ -39,6 +57,7 @@ class StageGeometry:
     size: float
     to_camera: Vector
     camera_circle: float | None
+    pixel_angle: float
 
     @classmethod
     def of(cls, spec: dict[str, Any]) -> StageGeometry:
@@ -51,7 +70,7 @@ class StageGeometry:
         # A camera straight above has no horizontal direction; any will do.
         to_camera = towards.normalized() if towards.length > 1e-6 else Vector((0.0, -1.0, 0.0))
         size = (box_max - box_min).length
-        return cls(centre, box_min.z, size, to_camera, camera["distance_all_round"])
+        return cls(centre, box_min.z, size, to_camera, camera["distance_all_round"], pixel_angle(spec))
 
     def place(self, *, right: float, towards_camera: float, above_floor: float) -> Vector:
         """A point given in domain sizes, in axes that turn with the camera [m]."""
@@ -65,18 +84,36 @@ class StageGeometry:
         return (self.size / _REFERENCE_SIZE_M) ** 2
 
 
-def build_stage(spec: dict[str, Any]) -> None:
-    """Build the stage that a specification names, and its extra lights."""
-    geometry = StageGeometry.of(spec)
-    STAGES[spec["stage"]["name"]](spec["stage"], geometry)
+def build_stage(spec: dict[str, Any], folder: Path) -> None:
+    """Build the stage that a specification names, and its extra lights.
+
+    Args:
+        spec: the specification.
+        folder: that paths in it are relative to.
+
+    Raises:
+        RenderInputError: the picture around the scene cannot be read.
+    """
+    geometry, stage = StageGeometry.of(spec), spec["stage"]
+    if stage["hdri"] is None:
+        STAGES[stage["name"]](stage, geometry)
+    else:
+        _build_under_hdri(stage, geometry, folder / stage["hdri"])
     for index, light in enumerate(spec["lights"]):
         _add_extra_light(f"light {index}", light)
+
+
+def plain_background(stage: dict[str, Any]) -> Color | None:
+    """The colour to lay pictures over once they are drawn, linear RGB; None for those that stay as they are."""
+    if stage["background"] != "plain":
+        return None
+    return _ground_color(stage, PLASTER if stage["name"] == "window" and stage["hdri"] is None else GREY)
 
 
 def _build_studio(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     """A cyclorama with a small warm key, a large cool fill and strong rims: water and smoke read by their rims."""
     backdrop = _cyclorama(geometry) if geometry.camera_circle is None else _round_cyclorama(geometry)
-    _add_ground(backdrop, "cyclorama", parameters["color"])
+    _add_ground(backdrop, "cyclorama", parameters, geometry)
     target = geometry.place(right=0.0, towards_camera=0.0, above_floor=0.22)
     strength = parameters["strength"] * geometry.power_scale
     for name, placement, size, spread_deg, power, color in (
@@ -98,7 +135,7 @@ def _build_studio(parameters: dict[str, Any], geometry: StageGeometry) -> None:
 
 def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     """Ground to the horizon, a physical sky and a sun from behind the camera's left."""
-    _add_ground(_plain(geometry), "ground", parameters["color"])
+    _add_ground(_plain(geometry), "ground", parameters, geometry)
 
     elevation = math.radians(38.0)
     from_sun = geometry.place(right=-1.0, towards_camera=-0.45, above_floor=0.0) - geometry.place(
@@ -123,7 +160,7 @@ def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
 
 def _build_night(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     """Ground to the horizon under a dark sky, for what glows; a moon from behind draws rims on what does not."""
-    _add_ground(_plain(geometry), "ground", parameters["color"])
+    _add_ground(_plain(geometry), "ground", parameters, geometry)
     moon = _new_light("moon", "SUN", 0.4 * parameters["strength"], (0.66, 0.80, 1.0))
     # Wider than the real one, of half a degree: its shadows are soft, as those of a night in a film are.
     moon.angle = math.radians(4.0)
@@ -132,10 +169,68 @@ def _build_night(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     bpy.context.scene.world.cycles.sampling_method = "NONE"
 
 
+def _build_window(parameters: dict[str, Any], geometry: StageGeometry) -> None:
+    """A room: light falls in through a window of four panes at the left, and what the walls give back is warm.
+
+    A camera that stays sees two walls of it; one that goes around, a whole room around its way.
+    """
+    _add_ground(_plain(geometry), "floor", parameters, geometry, own=PLASTER)
+    wall = _matt("wall", _ground_color(parameters, PLASTER))
+    # In diagonals of the domain, as `StageGeometry.place` takes them: the wall with the window, and the one behind.
+    left, behind = -_WINDOW_DISTANCE, -1.9
+    corners = [(left, 1.2), (left, behind), (30.0, behind)]
+    if geometry.camera_circle is not None:
+        half = max(3.0, 1.2 * geometry.camera_circle / geometry.size)
+        left = -half
+        corners = [(-half, half), (-half, -half), (half, -half), (half, half), (-half, half)]
+    walls = _walls(geometry, corners, height=max(8.0, 1.5 * -left))
+    _add_surface(walls, "walls", wall, parameters)
+    # As large and bright from afar as it would be near. Bars between the panes: what shines shows a window, not a lamp.
+    scale = -left / _WINDOW_DISTANCE
+    power = 210.0 * scale**2 * parameters["strength"] * geometry.power_scale
+    for number, (across, up) in enumerate(((-1, -1), (1, -1), (-1, 1), (1, 1))):
+        pane = _new_light(f"pane {number}", "AREA", power, (0.86, 0.93, 1.0))
+        pane.shape, pane.size = "SQUARE", 0.95 * scale * geometry.size
+        height, forward = scale * (1.15 + 0.5 * up), scale * (0.15 + 0.5 * across)
+        place = geometry.place(right=left + 0.01, towards_camera=forward, above_floor=height)
+        inwards = geometry.place(right=0.0, towards_camera=forward, above_floor=height)
+        window = _add_light_object(f"pane {number}", pane, place, inwards)
+        window.visible_camera = parameters["background"] == "stage"  # a window in the picture is what one expects
+    bounce = _new_light("bounce", "AREA", 14.0 * parameters["strength"] * geometry.power_scale, (1.0, 0.86, 0.70))
+    bounce.shape, bounce.size = "SQUARE", 2.2 * geometry.size
+    target = geometry.place(right=0.0, towards_camera=0.0, above_floor=0.35)
+    _add_light_object("bounce", bounce, geometry.place(right=2.2, towards_camera=0.6, above_floor=1.2), target)
+    _set_gradient_world(0.35 * parameters["strength"])
+    bpy.context.scene.world.cycles.sampling_method = "NONE"
+
+
+def _build_under_hdri(parameters: dict[str, Any], geometry: StageGeometry, path: Path) -> None:
+    """Ground to the horizon under the sky of a picture, lit by it alone."""
+    _add_ground(_plain(geometry), "ground", parameters, geometry)
+    try:
+        image = bpy.data.images.load(str(path))
+    except RuntimeError as error:
+        raise RenderInputError(f"cannot read the picture {path}: {error}") from error
+    if not all(image.size):
+        raise RenderInputError(f"cannot read the picture {path}: Blender finds no pixels in it")
+    tree = _new_world_tree()
+    coordinates, mapping = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeMapping")
+    # What lies in a direction shows the picture at the direction turned back.
+    mapping.inputs["Rotation"].default_value = (0.0, 0.0, -math.radians(parameters["rotation_deg"]))
+    texture = tree.nodes.new("ShaderNodeTexEnvironment")
+    texture.image = image
+    tree.links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
+    tree.links.new(mapping.outputs["Vector"], texture.inputs["Vector"])
+    _connect_background(tree, texture.outputs["Color"], parameters["strength"])
+    settings = bpy.context.scene.world.cycles
+    settings.sampling_method, settings.sample_map_resolution = "MANUAL", _HDRI_MAP_PIXELS
+
+
 STAGES: dict[str, Callable[[dict[str, Any], StageGeometry], None]] = {
     "studio": _build_studio,
     "outdoor": _build_outdoor,
     "night": _build_night,
+    "window": _build_window,
 }
 """How each stage is built, by the name that a specification uses."""
 
@@ -148,6 +243,21 @@ def _plain(geometry: StageGeometry) -> TriangleMesh:
         [(geometry.centre.x + x, geometry.centre.y + y, geometry.floor_z) for x, y in corners], dtype=np.float32
     )
     return TriangleMesh(positions, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
+
+
+def _walls(geometry: StageGeometry, corners: list[tuple[float, float]], *, height: float) -> TriangleMesh:
+    """Upright walls from corner to corner, each (right, towards the camera), in diagonals of the domain."""
+    positions = [
+        geometry.place(right=right, towards_camera=forward, above_floor=up)
+        for up in (0.0, height)
+        for right, forward in corners
+    ]
+    count = len(corners)
+    here = np.arange(count - 1)
+    triangles = np.concatenate(
+        [np.stack([here, here + 1, here + 1 + count], axis=1), np.stack([here, here + 1 + count, here + count], axis=1)]
+    )
+    return TriangleMesh(np.array(positions, dtype=np.float32), triangles.astype(np.int32))
 
 
 def _cyclorama(geometry: StageGeometry) -> TriangleMesh:
@@ -206,19 +316,82 @@ def _round_cyclorama(geometry: StageGeometry) -> TriangleMesh:
     return TriangleMesh(positions.astype(np.float32), np.concatenate(triangles).astype(np.int32))
 
 
-def _add_ground(mesh: TriangleMesh, name: str, color: list[float]) -> None:
-    ground = new_mesh_object(name, mesh)
+def _add_ground(
+    mesh: TriangleMesh, name: str, parameters: dict[str, Any], geometry: StageGeometry, own: Color = GREY
+) -> None:
     # A hair below the domain's floor: surfaces that lie on the floor would otherwise flicker against it.
-    extent = float(np.ptp(mesh.positions, axis=0).max())
-    ground.location.z = -2e-6 * extent
+    drop = 2e-6 * float(np.ptp(mesh.positions, axis=0).max())
+    ground = _add_surface(mesh, name, _ground_material(name, parameters, geometry, own), parameters)
+    ground.location.z = -drop
+    if parameters["background"] != "stage":
+        _add_shadow_catcher(geometry, _ground_color(parameters, own), drop=0.5 * drop)
+
+
+def _ground_material(name: str, parameters: dict[str, Any], geometry: StageGeometry, own: Color) -> Any:
+    if parameters["ground"] is None:
+        return _matt(name, _ground_color(parameters, own))
+    context = LookContext.of(
+        {"color": parameters["color"]},
+        domain_size=geometry.size,
+        pixel_angle=geometry.pixel_angle,
+        surface="ground",
+    )
+    return new_material(name, parameters["ground"], context)
+
+
+def _add_shadow_catcher(geometry: StageGeometry, color: Color, *, drop: float) -> None:
+    """Ground around the domain of which pictures without a background show the shadows; seen by the camera alone.
+
+    It fades out before a backdrop would begin to rise.
+    """
+    reach, fade_from = _CATCHER_REACH * geometry.size, 0.5 * _CATCHER_REACH * geometry.size
+    middle = geometry.place(right=0.0, towards_camera=_CATCHER_REACH - 1.4, above_floor=0.0)
+    corners = [middle + reach * Vector((x, y, 0.0)) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    mesh = TriangleMesh(np.array(corners, dtype=np.float32), np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
+    catcher = new_mesh_object("shadows", mesh)
+    builder = NodeBuilder(bpy.data.materials.new("shadows"))
+    place = builder.node("ShaderNodeNewGeometry").outputs["Position"]
+    distance = builder.node("ShaderNodeVectorMath")
+    distance.operation = "DISTANCE"
+    builder.link(place, distance.inputs[0])
+    distance.inputs[1].default_value = middle
+    fade = builder.node("ShaderNodeMapRange")
+    fade.interpolation_type = "SMOOTHSTEP"
+    builder.link(distance.outputs["Value"], fade.inputs["Value"])
+    fade.inputs["From Min"].default_value, fade.inputs["From Max"].default_value = fade_from, reach
+    matt = builder.node("ShaderNodeBsdfDiffuse", Color=color)
+    builder.surface(mix_shaders(builder, fade.outputs[0], matt, builder.node("ShaderNodeBsdfTransparent")))
+    catcher.data.materials.append(builder.material)
+    catcher.is_shadow_catcher = True
+    catcher.location.z = -drop
+    for kind in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+        setattr(catcher, f"visible_{kind}", False)
+
+
+def _add_surface(mesh: TriangleMesh, name: str, material: Any, parameters: dict[str, Any]) -> Any:
+    """A surface of the stage, which light and reflections meet whatever stands behind the picture."""
+    surface = new_mesh_object(name, mesh)
+    surface.data.materials.append(material)
+    surface.visible_camera = parameters["background"] == "stage"
+    # What a wall keeps from the ground is none of the scene's shadows.
+    surface.is_shadow_catcher = not surface.visible_camera
+    return surface
+
+
+def _matt(name: str, color: Color) -> Any:
+    """A matt material. Most of the picture and of all bounces end on one: it is a tenth cheaper than a Principled."""
     material = bpy.data.materials.new(name)
     tree = node_tree_of(material)
-    # Most of the picture and of all bounces end here: a plain matt surface is a tenth cheaper than a Principled one.
     shader = tree.nodes.new("ShaderNodeBsdfDiffuse")
     shader.inputs["Color"].default_value = (*color, 1.0)
     output = tree.nodes.new("ShaderNodeOutputMaterial")
     tree.links.new(shader.outputs["BSDF"], output.inputs["Surface"])
-    ground.data.materials.append(material)
+    return material
+
+
+def _ground_color(parameters: dict[str, Any], own: Color) -> Color:
+    red, green, blue = or_default(parameters["color"], own)
+    return red, green, blue
 
 
 def _set_gradient_world(strength: float) -> None:
@@ -257,12 +430,13 @@ def _new_light(name: str, kind: str, energy: float, color: tuple[float, float, f
     return light
 
 
-def _add_light_object(name: str, light: Any, position: Vector, target: Vector) -> None:
+def _add_light_object(name: str, light: Any, position: Vector, target: Vector) -> Any:
     blender_object = bpy.data.objects.new(name, light)
     aim(blender_object, position, target)
     # Lamps are reflected and refracted, but a glowing square in the picture itself would look like a mistake.
     blender_object.visible_camera = False
     bpy.context.scene.collection.objects.link(blender_object)
+    return blender_object
 
 
 def _add_extra_light(name: str, parameters: dict[str, Any]) -> None:

@@ -14,12 +14,29 @@ import bpy
 from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
 from blender_scripts.smoke_looks import build_fire, build_smoke
 from blender_scripts.weaves import build_cotton, build_denim, build_silk
+from blender_scripts.wood import build_wood
 
 WATER_IOR = 1.333
 WATER_ABSORPTION_PER_M: Color = (0.30, 0.055, 0.009)
 """Absorption of pure water for red, green and blue light [1/m] (Pope & Fry 1997, rounded)."""
 _WATER_ABSORPTION_BY_SIZE = 7.0
 """A domain this many metres across needs no exaggeration to look like deep water."""
+
+HONEY_IOR = 1.49
+"""Of honey with 18 % water (Chataway's table has 1.4915 at 20 °C)."""
+HONEY_TINT: Color = (0.96, 0.76, 0.20)
+"""What a centimetre of honey makes of white light: an amber between clover's and heather's, chosen by eye. Absorbance
+of honey falls about exponentially from blue to red, and from one honey to another by more than a factor of ten."""
+_HONEY_SIZE = 0.1
+"""A domain this many metres across needs no thinner honey: larger ones would look like tar."""
+
+MILK_REFLECTANCE: Color = (0.91, 0.88, 0.76)
+"""Diffuse reflectance of whole milk for red, green and blue light [-] (Jensen et al. 2001, fig. 5)."""
+MILK_PATH_M: Color = (10.9e-3, 6.6e-3, 2.5e-3)
+"""How far light spreads in whole milk [m]: 1 / sqrt(3 a (a + s)) with the absorption a = (0.0011, 0.0024, 0.014)/mm
+and the reduced scattering s = (2.55, 3.21, 3.77)/mm that Jensen et al. 2001, fig. 5, measured."""
+_MILK_SIZE = 0.5
+"""A domain this many metres across needs no exaggeration to look like milk, and not like plaster."""
 
 
 def new_material(name: str, look: str, context: LookContext) -> Any:
@@ -38,11 +55,44 @@ def _water(builder: NodeBuilder, context: LookContext) -> None:
         IOR=WATER_IOR,
         Transmission_Weight=1.0,
     )
-    builder.surface(_with_clear_shadow(builder, shader, tint=(0.94, 0.975, 1.0)))
+    builder.surface(_refracting(builder, context, shader, tint=(0.94, 0.975, 1.0)))
     # Given explicitly, the factor is on the real absorption; by default a small tank is as blue as a deep pool.
     factor = or_default(context.density, _WATER_ABSORPTION_BY_SIZE / context.domain_size)
     coefficients = WATER_ABSORPTION_PER_M if context.color is None else _absorption_of_tint(context.color)
     _homogeneous_absorption(builder, tuple(factor * value for value in coefficients))
+
+
+def _honey(builder: NodeBuilder, context: LookContext) -> None:
+    """Clear amber: it absorbs blue first, and scatters nothing, as filtered honey does."""
+    shader = builder.node(
+        "ShaderNodeBsdfPrincipled",
+        Base_Color=(1.0, 1.0, 1.0),
+        Roughness=or_default(context.roughness, 0.0),
+        IOR=HONEY_IOR,
+        Transmission_Weight=1.0,
+    )
+    builder.surface(_refracting(builder, context, shader, tint=(1.0, 0.97, 0.9)))
+    factor = or_default(context.density, _HONEY_SIZE / context.domain_size)
+    tint = or_default(context.color, HONEY_TINT)
+    per_metre = tuple(-100.0 * factor * math.log(min(max(channel, 1e-3), 0.999)) for channel in tint)
+    _homogeneous_absorption(builder, per_metre)
+
+
+def _milk(builder: NodeBuilder, context: LookContext) -> None:
+    """White that light enters and leaves elsewhere, red the farthest, under a wet surface."""
+    factor = or_default(context.density, _MILK_SIZE / context.domain_size)
+    shader = builder.node(
+        "ShaderNodeBsdfPrincipled",
+        Base_Color=or_default(context.color, MILK_REFLECTANCE),
+        Roughness=or_default(context.roughness, 0.06),
+        IOR=1.35,
+        Subsurface_Weight=1.0,
+        Subsurface_Scale=1.0,
+        Subsurface_Radius=tuple(length / factor for length in MILK_PATH_M),
+    )
+    # Paths that follow the light inside; the node's other method is tuned for skin.
+    shader.subsurface_method = "RANDOM_WALK"
+    builder.surface(shader)
 
 
 def _glass(builder: NodeBuilder, context: LookContext) -> None:
@@ -53,7 +103,7 @@ def _glass(builder: NodeBuilder, context: LookContext) -> None:
         IOR=1.5,
         Transmission_Weight=1.0,
     )
-    builder.surface(_with_clear_shadow(builder, shader, tint=or_default(context.color, (0.90, 0.93, 0.92))))
+    builder.surface(_refracting(builder, context, shader, tint=or_default(context.color, (0.90, 0.93, 0.92))))
 
 
 def _rubber(builder: NodeBuilder, context: LookContext) -> None:
@@ -105,9 +155,12 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
     """Grey rock: mottled colour and a rough surface from noise in the body's own coordinates, so it does not swim."""
     base = or_default(context.color, (0.32, 0.30, 0.28))
     coordinates = builder.node("ShaderNodeTexCoord")
-    # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box.
-    noise = builder.node("ShaderNodeTexNoise", Scale=7.0, Detail=6.0, Roughness=0.62)
-    builder.link(coordinates.outputs["Generated"], noise.inputs["Vector"])
+    # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box. Ground
+    # that reaches to the horizon has as many in the domain's size.
+    is_ground = context.surface == "ground"
+    scale = 7.0 / context.domain_size if is_ground else 7.0
+    noise = builder.node("ShaderNodeTexNoise", Scale=scale, Detail=6.0, Roughness=0.62)
+    builder.link(coordinates.outputs["Object" if is_ground else "Generated"], noise.inputs["Vector"])
     ramp = builder.node("ShaderNodeValToRGB")
     ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.3, 0.72
     ramp.color_ramp.elements[0].color = (*(0.55 * channel for channel in base), 1.0)
@@ -178,6 +231,8 @@ def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
 
 LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
     "water": _water,
+    "honey": _honey,
+    "milk": _milk,
     "smoke": build_smoke,
     "fire": build_fire,
     "rubber": _rubber,
@@ -185,6 +240,7 @@ LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
     "plastic": _plastic,
     "metal": _metal,
     "stone": _stone,
+    "wood": build_wood,
     "glass": _glass,
     "cotton": build_cotton,
     "silk": build_silk,
@@ -205,6 +261,11 @@ def _scattering(builder: NodeBuilder, color: Color) -> Any:
     back = builder.node("ShaderNodeBsdfDiffuse", Color=color)
     forth = builder.node("ShaderNodeBsdfTranslucent", Color=color)
     return mix_shaders(builder, half.outputs[0], back, forth)
+
+
+def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint: Color) -> Any:
+    """What a clear body is drawn with: as `_with_clear_shadow`, unless its caustics are to be found."""
+    return shader if context.caustics else _with_clear_shadow(builder, shader, tint=tint)
 
 
 def _with_clear_shadow(builder: NodeBuilder, shader: Any, *, tint: Color) -> Any:

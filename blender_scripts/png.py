@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # Blender stamps date and render time into text chunks; none of these kinds says anything about the pixels.
@@ -40,3 +43,23 @@ def strip_metadata(path: Path) -> None:
     stripped = _SIGNATURE + b"".join(kept)
     if len(stripped) != len(content):
         path.write_bytes(stripped)
+
+
+def write_rgb8(path: Path, pixels: np.ndarray) -> None:
+    """Write pixels, (rows, columns, 3) uint8 from the top."""
+    rows, columns, _ = pixels.shape
+    # What differs from the row above compresses better: filter 2, "up".
+    above = np.vstack([np.zeros((1, columns, 3), np.uint8), pixels[:-1]])
+    lines = np.hstack([np.full((rows, 1), 2, np.uint8), (pixels - above).reshape(rows, -1)])
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(lines.tobytes(), 6)),
+        (b"IEND", b""),
+    )
+    path.write_bytes(
+        _SIGNATURE
+        + b"".join(
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+            for kind, data in chunks
+        )
+    )

@@ -26,7 +26,22 @@ if __package__ in (None, ""):
 
 import bpy
 
-from blender_scripts import camera, exr, geometry, lights, looks, png, points, poses, settings, tank, volumes, workbench
+from blender_scripts import (
+    blend_materials,
+    camera,
+    exr,
+    flattening,
+    geometry,
+    lights,
+    looks,
+    png,
+    points,
+    poses,
+    settings,
+    tank,
+    volumes,
+    workbench,
+)
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
@@ -65,11 +80,15 @@ class SceneRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
+        self._has_alpha = spec["stage"]["background"] != "stage"
+        if self._has_alpha:
+            settings.leave_out_background()
+        self._behind = lights.plain_background(spec["stage"])
         self.device: str = settings.choose_device(spec["render"]["device"])
         self._camera = camera.add_camera(spec["camera"])
         self._format, self._passes = spec["render"]["format"], spec["render"]["passes"]
         self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
-        lights.build_stage(spec)
+        lights.build_stage(spec, self._folder)
         if spec["stage"]["tank"]:
             tank.add_tank(spec)
         self._stage = {blender_object.name for blender_object in bpy.data.objects}
@@ -78,6 +97,9 @@ class SceneRenderer:
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         for description in spec["objects"]:
             self._add_object(description, spec)
+        casters = {each["name"] for each in spec["objects"] if each["material"]["caustics"]}
+        if casters:
+            settings.cast_caustics(casters, domain_size=_domain_size(spec))
         if spec.get("engine") == "workbench":
             workbench.apply_workbench_settings(spec)
             self.device = "Workbench"
@@ -146,11 +168,14 @@ class SceneRenderer:
             raise RenderFailedError(f"Blender ended the render with {sorted(outcome)}")
         # save_render writes to exactly this path; the scene's own output path would expand '#', '{' and add suffixes.
         result = bpy.data.images["Render Result"]
-        settings.choose_png(self._format)
+        settings.choose_png(self._format, with_alpha=self._has_alpha)
         result.save_render(str(output_path.resolve()), scene=bpy.context.scene)
-        png.strip_metadata(output_path)
+        if self._behind is None:
+            png.strip_metadata(output_path)
+        else:
+            flattening.lay_over(output_path, self._behind)
         if master_path is not None:
-            settings.choose_exr(with_passes=bool(self._passes))
+            settings.choose_exr(with_passes=bool(self._passes), with_alpha=self._has_alpha)
             result.save_render(str(master_path.resolve()), scene=bpy.context.scene)
             exr.strip_metadata(master_path)
 
@@ -174,15 +199,22 @@ class SceneRenderer:
     def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> None:
         name, kind = description["name"], description["type"]
         look = description["material"]["look"]
+        at_rest = geometry.read_ply(self._folder / description["file"]) if kind in ("mesh", "moving_mesh") else None
         context = LookContext.of(
             description["material"],
             domain_size=_domain_size(spec),
             pixel_angle=camera.pixel_angle(spec),
             smoke_box=_smoke_box(description) if kind == "volume_sequence" else None,
+            surface="sheet" if kind == "mesh_sequence" else "body",
+            edges=None if at_rest is None else at_rest.edges(),
         )
-        material = looks.new_material(name, look, context)
-        if kind in ("mesh", "moving_mesh"):
-            blender_object = geometry.new_mesh_object(name, geometry.read_ply(self._folder / description["file"]))
+        if description["material"]["blend"] is None:
+            material = looks.new_material(name, look, context)
+        else:
+            file, inside = blend_materials.split_reference(description["material"]["blend"])
+            material = blend_materials.append_material(self._folder / file, inside)
+        if at_rest is not None:
+            blender_object = geometry.new_mesh_object(name, at_rest)
             blender_object.rotation_mode = "QUATERNION"
             if kind == "mesh":
                 blender_object.location = description["position"]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import bpy
+from mathutils import Vector
 
 from blender_scripts.compatibility import set_file_format
 
@@ -52,6 +53,9 @@ QUALITY_PRESETS = {
 _CLEAN_SAMPLES = 16
 """Of an empty stage, which is smooth: what is left of the noise after denoising is below a grey level or two."""
 
+_FAR_DISC = 300.0
+"""Distance of what stands for a sun, in diagonals of the domain: its light falls off by 1 % across two of them."""
+
 _GPU_BACKENDS = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
 """In order of preference."""
 
@@ -79,7 +83,6 @@ def apply_render_settings(parameters: dict[str, Any], *, fps: float, threads: in
     render.motion_blur_position = "CENTER"
     render.use_compositing = False
     render.use_sequencer = False
-    choose_png(parameters["format"])
     _enable_passes(bpy.context.view_layer, frozenset(parameters["passes"]))
     scene.display_settings.display_device = "sRGB"
     scene.view_settings.view_transform = "AgX"
@@ -88,20 +91,21 @@ def apply_render_settings(parameters: dict[str, Any], *, fps: float, threads: in
     _apply_cycles_settings(scene.cycles, parameters)
 
 
-def choose_png(picture_format: str) -> None:
+def choose_png(picture_format: str, *, with_alpha: bool) -> None:
     """What is saved next is a PNG as the display shows it.
 
     Args:
         picture_format: `render.format`; what an EXR accompanies has 8 bits.
+        with_alpha: whether it tells where nothing of the scene is seen.
     """
     image = bpy.context.scene.render.image_settings
     set_file_format(image, "PNG")
-    image.color_mode = "RGB"
+    image.color_mode = "RGBA" if with_alpha else "RGB"
     image.color_depth = "16" if picture_format == "png16" else "8"
     image.compression = 15
 
 
-def choose_exr(*, with_passes: bool) -> None:
+def choose_exr(*, with_passes: bool, with_alpha: bool) -> None:
     """What is saved next is an EXR of half floats; passes are in it as layers, in full precision where they are data.
 
     DWAA is made for pictures: of normals and vectors it would change the Y alone, so passes are kept without loss.
@@ -109,7 +113,7 @@ def choose_exr(*, with_passes: bool) -> None:
     image = bpy.context.scene.render.image_settings
     set_file_format(image, "OPEN_EXR_MULTILAYER" if with_passes else "OPEN_EXR")
     if not with_passes:
-        image.color_mode = "RGB"
+        image.color_mode = "RGBA" if with_alpha else "RGB"
     image.color_depth = "16"
     image.exr_codec = "ZIP" if with_passes else "DWAA"
 
@@ -178,6 +182,42 @@ def small_and_clean(resolution: tuple[int, int]) -> Iterator[None]:
     finally:
         for (owner, name, _), value in zip(changes, before, strict=True):
             setattr(owner, name, value)
+
+
+def cast_caustics(caster_names: set[str], *, domain_size: float) -> None:
+    """Let bodies bend the light of all lamps onto everything else in the scene.
+
+    Cycles walks from what is lit to a lamp through surfaces that are marked (manifold next event estimation, Hanika et
+    al. 2015), from lamps and not from the world. Through a single surface it does not reach a lamp at infinity, so what
+    lies in water would be black under a sun: a far disc of the same light takes the sun's place.
+    """
+    scene = bpy.context.scene
+    scene.cycles.caustics_refractive = True
+    for each in scene.objects:
+        if each.type == "LIGHT":
+            if each.data.type == "SUN":
+                _become_far_disc(each, _FAR_DISC * domain_size)
+            each.data.cycles.is_caustics_light = True
+        elif each.name in caster_names:
+            each.cycles.is_caustics_caster = True
+        else:
+            each.cycles.is_caustics_receiver = True
+
+
+def _become_far_disc(sun: Any, distance: float) -> None:
+    """Replace a sun by a disc of its direction, size and light, at this distance from the origin [m]."""
+    disc = bpy.data.lights.new(sun.name, "AREA")
+    disc.shape, disc.size = "DISK", 2.0 * distance * math.tan(0.5 * max(sun.data.angle, 1e-3))
+    disc.color = sun.data.color
+    # A lamp of power P that shines as Lambert's law says gives P / (pi d²) in front of it; a sun says what it gives.
+    disc.energy = sun.data.energy * math.pi * distance**2
+    sun.data = disc
+    sun.location = distance * (sun.rotation_quaternion @ Vector((0.0, 0.0, 1.0)))
+
+
+def leave_out_background() -> None:
+    """Give what is drawn an alpha channel, 0 where nothing of the scene is seen."""
+    bpy.context.scene.render.film_transparent = True
 
 
 def choose_device(wanted: str) -> str:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from blender_scripts.compatibility import node_tree_of
 
 Color = tuple[float, float, float]
 Value = TypeVar("Value")
+
+SurfaceKind = Literal["body", "sheet", "ground"]
+"""What a texture hangs on, so that it does not swim: axes of a body, coordinates of a sheet at rest, or the ground."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,11 @@ class LookContext:
         domain_size: diagonal of the domain [m].
         pixel_angle: width of a pixel at a distance of 1 m [m/m].
         smoke_box: of a volume; None for everything else.
+        surface: what a texture hangs on; see `SurfaceKind`.
+        edges: of the box around a body at rest, in its own axes [m]; None for what is no body.
         color: base colour or tint from the job, linear RGB.
         roughness: from the job [-].
+        caustics: whether light of lamps is bent, from the job.
         density: from the job; see `render.parameters.MaterialParameters`.
         thread_spacing: of woven cloth, from the job [m].
         anisotropy: of smoke, from the job [-].
@@ -49,8 +55,11 @@ class LookContext:
     domain_size: float
     pixel_angle: float
     smoke_box: SmokeBox | None
+    surface: SurfaceKind
+    edges: tuple[float, float, float] | None
     color: Color | None
     roughness: float | None
+    caustics: bool | None
     density: float | None
     thread_spacing: float | None
     anisotropy: float | None
@@ -60,17 +69,31 @@ class LookContext:
 
     @classmethod
     def of(
-        cls, parameters: dict[str, Any], *, domain_size: float, pixel_angle: float, smoke_box: SmokeBox | None = None
+        cls,
+        parameters: dict[str, Any],
+        *,
+        domain_size: float,
+        pixel_angle: float,
+        smoke_box: SmokeBox | None = None,
+        surface: SurfaceKind = "body",
+        edges: tuple[float, float, float] | None = None,
     ) -> LookContext:
         """The context for a material of the specification; keys that it does not have are left to the look."""
         own = {name: parameters.get(name) for name in _FROM_THE_JOB}
         if own["color"] is not None:
             own["color"] = tuple(own["color"])
-        return cls(domain_size=domain_size, pixel_angle=pixel_angle, smoke_box=smoke_box, **own)
+        return cls(
+            domain_size=domain_size,
+            pixel_angle=pixel_angle,
+            smoke_box=smoke_box,
+            surface=surface,
+            edges=edges,
+            **own,
+        )
 
 
 _FROM_THE_JOB = (
-    *("color", "roughness", "density", "thread_spacing"),
+    *("color", "roughness", "caustics", "density", "thread_spacing"),
     *("anisotropy", "edge_fade", "emission", "flame_temperature"),
 )
 
@@ -79,6 +102,7 @@ class NodeBuilder:
     """A material's node tree, with the steps that looks take made short."""
 
     def __init__(self, material: Any) -> None:
+        self.material = material
         self.tree = node_tree_of(material)
         self.output = self.tree.nodes.new("ShaderNodeOutputMaterial")
 

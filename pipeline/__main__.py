@@ -1,6 +1,20 @@
-"""`python -m pipeline`."""
+"""`python -m pipeline`, and the command `pipeline`."""
 
-from pipeline.cli import main
+import signal
+
+_HANDLER = signal.getsignal(signal.SIGINT)
+if _HANDLER is signal.default_int_handler:
+    # Ctrl-C while the commands are loading ends the process like any other program's, not with a traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+from pipeline.cli import main as commands  # noqa: E402
+
+
+def main() -> None:
+    """Run the command line."""
+    signal.signal(signal.SIGINT, _HANDLER)
+    commands(prog_name="pipeline")
+
 
 if __name__ == "__main__":
-    main(prog_name="pipeline")
+    main()

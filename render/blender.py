@@ -262,12 +262,14 @@ def _told_of(frame: int) -> Iterator[None]:
 def build_argv(blender: str, spec_path: Path, *, threads: int) -> list[str]:
     """Arguments that make a Blender executable serve frames of a specification. Pure.
 
-    `--factory-startup` keeps the user's preferences and add-ons out of the pictures.
+    `--factory-startup` keeps the user's preferences and add-ons out of the pictures, `--disable-autoexec` what .blend
+    files would run.
     """
     return [
         blender,
         "--background",
         "--factory-startup",
+        "--disable-autoexec",
         "--threads",
         str(threads),
         "--python",

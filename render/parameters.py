@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 Vector3 = tuple[float, float, float]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -136,31 +136,63 @@ class LightParameters(Parameters):
 class StageParameters(Parameters):
     """Ground, background and the lights that come with them."""
 
-    name: Literal["studio", "outdoor", "night"] = Field(
+    name: Literal["studio", "outdoor", "night", "window"] = Field(
         default="studio",
         description="studio: cyclorama with key, fill and rim lights; outdoor: ground, sky and sun; night: ground, "
-        "a dark sky and a moon behind the domain.",
+        "a dark sky and a moon behind the domain; window: a room with soft light from a large window at the left.",
     )
     strength: Positive = Field(default=1.0, description="Factor on all of its lights [-].")
-    color: Color = Field(default=(0.22, 0.25, 0.29), description="Colour of the ground and backdrop, linear RGB.")
+    color: Color | None = Field(
+        default=None,
+        description="Colour of the ground and backdrop, linear RGB; the stage's own if omitted, or that of the look in "
+        "ground.",
+    )
+    ground: Literal["rubber", "ceramic", "plastic", "metal", "stone", "wood"] | None = Field(
+        default=None, description="Look of the ground, and of a backdrop that it curves up into; matt if omitted."
+    )
+    background: Literal["stage", "plain", "transparent"] = Field(
+        default="stage",
+        description="stage: as it is; plain: exactly the stage's colour behind everything; transparent: frames have an "
+        "alpha channel, and the film, which can have none, is laid over black. Of the ground only the shadows on it "
+        "are seen in the last two.",
+    )
+    hdri: str | None = Field(
+        default=None,
+        description="Picture of the whole sphere around the scene, .hdr or .exr, relative to the job file: light and "
+        "sky come from it, above the ground, in place of those of name.",
+    )
+    rotation_deg: float = Field(
+        default=0.0, description="How far the hdri is turned, counter-clockwise from above [degrees]."
+    )
     tank: bool = Field(default=False, description="Show the domain's walls as a glass tank.")
 
 
 Look = Literal[
-    "water", "smoke", "fire", "rubber", "ceramic", "plastic", "metal", "stone", "glass", "spray", "foam", "bubbles",
-    "cotton", "silk", "denim",
+    "water", "honey", "milk", "smoke", "fire", "rubber", "ceramic", "plastic", "metal", "stone", "wood", "glass",
+    "spray", "foam", "bubbles", "cotton", "silk", "denim",
 ]  # fmt: skip
 
 
 class MaterialParameters(Parameters):
-    """What a body looks like."""
+    """What a body looks like: a look, or a material of one's own."""
 
-    look: Look = Field(description="Name of the look.")
+    look: Look | None = Field(default=None, description="Name of the look; give this or blend.")
+    blend: str | None = Field(
+        default=None,
+        description='Material of a .blend file, relative to the job file: "materials.blend:Old gold". Its pictures '
+        "must be packed into the file; drivers and key frames of it are left out.",
+    )
     color: Color | None = Field(default=None, description="Base colour or tint, linear RGB; the look's own if omitted.")
     roughness: Fraction | None = Field(default=None, description="Roughness [-]; the look's own if omitted.")
     density: Positive | None = Field(
         default=None,
-        description="Smoke and fire: extinction per metre at density 1 [1/m]. Water: factor on its absorption [-].",
+        description="Smoke and fire: extinction per metre at density 1 [1/m]. Water and honey: factor on their "
+        "absorption, milk: on its scattering [-].",
+    )
+    caustics: bool = Field(
+        default=False,
+        description="Water, honey and glass: bend the light of lamps onto what lies around, instead of letting it "
+        "straight through; docs/rendering.md has what it costs.",
     )
     thread_spacing: Positive | None = Field(
         default=None, description="Woven cloth: distance of its threads [m]; the look's own if omitted."
@@ -184,6 +216,20 @@ class MaterialParameters(Parameters):
         description="Fire: temperature that glows as emission says [K]; 1500 if omitted. What is hotter or colder "
         "glows more or less as a black body does.",
     )
+
+    @field_validator("blend")
+    @classmethod
+    def _names_a_material(cls, blend: str | None) -> str | None:
+        file, separator, name = (blend or "").partition(".blend:")
+        if blend is not None and not (file and separator and name):
+            raise ValueError('must name a file and a material in it, such as "materials.blend:Old gold"')
+        return blend
+
+    @model_validator(mode="after")
+    def _is_one_material(self) -> Self:
+        if (self.look is None) == (self.blend is None):
+            raise ValueError('give look, such as look = "metal", or blend, one of them')
+        return self
 
 
 RenderPass = Literal["depth", "vector", "normal", "cryptomatte", "denoising"]

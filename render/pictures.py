@@ -85,7 +85,7 @@ def read_picture(path: Path) -> Pixels:
 
 
 def read_rgb8(path: Path) -> NDArray[np.uint8]:
-    """Pixels as (height, width, 3) uint8; 16-bit channels are rounded, alpha is dropped."""
+    """Pixels as (height, width, 3) uint8; 16-bit channels are rounded, what has alpha is laid over black."""
     color = _rgb(path)
     if color.dtype == np.uint16:
         color = ((color.astype(np.uint32) + 128) // 257).astype(np.uint8)
@@ -93,7 +93,7 @@ def read_rgb8(path: Path) -> NDArray[np.uint8]:
 
 
 def read_rgb16(path: Path) -> NDArray[np.uint16]:
-    """Pixels as (height, width, 3) uint16; 8-bit channels are spread over the range, alpha is dropped."""
+    """Pixels as (height, width, 3) uint16; 8-bit channels are spread over the range, alpha is laid over black."""
     color = _rgb(path)
     if color.dtype == np.uint8:
         color = color.astype(np.uint16) * np.uint16(257)
@@ -101,9 +101,14 @@ def read_rgb16(path: Path) -> NDArray[np.uint16]:
 
 
 def _rgb(path: Path) -> Pixels:
-    """Colours of a picture, (height, width, 3), grey ones as well."""
+    """Colours of a picture, (height, width, 3), grey ones as well; what has alpha is laid over black."""
     pixels = read_picture(path)
-    return np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] <= 2 else pixels[..., :3]
+    channels, full = pixels.shape[2], np.iinfo(pixels.dtype).max
+    color: Pixels = np.repeat(pixels[..., :1], 3, axis=2) if channels <= 2 else pixels[..., :3]
+    if channels in (2, 4):
+        shaded = (color.astype(np.uint32) * pixels[..., -1:] + full // 2) // full
+        color = shaded.astype(np.uint8) if full == 255 else shaded.astype(np.uint16)
+    return color
 
 
 def validate_picture(path: Path, resolution: tuple[int, int]) -> PictureStatistics:

@@ -8,14 +8,25 @@ from pathlib import Path
 
 from pipeline.errors import JobFileError
 from pipeline.job.loading import LoadedJob, read_job
-from pipeline.job.looks import BODY, GLOWING_K, VOLUME_LOOKS, WHITEWATER, WOVEN_LOOKS, parts_of
+from pipeline.job.looks import (
+    BODY,
+    GLOWING_K,
+    REFRACTING_LOOKS,
+    TEXTURED_LOOKS,
+    VOLUME_LOOKS,
+    WHITEWATER,
+    WOVEN_LOOKS,
+    parts_of,
+)
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.scene_checks import check_scene
+from pipeline.job.stage_checks import check_blend, check_stage
 from pipeline.stages import STAGES
 from pipeline.stages.movie import MovieStage
+from render.parameters import MaterialParameters
 
 MANY_FRAMES = 100_000
 
@@ -37,6 +48,7 @@ def check_job(job: Job, *, memory_bytes: int | None = None) -> Findings:
     _check_faces(job, findings)
     _check_time(job, findings)
     _check_pictures(job, findings)
+    check_stage(job, findings)
     _check_limits(job, findings)
     if check_magnitudes(job, findings):
         check_scene(job, findings, memory_bytes)
@@ -96,10 +108,12 @@ def _check_materials(job: Job, findings: Findings) -> None:
     kinds |= {f"{fluid}.{part}": "fluid" for fluid in job.whitewater for part in WHITEWATER}
     for name, material in job.material.items():
         path: KeyPath = ("material", name)
+        if material.blend is not None:
+            check_blend(material, path, kinds.get(name), findings)
         if name not in kinds:
             hint = suggestion(name, kinds) or (f"; bodies are {', '.join(kinds)}" if kinds else "")
             findings.error(path, f'no body is named "{name}"{hint}')
-        elif kinds[name] == "smoke" and material.look not in VOLUME_LOOKS:
+        elif kinds[name] == "smoke" and material.look not in VOLUME_LOOKS and material.look is not None:
             findings.error((*path, "look"), f'smoke can only look like "smoke" or "fire", got "{material.look}"')
         elif kinds[name] != "smoke" and material.look in VOLUME_LOOKS:
             findings.error(
@@ -109,19 +123,30 @@ def _check_materials(job: Job, findings: Findings) -> None:
             findings.error(
                 (*path, "look"), f'"{material.look}" is a look for [[cloth]]; "{name}" is in [[{kinds[name]}]]'
             )
-        if material.thread_spacing is not None and material.look not in WOVEN_LOOKS:
-            findings.warn((*path, "thread_spacing"), f'has no effect on the look "{material.look}"')
-        for key, looks in (
-            ("density", (*VOLUME_LOOKS, "water")),
-            ("anisotropy", VOLUME_LOOKS),
-            ("edge_fade", VOLUME_LOOKS),
-            ("emission", ("fire",)),
-            ("flame_temperature", ("fire",)),
-        ):
-            if getattr(material, key) is not None and material.look not in looks:
-                findings.warn((*path, key), f'has no effect on the look "{material.look}"')
+        elif material.look in TEXTURED_LOOKS and kinds[name] not in TEXTURED_LOOKS[material.look]:
+            findings.warn(
+                (*path, "look"), f'is "{material.look}", whose texture hangs on nothing in [[{kinds[name]}]]: it swims'
+            )
+        if material.look is not None:
+            _check_keys(material, path, findings)
         if material.look == "fire":
             _check_glow(job, name, findings)
+
+
+def _check_keys(material: MaterialParameters, path: KeyPath, findings: Findings) -> None:
+    if material.thread_spacing is not None and material.look not in WOVEN_LOOKS:
+        findings.warn((*path, "thread_spacing"), f'has no effect on the look "{material.look}"')
+    if material.caustics and material.look not in REFRACTING_LOOKS:
+        findings.warn((*path, "caustics"), f'has no effect on the look "{material.look}"')
+    for key, looks in (
+        ("density", (*VOLUME_LOOKS, "water", "honey", "milk")),
+        ("anisotropy", VOLUME_LOOKS),
+        ("edge_fade", VOLUME_LOOKS),
+        ("emission", ("fire",)),
+        ("flame_temperature", ("fire",)),
+    ):
+        if getattr(material, key) is not None and material.look not in looks:
+            findings.warn((*path, key), f'has no effect on the look "{material.look}"')
 
 
 def _check_glow(job: Job, name: str, findings: Findings) -> None:

@@ -9,15 +9,15 @@ from pathlib import Path
 from blake3 import blake3
 
 from pipeline.files import sync
+from pipeline.job.input_files import input_files
 from pipeline.job.loading import LoadedJob, changed_text, job_of_text
 from pipeline.job.models import Job
 from pipeline.job.overrides import Override
-from pipeline.job.placements import mesh_shapes
 from pipeline.layout import JobLayout
 
 
 def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
-    """Copy the job's mesh files into its folder.
+    """Copy the files that the job reads into its folder.
 
     A copy is named after its content, so one of another job version never replaces it. One that does not hold that
     content any more is written again.
@@ -28,17 +28,18 @@ def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
         meanwhile.
 
     Raises:
-        OSError: a mesh cannot be read, or the folder not be written.
+        OSError: a file cannot be read, or the folder not be written.
     """
     changes = []
-    for place, shape in mesh_shapes(loaded.job):
-        source = Path(shape.file)
+    for file in input_files(loaded.job):
+        source = Path(file.path)
         content = source.read_bytes()
         digest = blake3(content).hexdigest()[:12]
         copy = layout.inputs / f"{source.stem.removesuffix(f'-{digest}')}-{digest}{source.suffix}"
         if not copy.is_file() or copy.read_bytes() != content:
             _write(copy, content)
-        changes.append(Override((*place, "file"), copy.relative_to(layout.root).as_posix(), loaded.path.name))
+        kept = file.written(copy.relative_to(layout.root).as_posix())
+        changes.append(Override(file.place, kept, loaded.path.name))
     text = changed_text(loaded.text, changes) if changes else loaded.text
     return job_of_text(text, layout.job_file), text
 

@@ -12,11 +12,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from pipeline.errors import JobFileError
+from pipeline.job.input_files import InputFile, input_files
 from pipeline.job.messages import explain
 from pipeline.job.models import Job
 from pipeline.job.overrides import Override, OverrideError, apply_overrides, parse_override
-from pipeline.job.placements import mesh_shapes
-from pipeline.job.positions import KeyPath
 from pipeline.job.presets import preview_overrides
 from pipeline.job.problems import JobSource
 
@@ -199,11 +198,13 @@ def _with_tuples(value: Any) -> Any:
 
 def _with_absolute_files(text: str, job: Job, path: Path) -> str:
     """The text with the files that it names relative to its own folder named by absolute paths."""
-    files: list[tuple[KeyPath, str]] = [((*place, "file"), shape.file) for place, shape in mesh_shapes(job)]
+    files = list(input_files(job))
     if job.render.blender is not None:
-        files.append((("render", "blender"), job.render.blender))
+        files.append(InputFile(("render", "blender"), job.render.blender, "program"))
     folder = path.resolve().parent
     changes = [
-        Override(place, (folder / file).as_posix(), path.name) for place, file in files if not Path(file).is_absolute()
+        Override(file.place, file.written((folder / file.path).as_posix()), path.name)
+        for file in files
+        if not Path(file.path).is_absolute()
     ]
     return changed_text(text, changes) if changes else text

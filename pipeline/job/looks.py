@@ -42,6 +42,12 @@ CLOTHS: dict[Material, MaterialParameters] = {
 WOVEN_LOOKS = ("cotton", "silk", "denim")
 """Their threads run along coordinates on the sheet at rest, which only cloths have."""
 
+REFRACTING_LOOKS = ("water", "honey", "glass")
+"""What bends light, and can have caustics."""
+
+TEXTURED_LOOKS = {"stone": ("rigid",), "wood": ("rigid", "cloth")}
+"""What the textures of these looks can hang on; on anything else they swim from frame to frame."""
+
 VOLUME_LOOKS = ("smoke", "fire")
 """What a volume can look like, and nothing else."""
 

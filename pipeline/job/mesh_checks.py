@@ -1,4 +1,4 @@
-"""Whether the mesh files that a job names are there."""
+"""Whether the files that a job names are there."""
 
 from __future__ import annotations
 
@@ -19,11 +19,23 @@ def mesh_exists(shape: object, path: KeyPath, findings: Findings) -> bool:
     """
     if not isinstance(shape, MeshShape):
         return True
-    file, key = Path(shape.file), (*path, "shape", "file")
+    return file_exists(shape.file, "mesh", (*path, "shape", "file"), findings)
+
+
+def file_exists(name: str, kind: str, key: KeyPath, findings: Findings) -> bool:
+    """Whether a file is there; notes what is wrong, and the name that may be meant.
+
+    Args:
+        name: its absolute path.
+        kind: what it is, for messages: "mesh".
+        key: that names it.
+        findings: where errors go.
+    """
+    file = Path(name)
     if file.is_file():
         return True
     if file.is_dir():
-        findings.error(key, f"{file} is a folder, not a mesh")
+        findings.error(key, f"{file} is a folder, not a {kind}")
     elif not file.parent.is_dir():
         findings.error(key, f"no such file: {file}; there is no folder {file.parent}")
     else:

@@ -44,7 +44,7 @@ def by_content(placement: P) -> P:
     """
     if not isinstance(placement.shape, MeshShape):
         return placement
-    shape = placement.shape.model_copy(update={"file": _content_name(placement.shape.file)})
+    shape = placement.shape.model_copy(update={"file": content_name(placement.shape.file, "mesh")})
     return placement.model_copy(update={"shape": shape})
 
 
@@ -90,31 +90,39 @@ def estimated_nodes(cloth: ClothParameters) -> int:
     """
     if isinstance(cloth.shape, RectangleSheet):
         return prod(cloth.shape.node_counts)
-    return _status(cloth.shape.file).st_size // BYTES_PER_VERTEX
+    return _status(cloth.shape.file, "mesh").st_size // BYTES_PER_VERTEX
 
 
-def _content_name(file: str) -> str:
-    """Hash and suffix, for the suffix decides how the file is read."""
-    status = _status(file)
-    return _hash(file, status.st_size, status.st_mtime_ns) + Path(file).suffix.lower()
+def content_name(file: str, kind: str) -> str:
+    """Hash and suffix of a file of the user's, for the suffix decides how the file is read.
+
+    Args:
+        file: its path.
+        kind: what it is, for messages: "mesh".
+
+    Raises:
+        MissingInputError: it cannot be read.
+    """
+    status = _status(file, kind)
+    return _hash(file, kind, status.st_size, status.st_mtime_ns) + Path(file).suffix.lower()
 
 
-def _status(file: str) -> os.stat_result:
+def _status(file: str, kind: str) -> os.stat_result:
     try:
         return Path(file).stat()
     except OSError as error:
-        raise _missing(file, error) from error
+        raise _missing(file, kind, error) from error
 
 
-def _missing(file: str, error: OSError) -> MissingInputError:
-    return MissingInputError(f"cannot read the mesh {file}: {error.strerror}; the job needs it")
+def _missing(file: str, kind: str, error: OSError) -> MissingInputError:
+    return MissingInputError(f"cannot read the {kind} {file}: {error.strerror}; the job needs it")
 
 
 @cache
-def _hash(file: str, _size: int, _mtime_ns: int) -> str:
+def _hash(file: str, kind: str, _size: int, _mtime_ns: int) -> str:
     try:
         if not Path(file).is_file():
             raise OSError(errno.EINVAL, "it is no file", file)  # a device or a pipe may never end
         return blake3(Path(file).read_bytes()).hexdigest()
     except OSError as error:
-        raise _missing(file, error) from error
+        raise _missing(file, kind, error) from error

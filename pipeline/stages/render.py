@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 
 from pipeline.cache import read_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
+from pipeline.job.input_files import split_blend
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
+from pipeline.job.problems import suggestion
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
 from pipeline.stages.bounds import read_framed
-from pipeline.stages.inputs import tool_version
+from pipeline.stages.inputs import content_name, tool_version
 from pipeline.stages.sight import BodyAtFrame, bodies_at, expected_cells, warn_of_sight
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
 from render.camera_path import CameraPath, View, write_views
@@ -71,7 +73,12 @@ _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "r
 differently."""
 
 _LATER_KEYS: dict[str, Any] = {"format": "png", "passes": []}
-"""Keys that jobs of earlier versions had not: where they say what was always so, those jobs' frames stay up to date."""
+_LATER_STAGE_KEYS: dict[str, Any] = {"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0}
+_LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None, "caustics": False}
+"""Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
+
+_FORMER_COLOR = [0.22, 0.25, 0.29]
+"""What stood for a stage's colour where the job gives none, in those versions."""
 
 
 class RenderStage:
@@ -82,10 +89,7 @@ class RenderStage:
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
-        spec = render_spec(job, layout).model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
-        for key, usual in _LATER_KEYS.items():
-            if spec["render"][key] == usual:
-                del spec["render"][key]
+        spec = _decisive(render_spec(job, layout))
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
             spec["camera"] = {"framing": job.camera.model_dump(mode="json")}
@@ -128,9 +132,9 @@ class RenderStage:
                 require_bpy()
             else:
                 require_supported_executable(job.render.blender)
+            return list(_missing_materials(job))
         except BlenderUnavailableError as error:
             return [str(error)]
-        return []
 
     def run(self, context: TaskContext) -> None:
         """Draw one frame.
@@ -165,6 +169,63 @@ class RenderStage:
             raise
         layout.rejected_picture(task.frame).unlink(missing_ok=True)
         context.progress(1, 1)
+
+
+def _missing_materials(job: Job) -> Iterator[str]:
+    """Materials of .blend files that are not there: told before hours of simulation, not after.
+
+    Raises:
+        BlenderUnavailableError: Blender does not answer.
+    """
+    from render.blend_file import read_material_names
+    from render.errors import InvalidFileError
+
+    wanted: dict[str, dict[str, str]] = {}
+    for body, material in job.material.items():
+        if material.blend is not None:
+            file, name = split_blend(material.blend)
+            wanted.setdefault(file, {})[body] = name
+    for file, names in wanted.items():
+        try:
+            there = read_material_names(Path(file), job.render.blender)
+        except InvalidFileError as error:
+            yield str(error)
+            continue
+        known = f"there are {', '.join(sorted(there))}" if there else "it has none"
+        for body, name in names.items():
+            if name not in there:
+                hint = suggestion(name, there)
+                yield f'material.{body}.blend: {file} has no material "{name}"{hint}; {known}'
+
+
+def _decisive(spec: RenderSpec) -> dict[str, Any]:
+    """What of a specification decides pixels: files by their content, and keys of later versions only where used.
+
+    Raises:
+        MissingInputError: a file cannot be read.
+    """
+    document = spec.model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
+    for key, usual in _LATER_KEYS.items():
+        if document["render"][key] == usual:
+            del document["render"][key]
+    stage = document["stage"]
+    for key, unused in _LATER_STAGE_KEYS.items():
+        if stage[key] == unused:
+            del stage[key]
+    if spec.stage.hdri is not None:
+        stage["hdri"] = content_name(spec.stage.hdri, "picture")
+        stage["name"] = None  # its light and sky are not there
+    if stage["color"] is None and "ground" not in stage and stage["name"] != "window":
+        stage["color"] = _FORMER_COLOR
+    for drawn in document["objects"]:
+        material = drawn["material"]
+        for key, unused in _LATER_MATERIAL_KEYS.items():
+            if material[key] == unused:
+                del material[key]
+        if "blend" in material:
+            file, name = split_blend(material["blend"])
+            drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
+    return document
 
 
 def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None = None) -> RenderSpec:

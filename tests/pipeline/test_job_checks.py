@@ -167,6 +167,14 @@ def test_job_that_cannot_be_meant_is_refused_with_this_line(text, expected, tmp_
             "until that has moved off",
         ),
         (
+            HEAD + WATER + '[material.water]\nlook = "milk"\ncaustics = true',
+            'dam.toml:12 material.water.caustics: has no effect on the look "milk"',
+        ),
+        (
+            HEAD + WATER + '[material.water]\nlook = "wood"',
+            'dam.toml:11 material.water.look: is "wood", whose texture hangs on nothing in [[fluid]]: it swims',
+        ),
+        (
             HEAD + WATER + BALL + '[material.ball]\nlook = "metal"\ndensity = 2.0',
             'dam.toml:17 material.ball.density: has no effect on the look "metal"',
         ),

@@ -3,6 +3,7 @@
 import random
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import tomlkit
@@ -13,7 +14,9 @@ from pipeline.errors import JobFileError
 from pipeline.job.checks import check_job
 from pipeline.job.loading import load_job, read_job
 from pipeline.job.models import Job
+from pipeline.job.problems import quoted_list
 from pipeline.job.starter import TEMPLATES, starter
+from render.parameters import Look
 
 FLUID = """
 [[fluid]]
@@ -115,6 +118,13 @@ BAD = {
         [
             'dam.toml:3 render.quality: expected "draft", "preview" or "final", got the text "fnal"; '
             'did you mean "final"?'
+        ],
+    ),
+    "misspelt look": (
+        'name = "dam"\n[material.dam]\nlook = "hony"',
+        [
+            f'dam.toml:3 material.dam.look: expected {quoted_list(get_args(Look))}, got the text "hony"; '
+            'did you mean "honey"?'
         ],
     ),
     "speed of sound for a solver without one": (

@@ -150,12 +150,30 @@ def test_keys_that_a_codec_has_not_are_refused(table, sentence):
         ({"render": {"device": "cpu"}}, {"render"}),
         ({"render": {"shutter": 0.25}}, {"render", "volume"}),
         ({"fps": 30}, {"simulate", "volume", "render", "movie"}),
+        ({"stage": {"color": [0.22, 0.25, 0.29], "background": "stage", "rotation_deg": 0.0}}, set()),
+        ({"stage": {"name": "window"}}, {"render"}),
+        ({"material": {"water": {"look": "water", "caustics": True}}}, {"render"}),
+        ({"material": {"water": {"look": "water", "caustics": False}}}, set()),
+        ({"stage": {"ground": "wood"}}, {"render"}),
+        ({"stage": {"background": "plain"}}, {"render"}),
+        ({"stage": {"background": "transparent"}}, {"render"}),
     ],
     ids=lambda value: "+".join(sorted(value)) if isinstance(value, set) else str(value),
 )
 def test_a_change_concerns_only_the_stages_that_read_it(change, concerned):
     before, after = digests(job()), digests(job(**change))
     assert {stage for stage in before if before[stage] != after[stage]} == concerned
+
+
+def test_frames_of_a_job_without_later_keys_of_stages_stay_up_to_date():
+    """What earlier versions wrote into the parameters of a frame."""
+    task = next(task for task in plan_job(job(), LAYOUT, STAGES) if task.stage == "render")
+    document = json.loads(task.parameters.canonical)
+    assert document["stage"] == {"name": "studio", "strength": 1.0, "color": [0.22, 0.25, 0.29], "tank": False}
+    assert set(document["objects"][0]["material"]) == {
+        *("look", "color", "roughness", "density", "thread_spacing"),
+        *("anisotropy", "edge_fade", "emission", "flame_temperature"),
+    }
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (90, 0, 0), (10, 20, 30), (-35, 120, 200)])

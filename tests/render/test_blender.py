@@ -274,7 +274,7 @@ def test_smoke_is_drawn_where_it_is_and_unfit_volumes_are_refused(tmp_path):
 def test_every_look_and_stage_builds_and_draws(tmp_path):
     positions, triangles = sphere((0.0, 0.0, 0.0), 0.12, rings=8, segments=12)
     write_mesh(tmp_path / "ball.ply", positions, triangles)
-    looks = ("water", "rubber", "ceramic", "plastic", "metal", "stone", "glass")
+    looks = ("water", "honey", "milk", "rubber", "ceramic", "plastic", "metal", "stone", "wood", "glass")
     objects = tuple(
         MeshObject(
             name=look,
@@ -285,8 +285,9 @@ def test_every_look_and_stage_builds_and_draws(tmp_path):
         for index, look in enumerate(looks)
     )
     night = StageParameters(name="night", strength=30.0)
+    window = StageParameters(name="window", ground="stone")
     camera = still_camera(CameraParameters())
-    for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor"), night):
+    for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor"), night, window):
         spec = spec_of(*objects, samples=2).model_copy(update={"stage": stage, "camera": camera})
         spec.write(tmp_path / "spec.json")
         run_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")
@@ -302,7 +303,8 @@ def test_spec_survives_its_json(tmp_path):
 def test_argv_starts_blender_without_the_users_settings():
     argv = build_argv("/opt/blender", Path("/job/spec.json"), threads=3)
     script = argv[argv.index("--python") + 1]
-    assert argv[:6] == ["/opt/blender", "--background", "--factory-startup", "--threads", "3", "--python"]
+    start = ["/opt/blender", "--background", "--factory-startup", "--disable-autoexec", "--threads", "3", "--python"]
+    assert argv[: len(start)] == start
     assert Path(script).is_file()
     assert argv[argv.index("--") + 1 :] == ["/job/spec.json", "--serve", "--threads", "3"]
 

@@ -72,6 +72,18 @@ def test_sixteen_bits_round_to_eight(tmp_path, pixels):
     np.testing.assert_array_equal(read_rgb8(path)[pixels < 255], pixels[pixels < 255])
 
 
+@pytest.mark.parametrize("mode", ["LA", "RGBA"])
+def test_what_has_alpha_is_laid_over_black(tmp_path, pixels, mode):
+    image = Image.fromarray(pixels).convert(mode)
+    alpha = Image.linear_gradient("L").resize(image.size)
+    image.putalpha(alpha)
+    image.save(tmp_path / "frame.png")
+    black = Image.new("RGBA", image.size, "black")
+    expected = np.asarray(Image.alpha_composite(black, image.convert("RGBA")).convert("RGB"))
+    # Pillow rounds its products of eight bits in its own way.
+    np.testing.assert_allclose(read_rgb8(tmp_path / "frame.png").astype(int), expected.astype(int), atol=1)
+
+
 def test_the_hash_sees_pixels_and_nothing_else(tmp_path, pixels):
     info = PngInfo()
     info.add_text("Date", "2001-02-03")

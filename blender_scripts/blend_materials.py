@@ -1,0 +1,102 @@
+"""Materials of .blend files: their names, and one of them for a scene, without anything in the file being run.
+
+    blender --background --factory-startup --disable-autoexec --python blend_materials.py -- FILE
+
+writes the names to standard output as a line `MATERIALS ["...", ...]`, among the lines that Blender itself writes, or a
+line `MATERIALS_FAILED reason`; so does `python blend_materials.py FILE` with the bpy module.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+if __package__ in (None, ""):
+    # Run as a script: the package is not on the path.
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import bpy
+
+from blender_scripts.errors import RenderInputError
+
+SUFFIX = ".blend"
+
+
+def split_reference(reference: str) -> tuple[str, str]:
+    """File and name of `file.blend:Name`."""
+    file, _, name = reference.partition(f"{SUFFIX}:")
+    return file + SUFFIX, name
+
+
+def material_names(path: Path) -> list[str]:
+    """Names of the materials in a .blend file.
+
+    Raises:
+        RenderInputError: it cannot be read.
+    """
+    try:
+        with bpy.data.libraries.load(str(path), link=False) as (there, _):
+            return list(there.materials)
+    except OSError as error:
+        raise RenderInputError(f"cannot read the materials of {path}: {error}") from error
+
+
+def append_material(path: Path, name: str) -> Any:
+    """A copy of a material in this scene.
+
+    Drivers and key frames are taken off it: a driver may hold a program, and none of a file's is run.
+
+    Raises:
+        RenderInputError: the file cannot be read, has no such material, or one that needs further files.
+    """
+    names = material_names(path)
+    if name not in names:
+        close = difflib.get_close_matches(name.lower(), [each.lower() for each in names], n=1)
+        hint = next((f'; did you mean "{each}"?' for each in names if [each.lower()] == close), "")
+        known = f"there are {', '.join(sorted(names))}" if names else "it has none"
+        raise RenderInputError(f'{path} has no material "{name}"{hint}; {known}')
+    with bpy.data.libraries.load(str(path), link=False) as (_, wanted):
+        wanted.materials = [name]
+    material = wanted.materials[0]
+    for owner in (material, *_trees(material.node_tree)):
+        owner.animation_data_clear()
+    for tree in _trees(material.node_tree):
+        for node in tree.nodes:
+            _require_no_file(path, name, node)
+    return material
+
+
+def _trees(tree: Any) -> Iterator[Any]:
+    """A node tree, and those of the groups in it."""
+    if tree is None:
+        return
+    yield tree
+    for node in tree.nodes:
+        yield from _trees(getattr(node, "node_tree", None))
+
+
+def _require_no_file(path: Path, name: str, node: Any) -> None:
+    image = getattr(node, "image", None)
+    if image is not None and image.source != "GENERATED" and not image.packed_files:
+        raise RenderInputError(
+            f'the material "{name}" of {path} needs the picture {image.filepath}, which is not in the file; '
+            "pack it there (File > External Data > Pack Resources)"
+        )
+
+
+def main(arguments: list[str]) -> int:
+    """Write the names of a file's materials."""
+    try:
+        sys.stdout.write(f"MATERIALS {json.dumps(material_names(Path(arguments[0])))}\n")
+    except RenderInputError as error:
+        sys.stdout.write(f"MATERIALS_FAILED {str(error).replace(chr(10), ' ')}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]))

@@ -1,0 +1,49 @@
+"""The user's own files that a job names, each with its place in the job file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pipeline.job.models import Job
+from pipeline.job.placements import mesh_shapes
+from pipeline.job.positions import KeyPath
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """One file that a job reads.
+
+    Attributes:
+        place: of the key that names it.
+        path: as the job names it.
+        kind: what it is, for messages: "mesh".
+        rest: what the key's value says after the path.
+    """
+
+    place: KeyPath
+    path: str
+    kind: str
+    rest: str = ""
+
+    def written(self, path: str) -> str:
+        """The key's value with the file under another path."""
+        return path + self.rest
+
+
+def input_files(job: Job) -> Iterator[InputFile]:
+    """Every file that the job reads, meshes first."""
+    for place, shape in mesh_shapes(job):
+        yield InputFile((*place, "file"), shape.file, "mesh")
+    if job.stage.hdri is not None:
+        yield InputFile(("stage", "hdri"), job.stage.hdri, "picture")
+    for name, material in job.material.items():
+        if material.blend is not None:
+            file, inside = split_blend(material.blend)
+            yield InputFile(("material", name, "blend"), file, ".blend file", f":{inside}")
+
+
+def split_blend(reference: str) -> tuple[str, str]:
+    """File and name of a material: `file.blend:Name`."""
+    stem, _, name = reference.partition(".blend:")
+    return f"{stem}.blend", name

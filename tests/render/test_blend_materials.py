@@ -1,0 +1,129 @@
+"""Materials of .blend files on bodies: drawn, named where they are missing, and nothing of the file run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blender_scenes import RENDER_FRAMES, read, spec_of, sphere, write_mesh
+from blender_stand_in import write_blender_stand_in
+from fresh_python import run_python
+from needed_blender import needs_bpy
+
+from pipeline.job.models import Job
+from pipeline.stages.render import RenderStage
+from render.blend_file import build_argv, read_material_names
+from render.errors import InvalidFileError
+from render.parameters import MaterialParameters
+from render.spec import MeshObject
+
+pytestmark = needs_bpy
+
+# A green one, one whose strength a program of a driver decides, and one with a picture outside of the file.
+WRITE = """
+    import sys
+    import bpy
+
+    file, proof = sys.argv[1:]
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+    def new(name, color):
+        material = bpy.data.materials.new(name)
+        material.use_fake_user = True
+        tree = material.node_tree
+        tree.nodes.clear()
+        shader = tree.nodes.new("ShaderNodeEmission")
+        shader.inputs["Color"].default_value = (*color, 1.0)
+        tree.links.new(shader.outputs[0], tree.nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+        return tree, shader
+
+    new("Green: bright", (0.02, 0.8, 0.05))
+    tree, shader = new("Driven", (0.9, 0.02, 0.02))
+    driver = shader.inputs["Strength"].driver_add("default_value").driver
+    driver.expression = f"1.0 + (open({proof!r}, 'w').write('ran') and 0)"
+    tree, shader = new("Pictured", (1.0, 1.0, 1.0))
+    picture = tree.nodes.new("ShaderNodeTexImage")
+    picture.image = bpy.data.images.new("bricks", 8, 8)
+    picture.image.source, picture.image.filepath = "FILE", "//bricks.png"
+    text = bpy.data.texts.new("start.py")
+    text.write(f"open({proof!r}, 'w').write('ran')")
+    text.use_module = True
+    bpy.ops.wm.save_as_mainfile(filepath=file)
+"""
+
+
+@pytest.fixture(scope="module")
+def materials(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A .blend file whose programs would write `proof` beside it."""
+    folder = tmp_path_factory.mktemp("materials")
+    run_python(WRITE, str(folder / "my materials.blend"), str(folder / "proof"))
+    (folder / "proof").unlink(missing_ok=True)  # Blender ran the driver while it was written
+    return folder / "my materials.blend"
+
+
+def draw(folder: Path, blend: str) -> np.ndarray:
+    write_mesh(folder / "ball.ply", *sphere((0.0, 0.0, 0.5), 0.3))
+    spec_of(MeshObject(name="ball", file="ball.ply", material=MaterialParameters(blend=blend))).write(
+        folder / "spec.json"
+    )
+    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
+    return read(folder / "0.png")[14:22, 28:36].mean(axis=(0, 1))
+
+
+def test_a_body_takes_the_material_of_a_blend_file(materials, tmp_path):
+    red, green, blue = draw(tmp_path, f"{materials}:Green: bright")
+    assert green > 1.5 * red
+    assert green > 1.5 * blue
+
+
+def test_no_program_of_the_file_is_run(materials, tmp_path):
+    red, green, _ = draw(tmp_path, f"{materials}:Driven")
+    assert red > 1.5 * green
+    assert not (materials.parent / "proof").exists()
+
+
+def test_a_material_that_needs_a_picture_outside_of_the_file_is_refused(materials, tmp_path):
+    with pytest.raises(AssertionError, match=r'the material "Pictured" of .* needs the picture .*bricks\.png.*pack it'):
+        draw(tmp_path, f"{materials}:Pictured")
+
+
+def test_a_missing_name_is_told_with_those_that_are_there(materials, tmp_path):
+    with pytest.raises(
+        AssertionError,
+        match=r'has no material "driven"; did you mean "Driven"\?; there are Driven, Green: bright, Pictured',
+    ):
+        draw(tmp_path, f"{materials}:driven")
+
+
+def job(blend: str, **render: object) -> Job:
+    """A ball of that material."""
+    ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.1}}
+    document = {"name": "film", "rigid": [ball], "material": {"ball": {"blend": blend}}, "render": render}
+    return Job.model_validate(document)
+
+
+@pytest.mark.parametrize("external", [False, True])
+def test_a_missing_name_is_an_obstacle_before_any_work(materials, tmp_path, external):
+    render = {"blender": str(write_blender_stand_in(tmp_path))} if external else {}
+    assert RenderStage().obstacles(job(f"{materials}:Driven", **render)) == []
+    assert RenderStage().obstacles(job(f"{materials}:Gold", **render)) == [
+        f'material.ball.blend: {materials} has no material "Gold"; there are Driven, Green: bright, Pictured'
+    ]
+    assert not (materials.parent / "proof").exists()
+
+
+def test_a_file_that_is_no_blend_file_is_an_obstacle(tmp_path):
+    (tmp_path / "text.blend").write_text("this is no Blender file")
+    (obstacle,) = RenderStage().obstacles(job(f"{tmp_path}/text.blend:Gold"))
+    assert obstacle.startswith(f"{tmp_path}/text.blend: cannot read the materials of")
+    with pytest.raises(InvalidFileError):
+        read_material_names(tmp_path / "text.blend", None)
+
+
+def test_an_executable_reads_names_without_the_users_settings_or_the_files_programs():
+    argv = build_argv(Path("/job/a.blend"), "/opt/blender")
+    start = ["/opt/blender", "--background", "--factory-startup", "--disable-autoexec", "--python"]
+    assert argv[: len(start)] == start
+    assert argv[-2:] == ["--", "/job/a.blend"]
+    assert Path(argv[-3]).is_file()

@@ -1,0 +1,188 @@
+"""Looks as Cycles draws them, by what tells them apart: tiny pictures without denoising, in child processes."""
+
+from __future__ import annotations
+
+from math import sqrt
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blender_scenes import RENDER_FRAMES, RESOLUTION, read, spec_of, sphere, still_camera, write_mesh
+from fresh_python import run_python
+from needed_blender import needs_bpy
+
+from render.meshes import write_ply
+from render.parameters import CameraParameters, MaterialParameters, StageParameters
+from render.spec import MeshObject, MeshSequenceObject, SceneObject
+
+pytestmark = needs_bpy
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+QUARTER_TURN = (sqrt(0.5), 0.0, sqrt(0.5), 0.0)
+"""About the y axis, along which the camera looks."""
+
+
+def draw(folder: Path, *objects: SceneObject, **render: object) -> np.ndarray:
+    """Display values of frame 0 from 0 to 255, (rows, columns, 3)."""
+    spec_of(*objects, **{"samples": 24, "motion_blur": False, **render}).write(folder / "spec.json")
+    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
+    return read(folder / "0.png")
+
+
+def patch(picture: np.ndarray, x: float, z: float, half: float) -> np.ndarray:
+    """The square around a point of the plane y = 0, of this half edge, all in metres."""
+    scale = picture.shape[1] * 50.0 / 36.0 / 2.5
+    column, row = picture.shape[1] / 2 + x * scale, picture.shape[0] / 2 - (z - 0.5) * scale
+    reach = half * scale
+    return picture[round(row - reach) : round(row + reach), round(column - reach) : round(column + reach)]
+
+
+@pytest.fixture(scope="module")
+def liquids(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+    """Mean colour of the middle of a ball of each."""
+    folder = tmp_path_factory.mktemp("liquids")
+    write_mesh(folder / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.2))
+    places = {"water": -0.5, "honey": 0.0, "milk": 0.5}
+    picture = draw(
+        folder,
+        *(
+            MeshObject(name=look, file="ball.ply", position=(x, 0.0, 0.5), material=MaterialParameters(look=look))
+            for look, x in places.items()
+        ),
+        resolution=(128, 72),
+    )
+    return {look: patch(picture, x, 0.5, 0.12).mean(axis=(0, 1)) for look, x in places.items()}
+
+
+def test_honey_lets_red_light_through_and_keeps_blue_back(liquids):
+    red, green, blue = liquids["honey"]
+    # Its blue absorbs six times as much as its green, which is what makes it amber and not grey.
+    assert red > 1.1 * green > 1.3 * blue
+
+
+def test_water_is_bluish_and_milk_a_warm_white(liquids):
+    assert liquids["water"][2] > liquids["water"][0]
+    assert liquids["milk"][0] > liquids["milk"][2]
+    # Saturation of a white that reflects 0.91 of red light and 0.76 of blue is far below honey's.
+    assert np.ptp(liquids["milk"]) < 0.25 * np.ptp(liquids["honey"])
+
+
+def test_milk_is_the_brightest_and_none_is_black_or_burnt_out(liquids):
+    luminances = {look: color @ LUMINANCE for look, color in liquids.items()}
+    assert max(luminances, key=luminances.__getitem__) == "milk"
+    assert all(25 < luminance < 245 for luminance in luminances.values())
+
+
+@pytest.mark.parametrize("look", ["honey", "milk"])
+def test_density_decides_how_far_light_gets_inside(look, tmp_path):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.5), 0.3))
+    thin, dense = (
+        draw(
+            tmp_path,
+            MeshObject(name=look, file="ball.ply", material=MaterialParameters(look=look, density=density)),
+            resolution=(128, 72),
+            samples=64,
+        )
+        for density in (0.02, 0.5)
+    )
+    # The backdrop shows through thin honey. In thin milk, light that entered far away fills the shadow below; 500
+    # pixels of 64 samples are good to a fraction of a per cent.
+    z, half, factor = (0.5, 0.2, 1.3) if look == "honey" else (0.3, 0.06, 1.05)
+    lighter, darker = ((patch(each, 0.0, z, half) @ LUMINANCE).mean() for each in (thin, dense))
+    assert lighter > factor * darker
+
+
+def stripes(picture: np.ndarray) -> float:
+    """How much more the picture changes from left to right than up and down [-]: above 1 for upright stripes."""
+    luminance = picture @ LUMINANCE
+    # Second differences: shading is smooth, and stripes are not.
+    across, down = np.diff(luminance, 2, axis=1), np.diff(luminance, 2, axis=0)
+    return float(np.abs(across).mean() / np.abs(down).mean())
+
+
+WOOD = MaterialParameters(look="wood", roughness=1.0)
+
+
+def test_wood_is_brown_and_has_a_grain_that_plastic_of_its_colour_lacks(tmp_path):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.25))
+    plain = MaterialParameters(look="plastic", color=(0.36, 0.19, 0.085), roughness=1.0)
+    left, right = (
+        MeshObject(name=look.look, file="ball.ply", position=(x, 0.0, 0.5), material=look)
+        for look, x in ((WOOD, -0.35), (plain, 0.35))
+    )
+    picture = draw(tmp_path, left, right, resolution=(128, 72), samples=64)
+    wood, plastic = patch(picture, -0.35, 0.5, 0.15), patch(picture, 0.35, 0.5, 0.15)
+    red, green, blue = wood.mean(axis=(0, 1))
+    assert red > 1.1 * green > 1.2 * blue
+    # The same light and the same mean colour within a third; the grain is what differs.
+    assert (wood @ LUMINANCE).mean() == pytest.approx((plastic @ LUMINANCE).mean(), rel=0.33)
+    rough, smooth = (np.abs(np.diff(each @ LUMINANCE, 2, axis=1)).mean() for each in (wood, plastic))
+    assert rough > 1.5 * smooth
+
+
+def test_the_grain_of_wood_runs_along_a_body_and_turns_with_it(tmp_path):
+    """A texture that hung on the world would show the same stripes whichever way the body is turned."""
+    positions, triangles = sphere((0.0, 0.0, 0.0), 0.25)
+    write_mesh(tmp_path / "egg.ply", positions * (0.9, 0.9, 1.2), triangles)
+    upright, lying = (
+        MeshObject(name=name, file="egg.ply", position=(x, 0.0, 0.5), orientation=turn, material=WOOD)
+        for name, x, turn in (("upright", -0.35, (1.0, 0.0, 0.0, 0.0)), ("lying", 0.35, QUARTER_TURN))
+    )
+    picture = draw(tmp_path, upright, lying, resolution=(192, 108), samples=64)
+    assert stripes(patch(picture, -0.35, 0.5, 0.15)) > 1.25
+    assert stripes(patch(picture, 0.35, 0.5, 0.15)) < 0.8
+
+
+def test_the_grain_of_a_sheet_hangs_on_its_coordinates_at_rest(tmp_path):
+    """The sheet stays where it is, its coordinates at rest turn: so does the grain."""
+    side = np.linspace(-0.45, 0.45, 12)
+    x, z = (each.ravel() for each in np.meshgrid(side, side, indexing="ij"))
+    positions = np.stack([x, np.zeros_like(x), z + 0.5], axis=1)
+    corner = (np.arange(11)[:, None] * 12 + np.arange(11)).ravel()
+    a, b, c, d = corner, corner + 12, corner + 13, corner + 1
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    pictures = []
+    for name, uv in (("along", np.stack([x, z], axis=1)), ("across", np.stack([z, x], axis=1))):
+        folder = tmp_path / name
+        folder.mkdir()
+        normals = np.broadcast_to((0.0, -1.0, 0.0), positions.shape)
+        write_ply(folder / "sheet000000.ply", positions, triangles, normals=normals, velocities=0 * positions, uv=uv)
+        sheet = MeshSequenceObject(name="sheet", file="sheet{frame}.ply", material=WOOD)
+        pictures.append(patch(draw(folder, sheet, resolution=(128, 72), samples=64), 0.0, 0.5, 0.35))
+    assert stripes(pictures[0]) > 1.25
+    assert stripes(pictures[1]) < 0.8
+
+
+@pytest.mark.parametrize("look", ["glass", "metal", "stone", "ceramic", "plastic", "rubber"])
+def test_solid_looks_are_lit_and_differ_from_the_stage_behind_them(look, tmp_path):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.5), 0.3))
+    ball = MeshObject(name=look, file="ball.ply", material=MaterialParameters(look=look))
+    with_ball, without = draw(tmp_path, ball, samples=8), draw(tmp_path, samples=8)
+    seen = patch(with_ball, 0.0, 0.5, 0.2) @ LUMINANCE
+    assert 25 < seen.mean() < 245
+    changed = np.abs(with_ball - without).max(axis=2) > 12.0
+    # A disc of 0.3 m at 2.5 m, seen by 1.39 tangents a picture's width; glass hides least of what is behind it.
+    disc = np.pi * (RESOLUTION[0] * 50.0 / 36.0 * 0.3 / sqrt(2.5**2 - 0.3**2)) ** 2
+    assert changed.sum() > (0.3 if look == "glass" else 0.6) * disc
+
+
+def test_caustics_bend_the_sun_s_light_and_leave_the_rest_of_the_ground_as_it_is(tmp_path):
+    """A ball of glass gathers the light that its shadow lacks; without them it lets light straight through."""
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.3), 0.3, rings=48, segments=96))
+    above = still_camera(CameraParameters(position=(0.0, -1.2, 2.6), look_at=(0.15, 0.1, 0.0)))
+    pictures = []
+    for caustics in (False, True):
+        glass = MaterialParameters(look="glass", caustics=caustics)
+        ball = MeshObject(name="ball", file="ball.ply", material=glass)
+        scene = {"stage": StageParameters(name="outdoor", strength=0.5), "camera": above}
+        spec = spec_of(ball, samples=64, motion_blur=False).model_copy(update=scene)
+        spec.write(tmp_path / "spec.json")
+        run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0", "2")
+        pictures.append(read(tmp_path / "0.png") @ LUMINANCE)
+    straight, bent = pictures
+    ground = straight[:, :8].mean()
+    # A far disc stands for the sun: the same light to a hundredth, and noise of 64 samples over 288 pixels.
+    assert bent[:, :8].mean() == pytest.approx(ground, rel=0.02)
+    behind = np.s_[8:28, 38:60]  # the ground beside the ball, away from the sun
+    assert bent[behind].min() < 0.75 * straight[behind].min()
+    assert bent[behind].max() > 1.1 * ground
