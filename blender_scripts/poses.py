@@ -64,7 +64,7 @@ def place(blender_object: Any, pose: Pose, *, frame: int) -> None:
     """Put an object where its body is at a frame, and let it move while the shutter is open.
 
     Cycles looks at an object when the shutter opens, in the middle and when it closes, or for vectors a frame before
-    and after. These are the times that get a keyframe each, so nothing depends on how Blender interpolates between them.
+    and after. These are the times that get a keyframe each, so nothing depends on how Blender interpolates.
     """
     scene = bpy.context.scene
     forget_keyframes(blender_object)
