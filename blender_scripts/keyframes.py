@@ -14,3 +14,11 @@ def forget_keyframes(animated: Any) -> None:
         animated.animation_data_clear()
         if action is not None:  # an object and its data may share one
             bpy.data.actions.remove(action)
+
+
+def reach_of_motion() -> float:
+    """How far before and after a frame Cycles looks at what moves [frames]: for blur, or vectors to other frames."""
+    scene = bpy.context.scene
+    if bpy.context.view_layer.use_pass_vector:
+        return 1.0
+    return 0.5 * scene.render.motion_blur_shutter if scene.render.use_motion_blur else 0.0

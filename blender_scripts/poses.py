@@ -16,7 +16,7 @@ import numpy as np
 
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderInputError
-from blender_scripts.keyframes import forget_keyframes
+from blender_scripts.keyframes import forget_keyframes, reach_of_motion
 
 POSES_VERSION = 1
 _LENGTHS = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity": 3}
@@ -63,14 +63,14 @@ def read_poses(path: Path) -> dict[str, Pose]:
 def place(blender_object: Any, pose: Pose, *, frame: int) -> None:
     """Put an object where its body is at a frame, and let it move while the shutter is open.
 
-    Cycles looks at an object when the shutter opens, in the middle and when it closes. These are the times that get a
-    keyframe each, so nothing depends on how Blender interpolates between them.
+    Cycles looks at an object when the shutter opens, in the middle and when it closes, or for vectors a frame before
+    and after. These are the times that get a keyframe each, so nothing depends on how Blender interpolates.
     """
     scene = bpy.context.scene
     forget_keyframes(blender_object)
-    half_open = 0.5 * scene.render.motion_blur_shutter if scene.render.use_motion_blur else 0.0
+    reach = reach_of_motion()
     frames_per_second = scene.render.fps / scene.render.fps_base
-    for offset in sorted({-half_open, 0.0, half_open}):
+    for offset in sorted({-reach, 0.0, reach}):
         position, orientation = pose.after(offset / frames_per_second)
         blender_object.location = position
         blender_object.rotation_quaternion = orientation

@@ -53,19 +53,41 @@ class Size(NamedTuple):
         cells: of all smoke grids.
         nodes: of all cloths.
         pixels: of a picture.
+        picture_bytes_per_pixel: what a picture takes, on the mean of its files [bytes].
+        film_factor: how much more a film takes than one of H.264 [-].
     """
 
     particles: int
     cells: int
     nodes: int
     pixels: int
+    picture_bytes_per_pixel: float = 1.2
+    film_factor: float = 1.0
 
 
 def size_of(job: Job, findings: Findings) -> Size:
     """The size of a job that was checked."""
     width, height = job.render.resolution
-    return Size(findings.particles, findings.cells, findings.nodes, width * height)
+    return Size(
+        findings.particles,
+        findings.cells,
+        findings.nodes,
+        width * height,
+        _picture_bytes_per_pixel(job),
+        _PRORES_FACTOR if job.movie.codec == "prores" else 1.0,
+    )
 
+
+def _picture_bytes_per_pixel(job: Job) -> float:
+    """Measured with a draft of the quickstart at 480x270; a job with masters has two files a frame."""
+    png = 4.7 if job.render.format == "png16" else 1.2
+    if not job.render.has_master:
+        return png
+    passes = len(job.render.passes)
+    return (png + (5.0 + 6.0 * passes if passes else 1.0)) / 2
+
+
+_PRORES_FACTOR = 30.0
 
 _BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
     # Positions and velocities of particles; smoke is stored where there is some.
@@ -77,9 +99,9 @@ _BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
     "cloth": lambda size: 70.0 * size.nodes,
     "bodies": lambda _: 400_000.0,
     "bounds": lambda _: 500.0,
-    "render": lambda size: 1_000 + 1.2 * size.pixels,
+    "render": lambda size: 1_000 + size.picture_bytes_per_pixel * size.pixels,
     # Segments of 120 frames and the film; a frame takes a tenth of a byte a pixel in each.
-    "movie": lambda size: 12.0 * size.pixels,
+    "movie": lambda size: 12.0 * size.film_factor * size.pixels,
 }
 """What one file of a stage takes, about, where nothing has been made yet to go by [bytes]. The factors are those of a
 few small jobs, and rough."""

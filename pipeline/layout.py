@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -161,6 +162,7 @@ class JobLayout:
 
     @property
     def film(self) -> Path:
-        """Where the film lies that was made last, for one who does not know the job."""
-        made = [path for suffix in (".mp4", ".mov") if (path := self.path(self.movie(suffix))).exists()]
-        return max(made, key=lambda path: path.stat().st_mtime, default=self.path(self.movie()))
+        """Where the film lies, by the job's file; for one who does not know the job."""
+        text = self.job_file.read_text(encoding="utf-8") if self.job_file.exists() else ""
+        codec = tomllib.loads(text).get("movie", {}).get("codec")
+        return self.path(self.movie(".mov" if codec == "prores" else ".mp4"))

@@ -1,7 +1,7 @@
 """Whether a film runs on from frame to frame: pictures that pop up for one frame, repeat, or jump.
 
 How two pictures differ is the root mean square of the difference of their luma, in means over blocks: noise averages
-out, and what is as large as a block counts. Why not FLIP: docs/decisions/0031-checks-of-pictures.md.
+out, and what is as large as a block counts. Why not FLIP: docs/decisions/0030-checks-of-pictures.md.
 """
 
 from __future__ import annotations

@@ -277,6 +277,13 @@ class RenderParameters(Parameters):
         """Whether there is an EXR beside each PNG."""
         return self.format == "exr"
 
+    @property
+    def reach_of_motion(self) -> float:
+        """How far before and after a frame it matters where things are [frames]: for blur, or vectors."""
+        if "vector" in self.passes:
+            return 1.0
+        return 0.5 * self.shutter if self.motion_blur else 0.0
+
     @model_validator(mode="after")
     def _passes_have_a_place(self) -> Self:
         if self.passes and not self.has_master:

@@ -162,6 +162,7 @@ def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: 
 
     layout = JobLayout(find_job(job, output).root.absolute())
     submitted = read_job(layout.job_file)
+    require_own_programs(submitted, ())
     size = _fitted(submitted.job.render.resolution, width)
     loaded = read_job(layout.job_file, [f"render.resolution=[{size[0]}, {size[1]}]"])
     path = layout.root / f"{submitted.job.name}-animatic.mp4" if target is None else target

@@ -31,7 +31,7 @@ def check_stage(job: Job, findings: Findings) -> None:
     if stage.background == "plain" and job.render.format == "png16":
         findings.error(
             ("stage", "background"),
-            'is "plain", which pictures are laid over in 8 bits, but render.format is "png16"; take "transparent" or "png"',
+            'is "plain", which pictures are laid over in 8 bits, but render.format is "png16"; take "png"',
         )
 
 

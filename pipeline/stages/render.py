@@ -352,9 +352,9 @@ def write_motion(job: Job, layout: JobLayout, frame: int, *, attempt: int) -> tu
         with _replacing(layout, layout.poses, frame, attempt) as path:
             write_poses(path, frame, poses)
     if camera.moves:
-        half_open = 0.5 * job.render.shutter if job.render.motion_blur else 0.0
+        reach = job.render.reach_of_motion
         views = {}
-        for offset in sorted({-half_open, 0.0, half_open}):
+        for offset in sorted({-reach, 0.0, reach}):
             places = {name: _position_after(offset / job.fps, poses[name]) for name in camera.bodies}
             views[offset] = camera.view((frame + offset) / job.fps, places)
         with _replacing(layout, layout.views, frame, attempt) as path:

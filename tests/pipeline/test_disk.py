@@ -11,6 +11,8 @@ from record_samples import film
 
 from pipeline import disk
 from pipeline.commands.arguments import parse_age, parse_size
+from pipeline.job.models import Job
+from pipeline.job.problems import Findings
 from pipeline.manifest_reader import StageCost
 from pipeline.plan import assess
 
@@ -27,6 +29,23 @@ def test_an_estimate_grows_with_the_frames_that_are_to_be_made() -> None:
     ten, twenty = estimated(10, {}), estimated(20, {})
     # 22 bytes a particle and 1.2 a pixel; checkpoints and the film are there once.
     assert twenty - ten == pytest.approx(10 * (22_000 + 22e6 + 1_000 + 1.2 * 1920 * 1080))
+
+
+@pytest.mark.parametrize(
+    ("render", "bytes_per_pixel"),
+    [
+        ({}, 1.2),
+        ({"format": "png16"}, 4.7),
+        ({"format": "exr"}, (1.2 + 1.0) / 2),
+        ({"format": "exr", "passes": ["depth", "normal"]}, (1.2 + 17.0) / 2),
+    ],
+)
+def test_masters_and_deep_pictures_count_with_what_they_take(render: dict, bytes_per_pixel: float) -> None:
+    scene = {"name": "still", "frames": 1, "rigid": [{"name": "b", "shape": {"type": "sphere", "radius": 0.1}}]}
+    job = Job.model_validate({**scene, "render": render, "movie": {"codec": "prores"}}, strict=False)
+    size = disk.size_of(job, Findings())
+    assert size.picture_bytes_per_pixel == pytest.approx(bytes_per_pixel)
+    assert size.film_factor == 30.0
 
 
 def test_what_the_stages_have_taken_counts_more_than_what_jobs_usually_take() -> None:

@@ -107,6 +107,17 @@ def test_a_film_for_editing_is_a_quicktime_film():
     assert tasks["movie/film"].outputs == ("movie.mov",)
 
 
+def test_the_film_of_a_folder_is_the_one_that_its_job_asks_for(tmp_path):
+    layout = JobLayout(tmp_path)
+    assert layout.film == tmp_path / "movie.mp4"
+    for name in ("movie.mp4", "movie.mov"):  # the last one made is not what counts
+        (tmp_path / name).touch()
+    layout.job_file.write_text('name = "tank"\n[movie]\ncodec = "prores"\n')
+    assert layout.film == tmp_path / "movie.mov"
+    layout.job_file.write_text('name = "tank"\n')
+    assert layout.film == tmp_path / "movie.mp4"
+
+
 def test_films_of_jobs_from_before_there_were_other_codecs_stay_up_to_date():
     (film,) = (task for task in plan_job(job(), LAYOUT, STAGES) if task.id == "movie/film")
     parameters = json.loads(film.parameters.canonical)

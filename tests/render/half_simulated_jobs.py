@@ -40,7 +40,7 @@ def half_simulated_job(folder: Path, more: str = "") -> JobLayout:
                 if content is not None:
                     commit.path.write_bytes(content)
                     continue
-                ball = Snapshot("rigid", pose((0.2 * frame, 0.0, 0.5))["ball"], {})
+                ball = Snapshot("rigid", pose((0.2 * frame, 0.0, 0.5), velocity=(12.0, 0.0, 0.0))["ball"], {})
                 report = FrameReport(frame, frame / 60, {}, {}, {})
                 write_frame(commit.path, {"ball": ball}, report, device="cpu")
     return layout

@@ -7,7 +7,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from blender_scenes import redness
+from blender_scenes import read, redness, spec_of, sphere, write_mesh
 from command_line import pipeline
 from half_simulated_jobs import half_simulated_job
 from needed_blender import needs_bpy, needs_egl
@@ -15,6 +15,9 @@ from needed_blender import needs_bpy, needs_egl
 from pipeline.layout import JobLayout
 from render import workbench
 from render.blender import BlenderUnavailableError, FrameRenderError
+from render.parameters import MaterialParameters, StageParameters, VolumeParameters
+from render.spec import MeshObject, SceneObject, VolumeSequenceObject
+from render.volume import write_volume
 from render.workbench import build_workbench_argv, draw_frames, require_workbench
 
 
@@ -79,6 +82,15 @@ def test_argv_of_the_module_and_of_an_executable_run_the_same_script():
     assert Path(module[1]).is_file()
 
 
+@pytest.mark.parametrize("command", [("animatic",), ("still", "--frame", 0)])
+def test_a_foreign_job_file_may_not_choose_what_runs_here(tmp_path, command):
+    job = half_simulated_job(tmp_path)
+    job.manifest.unlink()
+    result = pipeline(*command, job.root)
+    assert result.exit_code == 2
+    assert "a job file may not choose what runs here" in result.stderr
+
+
 def test_a_job_without_simulated_frames_is_told_what_to_do(tmp_path):
     job = half_simulated_job(tmp_path)
     for receipt in (job.receipts / "cache").iterdir():
@@ -86,3 +98,69 @@ def test_a_job_without_simulated_frames_is_told_what_to_do(tmp_path):
     result = pipeline("animatic", job.root)
     assert result.exit_code == 1
     assert f"cache/000000.h5 is not simulated yet; go on with: pipeline resume {job.root}" in result.stderr
+
+
+def workbench_picture(folder: Path, *objects: SceneObject, **changes: object) -> np.ndarray:
+    spec = spec_of(*objects, resolution=(96, 54)).model_copy(update={"engine": "workbench", **changes})
+    spec.write(folder / "spec.json")
+    (picture,) = draw_frames(folder / "spec.json", [0], folder, threads=1, blender=None, drawn=lambda _frame: None)
+    return read(picture)
+
+
+@needs_bpy
+@needs_egl
+def test_bodies_have_the_colours_of_their_looks(tmp_path):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.12, rings=12, segments=24))
+    looks = {"rubber": (1.0, 0.59, 0.02), "plastic": (0.62, 0.06, 0.05), "ceramic": (0.82, 0.79, 0.74)}
+    balls = [
+        MeshObject(name=look, file="ball.ply", position=(x, 0.0, 0.5), material=MaterialParameters(look=look))
+        for look, x in zip(looks, (-0.35, 0.0, 0.35), strict=True)
+    ]
+    green = MaterialParameters(look="metal", color=(0.05, 0.6, 0.1))
+    balls.append(MeshObject(name="own", file="ball.ply", position=(0.0, 0.0, 0.85), material=green))
+    picture = workbench_picture(tmp_path, *balls, stage=StageParameters(tank=True))
+    # 96 pixels x 50 mm / 36 mm / 2.5 m = 53 pixels a metre.
+    orange, red, white = (picture[27, 48 + round(53 * x)] for x in (-0.35, 0.0, 0.35))
+    assert orange[0] > 1.2 * orange[1] > 2.0 * orange[2]
+    assert red[0] > 2.0 * red[1]
+    assert white.min() > 0.85 * white.max()
+    own = picture[27 - round(53 * 0.35), 48]
+    assert own[1] > 1.5 * own[0]
+
+
+@needs_bpy
+@needs_egl
+@pytest.mark.parametrize("look", ["smoke", "fire"])
+def test_smoke_and_fire_are_seen_where_they_are(tmp_path, look):
+    cells = 16
+    volume = VolumeSequenceObject(
+        name="smoke",
+        file="smoke/{frame}.vdb",
+        box_min=(-0.3, -0.3, 0.2),
+        box_max=(0.3, 0.3, 0.8),
+        open_faces=(),
+        ambient_temperature=293.0,
+        material=MaterialParameters(look=look),
+    )
+    (tmp_path / "smoke").mkdir()
+    pictures = []
+    for filled in (0, cells // 2):
+        density = np.zeros((cells,) * 3, np.float32)
+        density[:filled] = 1.0
+        write_volume(
+            tmp_path / "smoke/000000.vdb",
+            density=density,
+            temperature=np.full_like(density, 1200.0),
+            velocity=np.zeros((cells, cells, cells, 3), np.float32),
+            origin=(-0.3, -0.3, 0.2),
+            cell_size=0.6 / cells,
+            ambient_temperature=293.0,
+            parameters=VolumeParameters(),
+            fps=60.0,
+            shutter=0.5,
+        )
+        pictures.append(workbench_picture(tmp_path, volume))
+    # The left half of a cube of 0.6 m is full: 16 pixels of its 32 change, the right half does not.
+    change = abs(pictures[1] - pictures[0]).mean(axis=2)[18:36]
+    assert change[:, 36:46].mean() > 8.0
+    assert change[:, 52:62].mean() < 1.0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from command_line import pipeline
+from exr_channels import exr_channels
 from half_simulated_jobs import half_simulated_job
 from needed_blender import needs_bpy
 from PIL import Image
@@ -64,6 +66,29 @@ def test_a_still_with_a_master_has_both_files(job, tmp_path):
     assert result.exit_code == 0, result.output
     validate_exr(tmp_path / "poster.exr", (64, 36))
     validate_picture(tmp_path / "poster.png", (64, 36))
+
+
+@needs_bpy
+def test_vectors_of_a_rigid_body_and_of_a_camera_reach_to_the_next_frame(job, tmp_path):
+    render = {"format": '"exr"', "passes": '["vector"]', "motion_blur": "false", "samples": "1"}
+    view = {"position": "[0.0, -2.5, 0.5]", "look_at": "[0.0, 0.0, 0.5]"}
+    keys = [f"render.{key}={value}" for key, value in render.items()]
+    keys += [f"camera.{key}={value}" for key, value in view.items()]
+    vectors = {}
+    for name, more in {"still": [], "following": ['camera.follow="ball"']}.items():
+        overrides = [word for key in (*keys, *more) for word in ("--set", key)]
+        target = tmp_path / f"{name}.png"
+        result = pipeline("still", job.root, "--frame", 1, "--quality", "draft", *overrides, "-o", target)
+        render_stage._close_renderers()
+        assert result.exit_code == 0, result.output
+        vectors[name] = exr_channels(target.with_suffix(".exr"), tmp_path)["ViewLayer.Vector.X"]
+    # 12 m/s at 60 fps are 0.2 m a frame; 64 pixels x 50 mm / 36 mm / 2.4 m = 37.0 pixels a metre on the ball's front.
+    # Vectors point to where things were in the frame before.
+    moved = 0.2 * 37.0
+    assert np.median(vectors["still"]) == pytest.approx(0.0, abs=0.01)  # most of the picture is the stage
+    assert abs(vectors["still"]).max() == pytest.approx(moved, abs=0.3)
+    # A camera that flies along sees the ball stand still and the stage behind it move the other way.
+    assert np.median(vectors["following"]) * vectors["still"].sum() < 0.0
 
 
 def test_a_frame_that_is_not_simulated_yet_is_told_with_the_command_that_makes_it(job):
