@@ -32,4 +32,4 @@ def lay_over(path: Path, color: tuple[float, float, float]) -> None:
 
 def _encoded(linear: float) -> float:
     """sRGB's value of a linear one."""
-    return float(12.92 * linear if linear <= 0.0030308 else 1.055 * linear ** (1 / 2.4) - 0.055)
+    return float(12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055)
