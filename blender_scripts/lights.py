@@ -187,7 +187,9 @@ def _build_window(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     _add_surface(walls, "walls", wall, parameters)
     # As large and bright from afar as it would be near. Bars between the panes: what shines shows a window, not a lamp.
     scale = -left / _WINDOW_DISTANCE
-    power = 210.0 * scale**2 * parameters["strength"] * geometry.power_scale
+    # Four walls give more of the light back than two.
+    power = (210.0 if geometry.camera_circle is None else 115.0) * scale**2
+    power *= parameters["strength"] * geometry.power_scale
     for number, (across, up) in enumerate(((-1, -1), (1, -1), (-1, 1), (1, 1))):
         pane = _new_light(f"pane {number}", "AREA", power, (0.86, 0.93, 1.0))
         pane.shape, pane.size = "SQUARE", 0.95 * scale * geometry.size
