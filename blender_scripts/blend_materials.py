@@ -1,9 +1,10 @@
 """Materials of .blend files: their names, and one of them for a scene, without anything in the file being run.
 
-    blender --background --factory-startup --disable-autoexec --python blend_materials.py -- FILE
+    blender --background --factory-startup --disable-autoexec --python blend_materials.py -- FILE [NAME ...]
 
 writes the names to standard output as a line `MATERIALS ["...", ...]`, among the lines that Blender itself writes, or a
-line `MATERIALS_FAILED reason`; so does `python blend_materials.py FILE` with the bpy module.
+line `MATERIALS_FAILED reason`; so does `python blend_materials.py FILE` with the bpy module. Those that are named are
+also tried, if they are there.
 """
 
 from __future__ import annotations
@@ -65,8 +66,10 @@ def append_material(path: Path, name: str) -> Any:
     for owner in (material, *_trees(material.node_tree)):
         owner.animation_data_clear()
     for tree in _trees(material.node_tree):
+        if tree.library is not None:
+            raise RenderInputError(f'the material "{name}" of {path} uses "{tree.name}" of another file; make it local')
         for node in tree.nodes:
-            _require_no_file(path, name, node)
+            _require_nothing_else(path, name, node)
     return material
 
 
@@ -79,7 +82,14 @@ def _trees(tree: Any) -> Iterator[Any]:
         yield from _trees(getattr(node, "node_tree", None))
 
 
-def _require_no_file(path: Path, name: str, node: Any) -> None:
+def _require_nothing_else(path: Path, name: str, node: Any) -> None:
+    """Refuse what a node needs beside the material: files, and objects, with whom drivers and key frames would come."""
+    if getattr(node, "object", None) is not None:
+        raise RenderInputError(
+            f'the material "{name}" of {path} depends on the object "{node.object.name}", which a job has none of'
+        )
+    if node.bl_idname in ("ShaderNodeTexIES", "ShaderNodeScript") and node.mode == "EXTERNAL":
+        raise RenderInputError(f'the material "{name}" of {path} needs the file {node.filepath}; make it internal')
     image = getattr(node, "image", None)
     if image is not None and image.source != "GENERATED" and not image.packed_files:
         raise RenderInputError(
@@ -89,9 +99,14 @@ def _require_no_file(path: Path, name: str, node: Any) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the names of a file's materials."""
+    """Write the names of a file's materials, and try some."""
+    path, wanted = Path(arguments[0]), arguments[1:]
     try:
-        sys.stdout.write(f"MATERIALS {json.dumps(material_names(Path(arguments[0])))}\n")
+        names = material_names(path)
+        for name in wanted:
+            if name in names:
+                append_material(path, name)
+        sys.stdout.write(f"MATERIALS {json.dumps(names)}\n")
     except RenderInputError as error:
         sys.stdout.write(f"MATERIALS_FAILED {str(error).replace(chr(10), ' ')}\n")
         return 1

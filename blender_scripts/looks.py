@@ -229,6 +229,9 @@ def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
     )
 
 
+REFRACTING = ("water", "honey", "glass")
+"""Looks that bend light, and can have caustics."""
+
 LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
     "water": _water,
     "honey": _honey,

@@ -95,11 +95,13 @@ class SceneRenderer:
         self._sequences: list[tuple[dict[str, Any], Any]] = []
         self._fires: dict[str, volumes.FireLight] = {}
         self._bodies: list[tuple[dict[str, Any], Any]] = []
+        casters = set()
         for description in spec["objects"]:
-            self._add_object(description, spec)
-        casters = {each["name"] for each in spec["objects"] if each["material"]["caustics"]}
+            drawn = self._add_object(description, spec)
+            if description["material"]["caustics"] and description["material"]["look"] in looks.REFRACTING:
+                casters.add(drawn.name)  # Blender may have chosen another name than the job's
         if casters:
-            settings.cast_caustics(casters, domain_size=_domain_size(spec))
+            settings.cast_caustics(casters, domain_size=_domain_size(spec), domain_middle=_domain_middle(spec))
         if spec.get("engine") == "workbench":
             workbench.apply_workbench_settings(spec)
             self.device = "Workbench"
@@ -196,7 +198,7 @@ class SceneRenderer:
         # A pattern that stood still in a moving picture would look like dirt on the lens.
         bpy.context.scene.cycles.seed = (self._seed + frame) % 2**31
 
-    def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> None:
+    def _add_object(self, description: dict[str, Any], spec: dict[str, Any]) -> Any:
         name, kind = description["name"], description["type"]
         look = description["material"]["look"]
         at_rest = geometry.read_ply(self._folder / description["file"]) if kind in ("mesh", "moving_mesh") else None
@@ -234,6 +236,11 @@ class SceneRenderer:
             if look == "fire":
                 self._fires[name] = volumes.FireLight(name, glow_of(context))
         blender_object.data.materials.append(material)
+        return blender_object
+
+
+def _domain_middle(spec: dict[str, Any]) -> tuple[float, ...]:
+    return tuple(0.5 * (low + high) for low, high in zip(spec["domain_min"], spec["domain_max"], strict=True))
 
 
 def _domain_size(spec: dict[str, Any]) -> float:

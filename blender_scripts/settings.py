@@ -184,7 +184,7 @@ def small_and_clean(resolution: tuple[int, int]) -> Iterator[None]:
             setattr(owner, name, value)
 
 
-def cast_caustics(caster_names: set[str], *, domain_size: float) -> None:
+def cast_caustics(caster_names: set[str], *, domain_size: float, domain_middle: tuple[float, ...]) -> None:
     """Let bodies bend the light of all lamps onto everything else in the scene.
 
     Cycles walks from what is lit to a lamp through surfaces that are marked (manifold next event estimation, Hanika et
@@ -196,7 +196,7 @@ def cast_caustics(caster_names: set[str], *, domain_size: float) -> None:
     for each in scene.objects:
         if each.type == "LIGHT":
             if each.data.type == "SUN":
-                _become_far_disc(each, _FAR_DISC * domain_size)
+                _become_far_disc(each, _FAR_DISC * domain_size, Vector(domain_middle))
             each.data.cycles.is_caustics_light = True
         elif each.name in caster_names:
             each.cycles.is_caustics_caster = True
@@ -204,15 +204,15 @@ def cast_caustics(caster_names: set[str], *, domain_size: float) -> None:
             each.cycles.is_caustics_receiver = True
 
 
-def _become_far_disc(sun: Any, distance: float) -> None:
-    """Replace a sun by a disc of its direction, size and light, at this distance from the origin [m]."""
+def _become_far_disc(sun: Any, distance: float, middle: Vector) -> None:
+    """Replace a sun by a disc of its direction, size and light, so far from the middle of what it lights [m]."""
     disc = bpy.data.lights.new(sun.name, "AREA")
     disc.shape, disc.size = "DISK", 2.0 * distance * math.tan(0.5 * max(sun.data.angle, 1e-3))
     disc.color = sun.data.color
     # A lamp of power P that shines as Lambert's law says gives P / (pi d²) in front of it; a sun says what it gives.
     disc.energy = sun.data.energy * math.pi * distance**2
     sun.data = disc
-    sun.location = distance * (sun.rotation_quaternion @ Vector((0.0, 0.0, 1.0)))
+    sun.location = middle + distance * (sun.rotation_quaternion @ Vector((0.0, 0.0, 1.0)))
 
 
 def leave_out_background() -> None:

@@ -59,7 +59,8 @@ def _density(described: dict[str, Any]) -> float:
 
 def _viewport_color(material: Any, described: dict[str, Any]) -> tuple[float, float, float, float]:
     """Colour and opacity that stand for a material's nodes."""
-    shader = next((node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"), None)
+    nodes = [] if material.node_tree is None else material.node_tree.nodes
+    shader = next((node for node in nodes if node.type == "BSDF_PRINCIPLED"), None)
     color = described.get("color")
     if described.get("look") == "fire":
         return (*(color or _FIRE_COLOR), 1.0)

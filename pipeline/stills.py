@@ -120,7 +120,8 @@ def make_still(
                 raise PipelineError(f"{failed.task_id}: {failed.message}")
         target.parent.mkdir(parents=True, exist_ok=True)
         for output in found.todo[-1].outputs:
-            path = target.with_suffix(Path(output).suffix)  # an EXR lies beside its PNG
+            suffix = Path(output).suffix
+            path = target if suffix == ".png" else target.with_suffix(suffix)  # an EXR lies beside its PNG
             part = path.with_name(f".{path.name}.part")
             try:
                 shutil.copyfile(scratch.path(output), part)

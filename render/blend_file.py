@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,18 +15,19 @@ from render.errors import InvalidFileError
 _TIMEOUT_S = 120.0
 
 
-def read_material_names(path: Path, blender: str | None) -> list[str]:
+def read_material_names(path: Path, blender: str | None, *, tried: Sequence[str] = ()) -> list[str]:
     """Names of the materials in a .blend file, in any order.
 
     Args:
         path: the file.
         blender: a Blender executable; the bpy module if None.
+        tried: materials that are appended as for a picture, if they are there.
 
     Raises:
         BlenderUnavailableError: Blender does not answer.
-        InvalidFileError: the file cannot be read.
+        InvalidFileError: the file cannot be read, or a material that is tried needs more than is in the file.
     """
-    argv = build_argv(path, blender)
+    argv = build_argv(path, blender, tried)
     try:
         completed = subprocess.run(argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
     except OSError as error:
@@ -42,8 +44,8 @@ def read_material_names(path: Path, blender: str | None) -> list[str]:
     raise InvalidFileError(path, f"Blender ended with exit code {completed.returncode} while it read it: {last}")
 
 
-def build_argv(path: Path, blender: str | None) -> list[str]:
-    """Arguments that make Blender write the names of a file's materials. Pure.
+def build_argv(path: Path, blender: str | None, tried: Sequence[str] = ()) -> list[str]:
+    """Arguments that make Blender write the names of a file's materials, and try some. Pure.
 
     `--disable-autoexec`: nothing that the file holds is run.
     """
@@ -52,5 +54,15 @@ def build_argv(path: Path, blender: str | None) -> list[str]:
         raise BlenderUnavailableError("the folder blender_scripts of this project is not on Python's path")
     script = str(Path(package.origin).with_name("blend_materials.py"))
     if blender is None:
-        return [sys.executable, script, str(path)]
-    return [blender, "--background", "--factory-startup", "--disable-autoexec", "--python", script, "--", str(path)]
+        return [sys.executable, script, str(path), *tried]
+    return [
+        blender,
+        "--background",
+        "--factory-startup",
+        "--disable-autoexec",
+        "--python",
+        script,
+        "--",
+        str(path),
+        *tried,
+    ]

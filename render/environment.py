@@ -26,7 +26,9 @@ def read_environment_size(path: Path) -> tuple[int, int]:
         raise InvalidFileError(path, f"is no {' or '.join(SUFFIXES)} picture")
     try:
         # Through an open file, as a path would be taken apart for patterns of numbered pictures.
-        with path.open("rb") as file, av.open(file, "r") as container:
+        # Of the format that the name says: FFmpeg would take anything else as well, even a list of other files.
+        reader = f"{path.suffix.lower()[1:]}_pipe"
+        with path.open("rb") as file, av.open(file, "r", format=reader) as container:
             frame = next(container.decode(video=0), None)
     except (av.FFmpegError, IndexError, ValueError) as error:
         raise InvalidFileError(path, f"cannot be decoded: {error}") from error

@@ -96,10 +96,11 @@ class CameraParameters(Parameters):
 
     @model_validator(mode="after")
     def _is_one_motion(self) -> Self:
-        if "framing" in self.model_fields_set and (self.keyframe or self.position is not None):
+        if self.frames_action and (self.keyframe or self.position is not None):
             place = "keyframes" if self.keyframe else "a position"
             raise ValueError(
-                f"framing has no meaning beside {place}, which say where the camera is; remove one of them"
+                f'framing = "action" has no meaning beside {place}, which say where the camera is; remove one of them, '
+                'or set framing = "domain"'
             )
         if self.keyframe and self.orbit_deg_per_s:
             raise ValueError("orbit_deg_per_s has no meaning beside keyframes; remove one of them")

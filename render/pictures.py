@@ -100,6 +100,18 @@ def read_rgb16(path: Path) -> NDArray[np.uint16]:
     return np.ascontiguousarray(color, np.uint16)
 
 
+def read_shown(path: Path) -> NDArray[np.uint8]:
+    """What is seen over black, and how much of it is there: (height, width, 4) uint8; alpha is 255 where there is none.
+
+    A dark body before nothing differs from nothing by its alpha alone.
+    """
+    pixels = read_picture(path)
+    alpha = np.full(pixels.shape[:2], 255, np.uint8)
+    if pixels.shape[2] in (2, 4):
+        alpha = (pixels[..., -1] >> (8 * (pixels.dtype.itemsize - 1))).astype(np.uint8)
+    return np.dstack([read_rgb8(path), alpha])
+
+
 def _rgb(path: Path) -> Pixels:
     """Colours of a picture, (height, width, 3), grey ones as well; what has alpha is laid over black."""
     pixels = read_picture(path)
@@ -111,12 +123,13 @@ def _rgb(path: Path) -> Pixels:
     return color
 
 
-def validate_picture(path: Path, resolution: tuple[int, int]) -> PictureStatistics:
+def validate_picture(path: Path, resolution: tuple[int, int], *, may_be_empty: bool = False) -> PictureStatistics:
     """Decode a rendered picture and check that it shows something.
 
     Args:
         path: a PNG of 8 or 16 bits.
         resolution: expected width and height [pixels].
+        may_be_empty: whether nothing is left of it where no body is, so that it may be black or of one colour.
 
     Raises:
         InvalidFileError: it is damaged, of another size, black, or of one colour only.
@@ -137,6 +150,8 @@ def validate_picture(path: Path, resolution: tuple[int, int]) -> PictureStatisti
         darkest=float(luminance.min()),
         brightest=float(luminance.max()),
     )
+    if may_be_empty:
+        return statistics
     if statistics.mean_luminance < BLACK_LUMINANCE:
         raise InvalidFileError(path, f"is black (mean luminance {statistics.mean_luminance:.2g})")
     color = pixels[..., :3] if channels >= 3 else pixels[..., :1]
@@ -151,14 +166,14 @@ def require_more_than_stage(path: Path, stage: NDArray[np.uint8], cells: NDArray
 
     Args:
         path: the picture.
-        stage: the same view without the bodies, a pixel for each of the cells, (rows, columns, 3).
+        stage: the same view without the bodies, a pixel for each of the cells, (rows, columns, 4) of `read_shown`.
         cells: where bodies are, (rows, columns); some of them.
 
     Raises:
         InvalidFileError: nearly all of these cells look as they do without the bodies.
     """
     rows, columns = cells.shape
-    small = Image.fromarray(read_rgb8(path)).resize((columns, rows), Image.Resampling.BOX)
+    small = Image.fromarray(read_shown(path)).resize((columns, rows), Image.Resampling.BOX)
     difference = np.abs(np.asarray(small, np.int16) - stage.astype(np.int16)).max(axis=2)
     if (difference[cells] >= VISIBLE_LEVELS).mean() < SHARE_THAT_SHOWS:
         raise InvalidFileError(
@@ -166,13 +181,14 @@ def require_more_than_stage(path: Path, stage: NDArray[np.uint8], cells: NDArray
         )
 
 
-def validate_exr(path: Path, resolution: tuple[int, int], *, layer: str = "") -> None:
+def validate_exr(path: Path, resolution: tuple[int, int], *, layer: str = "", may_be_empty: bool = False) -> None:
     """Decode an EXR and check that it shows something. All layers of a part are compressed together, so all are read.
 
     Args:
         path: an EXR in one part.
         resolution: expected width and height [pixels].
         layer: the layer that is the picture; empty where there is nothing else.
+        may_be_empty: as for `validate_picture`.
 
     Raises:
         InvalidFileError: it is damaged, of another size, black, or has values that are not finite.
@@ -209,7 +225,7 @@ def validate_exr(path: Path, resolution: tuple[int, int], *, layer: str = "") ->
     if not all(np.isfinite(plane).all() for plane in planes):
         raise InvalidFileError(path, "has values that are not finite")
     brightest = max(float(plane.max()) for plane in planes)
-    if brightest < BLACK_LUMINANCE:
+    if brightest < BLACK_LUMINANCE and not may_be_empty:
         raise InvalidFileError(path, f"is black (brightest value {brightest:.2g})")
 
 

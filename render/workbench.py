@@ -75,7 +75,7 @@ def draw_frames(
         FrameRenderError: a frame could not be drawn.
     """
     output = str(folder / "{frame:06d}.png")
-    wanted = ",".join(map(str, frames))
+    wanted = f"{frames[0]}-{frames[-1]}" if isinstance(frames, range) else ",".join(map(str, frames))
     options = [str(spec_path), "--frames", wanted, "--output", output, "--threads", str(threads)]
     argv = build_workbench_argv(blender, "render_frames.py", options)
     done, last = 0, ""
@@ -104,4 +104,4 @@ def build_workbench_argv(blender: str | None, script: str, options: Sequence[str
     path = str(script_path(script))
     if blender is None:
         return [sys.executable, path, *options]
-    return [blender, "--background", "--factory-startup", "--python", path, "--", *options]
+    return [blender, "--background", "--factory-startup", "--disable-autoexec", "--python", path, "--", *options]

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pipeline.task import Resources
 
 _QUALITIES = ("draft", "preview", "final")
+_PLACES = ("camera.position", "camera.keyframe")
 _TOLD_FRAMES = 10
 """One of so many frames of an animatic is told."""
 
@@ -69,16 +70,19 @@ def still(
 
     layout = JobLayout(find_job(job, output).root.absolute())
     changes = [f"render.quality={quality}"]
+    if any(each.partition("=")[0].strip() in _PLACES for each in overrides):
+        changes.append("camera.framing=domain")  # who says where the camera stands means it
     changes += [] if resolution is None else [f"render.resolution=[{resolution[0]}, {resolution[1]}]"]
     loaded = read_job(layout.job_file, [*changes, *overrides])
     require_own_programs(loaded, overrides)
     found = survey(loaded, layout, [frame], stages=STAGES_REFERENCE)
     if found.lacking:
         raise PipelineError(_why_lacking(found.lacking[-1], layout, frame))
-    path = layout.stills / f"{frame:06d}-{_words(loaded)}.png" if target is None else target
+    path = layout.stills / f"{frame:06d}-{_words(loaded, overrides)}.png" if target is None else target
     if path.suffix.lower() != ".png":
         raise PipelineError(f'{path}: a still is a PNG, so its name must end in ".png"')
     require_possible(loaded.job, {task.stage for task in found.todo})
+    _make_folder(path)
     capacity = _capacity(cores)
     width, height = loaded.job.render.resolution
     made = _made_first(found)
@@ -100,9 +104,23 @@ def still(
     click.echo(path)
 
 
-def _words(loaded: LoadedJob) -> str:
+def _words(loaded: LoadedJob, overrides: tuple[str, ...]) -> str:
+    """What tells stills of a frame apart; those with other keys by a digest of them."""
+    from pipeline.parameter_set import digest_of
+
     width, height = loaded.job.render.resolution
-    return f"{loaded.job.render.quality}-{width}x{height}"
+    other = f"-{digest_of(' '.join(overrides))[:6]}" if overrides else ""
+    return f"{loaded.job.render.quality}-{width}x{height}{other}"
+
+
+def _make_folder(target: Path) -> None:
+    """Before minutes of drawing, see that there is a place for what is drawn."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PipelineError(f"cannot write {target}: {error.strerror}") from error
+    if not os.access(target.parent, os.W_OK):
+        raise PipelineError(f"cannot write {target}: its folder is not writable")
 
 
 def _made_first(found: Survey) -> str:
@@ -125,6 +143,8 @@ def _why_lacking(artifact: str, layout: JobLayout, frame: int) -> str:
             "--set changes what is simulated, and a still shows what this job has simulated; "
             f"submit a job of its own: pipeline submit {shlex.quote(str(layout.job_file))} --set name=... --set ..."
         )
+    if read_job(layout.job_file).job.camera.frames_action:
+        artifact = f"{artifact}, which the camera's framing of the whole action needs,"
     if live_holder(layout.lease) is not None:
         return f"{artifact} is not simulated yet; the job is running: wait for it with pipeline watch"
     return f"{artifact} is not simulated yet; go on with: pipeline resume {shlex.quote(str(layout.root))}"
@@ -173,6 +193,7 @@ def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: 
     frames = drawable_frames(found)
     if frames == 0:
         raise PipelineError(_why_lacking(found.lacking[0], layout, 0))
+    _make_folder(path)
     try:
         require_workbench(loaded.job.render.blender)
     except BlenderUnavailableError as error:

@@ -110,7 +110,8 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
         raise PipelineError(f'{target}: a comparison is an MP4, so its name must end in ".mp4"')
     films = []
     for layout in (find_job(job, output) for job in jobs):
-        submitted, pictures = load_job(layout.job_file), frames_without_gap(layout)
+        submitted = load_job(layout.job_file)
+        pictures = frames_without_gap(layout)[: submitted.frame_count]  # a longer film may have been there before
         if not pictures:
             raise PipelineError(f"the first frame of {layout.root} has not been rendered yet")
         films.append(Film(submitted.name, pictures, submitted.movie.playback_fps or submitted.fps))
@@ -118,12 +119,14 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
             click.echo(f"{submitted.name}: {len(pictures)} of {submitted.frame_count} frames are there", err=True)
     part = target.with_name(f".{target.name}.part")
     try:
-        count = compare_films(films, part, width=width, threads=machine_capacity().cores)
-        part.replace(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            count = compare_films(films, part, width=width, threads=machine_capacity().cores)
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
     except (InvalidFileError, ValueError, OSError) as error:
         raise PipelineError(f"cannot make {target}: {error}") from error
-    finally:
-        part.unlink(missing_ok=True)
     click.echo(f"{target}: {count} frames")
 
 

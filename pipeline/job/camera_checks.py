@@ -47,7 +47,7 @@ def check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) 
 
 
 def _check_places(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    """The places that the job names, at the start."""
+    """The places that the job names: bodies that move, and water, may be elsewhere when the camera comes there."""
     places: dict[KeyPath, Vector3] = {
         ("camera", "keyframe", number, "position"): key.position for number, key in enumerate(job.camera.keyframe)
     }
@@ -55,14 +55,21 @@ def _check_places(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings)
         places["camera", "position"] = job.camera.position
     for place, position in places.items():
         for path, solid in solids.items():
-            if path[0] != "smoke" and _contains(solid, position):
+            if path[0] == "smoke" or not _contains(solid, position):
+                continue
+            if place[1] == "position" or job.camera.keyframe[int(place[2])].time_s == 0.0 or _stands(job, path):
                 findings.error(place, f'is inside "{_name(job, path)}"; move it out')
+            else:
+                findings.warn(place, f'is where "{_name(job, path)}" is at the start')
+
+
+def _stands(job: Job, path: KeyPath) -> bool:
+    return path[0] == "rigid" and next(body for body in job.rigid if body.name == _name(job, path)).kind == "static"
 
 
 def _check_way(job: Job, solids: Mapping[KeyPath, Solid], views: Mapping[float, View], findings: Findings) -> None:
     """Between the places: bodies that stand still are there all the time."""
-    still = {body.name for body in job.rigid if body.kind == "static"}
-    static = {path: solid for path, solid in solids.items() if path[0] == "rigid" and _name(job, path) in still}
+    static = {path: solid for path, solid in solids.items() if _stands(job, path)}
     for path, solid in static.items():
         inside = [time_s for time_s, view in views.items() if _contains(solid, view.position)]
         if inside:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.cache import read_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
 from pipeline.job.input_files import split_blend
-from pipeline.job.looks import BODY, parts_of
+from pipeline.job.looks import BODY, REFRACTING_LOOKS, parts_of
 from pipeline.job.models import Job
 from pipeline.job.problems import suggestion
 from pipeline.layout import JobLayout
@@ -152,10 +152,11 @@ class RenderStage:
         warn_of_sight(context, view, bodies)
 
         def validate(path: Path) -> None:
-            validate_picture(path, job.render.resolution)
+            validate_picture(path, job.render.resolution, may_be_empty=_may_be_empty(job))
 
         def validate_master(path: Path) -> None:
-            validate_exr(path, job.render.resolution, layer=COMBINED if job.render.passes else "")
+            layer = COMBINED if job.render.passes else ""
+            validate_exr(path, job.render.resolution, layer=layer, may_be_empty=_may_be_empty(job))
 
         try:
             with ExitStack() as stack:
@@ -187,7 +188,7 @@ def _missing_materials(job: Job) -> Iterator[str]:
             wanted.setdefault(file, {})[body] = name
     for file, names in wanted.items():
         try:
-            there = read_material_names(Path(file), job.render.blender)
+            there = read_material_names(Path(file), job.render.blender, tried=sorted(set(names.values())))
         except InvalidFileError as error:
             yield str(error)
             continue
@@ -205,6 +206,7 @@ def _decisive(spec: RenderSpec) -> dict[str, Any]:
         MissingInputError: a file cannot be read.
     """
     document = spec.model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
+    document["render"]["passes"].sort()  # their order changes nothing
     for key, usual in _LATER_KEYS.items():
         if document["render"][key] == usual:
             del document["render"][key]
@@ -215,10 +217,13 @@ def _decisive(spec: RenderSpec) -> dict[str, Any]:
     if spec.stage.hdri is not None:
         stage["hdri"] = content_name(spec.stage.hdri, "picture")
         stage["name"] = None  # its light and sky are not there
+    else:
+        stage.pop("rotation_deg", None)  # there is nothing to turn
     if stage["color"] is None and "ground" not in stage and stage["name"] != "window":
         stage["color"] = _FORMER_COLOR
     for drawn in document["objects"]:
         material = drawn["material"]
+        material["caustics"] &= material["look"] in REFRACTING_LOOKS
         for key, unused in _LATER_MATERIAL_KEYS.items():
             if material[key] == unused:
                 del material[key]
@@ -399,10 +404,10 @@ def _draw_until_good(context: TaskContext, paths: list[Path], view: View, bodies
 
 def _check_picture(context: TaskContext, frame: int, path: Path, view: View, bodies: Sequence[BodyAtFrame]) -> None:
     """Raise InvalidFileError if a picture is damaged, black, of one colour, or shows the stage without its bodies."""
-    from render.pictures import read_rgb8, require_more_than_stage, validate_picture
+    from render.pictures import read_shown, require_more_than_stage, validate_picture
 
     job = context.job
-    validate_picture(path, job.render.resolution)
+    validate_picture(path, job.render.resolution, may_be_empty=_may_be_empty(job))
     width, height = job.render.resolution
     scale = min(1.0, STAGE_PIXELS / max(width, height))
     columns, rows = max(4, round(scale * width)), max(4, round(scale * height))
@@ -413,12 +418,17 @@ def _check_picture(context: TaskContext, frame: int, path: Path, view: View, bod
         with tempfile.TemporaryDirectory(prefix="stage-") as folder:
             picture = Path(folder) / "stage.png"
             _warm_renderer(context).render_stage(frame, picture, resolution=(columns, rows))
-            stage = read_rgb8(picture)
+            stage = read_shown(picture)
         if not job.camera.moves:
             _EMPTY_STAGE["still"] = stage
     else:
         stage = _EMPTY_STAGE["still"]
     require_more_than_stage(path, stage, cells)
+
+
+def _may_be_empty(job: Job) -> bool:
+    """Whether nothing is left of a picture where no body is."""
+    return job.stage.background != "stage"
 
 
 def _position_after(time_s: float, pose: Mapping[str, NDArray[Any]]) -> list[float]:

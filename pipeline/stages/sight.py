@@ -102,9 +102,12 @@ def expected_cells(
     """Where a picture must look otherwise than the empty stage, as (rows, columns) of cells; None if nowhere surely.
 
     Rigid bodies, fluids and cloths count, as far as they are in the domain: ground and backdrop may hide what is not.
+    From below the ground it hides all.
     Smoke and spray may be too thin to be seen.
     """
     lower, upper = np.array(job.domain.min), np.array(job.domain.max)
+    if view.position[2] < lower[2]:
+        return None  # the ground may hide everything
     slack = ROUND_THE_DOMAIN * (upper - lower)
     width, height = job.render.resolution
     cells, share = np.zeros(shape, np.bool_), 0.0

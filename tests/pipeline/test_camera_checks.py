@@ -144,3 +144,13 @@ def test_a_good_camera_is_not_complained_about(tmp_path):
 def test_the_look_away_of_a_camera_that_goes_with_a_body_is_seen_at_the_start(tmp_path):
     camera = 'position = [0.0, -2.0, 0.5]\nlook_at = [0.0, -9.0, 0.5]\nfollow = "duck"'
     assert any("looks away from everything at the start" in line for line in warnings_of(camera, tmp_path))
+
+
+def test_a_place_where_a_body_that_moves_is_at_the_start_may_be_free_later(tmp_path):
+    keyframes = (
+        "keyframe = [{ time_s = 0, position = [0, -3, 0.5] }, "
+        "{ time_s = 1, position = [0, 0, 0.5], look_at = [0.4, 0, 0.5] }]"
+    )
+    found = checked(f"{DUCK}[camera]\n{keyframes}\n", tmp_path / "pond.toml")
+    assert found.errors == []
+    assert any('is where "duck" is at the start' in warning for warning in found.warnings)

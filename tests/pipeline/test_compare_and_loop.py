@@ -135,3 +135,18 @@ def test_what_cannot_be_looped_is_told(tmp_path, arguments, name, sentence):
     assert result.exit_code == 1
     assert sentence in result.stderr
     assert not (tmp_path / name).exists()
+
+
+def test_frames_of_a_longer_film_that_was_there_before_are_not_shown(tmp_path):
+    films = [film(tmp_path / name, (100, 20, 20), frames=6, planned=3) for name in ("a", "b")]
+    result = pipeline("compare", *films, "-o", tmp_path / "new folder" / "both.mp4")
+    assert result.exit_code == 0, result.output
+    assert len(decode(tmp_path / "new folder" / "both.mp4")[0]) == 3
+
+
+def test_a_place_that_is_no_folder_is_told_in_a_line(tmp_path):
+    films = [film(tmp_path / name, (100, 20, 20), frames=3, planned=3) for name in ("a", "b")]
+    (tmp_path / "file").write_text("")
+    result = pipeline("compare", *films, "-o", tmp_path / "file" / "both.mp4")
+    assert result.exit_code == 1
+    assert "cannot make" in result.output

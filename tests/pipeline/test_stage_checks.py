@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from checked_jobs import checked
+from PIL import Image
 from radiance_pictures import write_hdr
 
 from pipeline.errors import JobFileError
@@ -148,3 +149,13 @@ def test_a_plain_background_is_refused_in_16_bits_which_it_is_not_laid_over_in(t
     errors, _ = problems(tmp_path, 'background = "plain"\n[render]\nformat = "png16"')
     assert len(errors) == 1 and 'is "plain", which pictures are laid over in 8 bits' in errors[0]
     assert problems(tmp_path, 'background = "transparent"\n[render]\nformat = "png16"')[0] == []
+
+
+def test_a_picture_is_what_its_name_says(tmp_path):
+    """A PNG has no sun, and a list of other files is none of its own."""
+    Image.new("RGB", (16, 8), (90, 120, 200)).save(tmp_path / "sky.png")
+    (tmp_path / "sky.png").rename(tmp_path / "renamed.hdr")
+    (tmp_path / "list.hdr").write_text("ffconcat version 1.0\nfile renamed.hdr\n")
+    for name in ("renamed.hdr", "list.hdr"):
+        (error,) = problems(tmp_path, f'hdri = "{name}"')[0]
+        assert f"{name}: cannot be decoded" in error or f"{name}: holds no picture" in error

@@ -88,6 +88,21 @@ def test_frames_of_jobs_from_before_there_were_formats_stay_up_to_date():
     assert not {"format", "passes", "order"} & set(json.loads(drawn.parameters.canonical)["render"])
 
 
+def test_what_changes_no_pixel_runs_no_frame_again():
+    def render(**tables: object) -> str:
+        return digests(job(**tables))["render"]
+
+    passes = [{"render": {"format": "exr", "passes": each}} for each in (["depth", "normal"], ["normal", "depth"])]
+    assert render(**passes[0]) == render(**passes[1])
+    assert render(stage={"rotation_deg": 30.0}) == render()  # there is no picture to turn
+    assert render(material={"ball": {"look": "metal", "caustics": True}}) == render(
+        material={"ball": {"look": "metal"}}
+    )
+    assert render(material={"ball": {"look": "glass", "caustics": True}}) != render(
+        material={"ball": {"look": "glass"}}
+    )
+
+
 @pytest.mark.parametrize(
     ("table", "sentence"),
     [

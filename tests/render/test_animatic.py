@@ -78,7 +78,8 @@ def test_a_process_that_aborts_is_told_with_the_packages(tmp_path):
 def test_argv_of_the_module_and_of_an_executable_run_the_same_script():
     module = build_workbench_argv(None, "render_frames.py", ["spec.json"])
     executable = build_workbench_argv("/opt/blender", "render_frames.py", ["spec.json"])
-    assert executable == ["/opt/blender", "--background", "--factory-startup", "--python", module[1], "--", "spec.json"]
+    start = ["/opt/blender", "--background", "--factory-startup", "--disable-autoexec"]
+    assert executable == [*start, "--python", module[1], "--", "spec.json"]
     assert Path(module[1]).is_file()
 
 

@@ -20,6 +20,8 @@ from render.spec import MeshObject
 
 pytestmark = needs_bpy
 
+NAMES = "Driven, Green: bright, Lamp, Pictured, Projected"
+
 # A green one, one whose strength a program of a driver decides, and one with a picture outside of the file.
 WRITE = """
     import sys
@@ -46,6 +48,11 @@ WRITE = """
     picture = tree.nodes.new("ShaderNodeTexImage")
     picture.image = bpy.data.images.new("bricks", 8, 8)
     picture.image.source, picture.image.filepath = "FILE", "//bricks.png"
+    tree, shader = new("Lamp", (1.0, 1.0, 1.0))
+    light = tree.nodes.new("ShaderNodeTexIES")
+    light.mode, light.filepath = "EXTERNAL", "//lamp.ies"
+    tree, shader = new("Projected", (1.0, 1.0, 1.0))
+    tree.nodes.new("ShaderNodeTexCoord").object = bpy.data.objects.new("projector", None)
     text = bpy.data.texts.new("start.py")
     text.write(f"open({proof!r}, 'w').write('ran')")
     text.use_module = True
@@ -88,10 +95,23 @@ def test_a_material_that_needs_a_picture_outside_of_the_file_is_refused(material
         draw(tmp_path, f"{materials}:Pictured")
 
 
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("Lamp", "lamp.ies; make it internal"),
+        ("Projected", 'depends on the object "projector", which a job has none of'),
+        ("Pictured", "bricks.png, which is not in the file; pack it"),
+    ],
+)
+def test_a_material_that_needs_more_than_itself_is_an_obstacle_before_any_work(materials, name, reason):
+    (obstacle,) = RenderStage().obstacles(job(f"{materials}:{name}"))
+    assert f'the material "{name}" of' in obstacle and reason in obstacle
+
+
 def test_a_missing_name_is_told_with_those_that_are_there(materials, tmp_path):
     with pytest.raises(
         AssertionError,
-        match=r'has no material "driven"; did you mean "Driven"\?; there are Driven, Green: bright, Pictured',
+        match=rf'has no material "driven"; did you mean "Driven"\?; there are {NAMES}',
     ):
         draw(tmp_path, f"{materials}:driven")
 
@@ -108,7 +128,7 @@ def test_a_missing_name_is_an_obstacle_before_any_work(materials, tmp_path, exte
     render = {"blender": str(write_blender_stand_in(tmp_path))} if external else {}
     assert RenderStage().obstacles(job(f"{materials}:Driven", **render)) == []
     assert RenderStage().obstacles(job(f"{materials}:Gold", **render)) == [
-        f'material.ball.blend: {materials} has no material "Gold"; there are Driven, Green: bright, Pictured'
+        f'material.ball.blend: {materials} has no material "Gold"; there are {NAMES}'
     ]
     assert not (materials.parent / "proof").exists()
 

@@ -127,6 +127,7 @@ def test_only_cells_that_bodies_are_in_count_against_the_stage(tmp_path):
     shade = np.linspace(60, 120, 40)[:, None, None] * np.ones((40, 80, 3))
     stage = shade.reshape(20, 2, 40, 2, 3).mean(axis=(1, 3)).astype(np.uint8)
     noise = np.random.default_rng(0).normal(0.0, 2.0, shade.shape)
+    stage = np.dstack([stage, np.full(stage.shape[:2], 255, np.uint8)])
     cells = np.zeros((20, 40), np.bool_)
     cells[5:15, 10:20] = True
     empty, drawn, beside = shade + noise, shade + noise, shade + noise
@@ -150,3 +151,41 @@ def test_a_picture_of_one_colour_and_rounding_is_flat_and_one_with_a_faint_shade
     with pytest.raises(InvalidFileError, match="has one colour only"):
         validate_picture(tmp_path / "flat.png", (40, 30))
     validate_picture(tmp_path / "faint.png", (40, 30))
+
+
+def test_a_black_body_before_nothing_is_seen_by_its_alpha(tmp_path):
+    nothing = np.zeros((20, 40, 4), np.uint8)
+    body = nothing.copy()
+    body[5:15, 10:30, 3] = 255
+    cells = body[..., 3] > 0
+    Image.fromarray(body).save(tmp_path / "drawn.png")
+    Image.fromarray(nothing).save(tmp_path / "empty.png")
+    require_more_than_stage(tmp_path / "drawn.png", nothing, cells)
+    with pytest.raises(InvalidFileError, match="shows the empty stage"):
+        require_more_than_stage(tmp_path / "empty.png", nothing, cells)
+
+
+def test_without_a_background_a_picture_may_be_empty(tmp_path):
+    Image.new("RGBA", (40, 30)).save(tmp_path / "nothing.png")
+    Image.new("RGB", (40, 30), (129, 137, 147)).save(tmp_path / "plain.png")
+    for name in ("nothing", "plain"):
+        validate_picture(tmp_path / f"{name}.png", (40, 30), may_be_empty=True)
+        with pytest.raises(InvalidFileError):
+            validate_picture(tmp_path / f"{name}.png", (40, 30))
+    with pytest.raises(InvalidFileError, match="is 40x30 pixels"):
+        validate_picture(tmp_path / "plain.png", (40, 31), may_be_empty=True)
+
+
+@needs_bpy
+@pytest.mark.parametrize("background", ["plain", "transparent"])
+def test_a_frame_that_the_ball_is_not_in_is_no_fault_without_a_background(tmp_path, background):
+    away = "[camera]\nposition = [0.0, -3.0, 9.0]\nlook_at = [0.0, 0.0, 12.0]\n"
+    _, layout = job_of_the_ball(tmp_path, "away", f'{away}[stage]\nbackground = "{background}"\n')
+    cache = layout.path(layout.frame_cache(1))
+    cache.parent.mkdir()
+    write_frame(
+        cache, {"ball": Snapshot("rigid", pose()["ball"], {})}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu"
+    )
+    ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
+    render_stage._close_renderers()
+    assert isinstance(ended, Finished), ended

@@ -36,9 +36,11 @@ def test_a_still_is_drawn_beside_the_jobs_frames_and_touches_nothing_else(job):
     )
     render_stage._close_renderers()
     assert result.exit_code == 0, result.output
-    assert result.stdout == f"{job.stills}/000001-preview-48x32.png\n"
+    (drawn,) = job.stills.iterdir()
+    assert result.stdout == f"{drawn}\n"
+    assert drawn.name.startswith("000001-preview-48x32-"), "and what tells it from one without that --set"
     assert "frame 1 of flight: 48 x 32 pixels, preview quality" in result.stderr
-    with Image.open(job.stills / "000001-preview-48x32.png") as picture:
+    with Image.open(drawn) as picture:
         assert picture.size == (48, 32)
     assert contents(job) == before
 
@@ -116,3 +118,13 @@ def test_what_cannot_be_drawn_is_told(job, arguments, sentence):
     result = pipeline("still", job.root, *arguments)
     assert result.exit_code in (1, 2)
     assert sentence in result.stderr
+
+
+def test_a_still_from_elsewhere_says_where_and_is_kept_apart_from_others(job):
+    text = job.job_file.read_text() + '\n[camera]\nframing = "action"\n'
+    job.job_file.write_text(text)
+    result = pipeline(
+        "still", job.root, "--frame", 0, "--set", "camera.position=[0, -3, 1]", "-o", job.root / "job.toml" / "a.png"
+    )
+    assert result.exit_code == 1
+    assert "cannot write" in result.output  # the place is tried before anything is drawn
