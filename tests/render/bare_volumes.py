@@ -40,7 +40,7 @@ DRAW = """
     scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", float(width)
     image_settings = scene.render.image_settings
     image_settings.file_format, image_settings.color_mode, image_settings.color_depth = "OPEN_EXR", "RGB", "32"
-    settings.choose_png = lambda picture_format: None
+    settings.choose_png = lambda picture_format, *, with_alpha: None
     png.strip_metadata = lambda path: None
     exec(changes)
     for frame in map(int, frames.split(",")):
