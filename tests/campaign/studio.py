@@ -56,6 +56,7 @@ max = [0.3, 0.3, 0.6]
 resolution = [32, 18]
 quality = "draft"
 samples = 1
+device = "cpu"                  # a GPU may compile for minutes before its first frame
 
 {limits}"""
 LIMITS = """\

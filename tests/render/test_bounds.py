@@ -111,7 +111,8 @@ def test_without_a_box_the_domain_is_framed():
     assert action.first() == domain.first()
 
 
-def test_framing_beside_a_place_is_refused():
+def test_framing_the_action_beside_a_place_is_refused():
     for place in ({"position": (0, -2, 1)}, {"keyframe": ({"time_s": 0, "position": (0, -2, 1)},)}):
-        with pytest.raises(ValidationError, match="framing has no meaning beside"):
+        with pytest.raises(ValidationError, match='framing = "action" has no meaning beside'):
             CameraParameters.model_validate({"framing": "action", **place})
+        assert not CameraParameters.model_validate({"framing": "domain", **place}).frames_action
