@@ -48,30 +48,28 @@ def new_material(name: str, look: str, context: LookContext) -> Any:
 
 def _water(builder: NodeBuilder, context: LookContext) -> None:
     """Clear water that absorbs red first, and lets light through to what lies under it."""
-    shader = builder.node(
-        "ShaderNodeBsdfPrincipled",
-        Base_Color=(1.0, 1.0, 1.0),
-        Roughness=or_default(context.roughness, 0.0),
-        IOR=WATER_IOR,
-        Transmission_Weight=1.0,
-    )
-    builder.surface(_refracting(builder, context, shader, tint=(0.94, 0.975, 1.0)))
+    _clear_surface(builder, context, ior=WATER_IOR, tint=(0.94, 0.975, 1.0))
     # Given explicitly, the factor is on the real absorption; by default a small tank is as blue as a deep pool.
     factor = or_default(context.density, _WATER_ABSORPTION_BY_SIZE / context.domain_size)
     coefficients = WATER_ABSORPTION_PER_M if context.color is None else _absorption_of_tint(context.color)
     _homogeneous_absorption(builder, tuple(factor * value for value in coefficients))
 
 
-def _honey(builder: NodeBuilder, context: LookContext) -> None:
-    """Clear amber: it absorbs blue first, and scatters nothing, as filtered honey does."""
+def _clear_surface(builder: NodeBuilder, context: LookContext, *, ior: float, tint: tuple[float, float, float]) -> None:
+    """The surface of a clear liquid, which lets light through to what lies under it in a tint."""
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
         Base_Color=(1.0, 1.0, 1.0),
         Roughness=or_default(context.roughness, 0.0),
-        IOR=HONEY_IOR,
+        IOR=ior,
         Transmission_Weight=1.0,
     )
-    builder.surface(_refracting(builder, context, shader, tint=(1.0, 0.97, 0.9)))
+    builder.surface(_refracting(builder, context, shader, tint=tint))
+
+
+def _honey(builder: NodeBuilder, context: LookContext) -> None:
+    """Clear amber: it absorbs blue first, and scatters nothing, as filtered honey does."""
+    _clear_surface(builder, context, ior=HONEY_IOR, tint=(1.0, 0.97, 0.9))
     factor = or_default(context.density, _HONEY_SIZE / context.domain_size)
     tint = or_default(context.color, HONEY_TINT)
     per_metre = tuple(-100.0 * factor * math.log(min(max(channel, 1e-3), 0.999)) for channel in tint)
@@ -228,9 +226,6 @@ def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
         )
     )
 
-
-REFRACTING = ("water", "honey", "glass")
-"""Looks that bend light, and can have caustics."""
 
 LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
     "water": _water,

@@ -98,7 +98,7 @@ class SceneRenderer:
         casters = set()
         for description in spec["objects"]:
             drawn = self._add_object(description, spec)
-            if description["material"]["caustics"] and description["material"]["look"] in looks.REFRACTING:
+            if description["material"]["caustics"]:
                 casters.add(drawn.name)  # Blender may have chosen another name than the job's
         if casters:
             settings.cast_caustics(casters, domain_size=_domain_size(spec), domain_middle=_domain_middle(spec))

@@ -7,6 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from pipeline.errors import PipelineError
+from pipeline.files import replacing
 from pipeline.job.loading import LoadedJob
 from pipeline.layout import JobLayout
 from pipeline.stages.render import framed_box, render_spec, write_motion
@@ -71,12 +72,7 @@ def make_animatic(
             )
         except FrameRenderError as error:
             raise PipelineError(str(error)) from error
-        target.parent.mkdir(parents=True, exist_ok=True)
-        part = target.with_name(f".{target.name}.part")
-        try:
+        with replacing(target) as part:
             fps = job.movie.playback_fps or job.fps
             encode_segment(pictures, part, fps=fps, parameters=QUALITY, threads=threads)
             validate_movie(part, frames)
-            part.replace(target)
-        finally:
-            part.unlink(missing_ok=True)

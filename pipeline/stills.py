@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 
 from pipeline.errors import PipelineError
 from pipeline.executors.attempt import load_stages
+from pipeline.files import replacing
 from pipeline.fingerprint import task_fingerprint
 from pipeline.job.loading import LoadedJob
 from pipeline.layout import JobLayout
@@ -118,16 +119,11 @@ def make_still(
             )
             for failed in outcome.failures:
                 raise PipelineError(f"{failed.task_id}: {failed.message}")
-        target.parent.mkdir(parents=True, exist_ok=True)
         for output in found.todo[-1].outputs:
             suffix = Path(output).suffix
             path = target if suffix == ".png" else target.with_suffix(suffix)  # an EXR lies beside its PNG
-            part = path.with_name(f".{path.name}.part")
-            try:
+            with replacing(path) as part:
                 shutil.copyfile(scratch.path(output), part)
-                part.replace(path)
-            finally:
-                part.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
@@ -260,26 +260,53 @@ def _told_of(frame: int) -> Iterator[None]:
 
 
 def build_argv(blender: str, spec_path: Path, *, threads: int) -> list[str]:
-    """Arguments that make a Blender executable serve frames of a specification. Pure.
+    """Arguments that make a Blender executable serve frames of a specification. Pure."""
+    words = ["--threads", str(threads)]
+    return script_argv(blender, "render_frames.py", [str(spec_path), "--serve", *words], own=words)
+
+
+def script_argv(blender: str | None, script: str, options: Sequence[str], *, own: Sequence[str] = ()) -> list[str]:
+    """Arguments that run a script of `blender_scripts`. Pure.
 
     `--factory-startup` keeps the user's preferences and add-ons out of the pictures, `--disable-autoexec` what .blend
     files would run.
+
+    Args:
+        blender: path of a Blender executable, or None for the bpy module.
+        script: name of the script.
+        options: words for the script.
+        own: words for the executable.
+
+    Raises:
+        BlenderUnavailableError: the project is not on Python's path.
     """
-    return [
-        blender,
-        "--background",
-        "--factory-startup",
-        "--disable-autoexec",
-        "--threads",
-        str(threads),
-        "--python",
-        str(script_path("render_frames.py")),
-        "--",
-        str(spec_path),
-        "--serve",
-        "--threads",
-        str(threads),
-    ]
+    package = find_spec("blender_scripts")
+    if package is None or package.origin is None:
+        raise BlenderUnavailableError("the folder blender_scripts of this project is not on Python's path")
+    path = str(Path(package.origin).with_name(script))
+    if blender is None:
+        return [sys.executable, path, *options]
+    start = [blender, "--background", "--factory-startup", "--disable-autoexec", *own]
+    return [*start, "--python", path, "--", *options]
+
+
+def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subprocess.CompletedProcess[str]:
+    """Run a script to its end, whatever that is; its output is text.
+
+    Args:
+        argv: of `script_argv`.
+        timeout_s: when it is given up [s].
+        purpose: what it was to do, to be told then.
+
+    Raises:
+        BlenderUnavailableError: it cannot be started, or does not end in time.
+    """
+    try:
+        return subprocess.run(argv, capture_output=True, text=True, timeout=timeout_s, check=False)
+    except OSError as error:
+        raise BlenderUnavailableError(f"cannot start {argv[0]}: {error.strerror}") from error
+    except subprocess.TimeoutExpired as error:
+        raise BlenderUnavailableError(f"Blender took more than {timeout_s:g} s to {purpose}") from error
 
 
 def parse_blender_version(text: str) -> tuple[int, int, int] | None:
@@ -311,15 +338,3 @@ def require_supported_executable(blender: str) -> tuple[int, int, int]:
     if version[:2] < MINIMUM_BLENDER_VERSION:
         raise BlenderUnavailableError(f"{blender} is Blender {'.'.join(map(str, version))}; 4.5 LTS or newer is needed")
     return version
-
-
-def script_path(name: str) -> Path:
-    """Where a script of `blender_scripts` lies.
-
-    Raises:
-        BlenderUnavailableError: the project is not on Python's path.
-    """
-    package = find_spec("blender_scripts")
-    if package is None or package.origin is None:
-        raise BlenderUnavailableError("the folder blender_scripts of this project is not on Python's path")
-    return Path(package.origin).with_name(name)

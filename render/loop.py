@@ -51,21 +51,15 @@ def write_loop(pictures: Sequence[Path], output: Path, *, fps: float, width: int
         # One palette for all: with one a frame, still backgrounds would flicker.
         palette = _palette_of(frames)
         frames = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in frames]
-    part = output.with_name(f".{output.name}.part")
-    try:
-        with part.open("wb") as file:
-            frames[0].save(
-                file,
-                format=suffix[1:],
-                save_all=True,
-                append_images=frames[1:],
-                duration=durations,
-                loop=0,
-                **options,
-            )
-        part.replace(output)
-    finally:
-        part.unlink(missing_ok=True)
+    frames[0].save(
+        output,
+        format=suffix[1:],
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        loop=0,
+        **options,
+    )
     return count
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from render.blender import BlenderUnavailableError, FrameRenderError, require_bpy, script_path
+from render.blender import BlenderUnavailableError, FrameRenderError, require_bpy, run_script, script_argv
 from render.system_libraries import install_line, missing_libraries
 
 EGL_PACKAGES = {"libEGL.so.1": "libegl1"}
@@ -34,13 +33,8 @@ def require_workbench(blender: str | None) -> None:
         raise BlenderUnavailableError(
             f"Workbench draws through EGL, and this system lacks {', '.join(missing)}; install it: {install}"
         )
-    argv = build_workbench_argv(blender, "workbench.py", [])
-    try:
-        completed = subprocess.run(argv, capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S, check=False)
-    except OSError as error:
-        raise BlenderUnavailableError(f"cannot start {argv[0]}: {error.strerror}") from error
-    except subprocess.TimeoutExpired as error:
-        raise BlenderUnavailableError(f"Workbench drew nothing in {error.timeout:g} s") from error
+    argv = script_argv(blender, "workbench.py", [])
+    completed = run_script(argv, timeout_s=_PROBE_TIMEOUT_S, purpose="draw a picture with Workbench")
     if _READY not in completed.stdout:
         last = "\n".join((completed.stdout + completed.stderr).splitlines()[-5:])
         raise BlenderUnavailableError(
@@ -77,7 +71,7 @@ def draw_frames(
     output = str(folder / "{frame:06d}.png")
     wanted = f"{frames[0]}-{frames[-1]}" if isinstance(frames, range) else ",".join(map(str, frames))
     options = [str(spec_path), "--frames", wanted, "--output", output, "--threads", str(threads)]
-    argv = build_workbench_argv(blender, "render_frames.py", options)
+    argv = script_argv(blender, "render_frames.py", options)
     done, last = 0, ""
     with subprocess.Popen(
         argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8", errors="replace"
@@ -97,11 +91,3 @@ def draw_frames(
     if done < len(frames):
         raise FrameRenderError(frames[done], f"Blender ended with exit code {process.returncode}: {last}")
     return [folder / f"{frame:06d}.png" for frame in frames]
-
-
-def build_workbench_argv(blender: str | None, script: str, options: Sequence[str]) -> list[str]:
-    """Arguments that run a script of `blender_scripts` with the bpy module or in a Blender executable. Pure."""
-    path = str(script_path(script))
-    if blender is None:
-        return [sys.executable, path, *options]
-    return [blender, "--background", "--factory-startup", "--disable-autoexec", "--python", path, "--", *options]

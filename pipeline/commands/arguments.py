@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +52,12 @@ def output_option(command: Any) -> Any:
 def submitted_job_argument(command: Any) -> Any:
     """A job that was submitted before: its folder, its name, or its job file."""
     return output_option(click.argument("job", metavar="JOB")(command))
+
+
+def target_option(meaning: str, *, required: bool = False) -> Callable[[Any], Any]:
+    """Where to write a file."""
+    path = click.Path(path_type=Path, dir_okay=False)
+    return click.option("-o", "--to", "target", type=path, required=required, help=f"Where to write it{meaning}.")
 
 
 def json_option(command: Any) -> Any:

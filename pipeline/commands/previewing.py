@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pipeline.commands.arguments import find_job, require_own_programs, submitted_job_argument
+from pipeline.commands.arguments import find_job, require_own_programs, submitted_job_argument, target_option
 from pipeline.commands.executing import require_possible
 from pipeline.errors import PipelineError, StageUnavailableError
 from pipeline.layout import JobLayout
@@ -36,13 +36,7 @@ _TOLD_FRAMES = 10
 @click.option(
     "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Override a key: render.exposure=0.5, stage.name=..."
 )
-@click.option(
-    "-o",
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Where to write it; in JOB/stills/ if omitted.",
-)
+@target_option("; in JOB/stills/ if omitted")
 @click.option("--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all if omitted.")
 def still(
     job: str,
@@ -153,13 +147,7 @@ def _why_lacking(artifact: str, layout: JobLayout, frame: int) -> str:
 @click.command()
 @submitted_job_argument
 @click.option("--width", type=click.IntRange(64, 3840), default=640, show_default=True, help="Of the film [pixels].")
-@click.option(
-    "-o",
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Where to write it; JOB/NAME-animatic.mp4 if omitted.",
-)
+@target_option("; JOB/NAME-animatic.mp4 if omitted")
 @click.option("--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all if omitted.")
 def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: int | None) -> None:
     """Show how a job moves before it is rendered: its whole film in plain pictures, a fraction of a second each.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.commands.arguments import find_job, output_option, submitted_job_argument
+from pipeline.commands.arguments import find_job, output_option, submitted_job_argument, target_option
 from pipeline.errors import PipelineError
 
 
@@ -14,12 +14,7 @@ from pipeline.errors import PipelineError
 @submitted_job_argument
 @click.option("--pictures", type=click.IntRange(min=1), default=12, show_default=True, help="Most pictures on it.")
 @click.option("--columns", type=click.IntRange(min=1), default=4, show_default=True, help="Pictures in a row.")
-@click.option(
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Where to write it; JOB/sheet.png if omitted.",
-)
+@target_option("; JOB/sheet.png if omitted")
 def sheet(job: str, output: Path, pictures: int, columns: int, target: Path | None) -> None:
     """Put frames of a job side by side on one picture, spread evenly over those that are there. Works while it runs.
 
@@ -50,12 +45,7 @@ def sheet(job: str, output: Path, pictures: int, columns: int, target: Path | No
 @click.command()
 @click.argument("jobs", metavar="JOB...", nargs=-1, required=True)
 @output_option
-@click.option(
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Where to write it; JOB/report.html if omitted, which several jobs cannot.",
-)
+@target_option("; JOB/report.html if omitted, which several jobs cannot")
 def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
     """Write what a job took and what its solvers told into one HTML file: timings, plots, pictures, warnings.
 
@@ -82,14 +72,7 @@ def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
 @click.argument("jobs", metavar="JOB JOB...", nargs=-1, required=True)
 @output_option
 @click.option("--width", type=click.IntRange(128, 7680), default=1920, show_default=True, help="Most pixels across.")
-@click.option(
-    "-o",
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, dir_okay=False),
-    required=True,
-    help="Where to write it: an MP4.",
-)
+@target_option(": an MP4", required=True)
 def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> None:
     """Put the films of jobs side by side into one, each with its name under it.
 
@@ -99,6 +82,7 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
     pipeline compare bunny-wcsph bunny-dfsph -o solvers.mp4
     """
     from pipeline.committed_pictures import frames_without_gap
+    from pipeline.files import replacing
     from pipeline.job.loading import load_job
     from pipeline.resources import machine_capacity
     from render.errors import InvalidFileError
@@ -117,14 +101,9 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
         films.append(Film(submitted.name, pictures, submitted.movie.playback_fps or submitted.fps))
         if len(pictures) < submitted.frame_count:
             click.echo(f"{submitted.name}: {len(pictures)} of {submitted.frame_count} frames are there", err=True)
-    part = target.with_name(f".{target.name}.part")
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
+        with replacing(target) as part:
             count = compare_films(films, part, width=width, threads=machine_capacity().cores)
-            part.replace(target)
-        finally:
-            part.unlink(missing_ok=True)
     except (InvalidFileError, ValueError, OSError) as error:
         raise PipelineError(f"cannot make {target}: {error}") from error
     click.echo(f"{target}: {count} frames")
@@ -136,14 +115,7 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
 @click.option("--fps", type=click.FloatRange(1.0, 120.0), default=15.0, show_default=True, help="Of the loop.")
 @click.option("--from", "first", type=click.IntRange(min=0), default=0, show_default=True, help="Its first frame.")
 @click.option("--until", "last", type=click.IntRange(min=0), help="Its last frame; the job's if omitted.")
-@click.option(
-    "-o",
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, dir_okay=False),
-    required=True,
-    help="Where to write it: .webp or .gif.",
-)
+@target_option(": .webp or .gif", required=True)
 def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: int | None, target: Path) -> None:
     """Make a small film that starts again, for a README or a web page: an animated WebP or GIF.
 
@@ -152,6 +124,7 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
     pipeline loop quickstart --width 320 --fps 12 --from 20 --until 59 -o splash.gif
     """
     from pipeline.committed_pictures import frames_without_gap
+    from pipeline.files import replacing
     from pipeline.job.loading import load_job
     from render.errors import InvalidFileError
     from render.loop import FORMATS, write_loop
@@ -169,13 +142,14 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
             f"of the frames {first}-{last} of {submitted.name} {there} are rendered; choose with --until"
         )
     try:
-        count = write_loop(
-            pictures[first : last + 1],
-            target,
-            fps=submitted.movie.playback_fps or submitted.fps,
-            width=width,
-            loop_fps=fps,
-        )
+        with replacing(target) as part:
+            count = write_loop(
+                pictures[first : last + 1],
+                part,
+                fps=submitted.movie.playback_fps or submitted.fps,
+                width=width,
+                loop_fps=fps,
+            )
     except (InvalidFileError, ValueError, OSError) as error:
         raise PipelineError(f"cannot make {target}: {error}") from error
     click.echo(f"{target}: {count} frames, {target.stat().st_size / 1e6:.2g} MB")

@@ -8,7 +8,17 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from pipeline.job.limits import LimitParameters
-from pipeline.job.looks import BODY, CLOTHS, FLUID, NATURAL_MATERIALS, PAINTED_LOOKS, SMOKE, SOLID, WHITEWATER
+from pipeline.job.looks import (
+    BODY,
+    CLOTHS,
+    FLUID,
+    NATURAL_MATERIALS,
+    PAINTED_LOOKS,
+    REFRACTING_LOOKS,
+    SMOKE,
+    SOLID,
+    WHITEWATER,
+)
 from pipeline.job.problems import suggestion
 from render.parameters import (
     CameraParameters,
@@ -78,7 +88,16 @@ class Job(SceneParameters):
         return [body.name for body in self._bodies()]
 
     def material_of(self, body: str, part: str = BODY) -> MaterialParameters:
-        """What a body, or a part of it or of its whitewater, looks like: from the job file, else as is usual."""
+        """What a body, or a part of it or of its whitewater, looks like: from the job file, else as is usual.
+
+        Caustics are asked for only of what bends light: they change the light of the whole scene.
+        """
+        material = self._material_of(body, part)
+        if material.caustics and material.look not in REFRACTING_LOOKS:
+            return material.model_copy(update={"caustics": False})
+        return material
+
+    def _material_of(self, body: str, part: str) -> MaterialParameters:
         if part in WHITEWATER:
             return self.material.get(f"{body}.{part}", WHITEWATER[part])
         shape = next((rigid.shape.type for rigid in self.rigid if rigid.name == body), "")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.cache import read_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
 from pipeline.job.input_files import split_blend
-from pipeline.job.looks import BODY, REFRACTING_LOOKS, parts_of
+from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
 from pipeline.job.problems import suggestion
 from pipeline.layout import JobLayout
@@ -223,7 +223,6 @@ def _decisive(spec: RenderSpec) -> dict[str, Any]:
         stage["color"] = _FORMER_COLOR
     for drawn in document["objects"]:
         material = drawn["material"]
-        material["caustics"] &= material["look"] in REFRACTING_LOOKS
         for key, unused in _LATER_MATERIAL_KEYS.items():
             if material[key] == unused:
                 del material[key]

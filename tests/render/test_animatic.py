@@ -7,6 +7,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from bare_volumes import smoke_object, write_frame
 from blender_scenes import read, redness, spec_of, sphere, write_mesh
 from command_line import pipeline
 from half_simulated_jobs import half_simulated_job
@@ -14,11 +15,10 @@ from needed_blender import needs_bpy, needs_egl
 
 from pipeline.layout import JobLayout
 from render import workbench
-from render.blender import BlenderUnavailableError, FrameRenderError
-from render.parameters import MaterialParameters, StageParameters, VolumeParameters
-from render.spec import MeshObject, SceneObject, VolumeSequenceObject
-from render.volume import write_volume
-from render.workbench import build_workbench_argv, draw_frames, require_workbench
+from render.blender import BlenderUnavailableError, FrameRenderError, script_argv
+from render.parameters import MaterialParameters, StageParameters
+from render.spec import MeshObject, SceneObject
+from render.workbench import draw_frames, require_workbench
 
 
 def frames_of(film: Path) -> list[np.ndarray]:
@@ -76,8 +76,8 @@ def test_a_process_that_aborts_is_told_with_the_packages(tmp_path):
 
 
 def test_argv_of_the_module_and_of_an_executable_run_the_same_script():
-    module = build_workbench_argv(None, "render_frames.py", ["spec.json"])
-    executable = build_workbench_argv("/opt/blender", "render_frames.py", ["spec.json"])
+    module = script_argv(None, "render_frames.py", ["spec.json"])
+    executable = script_argv("/opt/blender", "render_frames.py", ["spec.json"])
     start = ["/opt/blender", "--background", "--factory-startup", "--disable-autoexec"]
     assert executable == [*start, "--python", module[1], "--", "spec.json"]
     assert Path(module[1]).is_file()
@@ -134,32 +134,12 @@ def test_bodies_have_the_colours_of_their_looks(tmp_path):
 @pytest.mark.parametrize("look", ["smoke", "fire"])
 def test_smoke_and_fire_are_seen_where_they_are(tmp_path, look):
     cells = 16
-    volume = VolumeSequenceObject(
-        name="smoke",
-        file="smoke/{frame}.vdb",
-        box_min=(-0.3, -0.3, 0.2),
-        box_max=(0.3, 0.3, 0.8),
-        open_faces=(),
-        ambient_temperature=293.0,
-        material=MaterialParameters(look=look),
-    )
-    (tmp_path / "smoke").mkdir()
+    volume = smoke_object(MaterialParameters(look=look))
     pictures = []
     for filled in (0, cells // 2):
         density = np.zeros((cells,) * 3, np.float32)
         density[:filled] = 1.0
-        write_volume(
-            tmp_path / "smoke/000000.vdb",
-            density=density,
-            temperature=np.full_like(density, 1200.0),
-            velocity=np.zeros((cells, cells, cells, 3), np.float32),
-            origin=(-0.3, -0.3, 0.2),
-            cell_size=0.6 / cells,
-            ambient_temperature=293.0,
-            parameters=VolumeParameters(),
-            fps=60.0,
-            shutter=0.5,
-        )
+        write_frame(tmp_path, 0, density, kelvin=1200.0)
         pictures.append(workbench_picture(tmp_path, volume))
     # The left half of a cube of 0.6 m is full: 16 pixels of its 32 change, the right half does not.
     change = abs(pictures[1] - pictures[0]).mean(axis=2)[18:36]

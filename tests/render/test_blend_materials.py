@@ -13,7 +13,8 @@ from needed_blender import needs_bpy
 
 from pipeline.job.models import Job
 from pipeline.stages.render import RenderStage
-from render.blend_file import build_argv, read_material_names
+from render.blend_file import read_material_names
+from render.blender import script_argv
 from render.errors import InvalidFileError
 from render.parameters import MaterialParameters
 from render.spec import MeshObject
@@ -142,7 +143,7 @@ def test_a_file_that_is_no_blend_file_is_an_obstacle(tmp_path):
 
 
 def test_an_executable_reads_names_without_the_users_settings_or_the_files_programs():
-    argv = build_argv(Path("/job/a.blend"), "/opt/blender")
+    argv = script_argv("/opt/blender", "blend_materials.py", ["/job/a.blend"])
     start = ["/opt/blender", "--background", "--factory-startup", "--disable-autoexec", "--python"]
     assert argv[: len(start)] == start
     assert argv[-2:] == ["--", "/job/a.blend"]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bare_volumes import smoke_object, write_frame
 from blender_scenes import (
     RENDER_FRAMES,
     RESOLUTION,
@@ -41,9 +42,8 @@ from render.blender import (
     parse_blender_version,
     require_supported_executable,
 )
-from render.parameters import CameraParameters, MaterialParameters, StageParameters, VolumeParameters
-from render.spec import MeshObject, MeshSequenceObject, RenderSpec, VolumeSequenceObject
-from render.volume import write_volume
+from render.parameters import CameraParameters, MaterialParameters, StageParameters
+from render.spec import MeshObject, MeshSequenceObject, RenderSpec
 
 pytestmark = needs_bpy
 
@@ -231,15 +231,7 @@ def test_missing_spec_is_refused_by_the_executable(tmp_path, blender_stand_in):
 
 
 def test_smoke_is_drawn_where_it_is_and_unfit_volumes_are_refused(tmp_path):
-    smoke = VolumeSequenceObject(
-        name="smoke",
-        file="smoke/{frame}.vdb",
-        box_min=(-0.3, -0.3, 0.2),
-        box_max=(0.3, 0.3, 0.8),
-        open_faces=(),
-        ambient_temperature=293.0,
-        material=MaterialParameters(look="smoke", color=(0.02, 0.02, 0.02), density=200.0),
-    )
+    smoke = smoke_object(MaterialParameters(look="smoke", color=(0.02, 0.02, 0.02), density=200.0))
     spec_of(smoke).write(tmp_path / "spec.json")
     (tmp_path / "smoke").mkdir()
     (tmp_path / "smoke/000001.vdb").write_bytes(b"this is no volume")
@@ -247,18 +239,7 @@ def test_smoke_is_drawn_where_it_is_and_unfit_volumes_are_refused(tmp_path):
     for frame, filled in ((2, slice(0, 0)), (3, slice(0, cells // 2))):
         density = np.zeros((cells,) * 3, np.float32)
         density[filled] = 1.0
-        write_volume(
-            tmp_path / f"smoke/{frame:06d}.vdb",
-            density=density,
-            temperature=np.full_like(density, 300.0),
-            velocity=np.zeros((cells, cells, cells, 3), np.float32),
-            origin=(-0.3, -0.3, 0.2),
-            cell_size=0.6 / cells,
-            ambient_temperature=293.0,
-            parameters=VolumeParameters(),
-            fps=60.0,
-            shutter=0.5,
-        )
+        write_frame(tmp_path, frame, density, kelvin=300.0)
     printed = run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0,1,2,3")
     assert "frame 0: the volume" in printed and "000000.vdb does not exist" in printed
     assert "frame 1: cannot read the volume" in printed
