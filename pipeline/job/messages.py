@@ -189,7 +189,9 @@ def _unknown_type(_path: KeyPath, details: ErrorDetails, _value: object) -> str:
 
 def _no_type(path: KeyPath, _details: ErrorDetails, _value: object) -> str:
     node = schema.node_at(path)
-    known = [each["properties"]["type"]["const"] for each in node.alternatives] if node is not None else []
+    assert node is not None, path
+    # What may be left out may be null as well, which has no type.
+    known = [each["properties"]["type"]["const"] for each in node.alternatives if "properties" in each]
     return f'missing key "type"; types are {", ".join(known)}'
 
 

@@ -101,6 +101,11 @@ BAD = {
             "duck, bunny, mesh"
         ],
     ),
+    "region, which may be left out, without type": (
+        'name = "dam"\n[[cloth]]\nname = "c"\nshape = {type = "rectangle", size = [1.0, 1.0], counts = [9, 9]}\n'
+        '[[cloth.pin]]\nregion = {typf = "box"}',
+        ['dam.toml:6 cloth[0].pin[0].region: missing key "type"; types are box, sphere'],
+    ),
     "shape without its size": (
         'name = "dam"\n[[rigid]]\nname = "r"\nshape = {type = "sphere"}',
         ['dam.toml:4 rigid[0].shape: missing key "radius" (Radius [m])'],
