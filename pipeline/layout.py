@@ -71,6 +71,16 @@ class JobLayout:
         return self.root / "report.html"
 
     @property
+    def film_so_far(self) -> Path:
+        """A small film of the pictures that are there, while there is no whole one; no artifact."""
+        return self.root / "movie-so-far.mp4"
+
+    @property
+    def so_far_scratch(self) -> Path:
+        """Folder of what the film so far is made of, while a run makes it."""
+        return self.root / ".so-far"
+
+    @property
     def stills(self) -> Path:
         """Folder of single frames drawn otherwise than the film's; no artifacts."""
         return self.root / "stills"
