@@ -117,12 +117,12 @@ class JobLayout:
 
     @staticmethod
     def frame_bounds(frame: int) -> ArtifactPath:
-        """Boxes around the bodies of one frame."""
+        """How far the bodies of one frame reach."""
         return ArtifactPath(f"bounds/{frame:06d}.json")
 
     @staticmethod
     def film_bounds() -> ArtifactPath:
-        """The box that a camera frames which frames the action."""
+        """What a camera frames which frames the action."""
         return ArtifactPath("bounds.json")
 
     @staticmethod
