@@ -89,21 +89,18 @@ class SceneRenderer:
         self._format, self._passes = spec["render"]["format"], spec["render"]["passes"]
         self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
         lights.build_stage(spec, self._folder)
-        if spec["stage"]["tank"]:
-            tank.add_tank(spec)
+        panes = tank.add_tank(spec) if spec["stage"]["tank"] else None
         self._stage = {blender_object.name for blender_object in bpy.data.objects}
         self._sequences: list[tuple[dict[str, Any], Any]] = []
         self._fires: dict[str, volumes.FireLight] = {}
         self._bodies: list[tuple[dict[str, Any], Any]] = []
-        casters = set()
-        for description in spec["objects"]:
-            drawn = self._add_object(description, spec)
-            if description["material"]["caustics"]:
-                casters.add(drawn.name)  # Blender may have chosen another name than the job's
+        drawn = [(description, self._add_object(description, spec)) for description in spec["objects"]]
+        # Blender may have chosen another name than the job's.
+        casters = {made.name for description, made in drawn if description["material"]["caustics"]}
         if casters:
             settings.cast_caustics(casters, domain_size=_domain_size(spec), domain_middle=_domain_middle(spec))
         if spec.get("engine") == "workbench":
-            workbench.apply_workbench_settings(spec)
+            workbench.apply_workbench_settings(drawn, panes=panes)
             self.device = "Workbench"
 
     def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:

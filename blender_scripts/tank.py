@@ -17,8 +17,12 @@ _GAP = 0.002
 """Between water and glass, in domain diagonals: coinciding surfaces would shade each other at random."""
 
 
-def add_tank(spec: dict[str, Any]) -> None:
-    """Put four panes around the domain; their rims and corners are solid, so that the tank can be seen."""
+def add_tank(spec: dict[str, Any]) -> Any:
+    """Put four panes around the domain; their rims and corners are solid, so that the tank can be seen.
+
+    Returns:
+        The object of the panes.
+    """
     low, high = np.array(spec["domain_min"], dtype=np.float64), np.array(spec["domain_max"], dtype=np.float64)
     size = float(np.linalg.norm(high - low))
     inner_low, inner_high = low - _GAP * size, high + _GAP * size
@@ -40,11 +44,14 @@ def add_tank(spec: dict[str, Any]) -> None:
     for x_low, x_high in ((outer_low[0], inner_low[0]), (inner_high[0], outer_high[0])):
         for y_low, y_high in ((outer_low[1], inner_low[1]), (inner_high[1], outer_high[1])):
             edges.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2])))
+    made = []
     for name, boxes in (("tank_glass", panes), ("tank_edge", edges)):
         tank = new_mesh_object(name, _boxes(boxes))
         context = LookContext.of({}, domain_size=size, pixel_angle=pixel_angle(spec))
         tank.data.materials.append(new_material(name, name, context))
         tank.data.shade_flat()
+        made.append(tank)
+    return made[0]
 
 
 def _boxes(extents: list[tuple[tuple[float, ...], tuple[float, ...]]]) -> TriangleMesh:

@@ -6,6 +6,7 @@ script it says whether it can draw here, by drawing a picture of a few pixels, a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
@@ -20,13 +21,15 @@ _SMOKE_DENSITY = 12.0
 """Extinction [1/m], where the job leaves it to the look."""
 
 
-def apply_workbench_settings(spec: dict[str, Any]) -> None:
+def apply_workbench_settings(bodies: Sequence[tuple[dict[str, Any], Any]], *, panes: Any | None) -> None:
     """Make the current scene one that Workbench draws: flat colours like those of the looks, studio light, shadows.
 
     Call it when the scene is built: it reads the materials that are there.
 
     Args:
-        spec: the render specification.
+        bodies: descriptions from the render specification, each with the object that was made of it. Not by name:
+            Blender gives a body another one if the stage has its own already, as with a body called "ground".
+        panes: the glass of the tank; None without one.
     """
     scene = bpy.context.scene
     scene.render.engine = "BLENDER_WORKBENCH"
@@ -42,13 +45,14 @@ def apply_workbench_settings(spec: dict[str, Any]) -> None:
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
     scene.view_settings.exposure = 0.0
-    looks = {each["name"]: each["material"] for each in spec["objects"]}
+    looks = {made.data.materials[0].name: described["material"] for described, made in bodies}
     for material in bpy.data.materials:
         material.diffuse_color = _viewport_color(material, looks.get(material.name, {}))
-    for volume in bpy.data.volumes:
-        volume.display.density = _density(looks.get(volume.name, {}))
+    for described, made in bodies:
+        if made.type == "VOLUME":
+            made.data.display.density = _density(described["material"])
     # Workbench sorts no panes behind each other; the rims alone tell where the tank is.
-    if (panes := bpy.data.objects.get("tank_glass")) is not None:
+    if panes is not None:
         panes.hide_render = True
 
 

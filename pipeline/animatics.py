@@ -10,7 +10,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import replacing
 from pipeline.job.loading import LoadedJob
 from pipeline.layout import JobLayout
-from pipeline.stages.render import framed_box, render_spec, write_motion
+from pipeline.stages.render import framed_points, render_spec, write_motion
 from pipeline.stills import Survey, scratch_folder, survey
 from pipeline.task import Task
 from render.parameters import MovieParameters
@@ -63,7 +63,7 @@ def make_animatic(
     found = survey(loaded, layout, range(frames), stages=stages)
     with scratch_folder(loaded, found, layout) as scratch, TemporaryDirectory(prefix="animatic-") as folder:
         spec = scratch.root / "scene.json"
-        render_spec(job, scratch, framed_box(job, scratch)).model_copy(update={"engine": "workbench"}).write(spec)
+        render_spec(job, scratch, framed_points(job, scratch)).model_copy(update={"engine": "workbench"}).write(spec)
         for frame in range(frames):
             write_motion(job, scratch, frame, attempt=1)
         try:

@@ -14,11 +14,6 @@ def committed_pictures(layout: JobLayout) -> list[Path]:
     return [folder / receipt.name.removesuffix(".json") for receipt in receipts]
 
 
-def frames_without_gap(layout: JobLayout) -> list[Path]:
-    """The finished frames from the first on, up to the first one that is missing."""
-    return [path for number, path in enumerate(committed_pictures(layout)) if int(path.stem) == number]
-
-
 def evenly_spread(frames: list[Path], count: int) -> list[Path]:
     """At most so many of the frames, the first and the last among them."""
     if len(frames) <= count:

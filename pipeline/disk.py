@@ -98,7 +98,7 @@ _BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
     "whitewater": lambda size: 10.0 * size.particles,
     "cloth": lambda size: 70.0 * size.nodes,
     "bodies": lambda _: 400_000.0,
-    "bounds": lambda _: 500.0,
+    "bounds": lambda _: 3000.0,
     "render": lambda size: 1_000 + size.picture_bytes_per_pixel * size.pixels,
     # Segments of 120 frames and the film; a frame takes a tenth of a byte a pixel in each.
     "movie": lambda size: 12.0 * size.film_factor * size.pixels,

@@ -71,6 +71,16 @@ class JobLayout:
         return self.root / "report.html"
 
     @property
+    def film_so_far(self) -> Path:
+        """A small film of the pictures that are there, while there is no whole one; no artifact."""
+        return self.root / "movie-so-far.mp4"
+
+    @property
+    def so_far_scratch(self) -> Path:
+        """Folder of what the film so far is made of, while a run makes it."""
+        return self.root / ".so-far"
+
+    @property
     def stills(self) -> Path:
         """Folder of single frames drawn otherwise than the film's; no artifacts."""
         return self.root / "stills"
@@ -107,12 +117,12 @@ class JobLayout:
 
     @staticmethod
     def frame_bounds(frame: int) -> ArtifactPath:
-        """Boxes around the bodies of one frame."""
+        """How far the bodies of one frame reach."""
         return ArtifactPath(f"bounds/{frame:06d}.json")
 
     @staticmethod
     def film_bounds() -> ArtifactPath:
-        """The box that a camera frames which frames the action."""
+        """What a camera frames which frames the action."""
         return ArtifactPath("bounds.json")
 
     @staticmethod

@@ -119,18 +119,20 @@ def frame_points(
     return _vector(target - max(distances) * forward), _vector(target)
 
 
-def _frame_all_round(box: Array, *, focal_length_mm: float, aspect: float) -> tuple[Vector3, Vector3]:
-    """The closest view from which a whole box stays in the picture on the way around its vertical axis.
+def _frame_all_round(points: Array, *, focal_length_mm: float, aspect: float) -> tuple[Vector3, Vector3]:
+    """The closest view from which all points stay in the picture on the way around the vertical axis in their middle.
 
-    The box turns in a cylinder; its rims are framed. The point looked at is moved along the view onto the axis, which
-    the way leads around.
+    Each turns in a circle, and all of these are framed. The point looked at is moved along the view onto the axis,
+    which the way leads around.
     """
-    centre, radius = box.mean(axis=0), float(np.linalg.norm(box[1, :2] - box[0, :2])) / 2
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    # The corners of the polygon around a circle, so that no part of it is left out.
+    radius = np.linalg.norm(points[:, :2] - centre[:2], axis=1) / math.cos(math.pi / RIM_POINTS)
     angles = AZIMUTH + np.linspace(0.0, 2.0 * math.pi, RIM_POINTS, endpoint=False)
-    # The corners of the polygon around the circle, so that no part of the rim is left out.
-    rim = centre[:2] + radius / math.cos(math.pi / RIM_POINTS) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    points = np.concatenate([np.column_stack([rim, np.full(RIM_POINTS, z)]) for z in box[:, 2]])
-    position, target = map(np.array, frame_points(points, focal_length_mm=focal_length_mm, aspect=aspect))
+    around = centre[:2] + radius[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    heights = np.broadcast_to(points[:, None, 2:], (*around.shape[:2], 1))
+    circles = np.concatenate([around, heights], axis=2).reshape(-1, 3)
+    position, target = map(np.array, frame_points(circles, focal_length_mm=focal_length_mm, aspect=aspect))
     forward = target - position
     along = (centre[:2] - target[:2]) @ forward[:2] / (forward[:2] @ forward[:2])
     return _vector(position), _vector(target + along * forward)
@@ -148,8 +150,7 @@ class CameraPath:
         box_min, box_max: corners of the domain, which a camera without a position frames if nothing else is named [m].
         aspect: width over height of the picture.
         starts: where bodies are at the start [m].
-        framed: corners of the box that a camera without a position frames instead [m], (2, 3); from all sides if it
-            goes around.
+        framed: points that a camera without a position frames instead [m], (n, 3); from all sides if it goes around.
     """
 
     def __init__(
@@ -177,7 +178,7 @@ class CameraPath:
             elif camera.orbit_deg_per_s:
                 position, middle = _frame_all_round(framed, focal_length_mm=focal_length, aspect=aspect)
             else:
-                position, middle = frame_box(*framed, focal_length_mm=focal_length, aspect=aspect)
+                position, middle = frame_points(framed, focal_length_mm=focal_length, aspect=aspect)
         else:
             position, middle = camera.position or camera.keyframe[0].position, _vector(self._centre)
         self._position, self._look_at = np.array(position), np.array(middle if look_at is None else look_at)

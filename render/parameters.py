@@ -323,6 +323,10 @@ class MovieParameters(Parameters):
         default=None,
         description="Frames a second of the film; the job's fps if omitted (less is slow motion).",
     )
+    so_far: bool = Field(
+        default=True,
+        description="While frames are drawn, keep a small film of those that are there, movie-so-far.mp4.",
+    )
 
     @property
     def suffix(self) -> str:

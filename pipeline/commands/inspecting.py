@@ -92,6 +92,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
         summary, failures, events = manifest.summary(), manifest.failures(), manifest.events(limit=5)
     holder = live_holder(layout.lease)
     numbers = simulation_numbers(layout)
+    so_far = layout.film_so_far if layout.film_so_far.exists() else None
     if as_json:
         click.echo(
             json.dumps(
@@ -102,6 +103,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
                     "failures": [_attempt_as_json(attempt) for attempt in failures],
                     "events": [event._asdict() for event in events],
                     "simulation": numbers.as_json(),
+                    "film_so_far": None if so_far is None else str(so_far),
                 },
                 indent=1,
             )
@@ -114,6 +116,8 @@ def status(job: str, output: Path, as_json: bool) -> None:
             for state, count in stage.counts.items()
         )
         click.echo(f"  {stage.stage:>9}  {counts}")
+    if so_far is not None:
+        click.echo(f"  the film so far: {so_far}")
     for line in numbers.lines():
         click.echo(f"  {line}")
     for sentence in numbers.warnings():

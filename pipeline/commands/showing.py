@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from pipeline.commands.arguments import find_job, output_option, submitted_job_argument, target_option
 from pipeline.errors import PipelineError
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+    from pipeline.layout import JobLayout
 
 
 @click.command()
@@ -81,7 +86,6 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
     \b
     pipeline compare bunny-wcsph bunny-dfsph -o solvers.mp4
     """
-    from pipeline.committed_pictures import frames_without_gap
     from pipeline.files import replacing
     from pipeline.job.loading import load_job
     from pipeline.resources import machine_capacity
@@ -95,12 +99,13 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
     films = []
     for layout in (find_job(job, output) for job in jobs):
         submitted = load_job(layout.job_file)
-        pictures = frames_without_gap(layout)[: submitted.frame_count]  # a longer film may have been there before
+        pictures, others = _finished_frames(submitted, layout)
         if not pictures:
-            raise PipelineError(f"the first frame of {layout.root} has not been rendered yet")
+            raise PipelineError(f"the first frame of {layout.root} has not been rendered yet{others}")
         films.append(Film(submitted.name, pictures, submitted.movie.playback_fps or submitted.fps))
         if len(pictures) < submitted.frame_count:
-            click.echo(f"{submitted.name}: {len(pictures)} of {submitted.frame_count} frames are there", err=True)
+            there = f"{len(pictures)} of {submitted.frame_count} frames are there"
+            click.echo(f"{submitted.name}: {there}{others}", err=True)
     try:
         with replacing(target) as part:
             count = compare_films(films, part, width=width, threads=machine_capacity().cores)
@@ -123,7 +128,6 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
     pipeline loop quickstart -o quickstart.webp
     pipeline loop quickstart --width 320 --fps 12 --from 20 --until 59 -o splash.gif
     """
-    from pipeline.committed_pictures import frames_without_gap
     from pipeline.files import replacing
     from pipeline.job.loading import load_job
     from render.errors import InvalidFileError
@@ -132,14 +136,15 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
     if target.suffix.lower() not in FORMATS:
         raise PipelineError(f'{target}: "{target.suffix}" is no loop; use {" or ".join(FORMATS)}')
     layout = find_job(job, output)
-    submitted, pictures = load_job(layout.job_file), frames_without_gap(layout)
+    submitted = load_job(layout.job_file)
+    pictures, others = _finished_frames(submitted, layout)
     last = submitted.frame_count - 1 if last is None else last
     if not first <= last < submitted.frame_count:
         raise PipelineError(f"{submitted.name} has the frames 0-{submitted.frame_count - 1}, not {first}-{last}")
     if last >= len(pictures):
         there = f"only 0-{len(pictures) - 1}" if pictures else "none"
         raise PipelineError(
-            f"of the frames {first}-{last} of {submitted.name} {there} are rendered; choose with --until"
+            f"of the frames {first}-{last} of {submitted.name} {there} are rendered{others}; choose with --until"
         )
     try:
         with replacing(target) as part:
@@ -153,3 +158,34 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
     except (InvalidFileError, ValueError, OSError) as error:
         raise PipelineError(f"cannot make {target}: {error}") from error
     click.echo(f"{target}: {count} frames, {target.stat().st_size / 1e6:.2g} MB")
+
+
+class _FinishedFrames(NamedTuple):
+    """The frames of a job that can be shown one after the other.
+
+    Attributes:
+        pictures: from the first frame on, up to the first one that is not finished.
+        others: what to say of frames that are there and do not count; empty if there are none.
+    """
+
+    pictures: list[Path]
+    others: str
+
+
+def _finished_frames(job: Job, layout: JobLayout) -> _FinishedFrames:
+    """The frames that the film would be made of: those of the job as it is now, by the record and the files."""
+    from pipeline.commands.inspecting import assess_job
+    from pipeline.committed_pictures import committed_pictures
+    from pipeline.plan import Verdict
+
+    current = {
+        output
+        for each in assess_job(job, layout).assessments
+        if each.verdict is Verdict.UP_TO_DATE
+        for output in each.task.outputs
+    }
+    planned = [layout.picture(frame) for frame in range(job.frame_count)]
+    first_gap = next((frame for frame, picture in enumerate(planned) if picture not in current), len(planned))
+    earlier = {layout.path(picture) for picture in planned if picture not in current} & {*committed_pictures(layout)}
+    others = f" ({len(earlier)} more are of an earlier version of it)" if earlier else ""
+    return _FinishedFrames([layout.path(picture) for picture in planned[:first_gap]], others)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from pipeline.commands.executing import ExecutorChoice, open_machines
 from pipeline.commands.watching import CTRL_C, STOPPED_FROM_ELSEWHERE, Follower
 from pipeline.errors import DiskFullError, JobBusyError, PipelineError
 from pipeline.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background
+from pipeline.film_so_far import FilmSoFar
 from pipeline.job.loading import job_of_text, load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -184,15 +185,24 @@ def _run_once(
     with (
         ProgressObserver(open_display()) as progress,
         open_machines(choice, layout, capacity, progress.display.say) as machines,
+        ExitStack() as stack,
     ):
-        solvers = SolverWatch(layout, lambda sentence: progress.display.say(f"warning: {sentence}", style="yellow"))
+
+        def warn(sentence: str) -> None:
+            progress.display.say(f"warning: {sentence}", style="yellow")
+
+        observers: list[Observer] = [progress, SolverWatch(layout, warn)]
+        if observer is not None:
+            observers.append(observer)
+        if job.movie.so_far:
+            observers.append(stack.enter_context(FilmSoFar(job, layout, progress.display.say, warn)))
         return run_job(
             job,
             layout,
             executor=machines.executor,
             job_text=entry.text,
             stages=STAGES_REFERENCE,
-            observer=Observers(progress, solvers, *([] if observer is None else [observer])),
+            observer=Observers(*observers),
             control=control,
             rerun=rerun,
             capacity=machines.capacity,

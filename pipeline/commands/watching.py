@@ -33,6 +33,7 @@ def watch(layout: JobLayout) -> int:
         0 if that run itself says that it has done everything, else 5, as `submit` would have; CTRL_C after Ctrl-C.
     """
     watched: str | None = None
+    so_far_said = False
     display = open_display()
     stages: dict[str, StageProgress] = {}
     try:
@@ -43,6 +44,7 @@ def watch(layout: JobLayout) -> int:
             summary, last_run = _record(layout)
             _update(stages, summary)
             display.show(stages.values())
+            so_far_said = so_far_said or (holder is not None and _say_film_so_far(display, layout))
             if holder is None:
                 # A run that ended before we looked has no name for us; it is the last one on record then.
                 ended_as = last_run.outcome if watched in (None, last_run.run) else None
@@ -69,6 +71,7 @@ class Follower:
         self._before = _record(layout)[1].run
         self._seen_running = live_holder(layout.lease) is not None
         self._said = ""
+        self._so_far_said = False
         self.ticket = ticket
 
     def enqueue(self, entry: QueuedJob) -> QueuedJob:
@@ -100,6 +103,7 @@ class Follower:
                 if runs:
                     self._seen_running = True
                     display.show(stages.values())
+                    self._so_far_said = self._so_far_said or _say_film_so_far(display, self._layout)
                 if entry is None:
                     if not runs:
                         return self._say_how_it_left(display, summary, last_run)
@@ -161,6 +165,14 @@ def _say_how_it_ended(display: Display, layout: JobLayout, summary: list[StageSu
     how = "was cut short" if ended_as is None else f"ended ({ended_as})"
     display.say(f"it {how} with {done} of {total} tasks done; continue with: pipeline resume {layout.root}")
     return 5
+
+
+def _say_film_so_far(display: Display, layout: JobLayout) -> bool:
+    """Name the film so far, if there is one; returns whether there is."""
+    if not layout.film_so_far.exists():
+        return False
+    display.say(f"the film so far, made anew now and then: {layout.film_so_far}")
+    return True
 
 
 def _record(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:

@@ -20,29 +20,30 @@ from pipeline.task import ArtifactPath, Resources, Task, TaskId
 from sim.rigid.parameters import RigidBodyParameters
 
 if TYPE_CHECKING:
-    from render.bounds import Box
+    from render.bounds import Reach
 
 ACTION = "action"
-"""The film's one box, by this name."""
+"""The film's one reach, by this name."""
 FILM = TaskId("bounds/film")
 
 BASE_BYTES = 150_000_000
 """Interpreter, numpy, h5py and the meshes of bodies."""
-BYTES_PER_PARTICLE = 120
-"""The arrays of a snapshot, which are read together, and positions in double precision, sorted."""
+BYTES_PER_PARTICLE = 160
+"""The arrays of a snapshot, which are read together, positions in double precision, those without the outliers, and the
+cells that they are in."""
 BYTES_PER_NODE = 100
 BYTES_PER_CELL = 8
 
 
 class BoundsStage:
-    """Boxes around the bodies of each frame, and one around the film; only for `camera.framing = "action"`.
+    """How far the bodies of each frame reach, and those of the film; only for `camera.framing = "action"`.
 
-    A file a frame, made while the simulation goes on, so that the last frame is soon followed by the box that all
-    pictures wait for. A film whose box stays the same has none of its frames drawn again.
+    A file a frame, made while the simulation goes on, so that the last frame is soon followed by the one that all
+    pictures wait for. A film whose reach stays the same has none of its frames drawn again.
     """
 
     name = "bounds"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame, and one for the film; none for a camera that frames the domain or stands by itself."""
@@ -95,21 +96,21 @@ class BoundsStage:
         return []
 
     def run(self, context: TaskContext) -> None:
-        """Find the boxes of a frame, or that of the film."""
+        """Find how far a frame's bodies reach, or the film's."""
         from render.bounds import validate_bounds, write_bounds
 
         frame = context.task.frame
-        boxes = {ACTION: _of_film(context)} if frame is None else _of_frame(context.job, context.layout, frame)
+        reaches = {ACTION: _of_film(context)} if frame is None else _of_frame(context.job, context.layout, frame)
         with context.committing(context.task.outputs[0], validate_bounds) as path:
-            write_bounds(path, boxes)
+            write_bounds(path, reaches)
         context.progress(1, 1)
 
 
-def read_framed(path: Path) -> Box:
-    """The box that the camera of a film frames [m], (2, 3)."""
-    from render.bounds import read_bounds
+def read_framed(path: Path) -> NDArray[np.float64]:
+    """The points that the camera of a film frames [m], (n, 3): corners of a convex body around the action."""
+    from render.bounds import corners_of, read_bounds
 
-    return read_bounds(path)[ACTION]
+    return corners_of(read_bounds(path)[ACTION])
 
 
 def _memory_bytes(job: Job) -> int:
@@ -118,52 +119,55 @@ def _memory_bytes(job: Job) -> int:
     return int(BASE_BYTES + particles + BYTES_PER_NODE * estimated_cloth_nodes(job) + BYTES_PER_CELL * cells)
 
 
-def _of_frame(job: Job, layout: JobLayout, frame: int) -> dict[str, Box]:
-    """The boxes of what there is at a frame, by body."""
-    from render.bounds import box_of_particles, box_of_points, box_of_smoke
+def _of_frame(job: Job, layout: JobLayout, frame: int) -> dict[str, Reach]:
+    """How far what there is at a frame reaches, by body."""
+    from render.bounds import box_of_smoke, reach_of_box, reach_of_particles, reach_of_points
     from sim.rigid.rotation import rotated
 
     cached = layout.path(layout.frame_cache(frame))
-    boxes = {}
+    reaches = {}
     for name, body in read_frame(cached, kind="fluid").bodies.items():
         if len(body.arrays["position"]):
-            boxes[name] = box_of_particles(body.arrays["position"], body.number("particle_radius"))
+            reaches[name] = reach_of_particles(body.arrays["position"], body.number("particle_radius"))
     for name, body in read_frame(cached, kind="cloth").bodies.items():
-        boxes[name] = box_of_points(body.arrays["position"])
+        reaches[name] = reach_of_points(body.arrays["position"])
     moving = job.moving_bodies
     for name, body in read_frame(cached, kind="rigid").bodies.items():
         if name in moving:
             vertices = _mesh_of(layout, next(each for each in job.rigid if each.name == name))
             position, orientation = (np.asarray(body.arrays[key], np.float64) for key in ("position", "orientation"))
-            boxes[name] = box_of_points(position + rotated(orientation, vertices))
+            reaches[name] = reach_of_points(position + rotated(orientation, vertices))
     for smoke in job.smoke:
         density, lower, cell_size = read_smoke_density(cached, smoke.name)
         box = box_of_smoke(density, lower, cell_size)
         if box is not None:
-            boxes[smoke.name] = box
-    return boxes
+            reaches[smoke.name] = reach_of_box(box)
+    return reaches
 
 
-def _of_film(context: TaskContext) -> Box:
-    """The box around all frames and the bodies that stand still, as far as they are in the world."""
-    from render.bounds import around, box_of_points, framed_box, read_bounds
+def _of_film(context: TaskContext) -> Reach:
+    """How far all frames and the bodies that stand still reach, as far as they are in the world."""
+    from render.bounds import around, framed, reach_of_box, reach_of_points, read_bounds
     from sim.rigid.rotation import from_degrees, rotated
 
     job, layout = context.job, context.layout
     domain = np.array([job.domain.min, job.domain.max])
-    world = around([domain, *(np.array(smoke.corners(job.domain)) for smoke in job.smoke)])
-    assert world is not None
-    boxes = [
-        box for frame in range(job.frame_count) for box in read_bounds(layout.path(layout.frame_bounds(frame))).values()
+    smokes = [smoke.corners(job.domain) for smoke in job.smoke]
+    lower, upper = zip((job.domain.min, job.domain.max), *smokes, strict=True)
+    world = np.stack([np.min(lower, axis=0), np.max(upper, axis=0)])
+    reaches = [
+        reach
+        for frame in range(job.frame_count)
+        for reach in read_bounds(layout.path(layout.frame_bounds(frame))).values()
     ]
     for body in job.rigid:
         if body.kind == "static":
             turned = rotated(from_degrees(body.rotation_deg), _mesh_of(layout, body))
-            boxes.append(box_of_points(np.array(body.position) + turned))
-    if job.stage.tank and boxes:
+            reaches.append(reach_of_points(np.array(body.position) + turned))
+    if job.stage.tank and reaches:
         # Its glass is seen, and walls that the picture cuts off look like a mistake.
-        boxes.append(np.array([domain[0], [*domain[1, :2], domain[0, 2]]]))
-    return framed_box(around(boxes), domain=domain, world=world)
+        reaches.append(reach_of_box(np.array([domain[0], [*domain[1, :2], domain[0, 2]]])))
+    return framed(around(reaches), domain=domain, world=world)
 
 
 def _mesh_of(layout: JobLayout, body: RigidBodyParameters) -> NDArray[np.float64]:

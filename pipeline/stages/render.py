@@ -299,7 +299,7 @@ def camera_path(job: Job, framed: NDArray[np.float64] | None = None) -> CameraPa
 
     Args:
         job: the job.
-        framed: the box that it frames if it frames the action [m], (2, 3); the domain while that is not known.
+        framed: points that it frames if it frames the action [m], (n, 3); the domain while they are not known.
     """
     width, height = job.render.resolution
     starts = {body.name: body.position for body in job.rigid}
@@ -333,8 +333,8 @@ def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]
     return surfaces + cloths + volumes + points + cached
 
 
-def framed_box(job: Job, layout: JobLayout) -> NDArray[np.float64] | None:
-    """The box that the camera frames [m], (2, 3), where it frames the action, which a file of the job's folder says."""
+def framed_points(job: Job, layout: JobLayout) -> NDArray[np.float64] | None:
+    """What the camera frames [m], (n, 3), where it frames the action, which a file of the job's folder says."""
     return read_framed(layout.path(layout.film_bounds())) if job.camera.frames_action else None
 
 
@@ -349,7 +349,7 @@ def write_motion(job: Job, layout: JobLayout, frame: int, *, attempt: int) -> tu
         frame: which frame.
         attempt: names the files that they are written to first.
     """
-    bodies, camera = job.moving_bodies, camera_path(job, framed_box(job, layout))
+    bodies, camera = job.moving_bodies, camera_path(job, framed_points(job, layout))
     cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies if bodies else {}
     poses = {name: cached[name].arrays for name in bodies}
     if bodies:
@@ -463,7 +463,7 @@ _WARM: dict[str, Renderer] = {}
 def _warm_renderer(context: TaskContext) -> Renderer:
     from render.blender import open_renderer
 
-    spec = render_spec(context.job, context.layout, framed_box(context.job, context.layout))
+    spec = render_spec(context.job, context.layout, framed_points(context.job, context.layout))
     key = digest_of(f"{context.layout.root} {context.threads} {spec.model_dump_json()}")
     if key not in _WARM:
         _close_renderers()

@@ -1,4 +1,4 @@
-"""The box of a film's action, from its cached frames; and what it makes of the plan."""
+"""Where a film's action is, from its cached frames; and what it makes of the plan."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.plan import plan_job
 from pipeline.stages import STAGES
 from pipeline.stages.bounds import read_framed
 from pipeline.stages.render import camera_path
-from render.bounds import read_bounds
+from render.bounds import box_of, read_bounds
 from render.meshes import write_ply
 from sim.snapshots import Snapshot
 from sim.world import FrameReport
@@ -114,6 +114,11 @@ def pond(tmp_path) -> tuple[Job, JobLayout]:
     return job, layout
 
 
+def box_of_film(layout: JobLayout) -> np.ndarray:
+    points = read_framed(layout.path(layout.film_bounds()))
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
 def tasks_of_bounds(job: Job, layout: JobLayout) -> list:
     return [task for task in plan_job(job, layout, STAGES) if task.stage == "bounds"]
 
@@ -122,16 +127,17 @@ def test_the_box_holds_what_moves_and_stands_in_all_frames(pond):
     job, layout = pond
     for task in tasks_of_bounds(job, layout):
         assert isinstance(run_task(task, layout), Finished)
-    first, second = (read_bounds(layout.path(layout.frame_bounds(frame))) for frame in (0, 1))
+    reaches = [read_bounds(layout.path(layout.frame_bounds(frame))) for frame in (0, 1)]
+    first, second = ({name: box_of(reach) for name, reach in of_frame.items()} for of_frame in reaches)
     assert set(first) == {"water", "stick"}  # no smoke yet
     assert second["plume"] == pytest.approx(np.array([[-0.1, -0.1, 0.6], [0.1, 0.1, 0.9]]), abs=1e-6)
     assert second["stick"] == pytest.approx(np.array([[0.09, 0.19, 0.5], [0.11, 0.21, 1.1]]), abs=1e-6)
     assert second["water"][1, 2] < 0.21, "the droplet is left out"
-    box = read_framed(layout.path(layout.film_bounds()))
+    box = box_of_film(layout)
     rock = 0.5 + 0.1 * 2**0.5
     assert box[1] == pytest.approx([rock, 0.22, 1.1], abs=0.01)
     assert box[0] == pytest.approx([-0.22, -0.22, 0.0], abs=0.01)
-    assert camera_path(job, box).first() != camera_path(job).first()
+    assert camera_path(job, read_framed(layout.path(layout.film_bounds()))).first() != camera_path(job).first()
 
 
 def test_a_tank_is_framed_with_its_whole_floor(pond):
@@ -139,8 +145,8 @@ def test_a_tank_is_framed_with_its_whole_floor(pond):
     job, _ = job_in(layout.root.parent, FRAMED + "[stage]\ntank = true\n")
     for task in tasks_of_bounds(job, layout):
         run_task(task, layout)
-    box = read_framed(layout.path(layout.film_bounds()))
-    assert box[:, :2].tolist() == [[-1.0, -1.0], [1.0, 1.0]]
+    box = box_of_film(layout)
+    assert box[:, :2] == pytest.approx(np.array([[-1.0, -1.0], [1.0, 1.0]]))
     assert box[1, 2] == pytest.approx(1.1, abs=0.01)
 
 
@@ -155,7 +161,7 @@ def test_the_same_frames_give_the_same_bytes_and_a_damaged_one_none(pond):
     assert contents[0] == contents[1]
     layout.path(first.outputs[0]).write_text("{}")
     ended = run_task(film, layout)
-    assert isinstance(ended, Failed) and "holds no boxes" in ended.message
+    assert isinstance(ended, Failed) and "holds no bounds" in ended.message
 
 
 def test_pictures_wait_for_the_box_and_other_jobs_have_none(tmp_path):

@@ -5,26 +5,57 @@ from __future__ import annotations
 from pathlib import Path
 
 import av
+import drawing_stages
 import numpy as np
 import pytest
 from command_line import pipeline
 from PIL import Image
 
+from pipeline.artifacts import committing
+from pipeline.fingerprint import task_fingerprint
+from pipeline.job.loading import load_job
+from pipeline.layout import JobLayout
+from pipeline.manifest import Manifest
+from pipeline.plan import plan_job
+from render.pictures import read_picture
+
 SIZE = (96, 64)
 SCENE = '[[rigid]]\nname = "ball"\nshape = { type = "sphere", radius = 0.1 }\n'
 
 
+@pytest.fixture(autouse=True)
+def pictures_without_a_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames that are made of the job file alone."""
+    monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES)
+
+
 def film(
-    folder: Path, color: tuple[int, int, int], *, frames: int = 12, fps: int = 60, planned: int = 12, step: int = 4
+    folder: Path,
+    color: tuple[int, int, int],
+    *,
+    frames: int = 12,
+    fps: int = 60,
+    planned: int = 12,
+    step: int = 4,
+    gravity: float = -9.0,
 ) -> Path:
-    """A job's folder whose frames are plain, brighter by so many levels each."""
-    (folder / "frames").mkdir(parents=True)
-    (folder / ".receipts" / "frames").mkdir(parents=True)
-    (folder / "job.toml").write_text(f'name = "{folder.name}"\nframes = {planned}\nfps = {fps}\n{SCENE}')
-    for frame in range(frames):
-        shade = tuple(level + step * frame for level in color)
-        Image.new("RGB", SIZE, shade).save(folder / "frames" / f"{frame:06d}.png")
-        (folder / ".receipts" / "frames" / f"{frame:06d}.png.json").write_text("{}")
+    """A job's folder whose frames are plain, brighter by so many levels each, and committed."""
+    layout = JobLayout(folder)
+    layout.root.mkdir(parents=True, exist_ok=True)
+    text = f'name = "{folder.name}"\nfps = {fps}\ngravity = [0.0, 0.0, {gravity}]\n'
+    layout.job_file.write_text(f"{text}frames = {max(frames, planned)}\n{SCENE}")
+    tasks = plan_job(load_job(layout.job_file), layout, drawing_stages.STAGES)
+    with Manifest(layout.manifest) as manifest:
+        manifest.record_plan(tasks)
+        for frame, task in enumerate(tasks[:frames]):
+            picture, fingerprint = layout.picture(frame), task_fingerprint(task, {})
+            with committing(
+                layout, picture, task=task, attempt=1, fingerprint=fingerprint, validate=read_picture
+            ) as new:
+                shade = tuple(level + step * frame for level in color)
+                Image.new("RGB", SIZE, shade).save(new.path, format="PNG")
+            manifest.record_artifact(new.receipt)
+    layout.job_file.write_text(f"{text}frames = {planned}\n{SCENE}")
     return folder
 
 
@@ -69,10 +100,47 @@ def test_films_of_other_rates_show_equal_times_and_end_with_the_shortest(tmp_pat
 
 def test_a_frame_behind_a_gap_is_not_shown(tmp_path):
     red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
-    (blue / ".receipts" / "frames" / "000007.png.json").unlink()
+    (blue / "frames" / "000007.png").unlink()
     result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
     assert result.exit_code == 0, result.output
     assert len(decode(tmp_path / "both.mp4")[0]) == 7
+
+
+def change(job: Path, frames: int) -> None:
+    """Change a job, and draw its first frames anew."""
+    film(job, (20, 160, 20), frames=frames, gravity=-20.0)
+
+
+def test_frames_of_an_earlier_version_of_a_job_are_not_compared(tmp_path):
+    red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
+    change(blue, 5)
+    result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
+    assert result.exit_code == 0, result.output
+    assert "blue: 5 of 12 frames are there (7 more are of an earlier version of it)" in result.stderr
+    frames, _ = decode(tmp_path / "both.mp4")
+    assert len(frames) == 5
+    for frame in frames:
+        assert frame[32, 152].argmax() == 1  # green, as drawn last
+
+
+def test_a_job_of_which_all_frames_are_of_an_earlier_version_is_not_compared(tmp_path):
+    red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
+    change(blue, 0)
+    result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
+    assert result.exit_code == 1
+    assert "has not been rendered yet (12 more are of an earlier version of it)" in result.stderr
+
+
+def test_frames_of_an_earlier_version_of_a_job_are_not_looped(tmp_path):
+    red = film(tmp_path / "red", (160, 20, 20))
+    change(red, 5)
+    result = pipeline("loop", red, "-o", tmp_path / "red.webp")
+    assert result.exit_code == 1
+    assert "only 0-4 are rendered (7 more are of an earlier version of it); choose with --until" in result.stderr
+    assert pipeline("loop", red, "--until", 4, "-o", tmp_path / "red.webp").exit_code == 0
+    with Image.open(tmp_path / "red.webp") as loop:
+        red_level, green_level, _ = loop.convert("RGB").getpixel((48, 32))
+    assert green_level > red_level
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,17 @@ def test_a_run_that_says_it_did_everything_is_a_success(layout: JobLayout, capsy
     assert "movie.mp4 is done" in capsys.readouterr().err
 
 
+def test_the_film_so_far_is_named_once_while_the_job_runs(
+    layout: JobLayout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make_film(_: Lease) -> None:
+        layout.film_so_far.touch()
+        time.sleep(0.2)
+
+    watch_while(layout, make_film)
+    assert capsys.readouterr().err.count(f"the film so far, made anew now and then: {layout.film_so_far}") == 1
+
+
 def test_a_run_that_was_killed_before_it_had_a_record_is_no_success(
     layout: JobLayout, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -131,6 +131,23 @@ def test_bodies_have_the_colours_of_their_looks(tmp_path):
 
 @needs_bpy
 @needs_egl
+@pytest.mark.parametrize("name", ["cyclorama", "tank_edge", "tank_glass"])
+def test_a_body_that_is_called_as_a_part_of_the_stage_has_its_own_colour_and_the_stage_keeps_its(tmp_path, name):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.25, rings=12, segments=24))
+    green = MaterialParameters(look="plastic", color=(0.05, 0.6, 0.1))
+    ball = MeshObject(name=name, file="ball.ply", position=(0.0, 0.0, 0.5), material=green)
+    for tank in (False, True):
+        picture = workbench_picture(tmp_path, ball, stage=StageParameters(tank=tank))
+        red, level, blue = picture[27, 48]
+        assert level > 1.5 * max(red, blue)
+        around = picture.copy()
+        around[12:42, 33:63] = 128.0  # the ball and its edge
+        tint = around.max(axis=2) - around.min(axis=2)
+        assert tint.max() < 40.0, "the stage is grey"
+
+
+@needs_bpy
+@needs_egl
 @pytest.mark.parametrize("look", ["smoke", "fire"])
 def test_smoke_and_fire_are_seen_where_they_are(tmp_path, look):
     cells = 16
