@@ -90,6 +90,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
     layout = find_job(job, output)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         summary, failures, events = manifest.summary(), manifest.failures(), manifest.events(limit=5)
+        drawn_on = manifest.devices("render")
     holder = live_holder(layout.lease)
     numbers = simulation_numbers(layout)
     if as_json:
@@ -101,6 +102,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
                     "stages": {stage.stage: dict(stage.counts) for stage in summary},
                     "failures": [_attempt_as_json(attempt) for attempt in failures],
                     "events": [event._asdict() for event in events],
+                    "drawn_on": drawn_on,
                     "simulation": numbers.as_json(),
                 },
                 indent=1,
@@ -116,7 +118,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
         click.echo(f"  {stage.stage:>9}  {counts}")
     for line in numbers.lines():
         click.echo(f"  {line}")
-    for sentence in numbers.warnings():
+    for sentence in [*numbers.warnings(), *wording.mixed_devices(drawn_on)]:
         click.secho(f"  warning: {sentence}", fg="yellow")
     for attempt in failures[:10]:
         click.secho(f"  {attempt.task} {attempt.outcome}: {attempt.message}", fg="red")
