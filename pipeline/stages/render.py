@@ -24,6 +24,7 @@ from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
 from pipeline.job.problems import suggestion
 from pipeline.layout import JobLayout
+from pipeline.own_pictures import own_picture_bytes
 from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
 from pipeline.stages.bounds import read_framed
@@ -92,7 +93,8 @@ class RenderStage:
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
-        spec = _decisive(render_spec(job, layout))
+        drawn = render_spec(job, layout)
+        spec = _decisive(drawn)
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
             spec["camera"] = {"framing": job.camera.model_dump(mode="json")}
@@ -105,9 +107,10 @@ class RenderStage:
             tools={"blender": _blender_version(job.render.blender)},
         )
         bytes_per_pixel = BYTES_PER_PIXEL + BYTES_PER_PIXEL_AND_PASS * len(job.render.passes)
+        renderer_bytes = WORKER_BYTES + own_picture_bytes(drawn)
         resources = Resources(
             cores=CORES,
-            memory_bytes=WORKER_BYTES + bytes_per_pixel * prod(job.render.resolution),
+            memory_bytes=renderer_bytes + bytes_per_pixel * prod(job.render.resolution),
             gpus=int(_draws_on_gpus(job)),
         )
         static = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]

@@ -30,7 +30,7 @@ def start(cache: Path) -> Iterator[Callable[..., Renderer]]:
     processes: list[Renderer] = []
 
     def start(device: str = CARD) -> Renderer:
-        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+        path = os.pathsep.join(entry or "." for entry in sys.path)
         process = subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("held_kernels.py")), device],
             stdin=subprocess.PIPE,
