@@ -4,7 +4,8 @@
 
 writes the names to standard output as a line `MATERIALS ["...", ...]`, among the lines that Blender itself writes, or a
 line `MATERIALS_FAILED reason`; so does `python blend_materials.py FILE` with the bpy module. Those that are named are
-also tried, if they are there.
+also tried, if they are there, and before that line comes one of the pictures in them, each once, as
+`TEXTURES [{"width": 4096, "height": 4096, "float": false}, ...]`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import difflib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,13 @@ def append_material(path: Path, name: str) -> Any:
     return material
 
 
+def textures(materials: Iterable[Any]) -> list[dict[str, Any]]:
+    """Sizes of the pictures in materials [pixels], each once, and whether their pixels are floats."""
+    nodes = [node for material in materials for tree in _trees(material.node_tree) for node in tree.nodes]
+    images = {image.name: image for node in nodes if (image := getattr(node, "image", None)) is not None}
+    return [{"width": each.size[0], "height": each.size[1], "float": each.is_float} for each in images.values()]
+
+
 def _trees(tree: Any) -> Iterator[Any]:
     """A node tree, and those of the groups in it."""
     if tree is None:
@@ -103,9 +111,8 @@ def main(arguments: list[str]) -> int:
     path, wanted = Path(arguments[0]), arguments[1:]
     try:
         names = material_names(path)
-        for name in wanted:
-            if name in names:
-                append_material(path, name)
+        tried = [append_material(path, name) for name in wanted if name in names]
+        sys.stdout.write(f"TEXTURES {json.dumps(textures(tried))}\n")
         sys.stdout.write(f"MATERIALS {json.dumps(names)}\n")
     except RenderInputError as error:
         sys.stdout.write(f"MATERIALS_FAILED {str(error).replace(chr(10), ' ')}\n")

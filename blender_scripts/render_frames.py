@@ -32,6 +32,7 @@ from blender_scripts import (
     exr,
     flattening,
     geometry,
+    gpus,
     lights,
     looks,
     png,
@@ -63,12 +64,13 @@ class SceneRenderer:
 
     _current: SceneRenderer | None = None
 
-    def __init__(self, spec_path: Path, *, threads: int) -> None:
+    def __init__(self, spec_path: Path, *, threads: int, gpu: int | None = 0) -> None:
         """Build the scene.
 
         Args:
             spec_path: the RenderSpec document; paths in it are relative to its folder.
             threads: CPU threads to render with.
+            gpu: which GPU to render on if the document leaves a choice, counted from 0; None: none.
 
         Raises:
             RenderInputError: the document, or a mesh that stays the same in all frames, cannot be used.
@@ -84,7 +86,7 @@ class SceneRenderer:
         if self._has_alpha:
             settings.leave_out_background()
         self._behind = lights.plain_background(spec["stage"])
-        self.device: str = settings.choose_device(spec["render"]["device"])
+        self.device: str = gpus.choose_device(spec["render"]["device"], gpu)
         self._camera = camera.add_camera(spec["camera"])
         self._format, self._passes = spec["render"]["format"], spec["render"]["passes"]
         self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
@@ -262,6 +264,10 @@ def _parse_frames(text: str) -> list[int]:
     return frames
 
 
+def _parse_gpu(text: str) -> int | None:
+    return None if text == "none" else int(text)
+
+
 def _parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="render_frames.py", description="Draw frames of a RenderSpec.")
     parser.add_argument("spec", type=Path, help="the RenderSpec document")
@@ -269,6 +275,7 @@ def _parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--output", help="path of a picture, with {frame} or {frame:06d}")
     parser.add_argument("--serve", action="store_true", help="read `frame path` lines from standard input instead")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="CPU threads (default: all)")
+    parser.add_argument("--gpu", type=_parse_gpu, default=0, help="which GPU, counted from 0, or none (default: 0)")
     parsed = parser.parse_args(arguments)
     if not parsed.serve and (parsed.frames is None or parsed.output is None):
         parser.error("give --frames and --output, or --serve")
@@ -328,7 +335,7 @@ def main(arguments: list[str]) -> int:
     """Run the command line; returns the exit code."""
     options = _parse_arguments(arguments)
     try:
-        renderer = SceneRenderer(options.spec, threads=options.threads)
+        renderer = SceneRenderer(options.spec, threads=options.threads, gpu=options.gpu)
     except (RenderInputError, RuntimeError) as error:
         _report(f"RENDERER_FAILED {error}")
         return EXIT_FRAME_FAILED

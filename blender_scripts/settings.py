@@ -1,4 +1,4 @@
-"""Cycles settings: what each quality preset means, and which device renders."""
+"""Cycles settings: what each quality preset means."""
 
 from __future__ import annotations
 
@@ -55,9 +55,6 @@ _CLEAN_SAMPLES = 16
 
 _FAR_DISC = 300.0
 """Distance of what stands for a sun, in diagonals of the domain: its light falls off by 1 % across two of them."""
-
-_GPU_BACKENDS = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
-"""In order of preference."""
 
 
 def apply_render_settings(parameters: dict[str, Any], *, fps: float, threads: int) -> None:
@@ -218,42 +215,3 @@ def _become_far_disc(sun: Any, distance: float, middle: Vector) -> None:
 def leave_out_background() -> None:
     """Give what is drawn an alpha channel, 0 where nothing of the scene is seen."""
     bpy.context.scene.render.film_transparent = True
-
-
-def choose_device(wanted: str) -> str:
-    """Select what Cycles renders on, and say what it is, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`.
-
-    Blender accepts a back end without a device behind it and silently renders on the CPU; so the devices are counted.
-
-    Args:
-        wanted: `auto`, `cpu` or `gpu`.
-
-    Raises:
-        RuntimeError: a GPU is wanted and there is none.
-    """
-    cycles = bpy.context.scene.cycles
-    cycles.device = "CPU"
-    if wanted == "cpu":
-        return "CPU"
-    preferences = bpy.context.preferences.addons["cycles"].preferences
-    for backend in _GPU_BACKENDS:
-        names = _enable_gpus(preferences, backend)
-        if names:
-            cycles.device = "GPU"
-            return f"{backend}: {', '.join(names)}"
-    if wanted == "gpu":
-        raise RuntimeError('render.device is "gpu", but Cycles finds none; use "auto" or "cpu"')
-    return "CPU"
-
-
-def _enable_gpus(preferences: Any, backend: str) -> list[str]:
-    try:
-        preferences.compute_device_type = backend
-    except TypeError:
-        # This build of Blender does not know the back end.
-        return []
-    preferences.get_devices()
-    gpus = [device for device in preferences.devices if device.type == backend]
-    for device in preferences.devices:
-        device.use = device.type == backend
-    return [device.name for device in gpus]

@@ -74,6 +74,7 @@ class Commit:
         fingerprint: str,
         validate: Callable[[Path], None],
         inputs: Mapping[ArtifactPath, str],
+        device: str,
     ) -> None:
         self._layout = layout
         self._artifact = artifact
@@ -82,6 +83,7 @@ class Commit:
         self._fingerprint = fingerprint
         self._validate = validate
         self._inputs = dict(inputs)
+        self._device = device
         self._target = layout.path(artifact)
         self._started = 0.0
         self._receipt: Receipt | None = None
@@ -151,6 +153,7 @@ class Commit:
             job=job,
             maker=maker(),
             host=platform.node(),
+            device=self._device,
             started=self._started,
             finished=_now_s(),
         )
@@ -173,6 +176,7 @@ def committing(
     fingerprint: str,
     validate: Callable[[Path], None],
     inputs: Mapping[ArtifactPath, str] | None = None,
+    device: str = "",
 ) -> Commit:
     """Commit one artifact: write to `commit.path` inside the block; after it `commit.receipt` is the Receipt.
 
@@ -188,6 +192,7 @@ def committing(
         fingerprint: `task_fingerprint` of the task with the inputs as they are now.
         validate: decodes the file; raises InvalidArtifactError if it is not what it should be.
         inputs: hash of each input, kept so that `explain` can name the one that changed.
+        device: what computes it, if that decides its last bits.
 
     Raises:
         InvalidArtifactError: on leaving, if nothing was written or `validate` refused it.
@@ -201,6 +206,7 @@ def committing(
         fingerprint=fingerprint,
         validate=validate,
         inputs=inputs or {},
+        device=device,
     )
 
 

@@ -77,6 +77,7 @@ def examine(output: Path) -> list[Examination]:
         ("shared libraries", _examine_shared_libraries),
         ("devices", _examine_devices),
         ("Blender", _examine_blender),
+        ("Cycles GPU", _examine_render_gpus),
         ("OpenVDB", lambda: [_examine_import("OpenVDB", _OPENVDB_PROBE, "warning", "smoke needs the bpy package")]),
         ("surfaces", lambda: [_examine_import("surfaces", _SURFACE_PROBE, "failed", _SYNC)]),
         ("video", lambda: [_examine_import("video", _CODEC_PROBE, "failed", _SYNC)]),
@@ -165,6 +166,28 @@ def _examine_blender() -> Iterable[Examination]:
         yield Examination(
             "Blender", "failed", answer, 'install Blender 4.5 or newer and set [render] blender = "/path"'
         )
+
+
+def _examine_render_gpus() -> Iterable[Examination]:
+    """What Blender finds now, whatever is remembered."""
+    from importlib.metadata import version
+    from importlib.util import find_spec
+
+    from pipeline.gpu_kernels import kernels_marker
+    from render.gpus import find_gpus
+
+    if find_spec("bpy") is None:
+        return
+    probe = find_gpus(None)
+    preferred = probe.of_kind("auto")
+    for gpu in probe.gpus:
+        kernels = "compiled" if kernels_marker(str(gpu), version("bpy")).exists() else "to be compiled"
+        place = f"GPU {preferred.index(gpu)}" if gpu in preferred else f'with render.device = "{gpu.backend.lower()}"'
+        yield Examination("Cycles GPU", "ok", f"{gpu}, {place}; kernels {kernels}, if the driver has to")
+    if probe.trouble:
+        yield Examination("Cycles GPU", "warning", probe.trouble, 'use render.device = "cpu", or look at the driver')
+    elif not probe.gpus:
+        yield Examination("Cycles GPU", "ok", "none found: frames are drawn on the processor")
 
 
 def _examine_import(name: str, code: str, otherwise: Status, remedy: str) -> Examination:

@@ -283,7 +283,7 @@ class Manifest(ManifestReader):
         with self.transaction():
             self.remember_attempts(rows)
             self._connection.executemany(
-                "INSERT OR REPLACE INTO artifact VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                "INSERT OR REPLACE INTO artifact VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 [artifact_row(row) for row in rows],
             )
 
@@ -324,6 +324,7 @@ def artifact_row(receipt: Receipt) -> ArtifactRow:
         mtime_ns=receipt.mtime_ns,
         hash=receipt.hash,
         inputs=json.dumps(receipt.inputs, sort_keys=True, separators=(",", ":")),
+        device=receipt.device,
     )
 
 

@@ -35,6 +35,7 @@ class ArtifactRow(NamedTuple):
     mtime_ns: int
     hash: str
     inputs: str  # JSON object, path -> hash; parsed only where a change is to be named
+    device: str = ""
 
 
 class AttemptRow(NamedTuple):
@@ -217,6 +218,15 @@ class ManifestReader:
             (task, limit),
         )
         return [EventRow._make(row) for row in reversed(rows)]
+
+    def devices(self, stage: str) -> dict[str, int]:
+        """What computed the artifacts of a stage, with the number of tasks; those that do not say are left out."""
+        rows = self._rows(
+            "SELECT device, count(DISTINCT artifact.task) FROM artifact JOIN task ON task.id = artifact.task"
+            " WHERE device != '' AND position IS NOT NULL AND stage = ? GROUP BY device ORDER BY device",
+            (stage,),
+        )
+        return {str(device): int(tasks) for device, tasks in rows}
 
     def parameters(self, digest: str) -> ParameterSet | None:
         """The parameter set of this digest; None if it is unknown, as after a rebuild."""

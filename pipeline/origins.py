@@ -38,6 +38,8 @@ class Origin:
         yield f"origin  {count} by attempt {receipt.attempt} on {receipt.host}, {wording.moment(receipt.finished)}"
         if receipt.maker:
             yield f"        {receipt.maker}"
+        if receipt.device:
+            yield f"        drawn on {receipt.device}"
         if self.tools is not None:
             tools = ", ".join(f"{name} {version}" for name, version in self.tools.items())
             yield f"        versions: {tools}"
@@ -51,6 +53,7 @@ class Origin:
             "artifacts": self.artifacts,
             "attempt": self.receipt.attempt,
             "host": self.receipt.host,
+            "device": self.receipt.device,
             "maker": self.receipt.maker,
             "finished": self.receipt.finished,
             "job": self.receipt.job,
@@ -65,7 +68,15 @@ def origins_of(layout: JobLayout, receipts: Sequence[Receipt]) -> list[Origin]:
     """Where a task's artifacts come from, latest last; those that have it in common together."""
     groups: dict[tuple[object, ...], list[Receipt]] = {}
     for receipt in receipts:
-        key = (receipt.attempt, receipt.host, receipt.maker, receipt.job, receipt.parameters, receipt.fingerprint)
+        key = (
+            receipt.attempt,
+            receipt.host,
+            receipt.maker,
+            receipt.device,
+            receipt.job,
+            receipt.parameters,
+            receipt.fingerprint,
+        )
         groups.setdefault(key, []).append(receipt)
     return sorted(
         (_origin(layout, members[-1], len(members)) for members in groups.values()),

@@ -93,6 +93,7 @@ class ProgressObserver:
     _awaited: dict[TaskId, set[ArtifactPath]] = field(default_factory=dict)
     _stage_of: dict[TaskId, str] = field(default_factory=dict)
     _warned: set[tuple[str, str]] = field(default_factory=set)
+    _announced: set[str] = field(default_factory=set)
 
     def notify(self, event: RunEvent) -> None:
         """Take note of an event, and show it."""
@@ -102,8 +103,10 @@ class ProgressObserver:
                 self._start(assessments)
             case Committed(task_id, _, receipt):
                 self._count(task_id, {receipt.artifact}, now)
-            case TaskProgress(task_id, _, _, _, message):
+            case TaskProgress(task_id, _, _, _, message, preparing):
                 self.stages[self._stage_of[task_id]].message = message
+                if preparing and message:
+                    self._announce(f"{self._stage_of[task_id]}: {message}")
             case StateChanged(task_id, _, TaskState.UP_TO_DATE | TaskState.SUCCEEDED):
                 self._count(task_id, self._awaited[task_id], now)
             case StateChanged(task_id, stage, TaskState.FAILED):
@@ -132,6 +135,12 @@ class ProgressObserver:
             stage.at_start += done
             self._stage_of[task.id] = task.stage
             self._awaited[task.id] = set(assessment.rebuilds)
+
+    def _announce(self, sentence: str) -> None:
+        """What takes minutes, so that nobody takes it for a hang; once, however many wait for it."""
+        if sentence not in self._announced:
+            self._announced.add(sentence)
+            self.display.say(sentence)
 
     def _warn(self, stage: str, kind: str, message: str) -> None:
         """The first of each kind; a camera that is lost may be so for thousands of frames."""

@@ -43,6 +43,8 @@ class Receipt:
         job: digest of the job file that it was made from; its text is `JobLayout.job_text`. Empty in older receipts.
         maker: program, Python and kind of machine that wrote it; see `provenance.maker`. Empty in older receipts.
         host: name of the machine that wrote it.
+        device: what computed it, as `CPU` or `OPTIX: NVIDIA RTX 4090`, where that decides its last bits; else, and in
+            older receipts, empty.
         started: wall time when the part file was opened [s since the epoch].
         finished: wall time when it was committed [s since the epoch].
     """
@@ -60,12 +62,15 @@ class Receipt:
     job: str = ""
     maker: str = ""
     host: str = ""
+    device: str = ""
     started: float = 0.0
     finished: float = 0.0
 
     def to_json(self) -> str:
         """The receipt file's text; its seal is a digest of all the rest, so that no flipped bit goes unseen."""
         values = asdict(self)
+        if not self.device:
+            del values["device"]  # as earlier versions know it
         return json.dumps({**values, "seal": _seal(values)}, indent=1, sort_keys=True) + "\n"
 
     @classmethod
@@ -90,7 +95,7 @@ def _seal(values: Mapping[str, Any]) -> str:
     return digest_of(json.dumps(values, sort_keys=True, separators=(",", ":")))
 
 
-_TEXTS = ("artifact", "task", "stage", "fingerprint", "parameters", "hash", "job", "maker", "host")
+_TEXTS = ("artifact", "task", "stage", "fingerprint", "parameters", "hash", "job", "maker", "host", "device")
 _NUMBERS = ("attempt", "size", "mtime_ns", "started", "finished")
 
 

@@ -15,6 +15,7 @@ from pipeline.errors import PipelineError
 from pipeline.executors.attempt import load_stages, run_attempt
 from pipeline.executors.base import Assignment, Failed, Progress, TaskEvent
 from pipeline.fingerprint import task_fingerprint
+from pipeline.gpus import first_gpu
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
@@ -138,6 +139,7 @@ def _assignment(task: Task, layout: JobLayout, *, capacity: Resources, stages: s
         root=layout.root,
         stages=stages,
         need=need,
+        gpu=first_gpu() if need.gpus else None,
     )
 
 

@@ -109,13 +109,18 @@ def make_still(
     with scratch_folder(loaded, found, layout) as scratch:
         for task in found.todo:
             say(task.id)
+
+            def tell(_share: float, sentence: str, name: str = task.id) -> None:
+                if sentence != name:
+                    say(sentence)
+
             outcome = run_tasks(
                 [task],
                 scratch,
                 capacity=capacity,
                 stages=stages,
                 stop_requested=lambda: False,
-                tell=lambda _share, _sentence: None,
+                tell=tell,
             )
             for failed in outcome.failures:
                 raise PipelineError(f"{failed.task_id}: {failed.message}")

@@ -1,7 +1,8 @@
-"""How times and sizes are written for people."""
+"""How times, sizes and what several commands tell are written for people."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 
 
@@ -30,3 +31,18 @@ def size(byte_count: float) -> str:
 def moment(time_s: float) -> str:
     """A wall time [s since the epoch] in this machine's time zone."""
     return datetime.fromtimestamp(time_s, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+
+
+def mixed_devices(drawn_on: Mapping[str, int]) -> list[str]:
+    """A warning of a film that was drawn by several kinds of device; empty for one that was not.
+
+    Args:
+        drawn_on: number of frames by device.
+    """
+    if len(drawn_on) < 2:
+        return []
+    counts = ", ".join(f"{frames} on {device}" for device, frames in drawn_on.items())
+    return [
+        f"the film's frames were drawn by devices that round differently: {counts}; pipeline explain tells of each "
+        "frame, pipeline rerun --stage render draws them anew"
+    ]

@@ -5,11 +5,29 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from render.blender import run_script, script_argv
 from render.errors import InvalidFileError
 
 _TIMEOUT_S = 120.0
+
+
+class Texture(NamedTuple):
+    """A picture in a material: its size [pixels], and whether its pixels are floats or bytes."""
+
+    width: int
+    height: int
+    floats: bool
+
+
+def read_textures(path: Path, name: str, blender: str | None) -> list[Texture]:
+    """The pictures in a material of a .blend file, each once; empty if it is not there.
+
+    Args and Raises as of `read_material_names`.
+    """
+    told = json.loads(_ask(path, blender, [name], "TEXTURES"))
+    return [Texture(int(each["width"]), int(each["height"]), bool(each["float"])) for each in told]
 
 
 def read_material_names(path: Path, blender: str | None, *, tried: Sequence[str] = ()) -> list[str]:
@@ -24,12 +42,17 @@ def read_material_names(path: Path, blender: str | None, *, tried: Sequence[str]
         BlenderUnavailableError: Blender does not answer.
         InvalidFileError: the file cannot be read, or a material that is tried needs more than is in the file.
     """
+    return [str(name) for name in json.loads(_ask(path, blender, tried, "MATERIALS"))]
+
+
+def _ask(path: Path, blender: str | None, tried: Sequence[str], wanted: str) -> str:
+    """What the script says after a word."""
     argv = script_argv(blender, "blend_materials.py", [str(path), *tried])
     completed = run_script(argv, timeout_s=_TIMEOUT_S, purpose=f"read {path}")
     for line in completed.stdout.splitlines():
         word, _, rest = line.partition(" ")
-        if word == "MATERIALS":
-            return [str(name) for name in json.loads(rest)]
+        if word == wanted:
+            return rest
         if word == "MATERIALS_FAILED":
             raise InvalidFileError(path, rest)
     last = (completed.stdout + completed.stderr).strip().rpartition("\n")[2]

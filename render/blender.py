@@ -85,20 +85,22 @@ class Renderer(Protocol):
         """Let go of Blender; idempotent."""
 
 
-def open_renderer(spec_path: Path, *, threads: int, blender: str | None) -> Renderer:
+def open_renderer(spec_path: Path, *, threads: int, blender: str | None, gpu: int | None = 0) -> Renderer:
     """Open a renderer for many frames of one specification.
 
     Args:
         spec_path: the RenderSpec document.
         threads: CPU threads to render with.
         blender: path of a Blender executable, or None for the bpy module.
+        gpu: which GPU to render on if the document leaves a choice, counted from 0 as `render.gpus` lists them; None:
+            none of them.
 
     Raises:
         BlenderUnavailableError: there is no usable Blender, or it refuses the specification.
     """
     if blender is None:
-        return ModuleRenderer(spec_path, threads=threads)
-    return ExecutableRenderer(spec_path, threads=threads, blender=blender)
+        return ModuleRenderer(spec_path, threads=threads, gpu=gpu)
+    return ExecutableRenderer(spec_path, threads=threads, blender=blender, gpu=gpu)
 
 
 def require_bpy() -> None:
@@ -123,13 +125,13 @@ def require_bpy() -> None:
 class ModuleRenderer:
     """Draws with the bpy module in this process. Blender has one scene per process: a new one closes the last."""
 
-    def __init__(self, spec_path: Path, *, threads: int) -> None:
+    def __init__(self, spec_path: Path, *, threads: int, gpu: int | None = 0) -> None:
         require_bpy()
         from blender_scripts.errors import RenderInputError
         from blender_scripts.render_frames import SceneRenderer
 
         try:
-            self._scene = SceneRenderer(spec_path, threads=threads)
+            self._scene = SceneRenderer(spec_path, threads=threads, gpu=gpu)
         except (RenderInputError, RuntimeError) as error:
             raise BlenderUnavailableError(str(error)) from error
         self.device: str = self._scene.device
@@ -151,10 +153,10 @@ class ModuleRenderer:
 class ExecutableRenderer:
     """Draws with a Blender executable, started once; asks it for frames over its standard input."""
 
-    def __init__(self, spec_path: Path, *, threads: int, blender: str) -> None:
+    def __init__(self, spec_path: Path, *, threads: int, blender: str, gpu: int | None = 0) -> None:
         require_supported_executable(blender)
         self._log_tail: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
-        self._argv = build_argv(blender, spec_path.resolve(), threads=threads)
+        self._argv = build_argv(blender, spec_path.resolve(), threads=threads, gpu=gpu)
         self._process = subprocess.Popen(
             self._argv,
             stdin=subprocess.PIPE,
@@ -259,10 +261,11 @@ def _told_of(frame: int) -> Iterator[None]:
         raise FrameRenderError(frame, str(error)) from error
 
 
-def build_argv(blender: str, spec_path: Path, *, threads: int) -> list[str]:
+def build_argv(blender: str, spec_path: Path, *, threads: int, gpu: int | None) -> list[str]:
     """Arguments that make a Blender executable serve frames of a specification. Pure."""
     words = ["--threads", str(threads)]
-    return script_argv(blender, "render_frames.py", [str(spec_path), "--serve", *words], own=words)
+    options = [str(spec_path), "--serve", *words, "--gpu", "none" if gpu is None else str(gpu)]
+    return script_argv(blender, "render_frames.py", options, own=words)
 
 
 def script_argv(blender: str | None, script: str, options: Sequence[str], *, own: Sequence[str] = ()) -> list[str]:

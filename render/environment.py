@@ -2,12 +2,37 @@
 
 from __future__ import annotations
 
+import re
+import struct
 from pathlib import Path
 
 from render.errors import InvalidFileError
 
 SUFFIXES = (".hdr", ".exr")
 """Formats whose pixels are radiances: a PNG or JPEG of a sky has no sun."""
+
+
+_HEADER_BYTES = 1 << 16
+"""The headers of such pictures have some hundred bytes; of a longer one the size is not looked for further on."""
+_EXR_WINDOW = b"dataWindow\0box2i\0"
+
+
+def environment_pixels(path: Path) -> int | None:
+    """How many pixels a picture has by its header, which is all that is read; None where that does not say.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        header = file.read(_HEADER_BYTES)
+    if path.suffix.lower() == ".hdr":
+        found = re.search(rb"^[-+][XY] (\d+) [-+][XY] (\d+)$", header, re.MULTILINE)
+        return int(found[1]) * int(found[2]) if found else None
+    start = header.find(_EXR_WINDOW) + len(_EXR_WINDOW) + 4  # behind the size of the attribute
+    if _EXR_WINDOW not in header or len(header) < start + 16:
+        return None
+    left, top, right, bottom = struct.unpack_from("<4i", header, start)
+    return int(max(0, right - left + 1) * max(0, bottom - top + 1))
 
 
 def read_environment_size(path: Path) -> tuple[int, int]:

@@ -233,6 +233,8 @@ class MaterialParameters(Parameters):
         return self
 
 
+RenderDevice = Literal["auto", "cpu", "gpu", "optix", "cuda", "hip", "oneapi", "metal"]
+
 RenderPass = Literal["depth", "vector", "normal", "cryptomatte", "denoising"]
 
 
@@ -251,7 +253,11 @@ class RenderParameters(Parameters):
     shutter: Fraction = Field(default=0.5, description="Time the shutter is open [frames].")
     exposure: float = Field(default=0.0, description="Exposure [stops].")
     seed: int = Field(default=0, ge=0, description="Seed of the sampling pattern.")
-    device: Literal["auto", "cpu", "gpu"] = Field(default="auto", description="What Cycles renders on.")
+    device: RenderDevice = Field(
+        default="auto",
+        description="What Cycles renders on. auto: GPUs where there are any, else the processor; gpu: GPUs of whatever "
+        "kind; optix and cuda: NVIDIA's, hip: AMD's, oneapi: Intel's, metal: Apple's.",
+    )
     format: Literal["png", "png16", "exr"] = Field(
         default="png",
         description="png: 8 bits a channel, as the display shows them; png16: the same in 16 bits; exr: an OpenEXR "

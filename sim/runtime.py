@@ -114,7 +114,7 @@ def available_devices() -> dict[str, str]:
     driver or the visible devices change.
     """
     key = _machine_key()
-    path = _cache_folder() / "devices.json"
+    path = cache_folder() / "devices.json"
     remembered = _read_answers(path, key)
     if remembered is not None:
         return remembered
@@ -185,7 +185,7 @@ def _usable_cores() -> int:
 def _start_taichi(device: str, threads: int) -> None:
     ti = import_taichi()
     tell_positions_unwrapped()
-    kernel_cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or _cache_folder() / "kernels")
+    kernel_cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or cache_folder() / "kernels")
     _remove_stale_lock(kernel_cache)
     # Taichi announces its back end with a bare print.
     with contextlib.redirect_stdout(io.StringIO()):
@@ -210,7 +210,7 @@ def _remove_stale_lock(kernel_cache: Path) -> None:
                 lock.unlink()
 
 
-def _cache_folder() -> Path:
+def cache_folder() -> Path:
     """Of kernels and devices; a relative XDG_CACHE_HOME counts as none, as its specification has it."""
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (base if base.is_absolute() else Path.home() / ".cache") / "physics-pipeline"

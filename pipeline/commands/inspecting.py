@@ -90,6 +90,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
     layout = find_job(job, output)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         summary, failures, events = manifest.summary(), manifest.failures(), manifest.events(limit=5)
+        drawn_on = manifest.devices("render")
     holder = live_holder(layout.lease)
     numbers = simulation_numbers(layout)
     so_far = layout.film_so_far if layout.film_so_far.exists() else None
@@ -102,6 +103,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
                     "stages": {stage.stage: dict(stage.counts) for stage in summary},
                     "failures": [_attempt_as_json(attempt) for attempt in failures],
                     "events": [event._asdict() for event in events],
+                    "drawn_on": drawn_on,
                     "simulation": numbers.as_json(),
                     "film_so_far": None if so_far is None else str(so_far),
                 },
@@ -120,7 +122,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
         click.echo(f"  the film so far: {so_far}")
     for line in numbers.lines():
         click.echo(f"  {line}")
-    for sentence in numbers.warnings():
+    for sentence in [*numbers.warnings(), *wording.mixed_devices(drawn_on)]:
         click.secho(f"  warning: {sentence}", fg="yellow")
     for attempt in failures[:10]:
         click.secho(f"  {attempt.task} {attempt.outcome}: {attempt.message}", fg="red")

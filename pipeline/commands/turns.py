@@ -15,6 +15,7 @@ from pipeline.commands.watching import CTRL_C, STOPPED_FROM_ELSEWHERE, Follower
 from pipeline.errors import DiskFullError, JobBusyError, PipelineError
 from pipeline.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background
 from pipeline.film_so_far import FilmSoFar
+from pipeline.gpus import render_trouble, usable_gpus
 from pipeline.job.loading import job_of_text, load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -31,8 +32,8 @@ from pipeline.solver_numbers import SolverWatch, simulation_numbers
 from pipeline.spool import QueuedJob, Spool, SpoolError, Wish
 
 GPU_TASKS = 1
-"""One task at a time on the GPU. Whether there is one is not asked here: if not, a stage that has to run names it as an
-obstacle, and what is up to date needs none."""
+"""At least one task at a time on a GPU. Whether there is one is not asked here: if not, a stage that has to run names
+it as an obstacle, and what is up to date needs none."""
 
 
 def stand_in_queue(spool: Spool, layout: JobLayout, entry: QueuedJob, *, detach: bool) -> int:
@@ -174,14 +175,14 @@ def _run_once(
     control: RunControl | None = None,
     observer: Observer | None = None,
 ) -> Outcome:
-    capacity = machine_capacity(gpus=GPU_TASKS)
+    choice = ExecutorChoice.from_settings(entry.settings)
+    capacity = machine_capacity(gpus=GPU_TASKS if choice.scheduler else max(GPU_TASKS, len(usable_gpus(job))))
     if entry.cores is not None:
         capacity = replace(capacity, cores=min(entry.cores, capacity.cores))
     rerun = None
     if entry.rerun_stages is not None:
         frames = None if entry.rerun_frames is None else frozenset(entry.rerun_frames)
         rerun = Selection(frozenset(entry.rerun_stages), frames)
-    choice = ExecutorChoice.from_settings(entry.settings)
     with (
         ProgressObserver(open_display()) as progress,
         open_machines(choice, layout, capacity, progress.display.say) as machines,
@@ -191,6 +192,8 @@ def _run_once(
         def warn(sentence: str) -> None:
             progress.display.say(f"warning: {sentence}", style="yellow")
 
+        if choice.scheduler is None and (trouble := render_trouble(job)):
+            warn(f"{trouble}; frames are drawn on the processor")
         observers: list[Observer] = [progress, SolverWatch(layout, warn)]
         if observer is not None:
             observers.append(observer)

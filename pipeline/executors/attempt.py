@@ -55,14 +55,18 @@ class AttemptContext:
         self.attempt = assignment.attempt
         self.fingerprint = assignment.fingerprint
         self.threads = assignment.threads
+        self.gpu = assignment.gpu
         self.committed: set[ArtifactPath] = set()
         self._inputs = assignment.inputs
         self._emit = emit
         self._stop_requested = stop_requested
         self._progress_told_at = 0.0
+        self._preparing = False
 
     @contextmanager
-    def committing(self, artifact: ArtifactPath, validate: Callable[[Path], None]) -> Iterator[Path]:
+    def committing(
+        self, artifact: ArtifactPath, validate: Callable[[Path], None], *, device: str = ""
+    ) -> Iterator[Path]:
         """Yield the path to write to; on leaving, validate, fsync, rename and receipt it, and tell the runner."""
         if artifact not in self.task.outputs:
             raise PipelineError(f"{self.task.id} commits {artifact}, which is not one of its outputs")
@@ -74,6 +78,7 @@ class AttemptContext:
             fingerprint=self.fingerprint,
             validate=validate,
             inputs=self._inputs,
+            device=device,
         )
         with commit:
             yield commit.path
@@ -86,13 +91,15 @@ class AttemptContext:
         """Whether this artifact is there, whole, and of this task's fingerprint."""
         return receipts.is_committed(self.layout, artifact, self.fingerprint)
 
-    def progress(self, done: float, total: float, message: str = "") -> None:
+    def progress(self, done: float, total: float, message: str = "", *, preparing: bool = False) -> None:
         """Tell how far the task is; too frequent calls are dropped, except the last one."""
         now = time.monotonic()
-        if done < total and now - self._progress_told_at < PROGRESS_INTERVAL_S:
+        steady = not (preparing or self._preparing)
+        if done < total and steady and now - self._progress_told_at < PROGRESS_INTERVAL_S:
             return
         self._progress_told_at = now
-        self._emit(Progress(self.task.id, self.attempt, done, total, message))
+        self._preparing = preparing
+        self._emit(Progress(self.task.id, self.attempt, done, total, message, preparing))
 
     def warn(self, kind: str, message: str) -> None:
         """Tell what is worth a look, in the log and to the runner; the task goes on."""

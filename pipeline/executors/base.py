@@ -31,6 +31,7 @@ class Assignment:
         stall_s: longest time that it may show no sign of life [s]; None: the executor's own limit.
         memory_bytes: most memory that its processes may hold together; None: the executor's own limit.
         need: what it occupies while it runs, for executors that choose among machines.
+        gpu: which of its machine's GPUs it has for itself, counted from 0; None: none. The executor chooses.
     """
 
     task: Task
@@ -45,6 +46,7 @@ class Assignment:
     stall_s: float | None = None
     memory_bytes: int | None = None
     need: Resources = field(default=Resources())
+    gpu: int | None = None
 
     @property
     def layout(self) -> JobLayout:
@@ -69,13 +71,17 @@ class Started:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far the attempt is: `done` of `total`, in units of the stage's choice."""
+    """How far the attempt is: `done` of `total`, in units of the stage's choice.
+
+    While `preparing`, it does what is done once on a machine, such as compiling: no limit of time counts that.
+    """
 
     task_id: TaskId
     attempt: int
     done: float
     total: float
     message: str = ""
+    preparing: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from distributed import Nanny, Scheduler
 from distributed.deploy.spec import SpecCluster
 
 from pipeline.executors.dask_slots import CPU_TAG, GPU_TAG, MEMORY_TAG
+from pipeline.gpus import OWN_GPUS, own_gpus
 from pipeline.task import Resources
 
 SCHEDULER_SETTINGS = {
@@ -47,7 +48,10 @@ def local_cluster(shares: list[Resources]) -> Iterator[str]:
     Yields:
         The scheduler's address.
     """
-    workers = {index: {"cls": Nanny, "options": _worker_options(share)} for index, share in enumerate(shares)}
+    workers = {
+        index: {"cls": Nanny, "options": _worker_options(share, places)}
+        for index, (share, places) in enumerate(zip(shares, gpu_places(shares), strict=True))
+    }
     scheduler = {"cls": Scheduler, "options": {"host": _HOST, "dashboard": False, "dashboard_address": _HTTP}}
     with (
         dask.config.set(SCHEDULER_SETTINGS),
@@ -56,13 +60,21 @@ def local_cluster(shares: list[Resources]) -> Iterator[str]:
         yield cluster.scheduler_address
 
 
-def _worker_options(share: Resources) -> dict[str, object]:
+def gpu_places(shares: list[Resources]) -> list[list[int]]:
+    """Which of the machine's GPUs each share has, so that no two have the same."""
+    own = own_gpus() or range(sum(share.gpus for share in shares))
+    ends = [sum(each.gpus for each in shares[: index + 1]) for index in range(len(shares))]
+    return [[*own[end - share.gpus : end]] for share, end in zip(shares, ends, strict=True)]
+
+
+def _worker_options(share: Resources, places: list[int]) -> dict[str, object]:
     tags = {CPU_TAG: share.cores, MEMORY_TAG: share.memory_bytes, GPU_TAG: share.gpus}
     return {
         "host": _HOST,
         "nthreads": share.cores,
         "memory_limit": 0,  # Dask would count its own process only; the worker processes have limits of their own
         "resources": {tag: amount for tag, amount in tags.items() if amount},
+        "env": {OWN_GPUS: ",".join(map(str, places))},
         "dashboard": False,
         "dashboard_address": _HTTP,
         "silence_logs": logging.CRITICAL,

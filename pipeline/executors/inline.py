@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections import deque
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
+from dataclasses import replace
 
 from pipeline.executors.attempt import run_attempt
 from pipeline.executors.base import Assignment, Failed, ShutDownOnExit, TaskEvent
+from pipeline.gpus import first_gpu
 from pipeline.task import FailureKind, TaskId
 
 
@@ -24,7 +26,7 @@ class InlineExecutor(ShutDownOnExit):
 
     def submit(self, assignment: Assignment) -> None:
         """Put the attempt into the queue."""
-        self._queue.append(assignment)
+        self._queue.append(replace(assignment, gpu=first_gpu()) if assignment.need.gpus else assignment)
 
     def wait(self, timeout_s: float) -> list[TaskEvent]:
         """Run the next assignment to its end, however long that takes."""

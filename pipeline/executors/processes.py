@@ -10,12 +10,13 @@ from __future__ import annotations
 import os
 import selectors
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
-from pipeline.executors.base import Assignment, Failed, Finished, ShutDownOnExit, TaskEvent
+from pipeline.executors.base import Assignment, Failed, Finished, Progress, ShutDownOnExit, TaskEvent
 from pipeline.executors.channel import Channel
 from pipeline.executors.failures import is_disk_full
+from pipeline.executors.gpu_places import places_of_process
 from pipeline.executors.memory import machine_memory_bytes
 from pipeline.executors.worker_process import WorkerProcess, log_tail
 from pipeline.resources import MEMORY_SHARE
@@ -32,6 +33,9 @@ for every frame, as one worker a core did on two cores with three stages, made t
 slow."""
 _MEMORY_WATCH_S = 0.5
 """How often the memory of busy workers is looked at [s]; a look takes a fraction of a millisecond."""
+PREPARATION_S = 4 * 3600.0
+"""A worker that prepares what is done once on a machine is silent meanwhile. Cycles' kernels took 7.5 minutes on one
+core; so long no compiler takes, and a driver that hangs does not keep a farm for ever [s]."""
 _POLL_S = 0.2
 """How often exits are looked for where the system has no pidfd [s]."""
 
@@ -72,6 +76,7 @@ class ProcessExecutor(ShutDownOnExit):
         self._task_memory_limit = self._limits.task_memory_bytes or int(memory_bytes * MEMORY_SHARE)
         self._memory_watched_at = 0.0
         self._worker_limit = self._limits.workers or (os.cpu_count() or 1) + FURTHER_WORKERS
+        self._places = places_of_process()
         self._workers: list[WorkerProcess] = []
         self._selector = selectors.DefaultSelector()
         self._events: list[TaskEvent] = []
@@ -81,9 +86,16 @@ class ProcessExecutor(ShutDownOnExit):
         """Process ids of all workers, idle ones too."""
         return [worker.pid for worker in self._workers]
 
+    @property
+    def worker_gpus(self) -> dict[int, int]:
+        """Places of the GPUs that workers have, by process id."""
+        return {worker.pid: worker.key[2] for worker in self._workers if worker.key[2] is not None}
+
     def submit(self, assignment: Assignment) -> None:
         """Give the attempt to a warm worker of its stage, or to a new one."""
-        key = (assignment.task.stage, assignment.threads)
+        if assignment.need.gpus:
+            assignment = replace(assignment, gpu=self._places.take(self._warm_places(assignment)))
+        key = (assignment.task.stage, assignment.threads, assignment.gpu)
         worker = next((worker for worker in self._workers if worker.idle and worker.key == key), None)
         if worker is None:
             self._make_room()
@@ -93,6 +105,7 @@ class ProcessExecutor(ShutDownOnExit):
                 kind = FailureKind.DISK_FULL if is_disk_full(error) else FailureKind.WORKER_LOST
                 sentence = f"no worker could be started: {error}"
                 self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence))
+                self._give_place_back(assignment)
                 return
             self._workers.append(worker)
             self._selector.register(worker.channel, selectors.EVENT_READ, worker)
@@ -131,6 +144,18 @@ class ProcessExecutor(ShutDownOnExit):
         while self._workers:
             self._turn(_POLL_S)
 
+    # --- places on GPUs ---
+
+    def _warm_places(self, assignment: Assignment) -> list[int]:
+        """GPUs on which an idle worker of the assignment's stage waits."""
+        wanted = (assignment.task.stage, assignment.threads)
+        keys = [worker.key for worker in self._workers if worker.idle and worker.key[:2] == wanted]
+        return [gpu for _, _, gpu in keys if gpu is not None]
+
+    def _give_place_back(self, assignment: Assignment) -> None:
+        if assignment.gpu is not None:
+            self._places.give_back(assignment.gpu)
+
     # --- the life of a worker ---
 
     def _make_room(self) -> None:
@@ -162,6 +187,7 @@ class ProcessExecutor(ShutDownOnExit):
             details = log_tail(assignment.log)
             peak = worker.peak_memory_bytes
             self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence, details, seconds, peak))
+            self._give_place_back(assignment)
         self._workers.remove(worker)
         self._close_channel(worker)
         if worker.exit_descriptor is not None:
@@ -202,7 +228,11 @@ class ProcessExecutor(ShutDownOnExit):
                 worker.resident_memory_bytes = message.resident_memory_bytes
                 continue
             self._events.append(worker.explain_failure(message) if isinstance(message, Failed) else message)
+            if isinstance(message, Progress):
+                worker.note_progress(message)
             if isinstance(message, Finished | Failed):
+                assert worker.assignment is not None
+                self._give_place_back(worker.assignment)
                 worker.end_assignment(failed=isinstance(message, Failed))
                 if self._is_worn_out(worker):
                     self._retire(worker)
@@ -227,9 +257,16 @@ class ProcessExecutor(ShutDownOnExit):
             if worker.kill_at is not None:
                 deadlines.append(worker.kill_at)
             elif worker.assignment is not None:
-                deadlines.append(worker.last_sign + (worker.assignment.stall_s or self._limits.stall_timeout_s))
-                deadlines.append(worker.began + (worker.assignment.timeout_s or inf))
+                deadlines.append(worker.last_sign + self._stall_s(worker, worker.assignment))
+                if worker.limited_since is not None:
+                    deadlines.append(worker.limited_since + (worker.assignment.timeout_s or inf))
         return min(deadlines, default=inf) - now
+
+    def _stall_s(self, worker: WorkerProcess, assignment: Assignment) -> float:
+        """How long it may be silent now [s]."""
+        if worker.limited_since is None:
+            return PREPARATION_S
+        return assignment.stall_s or self._limits.stall_timeout_s
 
     def _enforce_deadlines(self, worker: WorkerProcess, now: float) -> None:
         if worker.kill_at is not None:
@@ -239,11 +276,11 @@ class ProcessExecutor(ShutDownOnExit):
             return
         if worker.assignment is None:
             return
-        stall_s = worker.assignment.stall_s or self._limits.stall_timeout_s
-        timeout_s = worker.assignment.timeout_s
+        stall_s = self._stall_s(worker, worker.assignment)
+        timeout_s = None if worker.limited_since is None else worker.assignment.timeout_s
         if now - worker.last_sign >= stall_s:
             kind, sentence = FailureKind.STALLED, f"no sign of life for {stall_s:g} s; the log shows where it hung"
-        elif timeout_s is not None and now - worker.began >= timeout_s:
+        elif timeout_s is not None and now - (worker.limited_since or now) >= timeout_s:
             kind, sentence = FailureKind.TIMED_OUT, f"not done after {timeout_s:g} s; the log shows where it was"
         else:
             return

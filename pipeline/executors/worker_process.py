@@ -15,7 +15,7 @@ from pathlib import Path
 
 import psutil
 
-from pipeline.executors.base import Assignment, Failed
+from pipeline.executors.base import Assignment, Failed, Progress
 from pipeline.executors.channel import Channel
 from pipeline.executors.memory import out_of_memory_kills, process_tree, tree_memory_bytes
 from pipeline.task import FailureKind
@@ -24,6 +24,8 @@ from pipeline.worker import STACK_DUMP_SIGNAL
 _BOOT = "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from pipeline.worker import main; main()"
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 _LOG_TAIL_LINES = 20
+WorkerKey = tuple[str, int, int | None]
+"""Stage, thread count and GPU."""
 _LOG_TAIL_BYTES = 16_384
 _COMMAND_SHOWN = 100
 """How much of a command line is shown [characters]."""
@@ -33,20 +35,21 @@ class WorkerProcess:
     """A process that runs one assignment after another, in a session and process group of its own.
 
     Attributes:
-        key: stage and thread count that it is warm for.
+        key: stage, thread count and GPU that it is warm for.
         assignment: what it runs, or None.
         idle: it waits for an assignment.
         single_use: it is to be replaced after the task that it ended last.
         resident_memory_bytes: how large it was when its last task ended.
         tasks_done: how many tasks it has ended.
         began: when its assignment was given to it, monotonic [s].
+        limited_since: since when the assignment's limit of time counts, monotonic [s]; None: not yet, it prepares.
         last_sign: when it last said anything, monotonic [s].
         peak_memory_bytes: most that it and all it started were seen to hold together during its assignment.
         kill_at: when its process group is killed, monotonic [s], or None.
         verdict: what its task fails of, when it is us who end it.
     """
 
-    def __init__(self, key: tuple[str, int], first: Assignment) -> None:
+    def __init__(self, key: WorkerKey, first: Assignment) -> None:
         self.key = key
         self.assignment: Assignment | None = None
         self.idle = False
@@ -54,6 +57,7 @@ class WorkerProcess:
         self.resident_memory_bytes = 0
         self.tasks_done = 0
         self.began = self.last_sign = time.monotonic()
+        self.limited_since: float | None = self.began
         self.peak_memory_bytes = 0
         self.kill_at: float | None = None
         self.verdict: tuple[FailureKind, str] | None = None
@@ -71,10 +75,17 @@ class WorkerProcess:
         self.idle = False
         self.assignment = assignment
         self.verdict = None
-        self.began = self.last_sign = time.monotonic()
+        self.began = self.last_sign = self.limited_since = time.monotonic()
         self.peak_memory_bytes = 0
         self._out_of_memory_kills = out_of_memory_kills()
         self.channel.send(assignment)
+
+    def note_progress(self, progress: Progress) -> None:
+        """What it prepares once for this machine takes what it takes; its limit of time counts anew from the end."""
+        if progress.preparing:
+            self.limited_since = None
+        elif self.limited_since is None:
+            self.limited_since = time.monotonic()
 
     def end_assignment(self, *, failed: bool) -> None:
         """The attempt is over; what was planned against it is off.

@@ -38,6 +38,7 @@ class JobReport:
         warnings: what they warned of.
         unreadable: frames of the cache that cannot be read.
         unreadable_whitewater: files of whitewater that cannot.
+        drawn_on: number of frames by the device that drew them.
         sheet: its pictures side by side, as the bytes of a WebP picture; None before there are any.
     """
 
@@ -51,6 +52,7 @@ class JobReport:
     warnings: tuple[Warned, ...]
     unreadable: tuple[int, ...]
     unreadable_whitewater: tuple[ArtifactPath, ...]
+    drawn_on: dict[str, int]
     sheet: bytes | None
 
     @property
@@ -63,7 +65,8 @@ class JobReport:
             "simulated": f"{len(frames)} frames" + (f" on {frames[-1].device}" if frames else ""),
             "tasks": f"{self.done:,} of {self.total:,} done"
             + (f", last run {self.outcome}" if self.outcome is not None else ""),
-            "pictures": f"{width} × {height}, {job.render.quality} quality",
+            "pictures": f"{width} × {height}, {job.render.quality} quality"
+            + (f", drawn on {', '.join(self.drawn_on)}" if self.drawn_on else ""),
         }
         for fluid in job.fluid:
             count = self._particle_count(fluid.name)
@@ -93,6 +96,7 @@ class JobReport:
             "tasks": {"done": self.done, "total": self.total},
             "stages": [timing._asdict() for timing in self.timings],
             "warnings": [each.as_json() for each in self.warnings],
+            "drawn_on": self.drawn_on,
             "unreadable_frames": list(self.unreadable),
             "unreadable_whitewater": list(self.unreadable_whitewater),
             "frame": [frame.frame for frame in frames],
@@ -118,6 +122,7 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
     job = load_job(layout.job_file)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         summary, timings, last = manifest.summary(), manifest.stage_timings(), manifest.last_run()
+        drawn_on = manifest.devices("render")
     finished = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
     simulation = simulation_numbers(layout, history=True)
     return JobReport(
@@ -131,6 +136,7 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         warnings=tuple(simulation.warnings()),
         unreadable=simulation.unreadable,
         unreadable_whitewater=simulation.unreadable_whitewater,
+        drawn_on=drawn_on,
         sheet=_sheet(layout, picture_width=job.render.resolution[0]),
     )
 

@@ -58,7 +58,7 @@ def _job(report: JobReport) -> str:
 
 
 def _warnings(report: JobReport) -> str:
-    sentences = [str(each) for each in report.warnings]
+    sentences = [*map(str, report.warnings), *wording.mixed_devices(report.drawn_on)]
     if report.unreadable:
         frames = frame_ranges(report.unreadable, range(report.unreadable[-1] + 1))
         sentences.append(f"frames of the cache that cannot be read: {frames}")

@@ -22,20 +22,28 @@ class TaskContext(Protocol):
     task: Task
     attempt: int
     threads: int
+    gpu: int | None
+    """Which of the machine's GPUs the task has for itself, counted from 0; None: none."""
     fingerprint: str
     """Fingerprint of the task: what its artifacts are receipted with, and what a checkpoint must match."""
 
-    def committing(self, artifact: ArtifactPath, validate: Callable[[Path], None]) -> AbstractContextManager[Path]:
+    def committing(
+        self, artifact: ArtifactPath, validate: Callable[[Path], None], *, device: str = ""
+    ) -> AbstractContextManager[Path]:
         """Yield the path to write to; on leaving, validate, fsync, rename and receipt it.
 
-        `validate` decodes the file and raises InvalidArtifactError. An exception inside the block removes the part.
+        `validate` decodes the file and raises InvalidArtifactError; `device` goes into the receipt: what computed it,
+        if that decides its last bits. An exception inside the block removes the part.
         """
 
     def is_committed(self, artifact: ArtifactPath) -> bool:
         """Whether this artifact is there, whole, and of this task's fingerprint."""
 
-    def progress(self, done: float, total: float, message: str = "") -> None:
-        """Tell how far the task is; also the sign of life that keeps it from counting as stalled."""
+    def progress(self, done: float, total: float, message: str = "", *, preparing: bool = False) -> None:
+        """Tell how far the task is; also the sign of life that keeps it from counting as stalled.
+
+        After a call with `preparing` no limit of time counts until the next one without.
+        """
 
     def warn(self, kind: str, message: str) -> None:
         """Tell what is worth a look: in the log, on record, and the first of each kind (a word) while it runs."""

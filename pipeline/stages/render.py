@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 
 from pipeline.cache import read_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
+from pipeline.gpu_kernels import compiled_once
+from pipeline.gpus import known_gpus, render_gpus
 from pipeline.job.input_files import split_blend
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
 from pipeline.job.problems import suggestion
 from pipeline.layout import JobLayout
+from pipeline.own_pictures import own_picture_bytes
 from pipeline.parameter_set import ParameterSet, digest_of
 from pipeline.stages.base import TaskContext
 from pipeline.stages.bounds import read_framed
@@ -52,6 +55,7 @@ STAGE_PIXELS = 96
 """Along the longer side of the empty stage that pictures are held against: half a percent of it is 25 pixels."""
 
 BAD_PICTURE = "bad picture"
+NO_GPU = "no GPU"
 
 CORES = 2
 """Threads a frame. Cycles with one keeps a second busy waiting: 7.0 s of processor time a frame against 3.7 s with two
@@ -89,7 +93,8 @@ class RenderStage:
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
-        spec = _decisive(render_spec(job, layout))
+        drawn = render_spec(job, layout)
+        spec = _decisive(drawn)
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
             spec["camera"] = {"framing": job.camera.model_dump(mode="json")}
@@ -102,10 +107,11 @@ class RenderStage:
             tools={"blender": _blender_version(job.render.blender)},
         )
         bytes_per_pixel = BYTES_PER_PIXEL + BYTES_PER_PIXEL_AND_PASS * len(job.render.passes)
+        renderer_bytes = WORKER_BYTES + own_picture_bytes(drawn)
         resources = Resources(
             cores=CORES,
-            memory_bytes=WORKER_BYTES + bytes_per_pixel * prod(job.render.resolution),
-            gpus=int(job.render.device == "gpu"),
+            memory_bytes=renderer_bytes + bytes_per_pixel * prod(job.render.resolution),
+            gpus=int(_draws_on_gpus(job)),
         )
         static = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
         if job.camera.frames_action:
@@ -124,7 +130,7 @@ class RenderStage:
         ]
 
     def obstacles(self, job: Job) -> list[str]:
-        """No Blender, one that is too old, or one that lacks a shared library."""
+        """No Blender, one that is too old or lacks a shared library, or one without the material or GPU asked for."""
         from render.blender import BlenderUnavailableError, require_bpy, require_supported_executable
 
         try:
@@ -132,7 +138,7 @@ class RenderStage:
                 require_bpy()
             else:
                 require_supported_executable(job.render.blender)
-            return list(_missing_materials(job))
+            return [*_missing_materials(job), *_missing_gpus(job)]
         except BlenderUnavailableError as error:
             return [str(error)]
 
@@ -160,16 +166,36 @@ class RenderStage:
 
         try:
             with ExitStack() as stack:
+                device = _warm_renderer(context).device
+                print(f"Cycles draws on {device}", flush=True)
                 masters = [
-                    stack.enter_context(context.committing(output, validate_master)) for output in task.outputs[1:]
+                    stack.enter_context(context.committing(output, validate_master, device=device))
+                    for output in task.outputs[1:]
                 ]
-                path = stack.enter_context(context.committing(task.outputs[0], validate))
+                path = stack.enter_context(context.committing(task.outputs[0], validate, device=device))
                 _draw_until_good(context, [path, *masters], view, bodies)
         except BlenderDiedError:
             _close_renderers()  # the next attempt, maybe in this process, needs a living one
             raise
         layout.rejected_picture(task.frame).unlink(missing_ok=True)
         context.progress(1, 1)
+
+
+def _draws_on_gpus(job: Job) -> bool:
+    """Whether each frame has a GPU for itself. One that the job names is wanted wherever the frames are drawn."""
+    return bool(render_gpus(job)) if job.render.device == "auto" else job.render.device != "cpu"
+
+
+def _missing_gpus(job: Job) -> Iterator[str]:
+    """A kind of GPU that the job names and Cycles does not find here."""
+    device = job.render.device
+    if device in ("auto", "cpu") or render_gpus(job):
+        return
+    probe = known_gpus(job.render.blender)
+    there = ", ".join(f"{gpu.name} ({gpu.backend.lower()})" for gpu in probe.gpus)
+    found = f"finds only {there}" if there else "finds no GPU"
+    trouble = f" ({probe.trouble})" if probe.trouble else ""
+    yield f'render.device is "{device}", but Cycles {found} here{trouble}; use "auto" or "cpu"'
 
 
 def _missing_materials(job: Job) -> Iterator[str]:
@@ -385,7 +411,7 @@ def _draw_until_good(context: TaskContext, paths: list[Path], view: View, bodies
     assert frame is not None
     for once_more in (True, False):
         try:
-            _warm_renderer(context).render(frame, *paths)
+            _draw(context, frame, paths)
             _check_picture(context, frame, paths[0], view, bodies)
         except InvalidFileError as error:
             if once_more:
@@ -399,6 +425,24 @@ def _draw_until_good(context: TaskContext, paths: list[Path], view: View, bodies
                 f"frame {frame}: the picture {error.reason}; twice; it is kept as {rejected}"
             ) from error
         return
+
+
+def _draw(context: TaskContext, frame: int, paths: list[Path]) -> None:
+    """Draw a frame; the first one of this process on a GPU takes what compiling takes."""
+    renderer = _warm_renderer(context)
+    if context.gpu is not None and renderer.device == "CPU":
+        context.warn(NO_GPU, f"frame {frame}: Cycles finds no GPU {context.gpu} any more; drawn on the processor")
+    if renderer.device == "CPU" or renderer.device in _COMPILED:
+        renderer.render(frame, *paths)
+        return
+
+    def tell(message: str) -> None:
+        context.progress(0, 1, message, preparing=True)
+
+    with compiled_once(renderer.device, _blender_version(context.job.render.blender), tell):
+        renderer.render(frame, *paths)
+    _COMPILED.add(renderer.device)
+    context.progress(0, 1)
 
 
 def _check_picture(context: TaskContext, frame: int, path: Path, view: View, bodies: Sequence[BodyAtFrame]) -> None:
@@ -457,23 +501,27 @@ def _orientation(rotation_deg: tuple[float, float, float]) -> tuple[float, float
 
 
 _WARM: dict[str, Renderer] = {}
-"""The renderer of this worker process, by the digest of its specification and thread count; at most one."""
+"""The renderer of this worker process, by the digest of its specification, thread count and GPU; at most one."""
 
 
 def _warm_renderer(context: TaskContext) -> Renderer:
     from render.blender import open_renderer
 
     spec = render_spec(context.job, context.layout, framed_points(context.job, context.layout))
-    key = digest_of(f"{context.layout.root} {context.threads} {spec.model_dump_json()}")
+    key = digest_of(f"{context.layout.root} {context.threads} {context.gpu} {spec.model_dump_json()}")
     if key not in _WARM:
         _close_renderers()
         path = context.layout.root / "scene.json"
         part = context.layout.root / f".scene.json.part.{os.getpid()}"
         spec.write(part)
         part.replace(path)
-        _WARM[key] = open_renderer(path, threads=context.threads, blender=context.job.render.blender)
+        blender = context.job.render.blender
+        _WARM[key] = open_renderer(path, threads=context.threads, blender=blender, gpu=context.gpu)
     return _WARM[key]
 
+
+_COMPILED: set[str] = set()
+"""The devices on which this process has drawn."""
 
 _EMPTY_STAGE: dict[str, NDArray[np.uint8]] = {}
 """What the warm renderer draws without any body, (rows, columns, 3); kept for a camera that stands still."""

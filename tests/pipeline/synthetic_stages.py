@@ -223,6 +223,19 @@ def _hang(context: TaskContext) -> None:
     time.sleep(600)
 
 
+def _prepare(context: TaskContext) -> None:
+    """As one that compiles: silent for longer than tests allow a task to take."""
+    context.progress(0, 1, "compiling", preparing=True)
+    time.sleep(3.0)
+    context.progress(0, 1)
+
+
+def _prepare_and_hang(context: TaskContext) -> None:
+    context.progress(0, 1, "compiling", preparing=True)
+    context.progress(0, 1)
+    time.sleep(600)
+
+
 def _wait_for_stop(context: TaskContext) -> None:
     while not context.stop_requested():
         time.sleep(0.01)
@@ -273,6 +286,8 @@ FAULTS = {
     "kill": _kill,
     "half a message": _half_a_message,
     "hang": _hang,
+    "prepare": _prepare,
+    "prepare and hang": _prepare_and_hang,
     "wait for stop": _wait_for_stop,
     "child": _start_child_and_hang,
     "wait for reader": _wait_for_reader,

@@ -6,6 +6,7 @@ import errno
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -26,13 +27,13 @@ from processes_seen import pid_lives
 from synthetic_stages import write_faults
 
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
-from pipeline.executors.base import Committed, Executor, Failed, Finished, Started
+from pipeline.executors.base import Assignment, Committed, Executor, Failed, Finished, Progress, Started, TaskEvent
 from pipeline.executors.failures import classify
 from pipeline.executors.inline import InlineExecutor
 from pipeline.executors.memory import read_oom_kills
 from pipeline.executors.processes import ProcessExecutor, WorkerLimits
 from pipeline.layout import JobLayout
-from pipeline.task import FailureKind, TaskId
+from pipeline.task import FailureKind, Resources, TaskId
 from render.blender import BlenderDiedError, FrameRenderError
 
 __all__ = ["layout"]
@@ -169,6 +170,38 @@ class TestProcesses(ProcessesContract):
             FailureKind.TIMED_OUT,
             "not done after 2 s; the log shows where it was",
         )
+
+    def test_what_is_prepared_once_is_ended_neither_as_stalled_nor_by_the_time_limit_that_counts_after_it(
+        self, layout: JobLayout
+    ) -> None:
+        with ProcessExecutor() as executor:
+            run(executor, assign(layout, "steps"))
+            run(executor, assign(layout, "double/000000"))  # the worker is there: its start takes no time of the next
+            write_faults(layout.root, {"double/000001": ["prepare"], "double/000002": ["prepare and hang"]})
+            executor.submit(replace(assign(layout, "double/000001", timeout_s=2.0), stall_s=2.0))
+            events = events_until_end(executor)
+            assert Progress(TaskId("double/000001"), 1, 0, 1, "compiling", preparing=True) in events
+            assert isinstance(events[-1], Finished), events[-1]
+            failed = failure(run(executor, assign(layout, "double/000002", timeout_s=2.0)))
+        assert failed.kind is FailureKind.TIMED_OUT
+
+    def test_each_task_on_a_gpu_has_one_for_itself_and_its_worker_stays_with_that(self, layout: JobLayout) -> None:
+        def on_gpu(name: str) -> Assignment:
+            return replace(assign(layout, name), need=Resources(gpus=1))
+
+        def workers(events: list[TaskEvent]) -> list[int]:
+            started = {event.task_id: event.pid for event in events if isinstance(event, Started)}
+            return [started[task_id] for task_id in sorted(started)]
+
+        with ProcessExecutor() as executor:
+            run(executor, assign(layout, "steps"))
+            write_faults(layout.root, {}, pause_s=1.0)
+            executor.submit(on_gpu("double/000000"))
+            executor.submit(on_gpu("double/000001"))
+            first, second = workers(events_until_end(executor, 2))
+            assert executor.worker_gpus == {first: 0, second: 1}
+            assert workers(run(executor, on_gpu("double/000002"))) == [first]
+            assert workers(run(executor, assign(layout, "double/000003"))) not in ([first], [second])
 
     @pytest.mark.slow
     def test_sigterm_from_outside_lets_the_task_stop_and_the_worker_leave(

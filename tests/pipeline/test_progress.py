@@ -145,3 +145,17 @@ def test_durations_grow_with_their_texts() -> None:
     """No gap and no step back where one way of writing ends and the next begins."""
     texts = [wording.duration(tenths / 10) for tenths in range(0, 40_000)]
     assert len(set(texts)) == len(list(itertools.groupby(texts)))
+
+
+def test_what_takes_minutes_once_is_said_at_once_and_by_one_of_those_who_wait() -> None:
+    _, first, second, *_ = film(FRAMES)
+    compiling = "compiling Cycles' kernels for NVIDIA H100; minutes, once"
+    observer, printed = observe(
+        RunStarted(all_stale()),
+        Progress(first.id, 1, 0, 1, compiling, preparing=True),
+        Progress(second.id, 1, 0, 1, compiling, preparing=True),
+        Progress(first.id, 1, 0, 1, "", preparing=True),
+        Progress(first.id, 1, 0, 1),
+    )
+    assert lines(printed) == [f"render: {compiling}"]
+    assert observer.stages["render"].message == ""

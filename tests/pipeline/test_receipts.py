@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from blake3 import blake3
 from record_samples import commit, film
 
+from pipeline.errors import InvalidArtifactError
 from pipeline.fingerprint import task_fingerprint
 from pipeline.layout import JobLayout
 from pipeline.receipts import Receipt, hash_file, is_committed, read_receipt, verify_artifact
@@ -72,3 +74,12 @@ def test_a_file_that_is_no_receipt_does_not_count(layout: JobLayout, text: str) 
 def test_receipts_survive_their_text_form(layout: JobLayout) -> None:
     receipt = commit(layout, SIMULATE, ARTIFACT, "ours")
     assert Receipt.from_json(receipt.to_json()) == receipt
+
+
+def test_a_receipt_says_what_drew_its_file_and_one_that_does_not_is_as_it_was(layout: JobLayout) -> None:
+    receipt = commit(layout, SIMULATE, ARTIFACT, "ours")
+    assert '"device"' not in receipt.to_json()
+    drawn = replace(receipt, device="OPTIX: NVIDIA RTX 4090")
+    assert Receipt.from_json(drawn.to_json()) == drawn
+    with pytest.raises(InvalidArtifactError, match="its seal is broken"):
+        Receipt.from_json(drawn.to_json().replace("4090", "4080"))

@@ -282,12 +282,12 @@ def test_spec_survives_its_json(tmp_path):
 
 
 def test_argv_starts_blender_without_the_users_settings():
-    argv = build_argv("/opt/blender", Path("/job/spec.json"), threads=3)
+    argv = build_argv("/opt/blender", Path("/job/spec.json"), threads=3, gpu=None)
     script = argv[argv.index("--python") + 1]
     start = ["/opt/blender", "--background", "--factory-startup", "--disable-autoexec", "--threads", "3", "--python"]
     assert argv[: len(start)] == start
     assert Path(script).is_file()
-    assert argv[argv.index("--") + 1 :] == ["/job/spec.json", "--serve", "--threads", "3"]
+    assert argv[argv.index("--") + 1 :] == ["/job/spec.json", "--serve", "--threads", "3", "--gpu", "none"]
 
 
 @pytest.mark.parametrize(

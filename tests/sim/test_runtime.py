@@ -90,7 +90,7 @@ def test_devices_are_remembered_until_the_machine_changes(tmp_path, monkeypatch)
 @pytest.mark.parametrize(("named", "base"), [("/elsewhere", "/elsewhere"), ("beside", "~/.cache"), ("", "~/.cache")])
 def test_a_relative_cache_home_counts_as_none(monkeypatch, named, base):
     monkeypatch.setenv("XDG_CACHE_HOME", named)
-    assert runtime._cache_folder() == Path(base).expanduser() / "physics-pipeline"
+    assert runtime.cache_folder() == Path(base).expanduser() / "physics-pipeline"
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 1}'])

@@ -1,0 +1,79 @@
+"""The GPUs that Cycles can draw on, asked of Blender in a process of its own: a driver may end who asks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from render.blender import BlenderUnavailableError, run_script, script_argv
+
+PROBE_TIMEOUT_S = 120.0
+ANY_KIND = ("auto", "gpu")
+
+
+@dataclass(frozen=True, slots=True)
+class Gpu:
+    """A device of Cycles. One GPU may be several: NVIDIA's are one of OptiX and one of CUDA.
+
+    Attributes:
+        backend: what Cycles drives it by: OPTIX, CUDA, HIP, ONEAPI or METAL.
+        name: what its driver calls it.
+        id: tells it from others of that name.
+    """
+
+    backend: str
+    name: str
+    id: str
+
+    def __str__(self) -> str:
+        return f"{self.backend}: {self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """What asking for GPUs gave.
+
+    Attributes:
+        gpus: those that Cycles finds, its preferred back end first, each back end's in the driver's order.
+        trouble: why there may be more of them, or "": the process was ended before it had tried all back ends.
+    """
+
+    gpus: tuple[Gpu, ...] = ()
+    trouble: str = ""
+
+    def of_kind(self, device: str) -> tuple[Gpu, ...]:
+        """Those that a value of `render.device` means; an index counts in these. Of any kind: the first back end's."""
+        if device == "cpu" or not self.gpus:
+            return ()
+        backend = self.gpus[0].backend if device in ANY_KIND else device.upper()
+        return tuple(gpu for gpu in self.gpus if gpu.backend == backend)
+
+
+def find_gpus(blender: str | None) -> Probe:
+    """Ask Blender for the GPUs of this machine; takes a second or two.
+
+    Args:
+        blender: path of a Blender executable, or None for the bpy module.
+    """
+    try:
+        completed = run_script(script_argv(blender, "gpus.py", []), timeout_s=PROBE_TIMEOUT_S, purpose="look for GPUs")
+    except BlenderUnavailableError as error:
+        return Probe(trouble=str(error))
+    lines = completed.stdout.splitlines()
+    if any(line.startswith("GPUS_DONE ") for line in lines):
+        return Probe(read_answer(lines))
+    last = (completed.stdout + completed.stderr).strip().rpartition("\n")[2]
+    return Probe(
+        read_answer(lines), f"Blender ended with exit code {completed.returncode} while it looked for GPUs: {last}"
+    )
+
+
+def read_answer(lines: Sequence[str]) -> tuple[Gpu, ...]:
+    """The GPUs that the script's lines tell of, those of the preferred back end first. Pure."""
+    gpus: list[Gpu] = []
+    for line in lines:
+        if line.startswith("GPUS "):
+            told = json.loads(line.partition(" ")[2])
+            gpus += [Gpu(told["backend"], device["name"], device["id"]) for device in told["devices"]]
+    return tuple(gpus)
