@@ -29,6 +29,13 @@ class SurfaceParameters(Parameters):
     threshold: Positive = Field(default=0.6, description="Iso-value of the density, relative to the rest density [-].")
     mesh_smoothing_iterations: int = Field(default=25, ge=0, description="Weighted Laplacian smoothing passes [-].")
     normals_smoothing_iterations: int = Field(default=10, ge=0, description="Smoothing passes on the normals [-].")
+    droplet_size: float = Field(
+        default=0.5,
+        gt=0.0,
+        le=1.0,
+        description="Width of a droplet of a single particle, relative to its contour [-]; parts of up to 8 particles "
+        "lie in between. 1 leaves them as they are.",
+    )
 
 
 class VolumeParameters(Parameters):

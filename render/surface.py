@@ -3,17 +3,19 @@
 The density of the particles is sampled on a grid and contoured by marching cubes, the contour's slivers are collapsed
 (Moore & Warren 1992), and a Laplacian smoothing that spares isolated droplets removes the particles' bumps (Löschner,
 Böttcher, Jeske & Bender 2023, "Weighted Laplacian Smoothing for Surface Reconstruction of Particle-based Fluids").
-splashsurf does the work.
+splashsurf does the work; droplets of a few particles are then drawn finer than they came out (`render.droplets`).
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from render.droplets import shrink_droplets
 from render.meshes import SurfaceMesh
 from render.parameters import SurfaceParameters
 
@@ -50,6 +52,26 @@ def reconstruct_surface(
         ValueError: the arrays do not fit together, or the number of threads differs from the process's first call.
         SurfaceReconstructionError: positions or velocities are not finite, or splashsurf fails.
     """
+    return reconstruct_with_options(
+        positions,
+        velocities,
+        particle_radius=particle_radius,
+        options=pipeline_options(parameters),
+        droplet_size=parameters.droplet_size,
+        threads=threads,
+    )
+
+
+def reconstruct_with_options(
+    positions: ArrayLike,
+    velocities: ArrayLike,
+    *,
+    particle_radius: float,
+    options: Mapping[str, Any],
+    droplet_size: float,
+    threads: int = 1,
+) -> SurfaceMesh:
+    """As `reconstruct_surface`, with arguments of `pysplashsurf.reconstruction_pipeline` that no job changes, too."""
     position_rows = _particle_rows("positions", positions)
     velocity_rows = _particle_rows("velocities", velocities)
     if len(position_rows) != len(velocity_rows):
@@ -64,12 +86,12 @@ def reconstruct_surface(
             attributes_to_interpolate={"velocity": velocity_rows},
             particle_radius=particle_radius,
             multi_threading=threads > 1,
-            **pipeline_options(parameters),
+            **options,
         )
     except RuntimeError as error:
         raise SurfaceReconstructionError(f"splashsurf failed on {len(position_rows)} particles: {error}") from error
     attributes = reconstructed.point_attributes
-    return without_collapsed_parts(
+    mesh = without_collapsed_parts(
         SurfaceMesh(
             vertices=np.array(reconstructed.mesh.vertices, np.float32),
             faces=np.array(reconstructed.mesh.triangles, np.int32),
@@ -77,6 +99,7 @@ def reconstruct_surface(
             velocities=np.array(attributes["velocity"], np.float32),
         )
     )
+    return shrink_droplets(mesh, position_rows, particle_radius=particle_radius, size=droplet_size)
 
 
 def without_collapsed_parts(mesh: SurfaceMesh) -> SurfaceMesh:

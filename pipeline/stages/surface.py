@@ -24,11 +24,16 @@ class SurfaceStage:
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a fluid and frame."""
+        surface, tools = job.surface.model_dump(mode="json"), ["pysplashsurf"]
+        if job.surface.droplet_size == 1.0:
+            del surface["droplet_size"]  # droplets are as earlier versions left them, and so is the file
+        else:
+            tools.append("scipy")
         parameters = ParameterSet.of(
             stage=self.name,
             version=self.version,
-            tools={"pysplashsurf": tool_version("pysplashsurf")},
-            surface=job.surface,
+            tools={name: tool_version(name) for name in tools},
+            surface=surface,
         )
         resources = Resources(memory_bytes=MEMORY_BYTES)
         fluids = [(fluid.name, resources) for fluid in job.fluid]

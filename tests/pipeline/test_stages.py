@@ -274,6 +274,20 @@ def test_many_cores_do_not_draw_more_than_the_memory_holds(resolution):
     assert scheduler.free.memory_bytes < started[0].task.resources.memory_bytes  # and no fewer than it holds
 
 
+def test_surfaces_with_droplets_as_they_are_are_those_of_earlier_versions():
+    def document(**keys) -> dict:
+        task = next(task for task in plan_job(job(surface=keys), LAYOUT, STAGES) if task.stage == "surface")
+        return json.loads(task.parameters.canonical)
+
+    former = document(droplet_size=1.0)
+    assert set(former["surface"]) == {
+        *("smoothing_length_in_radii", "cube_size_in_radii", "threshold"),
+        *("mesh_smoothing_iterations", "normals_smoothing_iterations"),
+    }
+    assert set(former["tools"]) == {"pysplashsurf"}
+    assert document(droplet_size=0.5) == document() != former
+
+
 def test_surfaces_and_volumes_are_counted_in_memory_too():
     smoke = {**TANK["smoke"][0], "cell_size": 0.002}
     tasks = plan_job(job(smoke=[smoke]), LAYOUT, STAGES)
