@@ -63,9 +63,8 @@ def shot_of(job_file: Path, layout: JobLayout) -> tuple[Shot, list[Path]]:
         timings = {timing.stage: timing for timing in reader.stage_timings()}
     render = job["render"]
     width, height = render["resolution"]
-    shot = Shot(
-        job_file.stem, description(job_file), (width, height), render["quality"], len(frames), job["frames"], timings
-    )
+    drawn = timings["render"].artifacts
+    shot = Shot(job_file.stem, description(job_file), (width, height), render["quality"], drawn, job["frames"], timings)
     return shot, frames
 
 
