@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from PIL import Image
 
-from pipeline.committed_pictures import committed_pictures, evenly_spread
+from pipeline.committed_pictures import committed_pictures
 from pipeline.layout import JobLayout
 from pipeline.manifest_reader import ManifestReader, StageTiming
 from render.sheet import contact_sheet
@@ -73,6 +73,13 @@ def nearest(frames: list[Path], wanted: int) -> Path:
     return min(frames, key=lambda path: abs(int(path.stem) - wanted))
 
 
+def spread_in_time(frames: list[Path], count: int) -> list[Path]:
+    """At most so many frames, as evenly spread over the film as those that are there allow."""
+    last = int(frames[-1].stem)
+    chosen = {nearest(frames, round(index * last / (count - 1))) for index in range(count)}
+    return sorted(chosen)
+
+
 def write_pictures(shot: Shot, frames: list[Path], images: Path, hero: int) -> None:
     """`gallery-NAME.webp` and `gallery-NAME-sheet.webp`."""
     with Image.open(nearest(frames, hero)) as picture:
@@ -81,7 +88,7 @@ def write_pictures(shot: Shot, frames: list[Path], images: Path, hero: int) -> N
         shown = shown.resize((HERO_WIDTH, round(shown.height * HERO_WIDTH / shown.width)), Image.Resampling.LANCZOS)
     shown.save(images / f"gallery-{shot.name}.webp", quality=QUALITY, method=6)
     path = images / f"gallery-{shot.name}-sheet.webp"
-    contact_sheet(evenly_spread(frames, PICTURES), path, columns=COLUMNS, width=SHEET_WIDTH)
+    contact_sheet(spread_in_time(frames, PICTURES), path, columns=COLUMNS, width=SHEET_WIDTH)
 
 
 def section(shot: Shot) -> str:
