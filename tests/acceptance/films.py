@@ -143,12 +143,13 @@ class Studio:
     # --- what is in the job's folder ---
 
     def artifacts(self) -> dict[str, str]:
-        """Hash of every artifact on disk, by its path; kept edited files and checkpoints are none."""
+        """Hash of every artifact on disk, by its path; edited files, checkpoints and films so far are none."""
         root = self.layout.root
+        others = {self.layout.checkpoints, self.layout.so_far_scratch}
         return {
             path.relative_to(root).as_posix(): blake3(path.read_bytes()).hexdigest()
             for path in root.rglob("*")
-            if path.suffix in ARTIFACT_SUFFIXES and path.parent != self.layout.checkpoints
+            if path.suffix in ARTIFACT_SUFFIXES and path.parent not in others and path != self.layout.film_so_far
         }
 
     def mtimes_ns(self) -> dict[str, int]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 
 from .family import Family
-from .studio import ARTIFACT_SUFFIXES, Studio
+from .studio import Studio, is_artifact
 
 BALLOON_BYTES = 2_500_000_000
 """More than the job's limit on memory."""
@@ -128,11 +128,7 @@ def _leave_stopped(situation: Situation) -> None:
 def _damage(change: Callable[[Path, random.Random], None], *, unseen: bool = False) -> Callable[[Situation], bool]:
     def inject(situation: Situation) -> bool:
         root = situation.studio.root
-        whole = sorted(
-            path
-            for path in root.rglob("*")
-            if path.suffix in ARTIFACT_SUFFIXES and path.parent.name != "checkpoints" and ".part." not in path.name
-        )
+        whole = sorted(path for path in root.rglob("*") if is_artifact(path))
         if not whole:
             return False
         path = situation.chance.choice(whole)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Set
 
-from .studio import Studio
+from .studio import SO_FAR, Studio
 
 SUCCEEDED = "succeeded"
 
@@ -29,7 +29,11 @@ def broken_promises(studio: Studio, reference: Mapping[str, str], harmed: Set[st
         yield f"the record is wrong about {', '.join(wrong)}"
     if (studio.root / "runner.lease").exists():
         yield "a lease is left"
-    left = [path.relative_to(studio.root).as_posix() for path in studio.root.rglob("*") if ".part" in path.name]
+    left = [
+        path.relative_to(studio.root).as_posix()
+        for path in studio.root.rglob("*")
+        if ".part" in path.name or SO_FAR in path.name
+    ]
     if left:
         yield f"unfinished files are left: {', '.join(left)}"
     yield from _done_twice(studio, harmed)

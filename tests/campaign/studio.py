@@ -17,6 +17,8 @@ HOOKS = Path(__file__).with_name("hooks")
 NAME = "tiny"
 FRAMES = 8
 ARTIFACT_SUFFIXES = {".h5", ".ply", ".vdb", ".png", ".mp4"}
+SO_FAR = "so-far"
+"""In the names of the film so far, and of the folder in which it is made."""
 
 BALL = """\
 [[rigid]]
@@ -76,6 +78,16 @@ if arguments == ["--version"]:
     sys.exit()
 runpy.run_path(arguments[arguments.index("--python") + 1], run_name="__main__")
 """
+
+
+def is_artifact(path: Path) -> bool:
+    """Whether a file of a job's folder is to be the same after every run; a film so far is gone then."""
+    return (
+        path.suffix in ARTIFACT_SUFFIXES
+        and path.parent.name != "checkpoints"
+        and ".part." not in path.name
+        and SO_FAR not in path.parent.name + path.name
+    )
 
 
 @dataclass(frozen=True)
@@ -156,7 +168,7 @@ class Studio:
         return {
             path.relative_to(self.root).as_posix(): blake3(path.read_bytes()).hexdigest()
             for path in self.root.rglob("*")
-            if path.suffix in ARTIFACT_SUFFIXES and path.parent.name != "checkpoints" and ".part." not in path.name
+            if is_artifact(path)
         }
 
     def states(self) -> dict[str, str]:

@@ -21,6 +21,7 @@ from processes_seen import lives
 
 from pipeline.executors.base import Committed
 from pipeline.film_so_far import FilmSoFar
+from pipeline.frame_order import spread_turns
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.plan import Assessment, Verdict, plan_job
@@ -89,12 +90,13 @@ def test_while_frames_are_drawn_there_is_a_film_of_them_and_at_the_end_it_is_gon
 
 def test_frames_from_all_over_the_film_come_first_where_the_job_wants_them(tmp_path):
     write_job(tmp_path, more='render.order = "spread"')
-    result, layout = submit(tmp_path, wait=1)  # the last one but two that is drawn
+    result, layout = submit(tmp_path, wait=6)  # the last one that is drawn
     assert result.exit_code == 0, result.output
-    shown = [frame for frame, _ in colors(layout.root / "seen.mp4")]
-    assert shown[0] == 0
-    assert shown[-1] in {0, 7}
-    assert set(shown) <= set(range(FRAMES)) - {1}
+    turns = spread_turns(FRAMES)
+    order = sorted(range(FRAMES), key=lambda frame: turns[frame])
+    assert order[-1] == 6
+    drawn = {frame for frame, _ in colors(layout.root / "seen.mp4")}
+    assert drawn == set(order[: len(drawn)])
 
 
 def test_a_failed_run_leaves_the_film_so_far_and_status_names_it(tmp_path):
@@ -196,22 +198,17 @@ def test_a_film_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
     monkeypatch.setattr("pipeline.film_so_far.SHARE", 0.05)
     observer, said, assessments = watched(tmp_path, frames=400, drawn=200)
     layout = JobLayout(tmp_path)
-    made: list[float] = []
     with observer:
-        observer.notify(
-            RunStarted([*assessments[:100], *(Assessment(a.task, Verdict.STALE) for a in assessments[100:])])
-        )
-        until, frame = time.monotonic() + 4.0, 100
-        while time.monotonic() < until:
+        stale = [Assessment(each.task, Verdict.STALE) for each in assessments[100:]]
+        observer.notify(RunStarted([*assessments[:100], *stale]))
+        wait_until(layout.film_so_far.exists, "no film")
+        first = layout.film_so_far.stat().st_mtime_ns
+        for each in stale[:60]:
             time.sleep(0.05)
-            task = assessments[frame].task
-            receipt = Receipt(task.outputs[0], task.id, task.stage, 1, "f", "p", 1, 1, "h")
-            observer.notify(Committed(task.id, 1, receipt))
-            frame = min(frame + 1, 199)
-            if layout.film_so_far.exists() and layout.film_so_far.stat().st_mtime not in made:
-                made.append(layout.film_so_far.stat().st_mtime)
-    # It takes half a second at least for its imports alone: the next one would be due after ten.
-    assert len(made) == 1, said
+            receipt = Receipt(each.task.outputs[0], each.task.id, each.task.stage, 1, "f", "p", 1, 1, "h")
+            observer.notify(Committed(each.task.id, 1, receipt))
+    # It takes a quarter of a second at least for its imports alone: the next one would be due after five.
+    assert layout.film_so_far.stat().st_mtime_ns == first, said
 
 
 def test_a_killed_runner_leaves_neither_a_child_nor_half_a_film(tmp_path):
@@ -257,7 +254,7 @@ def test_the_end_of_a_run_does_not_wait_for_a_film(tmp_path):
         observer.notify(RunStarted(assessments))
         wait_until((layout.so_far_scratch / "film.mp4").exists, "it does not begin")
         began = time.monotonic()
-    assert time.monotonic() - began < 2.0  # the whole film takes a minute
+    assert time.monotonic() - began < 10.0  # the whole film takes a minute
     assert said == []
     assert not layout.film_so_far.exists()
     assert not layout.so_far_scratch.exists()
