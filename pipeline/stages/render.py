@@ -56,6 +56,8 @@ STAGE_PIXELS = 96
 
 BAD_PICTURE = "bad picture"
 NO_GPU = "no GPU"
+CPU = "CPU"
+"""What a renderer calls its device when it draws on none of the GPUs."""
 
 CORES = 2
 """Threads a frame. Cycles with one keeps a second busy waiting: 7.0 s of processor time a frame against 3.7 s with two
@@ -167,7 +169,7 @@ class RenderStage:
         try:
             with ExitStack() as stack:
                 device = _warm_renderer(context).device
-                print(f"Cycles draws on {device}", flush=True)
+                print(f"Cycles draws on {device}{'' if device == CPU else f', GPU {context.gpu}'}", flush=True)
                 masters = [
                     stack.enter_context(context.committing(output, validate_master, device=device))
                     for output in task.outputs[1:]
@@ -430,9 +432,9 @@ def _draw_until_good(context: TaskContext, paths: list[Path], view: View, bodies
 def _draw(context: TaskContext, frame: int, paths: list[Path]) -> None:
     """Draw a frame; the first one of this process on a GPU takes what compiling takes."""
     renderer = _warm_renderer(context)
-    if context.gpu is not None and renderer.device == "CPU":
+    if context.gpu is not None and renderer.device == CPU:
         context.warn(NO_GPU, f"frame {frame}: Cycles finds no GPU {context.gpu} any more; drawn on the processor")
-    if renderer.device == "CPU" or renderer.device in _COMPILED:
+    if renderer.device == CPU or renderer.device in _COMPILED:
         renderer.render(frame, *paths)
         return
 

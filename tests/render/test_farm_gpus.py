@@ -86,4 +86,6 @@ def test_two_gpus_have_a_renderer_each_one_compiles_and_each_frame_says_what_dre
     layout = JobLayout(tmp_path / "renders" / "ball")
     receipts = [read_receipt(layout, layout.picture(frame)) for frame in range(6)]
     assert {receipt and receipt.device for receipt in receipts} == {f"OPTIX: {CARD}"}
+    logs = [path.read_text() for path in (layout.root / "logs" / "render").glob("*.log")]
+    assert len(logs) == 6 and all(f"Cycles draws on OPTIX: {CARD}, GPU " in log for log in logs)
     assert f"drawn on OPTIX: {CARD}" in pipeline("explain", layout.root, "render/000005").stdout
