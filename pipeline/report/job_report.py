@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from base64 import b64encode
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.committed_pictures import committed_pictures, evenly_spread
@@ -14,7 +14,9 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.manifest_reader import ManifestReader, StageTiming
 from pipeline.quantities import COUNT_OF_FLUID
+from pipeline.report.film import ReportFilm, film_of
 from pipeline.report.panels import JobNumbers
+from pipeline.report.versions import MadeWith, made_with
 from pipeline.solver_numbers import Warned, simulation_numbers
 from pipeline.task import ArtifactPath, TaskState
 
@@ -39,6 +41,9 @@ class JobReport:
         unreadable: frames of the cache that cannot be read.
         unreadable_whitewater: files of whitewater that cannot.
         sheet: its pictures side by side, as the bytes of a WebP picture; None before there are any.
+        film: None before there is one.
+        versions: what made its files.
+        text: of its job file, as submitted.
     """
 
     job: Job
@@ -52,6 +57,9 @@ class JobReport:
     unreadable: tuple[int, ...]
     unreadable_whitewater: tuple[ArtifactPath, ...]
     sheet: bytes | None
+    film: ReportFilm | None
+    versions: tuple[MadeWith, ...]
+    text: str
 
     @property
     def facts(self) -> dict[str, str]:
@@ -95,6 +103,7 @@ class JobReport:
             "warnings": [each.as_json() for each in self.warnings],
             "unreadable_frames": list(self.unreadable),
             "unreadable_whitewater": list(self.unreadable_whitewater),
+            "versions": [asdict(each) for each in self.versions],
             "frame": [frame.frame for frame in frames],
             "time_s": [frame.time_s for frame in frames],
             "solvers": {
@@ -118,6 +127,7 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
     job = load_job(layout.job_file)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         summary, timings, last = manifest.summary(), manifest.stage_timings(), manifest.last_run()
+        artifacts = manifest.artifacts()
     finished = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
     simulation = simulation_numbers(layout, history=True)
     return JobReport(
@@ -132,6 +142,9 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         unreadable=simulation.unreadable,
         unreadable_whitewater=simulation.unreadable_whitewater,
         sheet=_sheet(layout, picture_width=job.render.resolution[0]),
+        film=film_of(layout, job),
+        versions=tuple(made_with(layout, artifacts)),
+        text=layout.job_file.read_text(encoding="utf-8"),
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.job.looks import parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.receipts import Receipt, read_receipt
@@ -90,9 +91,13 @@ class CommittedFrames:
         return tuple(stamp_of(self._layout.receipt(artifact)) for artifact in artifacts)
 
 
-def artifacts_of_frame(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:
-    """All files that a frame is shown from, the cached frame first."""
+def artifacts_of_frame(job: Job, layout: JobLayout, frame: int | None) -> list[ArtifactPath]:
+    """All files that a frame is shown from; None: those that belong to no frame."""
+    meshes = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
+    if frame is None:
+        return meshes
     return [
+        *meshes,
         layout.frame_cache(frame),
         *(layout.surface(fluid.name, frame) for fluid in job.fluid),
         *(layout.whitewater(fluid, frame) for fluid in job.whitewater),

@@ -187,9 +187,7 @@ class ViewPage:
     def _show(self, frame: int | None) -> None:
         settings = self._settings()
         top_speed = self._series.largest("max_speed")
-        stamp: Stamp = ()
-        if frame is not None:
-            stamp = self._committed.stamp(artifacts_of_frame(self._job, self._layout, frame))
+        stamp = self._committed.stamp(artifacts_of_frame(self._job, self._layout, frame))
         wanted = (frame, stamp, settings, top_speed)
         if wanted != self._drawn:
             shown = None if frame is None else self._load(frame, stamp)
@@ -272,6 +270,7 @@ class ViewPage:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
         scene.set_up_direction("+z")
+        scene.configure_default_lights(cast_shadow=False)  # a machine without a GPU draws thrice as fast
         self._look_from_afar()
         waits = not any(self._committed.folder.glob("*.h5.json"))
         self._title, self._notice = gui.add_html(""), gui.add_html("")
