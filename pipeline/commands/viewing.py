@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -34,15 +36,25 @@ def view(job: str, *, output: Path, port: int, host: str, particles: int, memory
     require_viser()
     from pipeline.view.page import show_job
 
+    with told_to_stop() as stop:
+        show_job(
+            layout,
+            host=host,
+            port=port,
+            most_particles=particles,
+            most_bytes=memory,
+            say=lambda address: click.echo(f"{address} shows {layout.root}; Ctrl-C ends it"),
+            stop=stop,
+        )
+
+
+@contextmanager
+def told_to_stop() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set, for the time of the block."""
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    show_job(
-        layout,
-        host=host,
-        port=port,
-        most_particles=particles,
-        most_bytes=memory,
-        say=lambda address: click.echo(f"{address} shows {layout.root}; Ctrl-C ends it"),
-        stop=stop,
-    )
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -102,11 +102,14 @@ def _finite(data: object) -> object:
 
 
 _STYLE = """
-:root { color-scheme: light dark; --paper: #fcfcfb; --soft-paper: #f2f1ed; --ink: #1d1d1b; --soft: #62615c; --rule: #dddcd6; --bar: #cfe0f5;
+:root { color-scheme: light dark; --paper: #fcfcfb; --soft-paper: #f2f1ed;
+  --ink: #1d1d1b; --soft: #62615c; --rule: #dddcd6; --bar: #cfe0f5;
   --warn: #8a4b00; --c0: #2a78d6; --c1: #d9541e; --c2: #12875f; --c3: #a86f00; --c4: #b93c7f; --c5: #4a3aa7;
   --c6: #6b6b66; --c7: #c22f2f;
-  --s0: #2567b5; --s1: #b8481a; --s2: #107350; --s3: #8a5c00; --s4: #9c3369; --s5: #4a3aa7; --s6: #5c5c58; --s7: #a82828; }
-@media (prefers-color-scheme: dark) { :root { --paper: #171716; --soft-paper: #222120; --ink: #ecebe6; --soft: #a3a29b; --rule: #3a3936;
+  --s0: #2567b5; --s1: #b8481a; --s2: #107350; --s3: #8a5c00; --s4: #9c3369;
+  --s5: #4a3aa7; --s6: #5c5c58; --s7: #a82828; }
+@media (prefers-color-scheme: dark) { :root { --paper: #171716;
+  --soft-paper: #222120; --ink: #ecebe6; --soft: #a3a29b; --rule: #3a3936;
   --bar: #24456b; --warn: #f0b45c; --c0: #5a9fee; --c1: #f07c4a; --c2: #35b98a; --c3: #d9a02c; --c4: #e578b0;
   --c5: #a196f0; --c6: #a9a8a1; --c7: #f07373; } }
 body { margin: 0 auto; max-width: 86rem; padding: 1.5rem; background: var(--paper); color: var(--ink);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,9 @@ from pipeline.task import ArtifactPath
 
 Stamp = tuple[tuple[int, int] | None, ...]
 """Modification time [ns] and size of receipts; None where there is none. It differs when one of them was replaced."""
+
+SETTLED_NS = 2_000_000_000
+"""File systems tell times to two seconds at worst."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +41,7 @@ class CommittedFrames:
     def __init__(self, layout: JobLayout) -> None:
         self._layout = layout
         self.folder = layout.receipt(layout.frame_cache(0)).parent
+        self._folder_stamp: int | None = None
         self._seen: dict[str, _Seen] = {}
         self._receipts: dict[int, Receipt] = {}
 
@@ -51,6 +56,10 @@ class CommittedFrames:
 
     def update(self) -> bool:
         """Look again; returns whether frames have come, gone or been replaced. Reads only receipts that are new."""
+        folder_stamp = self._settled_time_of_folder()
+        if folder_stamp is not None and folder_stamp == self._folder_stamp:
+            return False
+        self._folder_stamp = folder_stamp
         seen: dict[str, _Seen] = {}
         paths = sorted(self.folder.glob("[0-9]*.h5.json"))
         for path in paths:
@@ -76,6 +85,14 @@ class CommittedFrames:
             if newest is not None and receipt.fingerprint == newest.fingerprint
         }
         return True
+
+    def _settled_time_of_folder(self) -> int | None:
+        """When a receipt last came to the folder [ns]; None while it is so recent that another may have the same time.
+
+        Of ten thousand frames, looking at the folder takes a microsecond, and at all receipts a tenth of a second.
+        """
+        stamp = stamp_of(self.folder)
+        return stamp[0] if stamp is not None and time.time_ns() - stamp[0] > SETTLED_NS else None
 
     def derived(self, frame: int, artifact: ArtifactPath) -> bool:
         """Whether a file that is made from a frame is there, and was made from the frame as it is now."""

@@ -140,6 +140,19 @@ def read_shown_frame(
         InvalidArtifactError: the cached frame itself cannot be read.
     """
     path = layout.path(layout.frame_cache(frame))
+    try:
+        return _read(job, layout, committed, frame, most_particles=most_particles)
+    except (KeyError, TypeError, ValueError) as error:  # readable, but not what a frame holds
+        raise InvalidArtifactError(f"{path}: lacks what a frame has: {error}") from error
+
+
+def every(count: int, most: int) -> int:
+    """1 if so many particles may all be shown, else which of them: every second, third, ..."""
+    return max(1, -(-count // max(1, most)))
+
+
+def _read(job: Job, layout: JobLayout, committed: CommittedFrames, frame: int, *, most_particles: int) -> ShownFrame:
+    path = layout.path(layout.frame_cache(frame))
     numbers = read_numbers(path)
     fluids, cloths, poses, smokes = {}, {}, {}, {}
     for name, kind in numbers.kinds.items():
@@ -179,11 +192,6 @@ def read_shown_frame(
         view=_view(job, layout, committed, frame, poses),
         troubles=tuple(troubles),
     )
-
-
-def every(count: int, most: int) -> int:
-    """1 if so many particles may all be shown, else which of them: every second, third, ..."""
-    return max(1, -(-count // max(1, most)))
 
 
 def _particles(body: Snapshot, most: int) -> Particles:

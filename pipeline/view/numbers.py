@@ -25,6 +25,7 @@ class SolverSeries:
     def __init__(self) -> None:
         self._frames: dict[int, FrameNumbers] = {}
         self.version = 0
+        self._largest: dict[str, tuple[int, float]] = {}  # by name: of which version, and what
 
     def put(self, numbers: FrameNumbers) -> None:
         """Add a frame, or replace it."""
@@ -75,8 +76,10 @@ class SolverSeries:
 
     def largest(self, name: str) -> float:
         """Of all solvers and frames; 0 if nobody tells it."""
-        values = [of[name] for each in self._frames.values() for of in each.solvers.values() if name in of]
-        return max(filter(math.isfinite, values), default=0.0)
+        if self._largest.get(name, (-1, 0.0))[0] != self.version:
+            values = [of[name] for each in self._frames.values() for of in each.solvers.values() if name in of]
+            self._largest[name] = (self.version, max(filter(math.isfinite, values), default=0.0))
+        return self._largest[name][1]
 
 
 def label(solver: str, name: str) -> str:

@@ -209,7 +209,12 @@ class JobScene:
         return self._meshes.get(artifact)
 
     def _draw_pins(self, drawing: Drawing, frame: ShownFrame) -> None:
-        for name, pins in self._pins().items():
+        try:
+            pinned = self._pins()
+        except (ValueError, OSError) as error:  # the mesh of a cloth is gone or damaged
+            self.troubles.append(f"pins are not shown: {error}")
+            return
+        for name, pins in pinned.items():
             sheet = frame.cloths.get(name)
             held = [nodes for nodes, release_s in pins if frame.numbers.time_s < release_s]
             if sheet is not None and held:
@@ -222,15 +227,16 @@ class JobScene:
             from sim.cloth.sheet import build_sheet
             from sim.cloth.start import pinned_nodes, start_positions
 
-            self._pinned = {}
+            pinned = {}
             for cloth in self._job.cloth:
                 if cloth.pin:
                     sheet = build_sheet(cloth.shape)
                     position = start_positions(cloth, sheet)
-                    self._pinned[cloth.name] = [
+                    pinned[cloth.name] = [
                         (pinned_nodes(pin, sheet, position), math.inf if pin.release_s is None else pin.release_s)
                         for pin in cloth.pin
                     ]
+            self._pinned = pinned
         return self._pinned
 
     def _draw_smoke(self, drawing: Drawing, frame: ShownFrame, shown: Shown, extents: Extents) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import viewed_job
 from browser import needs_browser, open_page
 from PIL import Image
@@ -51,13 +52,25 @@ def served(layout: JobLayout, **limits: int) -> Iterator[Served]:
             loop.join()
 
 
+@pytest.fixture(scope="module")
+def window() -> Iterator[Any]:
+    """An empty page; its browser is started once for all tests."""
+    with open_page(720, 480) as page:
+        yield page
+
+
 @contextmanager
-def opened(served: Served) -> Iterator[Any]:
-    with open_page(720, 480) as browser:
-        browser.set_default_timeout(PATIENCE_S * 1000)
+def opened(window: Any, served: Served) -> Iterator[Any]:
+    """A page of its own, as of another person."""
+    context = window.context.browser.new_context(viewport=window.viewport_size)
+    context.set_default_timeout(PATIENCE_S * 1000)
+    try:
+        browser = context.new_page()
         browser.goto(served.url)
         browser.wait_for_selector("canvas")
         yield browser
+    finally:
+        context.close()
 
 
 def until(condition: Callable[[], bool], what: str, browser: Any, timeout_s: float = PATIENCE_S) -> None:
@@ -90,12 +103,12 @@ def changed(before: np.ndarray, after: np.ndarray) -> float:
     return float((np.abs(before - after).max(axis=2) > 24).mean())
 
 
-def test_a_job_is_drawn_scrubbed_and_played_in_two_browsers(tmp_path: Path):
+def test_a_job_is_drawn_scrubbed_and_played_in_two_pages(tmp_path: Path, window: Any):
     layout = viewed_job.submitted(tmp_path / "job")
     for frame in range(6):
         receipt = viewed_job.commit(layout, frame)
         viewed_job.commit_spray(layout, receipt, frame)
-    with served(layout, most_particles=500) as view, opened(view) as browser:
+    with served(layout, most_particles=500) as view, opened(window, view) as browser:
         complaints: list[str] = []
         browser.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
         browser.on("pageerror", lambda error: complaints.append(str(error)))
@@ -113,12 +126,10 @@ def test_a_job_is_drawn_scrubbed_and_played_in_two_browsers(tmp_path: Path):
         until(lambda: changed(first, picture(browser)) > 0.01, "another picture", browser)
         assert "/pins/flag" not in view.page.things  # let go at 0.1 s
 
-        other = browser.context.browser.new_context().new_page()
-        other.goto(view.url)
-        other.get_by_text("frame 4 · 0.133 s").wait_for()
-        other.get_by_role("button", name="first").click()
-        until(lambda: view.page.frame == 0, "the other browser's step", other)
-        other.context.close()
+        with opened(window, view) as other:
+            other.get_by_text("frame 4 · 0.133 s").wait_for()
+            other.get_by_role("button", name="first").click()
+            until(lambda: view.page.frame == 0, "the other browser's step", other)
         browser.get_by_text("frame 0 · 0.000 s").wait_for()
 
         browser.get_by_role("button", name="Play").click()
@@ -132,9 +143,9 @@ def test_a_job_is_drawn_scrubbed_and_played_in_two_browsers(tmp_path: Path):
         assert complaints == []
 
 
-def test_frames_of_a_running_job_appear_and_a_spoilt_one_is_a_line(tmp_path: Path):
+def test_frames_of_a_running_job_appear_and_a_spoilt_one_is_a_line(tmp_path: Path, window: Any):
     layout = viewed_job.submitted(tmp_path / "job")
-    with served(layout) as view, opened(view) as browser:
+    with served(layout) as view, opened(window, view) as browser:
         browser.get_by_text("has no frame yet").wait_for()
         viewed_job.commit(layout, 0)
         until(lambda: view.page.frame == 0, "the first frame", browser)
