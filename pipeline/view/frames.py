@@ -19,9 +19,11 @@ from render.camera_path import View
 from render.errors import InvalidFileError
 from render.meshes import SurfaceMesh, read_ply
 from render.point_clouds import read_point_cloud
-from sim.snapshots import Snapshot
+from sim.snapshots import BodyKind, Snapshot
 
 Floats = NDArray[np.float32]
+DENSE_KINDS: tuple[BodyKind, ...] = ("fluid", "rigid", "cloth")
+"""Kinds of bodies whose arrays are read whole; of a smoke only the cells that are not empty."""
 SPEED = "speed"
 """Computed from the velocities; every other value that particles are coloured by is an array of the cache."""
 
@@ -124,7 +126,7 @@ class ShownFrame:
 
 
 def read_shown_frame(
-    job: Job, layout: JobLayout, committed: CommittedFrames, frame: int, *, most_particles: int
+    job: Job, layout: JobLayout, committed: CommittedFrames, frame: int, *, most_particles: int, surfaces: bool = True
 ) -> ShownFrame:
     """Read a committed frame; what of it is missing yet is left out, what is spoilt is told.
 
@@ -135,13 +137,14 @@ def read_shown_frame(
         frame: its number.
         most_particles: of a fluid that are kept; of more, every second, third, ... by their numbers, so that the same
             ones are seen in every frame.
+        surfaces: whether to read the fluids' surfaces, which take longer than all the rest.
 
     Raises:
         InvalidArtifactError: the cached frame itself cannot be read.
     """
     path = layout.path(layout.frame_cache(frame))
     try:
-        return _read(job, layout, committed, frame, most_particles=most_particles)
+        return _read(job, layout, committed, frame, most_particles=most_particles, surfaces=surfaces)
     except (KeyError, TypeError, ValueError) as error:  # readable, but not what a frame holds
         raise InvalidArtifactError(f"{path}: lacks what a frame has: {error}") from error
 
@@ -151,32 +154,33 @@ def every(count: int, most: int) -> int:
     return max(1, -(-count // max(1, most)))
 
 
-def _read(job: Job, layout: JobLayout, committed: CommittedFrames, frame: int, *, most_particles: int) -> ShownFrame:
+def _read(
+    job: Job, layout: JobLayout, committed: CommittedFrames, frame: int, *, most_particles: int, surfaces: bool
+) -> ShownFrame:
     path = layout.path(layout.frame_cache(frame))
     numbers = read_numbers(path)
-    fluids, cloths, poses, smokes = {}, {}, {}, {}
-    for name, kind in numbers.kinds.items():
-        if kind == "smoke":
-            smokes[name] = Smoke(*read_smoke_density(path, name))
-            continue
-        body = read_frame(path, name).bodies[name]
-        if kind == "fluid":
-            fluids[name] = _particles(body, most_particles)
-        elif kind == "cloth":
-            cloths[name] = Sheet(_floats(body, "position"), np.asarray(body.arrays["triangles"], np.int32))
-        else:
-            pose = {key: np.asarray(body.arrays[key], np.float64) for key in ("position", "orientation")}
-            poses[name] = Pose(**pose)
-    surfaces: dict[str, SurfaceMesh] = {}
+    kinds = frozenset(numbers.kinds.values())
+    smokes = {name: Smoke(*read_smoke_density(path, name)) for name, kind in numbers.kinds.items() if kind == "smoke"}
+    bodies = {kind: read_frame(path, kind=kind).bodies for kind in DENSE_KINDS if kind in kinds}
+    fluids = {name: _particles(body, most_particles) for name, body in bodies.get("fluid", {}).items()}
+    poses = {
+        name: Pose(*(np.asarray(body.arrays[key], np.float64) for key in ("position", "orientation")))
+        for name, body in bodies.get("rigid", {}).items()
+    }
+    cloths = {
+        name: Sheet(_floats(body, "position"), np.asarray(body.arrays["triangles"], np.int32))
+        for name, body in bodies.get("cloth", {}).items()
+    }
+    meshes: dict[str, SurfaceMesh] = {}
     whitewater: dict[str, Particles] = {}
     troubles: list[str] = []
     for fluid in job.fluid:
         surface = layout.surface(fluid.name, frame)
         cloud = layout.whitewater(fluid.name, frame)
         try:
-            if committed.derived(frame, surface):
+            if surfaces and committed.derived(frame, surface):
                 mesh = read_ply(layout.path(surface))
-                surfaces[fluid.name] = SurfaceMesh(mesh.vertices, mesh.faces)
+                meshes[fluid.name] = SurfaceMesh(mesh.vertices, mesh.faces)
             if fluid.name in job.whitewater and committed.derived(frame, cloud):
                 whitewater[fluid.name] = _whitewater(layout, fluid.name, frame, most_particles)
         except (InvalidFileError, OSError) as error:
@@ -185,7 +189,7 @@ def _read(job: Job, layout: JobLayout, committed: CommittedFrames, frame: int, *
         numbers,
         fluids=fluids,
         whitewater=whitewater,
-        surfaces=surfaces,
+        surfaces=meshes,
         cloths=cloths,
         poses=poses,
         smokes=smokes,

@@ -161,18 +161,24 @@ class ViewPage:
             self._controls.offer_numbers(self._series)
         return False
 
-    def _load(self, frame: int, stamp: Stamp) -> ShownFrame | None:
-        shown = self._loaded.get(frame, stamp)
+    def _load(self, frame: int, stamp: Stamp, *, surfaces: bool) -> ShownFrame | None:
+        state = (stamp, surfaces)
+        shown = self._loaded.get(frame, state)
         if shown is None:
             try:
                 shown = read_shown_frame(
-                    self._job, self._layout, self._committed, frame, most_particles=self._most_particles
+                    self._job,
+                    self._layout,
+                    self._committed,
+                    frame,
+                    most_particles=self._most_particles,
+                    surfaces=surfaces,
                 )
             except (InvalidArtifactError, OSError) as error:
                 self._spoilt[frame] = str(error)
                 return None
             self._spoilt.pop(frame, None)
-            self._loaded.put(frame, stamp, shown)
+            self._loaded.put(frame, state, shown)
             self._extents.see(shown)
         return shown
 
@@ -184,7 +190,7 @@ class ViewPage:
         stamp = self._committed.stamp(artifacts_of_frame(self._job, self._layout, frame))
         wanted = (frame, stamp, settings, top_speed)
         if wanted != self._drawn:
-            shown = None if frame is None else self._load(frame, stamp)
+            shown = None if frame is None else self._load(frame, stamp, surfaces=SURFACES in settings.layers)
             self._scene.draw(self._drawing, shown, settings, self._extents, top_speed=top_speed)
             self._shown, self._drawn = shown, wanted
             if frame is not None and self.playback.plays:

@@ -20,6 +20,7 @@ from pipeline.view.frames import SPEED, Particles, Pose, ShownFrame
 from pipeline.view.smoke_pictures import cut, points
 from render.errors import InvalidFileError
 from render.meshes import SurfaceMesh, read_ply
+from sim.rigid.rotation import from_degrees
 
 PLAIN = "plain"
 DENSITY_AROUND = 0.03
@@ -111,6 +112,11 @@ class JobScene:
     def __init__(self, job: Job, layout: JobLayout, committed: CommittedFrames) -> None:
         self._job, self._layout, self._committed = job, layout, committed
         self._meshes: dict[str, SurfaceMesh] = {}
+        self._standing = {
+            body.name: Pose(np.array(body.position), from_degrees(body.rotation_deg))
+            for body in job.rigid
+            if body.kind == "static"
+        }
         self._pinned: dict[str, list[tuple[NDArray[np.int64], float]]] | None = None
         self.troubles: list[str] = []
         width, height = job.render.resolution
@@ -176,11 +182,9 @@ class JobScene:
                 drawing.points(f"/whitewater/{name}", cloud.position, WHITEWATER, radius=cloud.radius)
 
     def _draw_bodies(self, drawing: Drawing, poses: Mapping[str, Pose]) -> None:
-        from sim.rigid.rotation import from_degrees
-
         for body in self._job.rigid:
             if body.kind == "static":
-                pose = Pose(np.array(body.position), from_degrees(body.rotation_deg))
+                pose = self._standing[body.name]
             elif body.name in poses:
                 pose = poses[body.name]
             else:
