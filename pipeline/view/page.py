@@ -36,8 +36,8 @@ LOOK_S = 0.5
 """How often new frames are looked for."""
 NUMBERS_S = 0.05
 """So long numbers of frames are read before the page gets its turn again: a long film has thousands of frames."""
-ASIDE, FARTHER = np.radians(24.0), 1.3
-"""Where a page looks from at first: turned about the vertical [rad] from the film's camera, and farther away."""
+ASIDE = np.radians(24.0)
+"""By so much a page at first looks from another side than the film's camera, about the vertical [rad]."""
 
 
 class ViewPage:
@@ -73,7 +73,7 @@ class ViewPage:
         self._shown: ShownFrame | None = None
         server.scene.set_up_direction("+z")
         server.scene.configure_default_lights(cast_shadow=False)  # they cost a machine without a GPU much
-        self._look_from_afar()
+        self._look_from_aside()
         waits = not any(self._committed.folder.glob("*.h5.json"))
         self._controls = Controls(server.gui, self._job, rate=int(self.playback.rate), waits=waits)
         self._controls.offer_layers(self._scene.layers)
@@ -282,15 +282,15 @@ class ViewPage:
 
         return camera_path(self._job).first()
 
-    def _look_from_afar(self) -> None:
-        """Begin beside the film's camera and behind it, so that it is in the picture itself."""
+    def _look_from_aside(self) -> None:
+        """Begin beside the film's camera."""
         view = self._first_view()
         target = np.array(view.look_at)
         x, y, z = np.array(view.position) - target
         cosine, sine = np.cos(ASIDE), np.sin(ASIDE)
         camera = self._server.initial_camera
         camera.look_at = target
-        camera.position = target + FARTHER * np.array([cosine * x - sine * y, sine * x + cosine * y, z])
+        camera.position = target + np.array([cosine * x - sine * y, sine * x + cosine * y, z])
         camera.up = (0.0, 0.0, 1.0)
         camera.fov = 0.75
 
