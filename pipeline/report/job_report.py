@@ -143,7 +143,7 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         unreadable_whitewater=simulation.unreadable_whitewater,
         sheet=_sheet(layout, picture_width=job.render.resolution[0]),
         film=film_of(layout, job),
-        versions=tuple(made_with(layout, artifacts)),
+        versions=tuple(made_with(layout, artifacts, stages=[timing.stage for timing in timings])),
         text=layout.job_file.read_text(encoding="utf-8"),
     )
 

@@ -13,7 +13,7 @@ from pipeline.report.job_report import JobReport, as_data
 from pipeline.report.versions import MadeWith
 from pipeline.whitewater_numbers import unreadable_whitewater
 
-LEAST_SHARE = 0.04
+LEAST_SHARE = 0.07
 """Of all time: what a stage must have taken to have its name on the bar."""
 
 

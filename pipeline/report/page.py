@@ -126,7 +126,7 @@ h3 { font-size: 1.05rem; margin: 1.8rem 0 .6rem; } header { margin-bottom: 1.2re
 details { border-top: 1px solid var(--rule); padding: .6rem 0; } summary { cursor: pointer; font-weight: 600; }
 pre { overflow-x: auto; font: 13px/1.45 ui-monospace, monospace; background: var(--soft-paper); padding: 1rem;
   border-radius: 6px; }
-.texts td { text-align: left; white-space: normal; vertical-align: top; }
+.texts td, .texts th { text-align: left; vertical-align: top; } .texts td { white-space: normal; }
 header p, .quiet { color: var(--soft); margin: .3rem 0; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.2rem; margin: 0 0 .8rem; }
 dt { color: var(--soft); } dd { margin: 0; }
@@ -137,7 +137,7 @@ th, td { padding: .25rem .8rem; text-align: right; border-bottom: 1px solid var(
 th:first-child { text-align: left; } thead th { color: var(--soft); font-weight: 500; }
 .bar { position: relative; min-width: 9rem; } .bar span { position: absolute; inset: 3px auto 3px 0;
   background: var(--bar); border-radius: 2px; z-index: -1; }
-.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr)); gap: 1.6rem; }
+.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 28rem), 1fr)); gap: 1.6rem; }
 figure { margin: 0; } figcaption { font-weight: 600; }
 figure ul { list-style: none; margin: .2rem 0; padding: 0; display: flex; flex-wrap: wrap; gap: .1rem 1rem;
   font-size: 13px; color: var(--soft); }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pipeline.layout import JobLayout
@@ -21,7 +22,7 @@ class MadeWith:
         tools: versions of the stage and of the tools that did the work; empty if the parameters were not kept.
         maker: program, Python and kind of machine; empty in older receipts.
         host: name of the machine.
-        files: how many were made with the same parameters.
+        files: how many.
     """
 
     stage: str
@@ -31,20 +32,25 @@ class MadeWith:
     files: int
 
 
-def made_with(layout: JobLayout, artifacts: Mapping[ArtifactPath, ArtifactRow]) -> list[MadeWith]:
-    """By stage and parameters; of each the receipt of one file is read.
+def made_with(
+    layout: JobLayout, artifacts: Mapping[ArtifactPath, ArtifactRow], *, stages: Sequence[str]
+) -> list[MadeWith]:
+    """What made which files; of those with the same parameters the receipt of one is read.
 
     Args:
         layout: the job's folder.
         artifacts: every artifact on record.
+        stages: in the order in which they are told; others come last.
     """
     groups: dict[str, list[ArtifactPath]] = {}
     for path, row in artifacts.items():
         groups.setdefault(row.parameters, []).append(path)
-    found = []
+    files: Counter[tuple[str, tuple[tuple[str, str], ...], str, str]] = Counter()
     for paths in groups.values():
         receipt = read_receipt(layout, paths[-1])
         if receipt is not None:
             (origin,) = origins_of(layout, [receipt])
-            found.append(MadeWith(receipt.stage, origin.tools or {}, receipt.maker, receipt.host, len(paths)))
-    return found
+            files[receipt.stage, tuple((origin.tools or {}).items()), receipt.maker, receipt.host] += len(paths)
+    found = [MadeWith(stage, dict(tools), maker, host, count) for (stage, tools, maker, host), count in files.items()]
+    place = {stage: index for index, stage in enumerate(stages)}
+    return sorted(found, key=lambda each: place.get(each.stage, len(place)))
