@@ -24,12 +24,14 @@ class SolverSeries:
 
     def __init__(self) -> None:
         self._frames: dict[int, FrameNumbers] = {}
+        self._sources: dict[int, str] = {}
         self.version = 0
         self._largest: dict[str, tuple[int, float]] = {}  # by name: of which version, and what
 
-    def put(self, numbers: FrameNumbers) -> None:
-        """Add a frame, or replace it."""
+    def put(self, numbers: FrameNumbers, *, source: str) -> None:
+        """Add a frame, or replace it; `source` is the hash of the file that it was read from."""
         self._frames[numbers.frame] = numbers
+        self._sources[numbers.frame] = source
         self.version += 1
 
     def numbers(self, frame: int | None) -> FrameNumbers | None:
@@ -41,9 +43,9 @@ class SolverSeries:
         self._frames = {frame: self._frames[frame] for frame in frames if frame in self._frames}
         self.version += 1
 
-    def has(self, frame: int) -> bool:
-        """Whether a frame has been read."""
-        return frame in self._frames
+    def has(self, frame: int, *, source: str) -> bool:
+        """Whether a frame has been read from the file with this hash."""
+        return frame in self._frames and self._sources[frame] == source
 
     def names(self) -> list[tuple[str, str]]:
         """Every solver with each of its numbers, in the order in which they are shown."""

@@ -63,7 +63,7 @@ class ViewPage:
         self._scene = JobScene(self._job, layout, self._committed)
         self._loaded = LoadedFrames(most_bytes)
         self._series, self._extents = SolverSeries(), Extents()
-        self._spoilt: dict[int, str] = {}
+        self._spoilt: dict[int, tuple[str, str]] = {}  # by frame: the hash it should have, and what is wrong
         self._job_trouble = ""
         self._drawing = Drawing(server)
         self.playback = Playback(rate=float(min(self._job.fps, 60)))
@@ -93,6 +93,16 @@ class ViewPage:
     def things(self) -> frozenset[str]:
         """Names of all that is drawn."""
         return self._drawing.names
+
+    @property
+    def notice(self) -> str:
+        """What the page tells of troubles, as HTML."""
+        return str(self._controls.notice.content)
+
+    @property
+    def table(self) -> str:
+        """The solvers' numbers that the page shows, as HTML."""
+        return str(self._controls.table.content)
 
     def run(self, stop: threading.Event) -> None:
         """Show frames until told to stop."""
@@ -139,7 +149,7 @@ class ViewPage:
             frames = self._committed.numbers
             self.playback.offer(frames, follow=self._controls.follow.value)
             self._series.keep(frames)
-            self._spoilt = {frame: text for frame, text in self._spoilt.items() if frame in frames}
+            self._spoilt = {frame: told for frame, told in self._spoilt.items() if frame in frames}
             self._controls.offer_frames(frames)
             if self.playback.frame is not None and not self.playback.plays:
                 self._controls.slider.value = self.playback.frame
@@ -148,18 +158,24 @@ class ViewPage:
         """Read numbers of frames that are new; returns whether there are more."""
         changed = False
         for frame in self._committed.numbers:
-            if self._series.has(frame) or frame in self._spoilt:
+            source = self._committed.receipt(frame).hash
+            if self._series.has(frame, source=source) or self._is_spoilt(frame):
                 continue
             if time.monotonic() >= until:
                 return True
             try:
-                self._series.put(read_numbers(self._layout.path(self._layout.frame_cache(frame))))
+                numbers = read_numbers(self._layout.path(self._layout.frame_cache(frame)))
+                self._series.put(numbers, source=source)
                 changed = True
             except InvalidArtifactError as error:
-                self._spoilt[frame] = str(error)
+                self._spoilt[frame] = (source, str(error))
         if changed:
             self._controls.offer_numbers(self._series)
         return False
+
+    def _is_spoilt(self, frame: int) -> bool:
+        """Whether a frame could not be read, and was not simulated anew since."""
+        return frame in self._spoilt and self._spoilt[frame][0] == self._committed.receipt(frame).hash
 
     def _load(self, frame: int, stamp: Stamp, *, surfaces: bool) -> ShownFrame | None:
         state = (stamp, surfaces)
@@ -175,7 +191,7 @@ class ViewPage:
                     surfaces=surfaces,
                 )
             except (InvalidArtifactError, OSError) as error:
-                self._spoilt[frame] = str(error)
+                self._spoilt[frame] = (self._committed.receipt(frame).hash, str(error))
                 return None
             self._spoilt.pop(frame, None)
             self._loaded.put(frame, state, shown)
@@ -221,8 +237,8 @@ class ViewPage:
         if frame is None:
             where = f"{self._layout.root} has no frame yet; they appear here as soon as they are simulated"
             return [*troubles, where]
-        if frame in self._spoilt:
-            troubles.append(f"frame {frame} cannot be read, see: pipeline verify ({self._spoilt[frame]})")
+        if self._is_spoilt(frame):
+            troubles.append(f"frame {frame} cannot be read, see: pipeline verify ({self._spoilt[frame][1]})")
         if self._shown is not None:
             troubles += self._shown.troubles
             if SURFACES in settings.layers and not self._shown.surfaces:

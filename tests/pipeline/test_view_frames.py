@@ -308,7 +308,9 @@ def test_numbers_are_told_and_plotted_with_a_mark_at_the_frame(layout):
     series = SolverSeries()
     for frame in range(4):
         viewed_job.commit(layout, frame)
-        series.put(read_numbers(layout.path(layout.frame_cache(frame))))
+        series.put(read_numbers(layout.path(layout.frame_cache(frame))), source="f")
+    assert series.has(3, source="f")
+    assert not series.has(3, source="g")
     assert series.first_choice() == ("water", "kinetic_energy")
     assert series.of("water", "kinetic_energy") == ([0, 1, 2, 3], [0.0, 1.0, 4.0, 9.0])
     assert series.of("water", "mechanical_energy")[1] == [5.0, 6.0, 9.0, 14.0]
