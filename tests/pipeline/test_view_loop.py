@@ -9,14 +9,19 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import viewed_job
 import viser
+from scipy.spatial.transform import Rotation
 from websockets.sync.client import connect
 
 from pipeline.layout import JobLayout
+from pipeline.view.drawing import Drawing
+from pipeline.view.frames import Smoke
 from pipeline.view.page import ViewPage
 from pipeline.view.serving import page_server
+from pipeline.view.smoke_pictures import cut
 
 
 @pytest.fixture
@@ -95,6 +100,39 @@ def test_a_frame_that_is_simulated_anew_is_read_anew(server, layout):
     page.turn(10.0)
     assert page.frames == (0,)
     assert "123 J" in page.table
+
+
+def test_a_slice_is_a_picture_whose_axes_are_those_of_the_cut_and_goes_when_it_is_not_drawn(server):
+    smoke = Smoke(np.ones((2, 3, 4), np.float32), (0.0, 0.0, 0.0), 0.5)
+    across = cut(smoke, axis="x", share=0.5, box=((0.0, 0.0, 0.0), (1.0, 1.5, 2.0)), densest=1.0)
+    assert across is not None
+    drawing = Drawing(server)
+    with drawing.picture():
+        drawing.slice("/smoke", across)
+    handle = server.scene.get_handle_by_name("/smoke")
+    w, x, y, z = handle.wxyz
+    turn = Rotation.from_quat([x, y, z, w])
+    # viser's pictures have x to the right and y down.
+    assert turn.apply([1.0, 0.0, 0.0]) == pytest.approx([0.0, 1.0, 0.0])
+    assert turn.apply([0.0, 1.0, 0.0]) == pytest.approx([0.0, 0.0, -1.0])
+    assert handle.position == pytest.approx([0.5, 0.75, 1.0])
+    assert (handle.render_width, handle.render_height) == (1.5, 2.0)
+    with drawing.picture():
+        drawing.points("/points", np.zeros((2, 3), np.float32), (255, 0, 0), radius=0.1)
+    assert drawing.names == {"/points"}
+    assert server.scene.get_handle_by_name("/smoke") is None
+
+
+def test_particles_far_from_the_origin_are_sent_exactly_enough(server):
+    drawing = Drawing(server)
+    places = np.random.default_rng(1).uniform(0.0, 1.0, (100, 3)).astype(np.float32)
+    for shift, radius in ((0.0, 0.01), (1000.0, 0.01), (0.0, 1e-4)):
+        with drawing.picture():
+            drawing.points("/points", places + np.float32(shift), (255, 0, 0), radius=radius)
+        handle = server.scene.get_handle_by_name("/points")
+        error = np.abs(handle.points.astype(np.float64) + handle.position - (places + np.float32(shift))).max()
+        # A tenth of the radius, and what float32 itself is wrong by so far out.
+        assert error <= 0.1 * radius + 2.0**-23 * (1.0 + shift)
 
 
 def test_the_command_line_does_not_load_viser():
