@@ -55,7 +55,7 @@ def page_server(*, host: str = LOCAL, port: int, label: str) -> Iterator[viser.V
 def address(server: viser.ViserServer) -> str:
     """Where a browser finds it."""
     host = server.get_host()
-    return f"http://{'localhost' if host in ('0.0.0.0', LOCAL) else host}:{server.get_port()}"  # noqa: S104
+    return f"http://{'localhost' if host == LOCAL else host}:{server.get_port()}"
 
 
 def _require_free(host: str, port: int) -> None:
