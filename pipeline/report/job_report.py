@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from base64 import b64encode
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.committed_pictures import committed_pictures, evenly_spread
@@ -14,7 +14,9 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.manifest_reader import ManifestReader, StageTiming
 from pipeline.quantities import COUNT_OF_FLUID
+from pipeline.report.film import ReportFilm, film_of
 from pipeline.report.panels import JobNumbers
+from pipeline.report.versions import MadeWith, made_with
 from pipeline.solver_numbers import Warned, simulation_numbers
 from pipeline.task import ArtifactPath, TaskState
 
@@ -40,6 +42,9 @@ class JobReport:
         unreadable_whitewater: files of whitewater that cannot.
         drawn_on: number of frames by the device that drew them.
         sheet: its pictures side by side, as the bytes of a WebP picture; None before there are any.
+        film: None before there is one.
+        versions: what made its files.
+        text: of its job file, as submitted.
     """
 
     job: Job
@@ -54,6 +59,9 @@ class JobReport:
     unreadable_whitewater: tuple[ArtifactPath, ...]
     drawn_on: dict[str, int]
     sheet: bytes | None
+    film: ReportFilm | None
+    versions: tuple[MadeWith, ...]
+    text: str
 
     @property
     def facts(self) -> dict[str, str]:
@@ -99,6 +107,7 @@ class JobReport:
             "drawn_on": self.drawn_on,
             "unreadable_frames": list(self.unreadable),
             "unreadable_whitewater": list(self.unreadable_whitewater),
+            "versions": [asdict(each) for each in self.versions],
             "frame": [frame.frame for frame in frames],
             "time_s": [frame.time_s for frame in frames],
             "solvers": {
@@ -123,6 +132,7 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         summary, timings, last = manifest.summary(), manifest.stage_timings(), manifest.last_run()
         drawn_on = manifest.devices("render")
+        artifacts = manifest.artifacts()
     finished = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
     simulation = simulation_numbers(layout, history=True)
     return JobReport(
@@ -138,6 +148,9 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         unreadable_whitewater=simulation.unreadable_whitewater,
         drawn_on=drawn_on,
         sheet=_sheet(layout, picture_width=job.render.resolution[0]),
+        film=film_of(layout, job),
+        versions=tuple(made_with(layout, artifacts, stages=[timing.stage for timing in timings])),
+        text=layout.job_file.read_text(encoding="utf-8"),
     )
 
 

@@ -7,13 +7,10 @@ import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from pipeline import wording
-from pipeline.manifest_reader import StageTiming
-from pipeline.plan import frame_ranges
-from pipeline.report.chart import line_chart, swatch
-from pipeline.report.job_report import JobReport, as_data
+from pipeline.report.chart import COLORS, line_chart, swatch
+from pipeline.report.job_report import JobReport
+from pipeline.report.job_section import job_section, origins_section
 from pipeline.report.panels import Panel, panels_of
-from pipeline.whitewater_numbers import unreadable_whitewater
 
 
 def page(reports: Sequence[JobReport], *, written: str) -> str:
@@ -30,8 +27,9 @@ def page(reports: Sequence[JobReport], *, written: str) -> str:
         sections.insert(0, _section("Energy kept", _energies(reports)))
     body = [
         f"<header><h1>{escape(title)}</h1><p>{escape(written)}</p></header>",
-        *(_job(report) for report in reports),
+        *(job_section(report, headed=len(reports) > 1) for report in reports),
         *sections,
+        _section("What it was made of", "".join(origins_section(each, headed=len(reports) > 1) for each in reports)),
     ]
     data = _json({"written": written, "jobs": [report.as_json() for report in reports]})
     return (
@@ -45,43 +43,6 @@ def page(reports: Sequence[JobReport], *, written: str) -> str:
 
 def _over(reports: Sequence[JobReport]) -> str:
     return "" if len(reports) == 1 else " in comparison"
-
-
-def _job(report: JobReport) -> str:
-    facts = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in report.facts.items())
-    parts = [f"<h2>{escape(report.title)}</h2><dl>{facts}</dl>", _warnings(report)]
-    if report.sheet is not None:
-        parts.append(f'<img class="sheet" src="{as_data(report.sheet)}" alt="frames of {escape(report.title)}">')
-    if report.timings:
-        parts.append(_timings(report.timings))
-    return f"<section>{''.join(parts)}</section>"
-
-
-def _warnings(report: JobReport) -> str:
-    sentences = [*map(str, report.warnings), *wording.mixed_devices(report.drawn_on)]
-    if report.unreadable:
-        frames = frame_ranges(report.unreadable, range(report.unreadable[-1] + 1))
-        sentences.append(f"frames of the cache that cannot be read: {frames}")
-    sentences += unreadable_whitewater(report.unreadable_whitewater)
-    items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
-    return f'<ul class="warnings">{items}</ul>' if items else '<p class="quiet">No warnings.</p>'
-
-
-def _timings(timings: Sequence[StageTiming]) -> str:
-    most = max(timing.seconds for timing in timings) or 1.0
-    rows = "".join(
-        f"<tr><th>{escape(timing.stage)}</th><td>{timing.attempts:,}</td><td>{timing.failed:,}</td>"
-        f'<td class="bar"><span style="width:{100.0 * timing.seconds / most:.1f}%"></span>'
-        f"{wording.duration(timing.seconds)}</td><td>{wording.duration(timing.longest_s)}</td>"
-        f"<td>{wording.size(timing.peak_memory_bytes) if timing.peak_memory_bytes else '–'}</td>"
-        f"<td>{timing.artifacts:,}</td><td>{wording.size(timing.bytes)}</td></tr>"
-        for timing in timings
-    )
-    head = "".join(
-        f"<th>{name}</th>"
-        for name in ("stage", "attempts", "failed", "time of all", "longest", "peak memory", "files", "size")
-    )
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
 
 
 def _energies(reports: Sequence[JobReport]) -> str:
@@ -141,15 +102,31 @@ def _finite(data: object) -> object:
 
 
 _STYLE = """
-:root { color-scheme: light dark; --paper: #fcfcfb; --ink: #1d1d1b; --soft: #62615c; --rule: #dddcd6; --bar: #cfe0f5;
+:root { color-scheme: light dark; --paper: #fcfcfb; --soft-paper: #f2f1ed;
+  --ink: #1d1d1b; --soft: #62615c; --rule: #dddcd6; --bar: #cfe0f5;
   --warn: #8a4b00; --c0: #2a78d6; --c1: #d9541e; --c2: #12875f; --c3: #a86f00; --c4: #b93c7f; --c5: #4a3aa7;
-  --c6: #6b6b66; --c7: #c22f2f; }
-@media (prefers-color-scheme: dark) { :root { --paper: #171716; --ink: #ecebe6; --soft: #a3a29b; --rule: #3a3936;
+  --c6: #6b6b66; --c7: #c22f2f;
+  --s0: #2567b5; --s1: #b8481a; --s2: #107350; --s3: #8a5c00; --s4: #9c3369;
+  --s5: #4a3aa7; --s6: #5c5c58; --s7: #a82828; }
+@media (prefers-color-scheme: dark) { :root { --paper: #171716;
+  --soft-paper: #222120; --ink: #ecebe6; --soft: #a3a29b; --rule: #3a3936;
   --bar: #24456b; --warn: #f0b45c; --c0: #5a9fee; --c1: #f07c4a; --c2: #35b98a; --c3: #d9a02c; --c4: #e578b0;
   --c5: #a196f0; --c6: #a9a8a1; --c7: #f07373; } }
 body { margin: 0 auto; max-width: 86rem; padding: 1.5rem; background: var(--paper); color: var(--ink);
   font: 15px/1.45 system-ui, sans-serif; }
-h1 { font-size: 1.6rem; margin: 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .6rem; }
+h1 { font-size: 1.9rem; letter-spacing: -.015em; margin: 0; } h2 { font-size: 1.25rem; margin: 2.4rem 0 .8rem; }
+h3 { font-size: 1.05rem; margin: 1.8rem 0 .6rem; } header { margin-bottom: 1.2rem; }
+.head { display: grid; grid-template-columns: minmax(0, 3fr) minmax(16rem, 2fr); gap: 1.6rem; align-items: start; }
+@media (max-width: 50rem) { .head { grid-template-columns: 1fr; } }
+.film { display: block; width: 100%; height: auto; border-radius: 6px; background: #111; }
+.shares { display: flex; height: 2rem; border-radius: 6px; overflow: hidden; gap: 1px; }
+.shares span { flex: 0 1 0; min-width: 2px; overflow: hidden; white-space: nowrap; color: #fff; font-size: 13px;
+  line-height: 2rem; padding-left: .5rem; box-sizing: border-box; text-overflow: ellipsis; }
+.shares span:empty { padding: 0; }
+details { border-top: 1px solid var(--rule); padding: .6rem 0; } summary { cursor: pointer; font-weight: 600; }
+pre { overflow-x: auto; font: 13px/1.45 ui-monospace, monospace; background: var(--soft-paper); padding: 1rem;
+  border-radius: 6px; }
+.texts td, .texts th { text-align: left; vertical-align: top; } .texts td { white-space: normal; }
 header p, .quiet { color: var(--soft); margin: .3rem 0; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.2rem; margin: 0 0 .8rem; }
 dt { color: var(--soft); } dd { margin: 0; }
@@ -160,11 +137,13 @@ th, td { padding: .25rem .8rem; text-align: right; border-bottom: 1px solid var(
 th:first-child { text-align: left; } thead th { color: var(--soft); font-weight: 500; }
 .bar { position: relative; min-width: 9rem; } .bar span { position: absolute; inset: 3px auto 3px 0;
   background: var(--bar); border-radius: 2px; z-index: -1; }
-.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 34rem), 1fr)); gap: 1.6rem; }
+.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 28rem), 1fr)); gap: 1.6rem; }
 figure { margin: 0; } figcaption { font-weight: 600; }
 figure ul { list-style: none; margin: .2rem 0; padding: 0; display: flex; flex-wrap: wrap; gap: .1rem 1rem;
   font-size: 13px; color: var(--soft); }
 figure > svg { width: 100%; height: auto; display: block; } .swatch { width: 28px; height: 8px; margin-right: .4rem; }
 .line { fill: none; stroke-width: 1.8; stroke-linejoin: round; stroke-linecap: round; }
 .grid { stroke: var(--rule); } .axis { stroke: var(--soft); } .tick { fill: var(--soft); font-size: 11.5px; }
-""" + " ".join(f".c{index} {{ stroke: var(--c{index}); }}" for index in range(8))
+""" + " ".join(
+    f".c{index} {{ stroke: var(--c{index}); }} .b{index} {{ background: var(--s{index}); }}" for index in range(COLORS)
+)

@@ -1,0 +1,56 @@
+"""What made the files of a job: versions of the program, of its tools and of its stages, as receipts tell them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from pipeline.layout import JobLayout
+from pipeline.manifest_reader import ArtifactRow
+from pipeline.origins import origins_of
+from pipeline.receipts import read_receipt
+from pipeline.task import ArtifactPath
+
+
+@dataclass(frozen=True, slots=True)
+class MadeWith:
+    """What made some files of a stage.
+
+    Attributes:
+        stage: the stage.
+        tools: versions of the stage and of the tools that did the work; empty if the parameters were not kept.
+        maker: program, Python and kind of machine; empty in older receipts.
+        host: name of the machine.
+        files: how many.
+    """
+
+    stage: str
+    tools: Mapping[str, str]
+    maker: str
+    host: str
+    files: int
+
+
+def made_with(
+    layout: JobLayout, artifacts: Mapping[ArtifactPath, ArtifactRow], *, stages: Sequence[str]
+) -> list[MadeWith]:
+    """What made which files; of those with the same parameters the receipt of one is read.
+
+    Args:
+        layout: the job's folder.
+        artifacts: every artifact on record.
+        stages: in the order in which they are told; others come last.
+    """
+    groups: dict[str, list[ArtifactPath]] = {}
+    for path, row in artifacts.items():
+        groups.setdefault(row.parameters, []).append(path)
+    files: Counter[tuple[str, tuple[tuple[str, str], ...], str, str]] = Counter()
+    for paths in groups.values():
+        receipt = read_receipt(layout, paths[-1])
+        if receipt is not None:
+            (origin,) = origins_of(layout, [receipt])
+            files[receipt.stage, tuple((origin.tools or {}).items()), receipt.maker, receipt.host] += len(paths)
+    found = [MadeWith(stage, dict(tools), maker, host, count) for (stage, tools, maker, host), count in files.items()]
+    place = {stage: index for index, stage in enumerate(stages)}
+    return sorted(found, key=lambda each: place.get(each.stage, len(place)))

@@ -1,0 +1,141 @@
+"""The loop behind the viewer's page, with a server but without a browser."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import viewed_job
+import viser
+from scipy.spatial.transform import Rotation
+from websockets.sync.client import connect
+
+from pipeline.layout import JobLayout
+from pipeline.view.drawing import Drawing
+from pipeline.view.frames import Smoke
+from pipeline.view.page import ViewPage
+from pipeline.view.serving import page_server
+from pipeline.view.smoke_pictures import cut
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> JobLayout:
+    layout = viewed_job.submitted(tmp_path / "job")
+    for frame in range(6):
+        viewed_job.commit(layout, frame)
+    return layout
+
+
+@pytest.fixture
+def server() -> Iterator[viser.ViserServer]:
+    with page_server(port=0, label="view") as server:
+        yield server
+
+
+def page_of(server: viser.ViserServer, layout: JobLayout) -> ViewPage:
+    page = ViewPage(server, layout, most_particles=10_000, most_bytes=10**8)
+    page.turn(0.0)
+    return page
+
+
+def test_a_page_that_reads_nothing_holds_up_nobody_and_costs_no_memory(server, layout):
+    page = page_of(server, layout)
+    buffer = server._websock_server._broadcast_buffer
+    address = f"ws://127.0.0.1:{server.get_port()}"
+    with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_queue=1, close_timeout=0.1) as slow:
+        assert slow.recv()  # it is connected, and reads no more
+        sizes = []
+        for number in range(60):
+            page.playback.seek(number % 6)
+            page.turn(float(number))
+            sizes.append(len(buffer.message_from_id))
+        assert page.frame == 5
+        # Of each thing and property one message waits, however many frames were shown; six have been through all.
+        assert max(sizes[12:]) <= 2 * max(sizes[:12])
+
+
+def test_a_clock_that_runs_ahead_leaves_frames_out(server, layout):
+    page = page_of(server, layout)
+    page.playback.rate = 10.0
+    page.playback.play(0.0)
+    seen = []
+    for now in (0.05, 0.31, 0.52):
+        page.turn(now)
+        seen.append(page.frame)
+    assert seen == [0, 3, 5]
+
+
+def test_a_job_file_that_cannot_be_used_is_a_line_and_frames_stay(server, layout):
+    page = page_of(server, layout)
+    good = layout.job_file.read_text()
+    layout.job_file.write_text("name = ")
+    page.turn(10.0)
+    assert "shown as it was before" in page.notice
+    assert page.frame == 0
+    layout.job_file.write_text(good.replace("[[smoke]]", "[[light]]").partition("[[light]]")[0])
+    page.turn(20.0)
+    assert "shown as it was before" not in page.notice
+    assert "/smoke/plume" not in page.things
+    assert "/fluids/water" in page.things
+
+
+def test_a_folder_that_is_removed_leaves_a_page(server, layout):
+    page = page_of(server, layout)
+    shutil.rmtree(layout.root)
+    page.turn(10.0)
+    assert page.frames == ()
+    assert "has no frame yet" in page.notice
+
+
+def test_a_frame_that_is_simulated_anew_is_read_anew(server, layout):
+    page = page_of(server, layout)
+    time.sleep(0.01)  # a receipt of the same size must have another time
+    viewed_job.commit(layout, 0, fingerprint="other", energy=123.0)
+    page.turn(10.0)
+    assert page.frames == (0,)
+    assert "123 J" in page.table
+
+
+def test_a_slice_is_a_picture_whose_axes_are_those_of_the_cut_and_goes_when_it_is_not_drawn(server):
+    smoke = Smoke(np.ones((2, 3, 4), np.float32), (0.0, 0.0, 0.0), 0.5)
+    across = cut(smoke, axis="x", share=0.5, box=((0.0, 0.0, 0.0), (1.0, 1.5, 2.0)), densest=1.0)
+    assert across is not None
+    drawing = Drawing(server)
+    with drawing.picture():
+        drawing.slice("/smoke", across)
+    handle = server.scene.get_handle_by_name("/smoke")
+    w, x, y, z = handle.wxyz
+    turn = Rotation.from_quat([x, y, z, w])
+    # viser's pictures have x to the right and y down.
+    assert turn.apply([1.0, 0.0, 0.0]) == pytest.approx([0.0, 1.0, 0.0])
+    assert turn.apply([0.0, 1.0, 0.0]) == pytest.approx([0.0, 0.0, -1.0])
+    assert handle.position == pytest.approx([0.5, 0.75, 1.0])
+    assert (handle.render_width, handle.render_height) == (1.5, 2.0)
+    with drawing.picture():
+        drawing.points("/points", np.zeros((2, 3), np.float32), (255, 0, 0), radius=0.1)
+    assert drawing.names == {"/points"}
+    assert server.scene.get_handle_by_name("/smoke") is None
+
+
+def test_particles_far_from_the_origin_are_sent_exactly_enough(server):
+    drawing = Drawing(server)
+    places = np.random.default_rng(1).uniform(0.0, 1.0, (100, 3)).astype(np.float32)
+    for shift, radius in ((0.0, 0.01), (1000.0, 0.01), (0.0, 1e-4)):
+        with drawing.picture():
+            drawing.points("/points", places + np.float32(shift), (255, 0, 0), radius=radius)
+        handle = server.scene.get_handle_by_name("/points")
+        error = np.abs(handle.points.astype(np.float64) + handle.position - (places + np.float32(shift))).max()
+        # A tenth of the radius, and what float32 itself is wrong by so far out.
+        assert error <= 0.1 * radius + 2.0**-23 * (1.0 + shift)
+
+
+def test_the_command_line_does_not_load_viser():
+    code = "import sys, pipeline.cli; print('viser' in sys.modules)"
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert child.stdout.strip() == "False"
