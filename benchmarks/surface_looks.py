@@ -27,7 +27,7 @@ from pipeline.cache import read_frame
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
-from pipeline.stages.render import framed_box, render_spec, write_motion
+from pipeline.stages.render import framed_points, render_spec, write_motion
 from render.blender import open_renderer
 from render.camera_path import View
 from render.parameters import CameraParameters, SurfaceParameters
@@ -122,7 +122,7 @@ class Studio:
                 ),
             }
         )
-        render_spec(scene, scratch, framed_box(scene, scratch)).write(folder / "scene.json")
+        render_spec(scene, scratch, framed_points(scene, scratch)).write(folder / "scene.json")
         self.surface = scratch.path(scratch.surface(fluid, self._frame))
         self.surface.parent.mkdir(parents=True)
         self._renderer = open_renderer(folder / "scene.json", threads=2, blender=None)
