@@ -138,8 +138,9 @@ def main() -> int:
     head = f"""# Gallery
 
 The jobs of [jobs/](../jobs) as they are, one after the other. Each can be made with `pipeline submit jobs/NAME.toml`.
-Pictures and times are of {arguments.machine}; seconds are of a stage's tasks, which ran beside each other.
-Written by `python -m benchmarks.gallery`.
+Made on {arguments.machine}. Seconds are what a stage's tasks took beside all others; what a
+frame takes alone is in [rendering](rendering.md#quality-presets). Where not all frames are drawn, the run ended before
+they were: they are from all over what was simulated until then. Written by `python -m benchmarks.gallery`.
 """
     (arguments.output / "gallery.md").write_text("\n".join([head, *sections]), encoding="utf-8")
     print(f"{len(sections)} jobs; without frames: {', '.join(missing) or 'none'}")
