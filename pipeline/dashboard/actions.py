@@ -1,0 +1,122 @@
+"""What can be asked of a job where it stands, what that will do, and doing it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from pipeline.dashboard.farm_view import JobCard, JobState
+from pipeline.errors import PipelineError
+from pipeline.farm import start_in_background
+from pipeline.queue_changes import another_try, cancel_job, continuation, pause_job, set_priority
+from pipeline.spool import Spool
+
+MOST_PRIORITY = 1000
+"""As on the command line."""
+
+
+class Action(NamedTuple):
+    """A button.
+
+    Attributes:
+        key: names it in addresses.
+        label: what is on it.
+        hint: what it will do, in a sentence.
+        confirm: what is asked before; empty: nothing.
+    """
+
+    key: str
+    label: str
+    hint: str
+    confirm: str = ""
+
+
+def actions_of(card: JobCard, *, has_runner: bool) -> tuple[Action, ...]:
+    """What can be asked of a job.
+
+    Args:
+        card: the job.
+        has_runner: whether somebody runs the queue.
+    """
+    state, queued = card.state, card.entry is not None
+    turn = "It goes on when its turn comes." if has_runner else "Nobody runs the queue: a runner starts for it."
+    resume = Action("resume", "Resume", turn)
+    retry = Action("retry", "Retry", f"The failed tasks are tried again. {turn}")
+    pause = Action(
+        "pause",
+        "Pause",
+        "What runs is finished first, and a simulation writes a checkpoint."
+        if state is JobState.RUNNING
+        else "It waits until it is resumed; other jobs go on.",
+    )
+    what = "stops at once" if state in (JobState.RUNNING, JobState.PAUSING) else "leaves the queue"
+    cancel = Action(
+        "cancel",
+        "Cancel",
+        f"It {what}. What is finished stays.",
+        f"{card.name} {what}. What is finished stays, and resuming continues from there.",
+    )
+    match state:
+        case JobState.RUNNING if queued:
+            again = Action("retry", "Retry", "Failed tasks are tried again as soon as the others have ended.")
+            return (pause, *([again] if card.failed else []), cancel)
+        case JobState.QUEUED:
+            return (pause, cancel)
+        case JobState.PAUSED | JobState.PAUSING:
+            return (resume, cancel)
+        case JobState.FAILED if queued:
+            return (retry, cancel)
+        case JobState.FAILED | JobState.INTERRUPTED:
+            return (resume,)
+        case _:
+            return (cancel,) if queued else ()
+
+
+def act(spool: Spool, name: str, action: str, value: str) -> str:
+    """Do what a button says.
+
+    Args:
+        spool: the farm's queue.
+        name: the job.
+        action: an Action's key, or "priority".
+        value: of a priority.
+
+    Returns:
+        What happens now, in a sentence.
+
+    Raises:
+        PipelineError: it cannot be done; says why.
+        OSError: the farm cannot be written to.
+    """
+    match action:
+        case "pause":
+            return f"{name} pauses{' as soon as what runs is finished' if pause_job(spool, name) else ''}"
+        case "cancel":
+            cancel_job(spool, name)
+            return f"{name} is cancelled; what is finished stays"
+        case "resume":
+            spool.enqueue(continuation(spool, name))
+            return f"{name} is queued{run_queue(spool)}"
+        case "retry":
+            spool.enqueue(another_try(spool, name, background=True))
+            return f"{name} is queued to try again{run_queue(spool)}"
+        case "priority":
+            set_priority(spool, name, _priority(value))
+            return f"{name} has priority {_priority(value)}"
+        case _:
+            raise PipelineError(f"a job cannot be asked to {action!a:.40}")
+
+
+def run_queue(spool: Spool) -> str:
+    """Start a runner in the background if there is none; returns the end of a sentence about it."""
+    pid = start_in_background(spool)
+    return "; the runner takes it when its turn comes" if pid is None else f"; a runner was started, process {pid}"
+
+
+def _priority(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = MOST_PRIORITY + 1
+    if abs(value) > MOST_PRIORITY:
+        raise PipelineError(f"a priority is a whole number from -{MOST_PRIORITY} to {MOST_PRIORITY}")
+    return value
