@@ -13,7 +13,6 @@ import psutil
 
 from pipeline.lease import LeaseHolder
 
-
 LEAST_BYTES = 16 * 2**20
 """Smaller processes only mind the others'; they compute nothing."""
 

@@ -21,7 +21,7 @@ from pipeline.manifest import Manifest
 from pipeline.parameter_set import ParameterSet
 from pipeline.receipts import Receipt
 from pipeline.scheduler_events import JobOutcome
-from pipeline.task import Task, TaskId, TaskState
+from pipeline.task import FailureKind, Task, TaskId, TaskState
 
 
 class Answer(NamedTuple):
@@ -110,7 +110,9 @@ def frame_job(layout: JobLayout, frames: int, *, message: str = "") -> list[Task
         manifest.record_plan(tasks)
         if message:
             number = manifest.start_attempt(tasks[0].id)
-            manifest.finish_attempt(tasks[0].id, number, message=message, state=TaskState.FAILED)
+            manifest.finish_attempt(
+                tasks[0].id, number, failure=FailureKind.FAILED, message=message, state=TaskState.FAILED
+            )
         manifest.end_run(JobOutcome.FAILED if message else JobOutcome.SUCCEEDED)
     return tasks
 
