@@ -3,9 +3,10 @@
 A farm of 10 jobs of 10,000 tasks each, written through the record itself: three run, with attempts that are open, the
 others are done, failed in part or not begun. The command `pipeline dashboard` serves it in a process of its own, and a
 client asks it over a connection of its own each time, as a browser's first request does. Milliseconds from before the
-connection to the first byte of the answer, and to its last; `first` is the first request of all, which draws from
-nothing, `median` and `most` are of the repeats; the server's processor time does not depend on what else runs. For `changing` a runner writes to each running job before each request,
-so that nothing that is kept helps. Promised: 200 ms for a whole page.
+connection to the first byte of the answer, and to its last; `first` is the first request of its kind, `median` and
+`most` are of the repeats. The server's processor time, mean of the repeats, does not depend on what else runs. For
+`changing` a runner writes to each running job before each request, so that nothing that is kept helps. Promised: 200 ms
+for a whole page.
 """
 
 from __future__ import annotations
