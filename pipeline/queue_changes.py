@@ -14,8 +14,17 @@ from pipeline.spool import QueuedJob, Spool, Wish, new_ticket, submission
 
 
 def queue_state(spool: Spool, job: QueuedJob) -> str:
-    """One word for where a job of the queue stands: running, queued, pausing, paused or failed."""
-    runs = live_holder(spool.layout(job.name).lease) is not None
+    """One word for where a job of the queue stands; see `state_of`."""
+    return state_of(job, runs=live_holder(spool.layout(job.name).lease) is not None)
+
+
+def state_of(job: QueuedJob, *, runs: bool) -> str:
+    """One word for where a job of the queue stands: running, queued, pausing, paused or failed.
+
+    Args:
+        job: its entry.
+        runs: whether somebody works in its folder.
+    """
     if job.wish is Wish.RUN:
         return "running" if runs else "queued"
     if job.wish is Wish.PAUSE:

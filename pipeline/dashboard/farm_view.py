@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -19,7 +20,7 @@ from pipeline.lease import LeaseHolder, live_holder
 from pipeline.manifest_glance import Version, glance, version_of
 from pipeline.manifest_pages import Busy
 from pipeline.manifest_reader import AttemptRow, LastRun, ManifestReader, StageSummary
-from pipeline.queue_changes import queue_state
+from pipeline.queue_changes import state_of
 from pipeline.scheduler_events import JobOutcome
 from pipeline.spool import QueuedJob, Spool
 
@@ -223,26 +224,29 @@ class FarmView:
         names = []
         with os.scandir(self.places.farm) as entries:
             for entry in entries:
-                layout = JobLayout(Path(entry.path))
-                if not entry.name.startswith(".") and (layout.job_file.is_file() or layout.manifest.is_file()):
+                if not entry.name.startswith(".") and _holds_job(JobLayout(Path(entry.path))):
                     names.append(entry.name)
         return sorted(names)
 
     def _card(self, name: str, entry: QueuedJob | None) -> JobCard:
         submitted = 0.0 if entry is None else entry.submitted
         try:
-            root = self.places.job(name)
-        except NotThereError as error:
+            return self._card_of(name, entry, JobLayout(self.places.job(name)), submitted)
+        except (NotThereError, OSError) as error:
             # Before its first run a queued job has no folder yet.
-            waits = entry is not None and entry.text is not None and not (self.places.farm / name).exists()
-            state = JobState.UNKNOWN if entry is None else JobState(queue_state(self.spool, entry))
+            waits = entry is not None and entry.text is not None and not os.path.lexists(self.places.farm / name)
+            state = JobState.UNKNOWN if entry is None else JobState(state_of(entry, runs=False))
             return JobCard(name, state, entry, None, Record(), "" if waits else str(error), submitted)
-        layout = JobLayout(root)
-        holder = live_holder(layout.lease)
+
+    def _card_of(self, name: str, entry: QueuedJob | None, layout: JobLayout, submitted: float) -> JobCard:
+        """Raises OSError if its folder cannot be read."""
+        holder = None
+        with suppress(NotThereError):
+            holder = live_holder(self.places.file(name, layout.lease.name))
         remembered = self._record(name, layout, runs=holder is not None)
         record, flaw = remembered.record, remembered.flaw
         if entry is not None:
-            state = JobState(queue_state(self.spool, entry))
+            state = JobState(state_of(entry, runs=holder is not None))
         elif holder is not None:
             state = JobState.RUNNING
         elif flaw:
@@ -321,6 +325,14 @@ def _long_tasks(
                 frames = max(manifest.frame_count(), made)
                 found[str(attempt.task)] = LongTask(made, made_now, frames, now - attempt.started)
     return found
+
+
+def _holds_job(layout: JobLayout) -> bool:
+    """Whether a folder is that of a job; one that may not be looked into is told of as if it were."""
+    try:
+        return layout.job_file.is_file() or layout.manifest.is_file()
+    except PermissionError:
+        return True
 
 
 def _state_of_outcome(outcome: str | None) -> JobState:

@@ -8,15 +8,19 @@ import shutil
 import signal
 import socket
 import sqlite3
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from dashboards import Client, dashboard, draw_frame, frame_job, wait_until
 from farm_processes import Farm
 from PIL import Image
 
+from pipeline.cli import main
+from pipeline.layout import JobLayout
 from pipeline.lease import live_holder
 from pipeline.manifest import Manifest
 from pipeline.manifest_reader import ManifestReader
@@ -383,6 +387,13 @@ def test_a_token_that_can_be_guessed_is_refused(farm: Farm, tmp_path: Path) -> N
 
 
 # --- what goes wrong ---
+def test_without_the_extra_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "uvicorn", None)  # as Python marks what it could not import
+    ended = CliRunner().invoke(main, ["dashboard", "--output", str(tmp_path)])
+    assert ended.exit_code == 1
+    assert "the dashboard needs uvicorn: install the extra" in ended.output
+
+
 def test_a_taken_port_names_a_free_one(farm: Farm) -> None:
     farm.spool.farm.mkdir()
     with socket.socket() as taken:
@@ -416,8 +427,14 @@ def test_a_signal_ends_it_in_order_while_films_are_played(farm: Farm, number: si
 
 
 def test_records_that_cannot_be_read_are_told_and_the_page_lives(farm: Farm) -> None:
-    for name in ("good", "damaged", "newer", "unfinished", "strange", "emptied"):
+    names = ("good", "damaged", "newer", "unfinished", "strange", "emptied", "piped", "foldered")
+    for name in names:
         frame_job(farm.layout(name), 2)
+    os.mkfifo(farm.layout("piped").lease)
+    farm.layout("piped").manifest.unlink()
+    os.mkfifo(farm.layout("piped").manifest)
+    farm.layout("foldered").lease.mkdir()
+    farm.layout("foldered").receipt(JobLayout.picture(0)).mkdir(parents=True)
     farm.layout("damaged").manifest.write_bytes(b"SQLite format 3\0" + bytes(range(256)) * 64)
     for name, change in (("newer", "PRAGMA user_version = 99"), ("strange", "UPDATE task SET state = 'dreaming'")):
         with sqlite3.connect(farm.layout(name).manifest) as connection:
@@ -437,8 +454,9 @@ def test_records_that_cannot_be_read_are_told_and_the_page_lives(farm: Farm) -> 
             "odd.json",
         ):
             assert sentence in listed, sentence
-        for name in ("good", "damaged", "newer", "unfinished", "strange", "emptied"):
+        for name in names:
             page_of(client, name)
+            assert client.ask(f"/jobs/{name}/frames/0/small").status == 404
             page_of(client, name, "?task=render/000000&page=3")
 
 

@@ -121,6 +121,7 @@ def test_it_fits_a_phone(farm: Farm, scheme: str) -> None:
 
 def test_a_dashboard_that_is_gone_is_told_and_one_that_is_back_goes_on(farm: Farm) -> None:
     frame_job(farm.layout("film"), 2)
+    farm.spool.put(submission("film"))
     with dashboard(farm) as (client, process), open_page() as page:
         page.goto(f"http://{client.place}/")
         process.terminate()
@@ -129,6 +130,8 @@ def test_a_dashboard_that_is_gone_is_told_and_one_that_is_back_goes_on(farm: Far
         port = client.place.partition(":")[2]
         again = farm.start("dashboard", "--port", port)
         until(page, "document.getElementById('trouble').hidden")
+        page.get_by_role("button", name="Pause").click()  # of another session than when the page was loaded
+        page.get_by_text("film pauses").wait_for(timeout=PATIENCE_MS)
         again.terminate()
         farm.finish(again)
 

@@ -82,7 +82,7 @@ async function act(form, button) {
   try {
     const answer = await fetch(form.action, {
       method: "POST",
-      headers: { Accept: "application/json", "X-Form-Token": document.querySelector("meta[name=form-token]").content },
+      headers: { Accept: "application/json" },
       body: new URLSearchParams(new FormData(form)),
     });
     toast((await answer.json()).message, !answer.ok);
