@@ -18,7 +18,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from pipeline.dashboard.access import Access
-from pipeline.dashboard.actions import act, actions_of, run_queue
+from pipeline.dashboard.actions import Queue, actions_of
 from pipeline.dashboard.farm_view import FarmView, JobCard, JobState, Kept
 from pipeline.dashboard.gate import REPORT_POLICY, Gate, form_of
 from pipeline.dashboard.job_view import STATE_GROUPS, Question, film_of, look_at_job
@@ -46,8 +46,8 @@ class Dashboard:
         """`farm` is the folder that holds the jobs' folders; it is there."""
         self.access = access
         self.places = Places(farm)
-        self.spool = Spool(farm.absolute())
-        self.view = FarmView(self.places, self.spool)
+        self.queue = Queue(Spool(farm.absolute()))
+        self.view = FarmView(self.places, self.queue.spool)
         self.machine = Machine(self.places.farm)
         self.pages = Pages()
         self._load = Kept(self.machine.load)
@@ -106,7 +106,7 @@ class Dashboard:
     def _farm(self, request: Request) -> dict[str, Part]:
         glance = self.view.glance()
         show_all = "all" in request.query_params
-        has_runner = glance.runner is not None
+        has_runner = glance.runner is not None or self.queue.is_starting
         settled = [job for job in glance.jobs if job.state in (JobState.DONE, JobState.UNKNOWN) and job.entry is None]
         hidden = set() if show_all else {job.name for job in settled[SETTLED_SHOWN:]}
         return self.pages.parts(
@@ -121,7 +121,7 @@ class Dashboard:
     def _job(self, request: Request) -> dict[str, Part]:
         card = self.view.job(request.path_params["name"])
         detail = look_at_job(self.places, card, Question.of(request.query_params))
-        has_runner = self.view.glance().runner is not None
+        has_runner = self.view.glance().runner is not None or self.queue.is_starting
         return self.pages.parts(
             JOB_PARTS,
             job=card,
@@ -138,6 +138,7 @@ class Dashboard:
             "load": self._load.get(),
             "host": platform.node(),
             "runner": glance.runner,
+            "starting": self.queue.is_starting,
             "stranded": glance.stranded,
             **self._common(request),
         }
@@ -204,14 +205,14 @@ class Dashboard:
 
         def ask() -> str:
             self.view.job(name)
-            return act(self.spool, name, action, form.get("value", ""))
+            return self.queue.act(name, action, form.get("value", ""))
 
         return await self._answer(request, ask, job_url(name))
 
     async def work(self, request: Request) -> Response:
         """Run the queue."""
         await self._own_form(request)
-        return await self._answer(request, lambda: f"the queue runs{run_queue(self.spool)}", "/")
+        return await self._answer(request, lambda: f"the queue runs{self.queue.run()}", "/")
 
     async def _own_form(self, request: Request) -> dict[str, str]:
         form = await form_of(request)
@@ -259,6 +260,7 @@ def _grouped(jobs: list[JobCard]) -> list[tuple[str, list[JobCard]]]:
         "Running": (JobState.RUNNING, JobState.PAUSING),
         "Waiting": (JobState.QUEUED,),
         "Need attention": (JobState.FAILED, JobState.PAUSED, JobState.INTERRUPTED, JobState.UNKNOWN),
+        "Stopped": (JobState.STOPPED,),
         "Done": (JobState.DONE,),
     }
     groups = [(heading, [job for job in jobs if job.state in states]) for heading, states in headings.items()]

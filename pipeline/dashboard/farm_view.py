@@ -44,7 +44,9 @@ class JobState(StrEnum):
     PAUSED = "paused"
     FAILED = "failed"
     INTERRUPTED = "interrupted"
-    """Its last run neither ended nor goes on: it was killed, or stopped and taken out of the queue."""
+    """Its last run neither ended nor goes on: it was killed."""
+    STOPPED = "stopped"
+    """It was cancelled, or stopped otherwise, and is not in the queue."""
     DONE = "done"
     UNKNOWN = "unknown"
     """Its record cannot be read."""
@@ -340,4 +342,4 @@ def _state_of_outcome(outcome: str | None) -> JobState:
         return JobState.DONE
     if outcome in (JobOutcome.FAILED, JobOutcome.TOO_MANY_FAILURES):
         return JobState.FAILED
-    return JobState.INTERRUPTED
+    return JobState.INTERRUPTED if outcome is None else JobState.STOPPED

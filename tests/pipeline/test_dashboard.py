@@ -189,6 +189,7 @@ def test_a_running_job_is_paused_resumed_and_cancelled(farm: Farm) -> None:
         assert client.post("/jobs/a/priority", value="many").status == 409
         assert client.post("/jobs/a/cancel").status == 200
         wait_until(lambda: farm.settled("a"), "it was never cancelled")
+        wait_until(lambda: 'class="pill is-stopped"' in page_of(client, "a"), "it is not shown as stopped")
 
 
 def test_a_failed_job_is_tried_again_and_comes_to_its_end(farm: Farm) -> None:
@@ -204,7 +205,10 @@ def test_a_failed_job_is_tried_again_and_comes_to_its_end(farm: Farm) -> None:
 def test_jobs_that_wait_without_a_runner_get_one(farm: Farm) -> None:
     queued_job(farm, "a")
     with dashboard(farm) as (client, _):
-        assert client.post("/work").status == 200
+        assert "a runner was started" in client.post("/work").json["message"]
+        again = client.post("/work").json["message"]  # before the first one is there, or after
+        assert "a runner is starting" in again or "the runner takes it" in again
+        assert "nobody runs the queue" not in client.ask("/").text
         wait_until(lambda: farm.settled("a"), "it never ran")
         assert client.post("/jobs/a/pause").status == 409
         assert client.post("/jobs/nobody/pause").status == 404

@@ -67,7 +67,7 @@ function toast(sentence, bad = false) {
 function confirmed(sentence, label) {
   const dialog = document.getElementById("confirm");
   dialog.querySelector("p").textContent = sentence;
-  dialog.querySelector(".danger").textContent = label;
+  dialog.querySelector(".danger").textContent = `${label} the job`;
   dialog.returnValue = "no";
   dialog.showModal();
   return new Promise((resolve) => {
