@@ -16,13 +16,8 @@ class StagePace(NamedTuple):
     stage: str
     ended_well: int
     mean_seconds: float | None  # of an attempt that ended well; None before there is one
-
-
-class Busy(NamedTuple):
-    """How long attempts worked in a span of time."""
-
-    seconds: dict[str, float]  # by stage; one beside another counts twice
-    since: float  # when the first of them was at work [s since the epoch]
+    busy_s: float = 0.0  # how long attempts worked in a span of time [s]; one beside another counts twice
+    busy_since: float | None = None  # when the first of these was at work in it [s since the epoch]
 
 
 class TaskRow(NamedTuple):
@@ -52,23 +47,23 @@ class TaskPage(NamedTuple):
 class PageQueries(ABC):
     """The queries; `pipeline.manifest_reader.ManifestReader` has them, and says what they raise."""
 
-    def stage_paces(self) -> dict[str, StagePace]:
-        """How fast each stage's planned tasks are, stages without an attempt that ended well left out."""
+    def stage_paces(self, since: float, until: float) -> dict[str, StagePace]:
+        """How fast each stage's planned tasks are; stages without an attempt left out.
+
+        Args:
+            since: wall time from which on it is told how busy the stage was [s since the epoch].
+            until: wall time up to which.
+        """
         rows = self._rows(
-            "SELECT stage, count(*), avg(seconds) FROM attempt JOIN task ON task.id = attempt.task"
-            " WHERE outcome = ? AND position IS NOT NULL GROUP BY stage",
-            ("succeeded",),
+            "WITH tried AS (SELECT stage, outcome = ?3 AS well, seconds,"
+            "   max(started, ?1) AS began, min(coalesce(finished, ?2), ?2) AS ended"
+            "   FROM attempt JOIN task ON task.id = attempt.task WHERE position IS NOT NULL)"
+            " SELECT stage, coalesce(sum(well), 0), avg(seconds) FILTER (WHERE well),"
+            "   coalesce(sum(ended - began) FILTER (WHERE ended > began), 0.0), min(began) FILTER (WHERE ended > began)"
+            " FROM tried GROUP BY stage",
+            (since, until, "succeeded"),
         )
         return {row.stage: row for row in map(StagePace._make, rows)}
-
-    def busy_seconds(self, since: float, until: float) -> Busy:
-        """How long attempts worked between two wall times."""
-        rows = self._rows(
-            "SELECT stage, sum(min(coalesce(finished, ?2), ?2) - max(started, ?1)), min(max(started, ?1)) FROM attempt"
-            " JOIN task ON task.id = attempt.task WHERE coalesce(finished, ?2) > ?1 AND started < ?2 GROUP BY stage",
-            (since, until),
-        )
-        return Busy({row[0]: float(row[1]) for row in rows}, min((float(row[2]) for row in rows), default=until))
 
     def artifacts_of(self, task: TaskId, *, since: float = 0.0) -> tuple[int, int]:
         """How many artifacts of a task there are, and how many of them were written after a wall time."""
@@ -90,14 +85,15 @@ class PageQueries(ABC):
         )
         return [(ArtifactPath(path), int(mtime_ns)) for path, mtime_ns in rows]
 
-    def count_in(self, folder: str, suffix: str) -> int:
-        """How many artifacts `newest_in` chooses from."""
+    def newest_and_count_in(self, folder: str, suffix: str) -> tuple[tuple[ArtifactPath, int] | None, int]:
+        """The first one that `newest_in` tells, or None, and of how many."""
         rows = self._rows(
-            "SELECT count(*) FROM artifact WHERE path > ?1 || '/' AND path < ?1 || '0'"
-            " AND substr(path, -length(?2)) = ?2",
+            "SELECT path, max(mtime_ns), count(*) FROM artifact WHERE path > ?1 || '/' AND path < ?1 || '0'"
+            " AND substr(path, -length(?2)) = ?2",  # beside max() SQLite takes the path from its row
             (folder, suffix),
         )
-        return int(rows[0][0])
+        path, mtime_ns, count = rows[0]
+        return None if path is None else (ArtifactPath(path), int(mtime_ns)), int(count)
 
     def task_page(
         self,

@@ -18,7 +18,6 @@ from pipeline.errors import ManifestError
 from pipeline.layout import JobLayout
 from pipeline.lease import LeaseHolder, live_holder
 from pipeline.manifest_glance import Version, glance, version_of
-from pipeline.manifest_pages import Busy
 from pipeline.manifest_reader import AttemptRow, LastRun, ManifestReader, StageSummary
 from pipeline.queue_changes import state_of
 from pipeline.scheduler_events import JobOutcome
@@ -291,20 +290,21 @@ def read_record(manifest: ManifestReader, *, runs: bool) -> Record:
     """
     now = time.time()
     summaries, running = manifest.summary(), tuple(manifest.running_attempts()) if runs else ()
-    pictures = manifest.newest_in("frames", ".png", limit=1)
-    busy = manifest.busy_seconds(now - WINDOW_S, now) if running else Busy({}, now)
-    window_s = max(1.0, now - busy.since) if running else 0.0
-    paces = manifest.stage_paces() if runs else {}
-    rows = stage_rows(summaries, paces, _long_tasks(manifest, summaries, running, now), busy.seconds, window_s)
+    picture, pictures = manifest.newest_and_count_in("frames", ".png")
+    paces = manifest.stage_paces(now - WINDOW_S, now) if runs else {}
+    busy_s = {pace.stage: pace.busy_s for pace in paces.values()}
+    since = min((pace.busy_since for pace in paces.values() if pace.busy_since is not None), default=now)
+    window_s = max(1.0, now - since) if running else 0.0
+    rows = stage_rows(summaries, paces, _long_tasks(manifest, summaries, running, now), busy_s, window_s)
     if not runs:  # what a killed run left as running waits
         rows = tuple(row._replace(running=0) for row in rows)
     return Record(
         stages=rows,
         last_run=manifest.last_run(),
         running=running,
-        picture=None if not pictures else picture_of(*pictures[0]),
-        pictures=manifest.count_in("frames", ".png") if pictures else 0,
-        left=remaining(rows, busy.seconds, window_s) if runs else None,
+        picture=None if picture is None else picture_of(*picture),
+        pictures=pictures,
+        left=remaining(rows, busy_s, window_s) if runs else None,
     )
 
 

@@ -104,8 +104,27 @@ def test_the_newest_frames_come_first_and_only_those_right_in_the_folder(layout:
             draw_frame(layout, manifest, tasks[k])
         found = manifest.newest_in("frames", ".png", limit=2)
         assert [path for path, _ in found] == ["frames/000000.png", "frames/000003.png"]
-        assert manifest.count_in("frames", ".png") == 3
-        assert manifest.count_in("frame", ".png") == manifest.count_in("frames", ".exr") == 0
+        assert manifest.newest_and_count_in("frames", ".png") == (found[0], 3)
+        assert (
+            manifest.newest_and_count_in("frame", ".png") == manifest.newest_and_count_in("frames", ".exr") == (None, 0)
+        )
+
+
+def test_a_stage_s_pace_is_that_of_its_attempts_and_its_work_that_of_a_span(layout: JobLayout) -> None:
+    tasks = frame_job(layout, 5)
+    with Manifest(layout.manifest) as manifest:
+        assert manifest.stage_paces(0.0, 1e10) == {}
+        for k, failure in enumerate((None, None, FailureKind.FAILED)):
+            number = manifest.start_attempt(tasks[k].id)
+            manifest.finish_attempt(tasks[k].id, number, failure=failure, seconds=2.0 + 2.0 * k)
+        manifest.start_attempt(tasks[3].id)
+        for k, (started, finished) in enumerate(((0.0, 90.0), (95.0, 110.0), (104.0, 109.0), (108.0, None))):
+            manifest._connection.execute(
+                "UPDATE attempt SET started = ?, finished = ? WHERE task = ?", (started, finished, tasks[k].id)
+            )
+        [pace] = manifest.stage_paces(100.0, 112.0).values()
+    assert (pace.ended_well, pace.mean_seconds) == (2, 3.0)
+    assert (pace.busy_s, pace.busy_since) == (10.0 + 5.0 + 4.0, 100.0)
 
 
 # --- estimates ---
