@@ -44,13 +44,15 @@ class Machine:
     _seconds: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        psutil.cpu_percent()  # the first call only begins to count
+        self._counted = _counted()
 
     def load(self) -> Load:
         """How busy it is. Raises OSError if the farm's disk does not answer."""
         disk = shutil.disk_usage(self.farm)
+        before, self._counted = self._counted, _counted()
+        busy, all_of_it = (now - then for now, then in zip(self._counted, before, strict=True))
         return Load(
-            processor=psutil.cpu_percent() / 100.0,
+            processor=min(1.0, max(0.0, busy / all_of_it)) if all_of_it > 0 else 0.0,
             memory=psutil.virtual_memory().percent / 100.0,
             disk_used=disk.used / disk.total if disk.total else 0.0,
             disk_free=disk.free,
@@ -78,3 +80,13 @@ class Machine:
             pass  # one that ends in this moment; the next look sees the others
         self._seconds = {pid: counted for pid, counted in (self._seconds | seen).items() if psutil.pid_exists(pid)}
         return found
+
+
+def _counted() -> tuple[float, float]:
+    """Processor time of all cores since the start [s]: busy, and all of it.
+
+    Not psutil's own percentage: that counts by the thread that asks, and requests come in ever other threads.
+    """
+    times = psutil.cpu_times()._asdict()
+    whole = sum(seconds for name, seconds in times.items() if not name.startswith("guest"))  # which user has, too
+    return whole - times["idle"] - times.get("iowait", 0.0), whole
