@@ -11,6 +11,7 @@ import click
 
 from pipeline import __version__
 from pipeline.commands.arguments import job_options, print_warnings, require_own_programs
+from pipeline.commands.dashboard import dashboard
 from pipeline.commands.exporting import export, run_stage
 from pipeline.commands.inspecting import explain, logs, plan, status
 from pipeline.commands.keeping import clean, verify
@@ -57,7 +58,7 @@ def main() -> None:
 
 for command in (
     *(submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report, still, animatic, compare, loop),
-    *(queue, watch, pause, cancel, retry, priority, work),
+    *(queue, watch, pause, cancel, retry, priority, work, dashboard),
     *(export, run_stage, view),
 ):
     main.add_command(command)

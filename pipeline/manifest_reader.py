@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 
 from pipeline.bulk import many_objects
 from pipeline.errors import ManifestError, OutdatedManifestError
+from pipeline.manifest_pages import PageQueries
 from pipeline.migrations import migrations, refuse_newer, schema_version
 from pipeline.parameter_set import ParameterSet
 from pipeline.task import ArtifactPath, TaskId, TaskState
@@ -102,7 +103,7 @@ class LastRun(NamedTuple):
     outcome: str | None  # a JobOutcome's value; None while it goes on, and if it was killed
 
 
-class ManifestReader:
+class ManifestReader(PageQueries):
     """Queries on the record. The connection belongs to the thread that opened it.
 
     Every query raises ManifestError when the file is damaged, its text naming the remedy, or cannot be read.
@@ -113,8 +114,16 @@ class ManifestReader:
         self._path = path
 
     @classmethod
-    def open_readonly(cls, path: Path) -> ManifestReader:
+    def open_readonly(
+        cls, path: Path, *, leave_no_trace: bool = False, timeout_s: float = BUSY_TIMEOUT_S
+    ) -> ManifestReader:
         """Open beside a working runner, or where the folder itself may only be read.
+
+        Args:
+            path: the manifest.
+            leave_no_trace: make no file beside one that nobody has open, as SQLite else does for its index. A runner
+                that starts meanwhile is not noticed then: see `pipeline.manifest_glance`.
+            timeout_s: how long to wait for another process's lock [s].
 
         Raises:
             ManifestError: there is none, it is damaged, or a newer program's.
@@ -124,10 +133,11 @@ class ManifestReader:
             raise ManifestError(f"{path}: no manifest; this job has not been submitted yet")
         log_exists = path.with_name(f"{path.name}-wal").exists()
         # A write-ahead log needs a place for its index; without a log there is nothing that could change beneath us.
-        immutable = not log_exists and not os.access(path.parent, os.W_OK)
+        may_make_files = os.access(path.parent, os.W_OK) and not (leave_no_trace and _has_log_format(path))
+        immutable = not log_exists and not may_make_files
         uri = f"{path.absolute().as_uri()}?mode=ro{'&immutable=1' if immutable else ''}"
         with clear_errors(path, "read"):
-            connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=BUSY_TIMEOUT_S)
+            connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=timeout_s)
         try:
             with clear_errors(path, "read"):
                 version = schema_version(connection)
@@ -270,6 +280,12 @@ class ManifestReader:
         """All rows of a query. Damage shows only at the page that it hit, so they are fetched here, under one roof."""
         with clear_errors(self._path, "read"):
             return self._connection.execute(query, parameters).fetchall()
+
+
+def _has_log_format(path: Path) -> bool:
+    """Whether a manifest is read through a write-ahead log: byte 18 of SQLite's header is 2 then."""
+    with path.open("rb") as file:
+        return file.read(19)[18:] == b"\2"
 
 
 def damaged(path: Path, finding: str) -> ManifestError:

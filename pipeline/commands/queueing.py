@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +23,7 @@ from pipeline.errors import ManifestError, OutdatedManifestError, PipelineError
 from pipeline.layout import JobLayout
 
 if TYPE_CHECKING:
-    from pipeline.spool import QueuedJob, Spool
+    from pipeline.spool import Spool
 
 
 @click.command()
@@ -40,13 +39,14 @@ def queue(output: Path, as_json: bool) -> None:
     from dataclasses import asdict
 
     from pipeline.lease import live_holder
+    from pipeline.queue_changes import queue_state
     from pipeline.spool import Spool
 
     spool = Spool(output.absolute())
     listing = spool.listing()
     holder = live_holder(spool.lease)
     flaws = [*listing.flaws]
-    rows = [(job, _state(spool, job), *_done_of(spool.layout(job.name), flaws)) for job in listing.jobs]
+    rows = [(job, queue_state(spool, job), *_done_of(spool.layout(job.name), flaws)) for job in listing.jobs]
     if as_json:
         jobs = [
             {
@@ -111,16 +111,10 @@ def pause(job: str, output: Path) -> None:
     \b
     pipeline pause quickstart
     """
-    from pipeline.spool import Wish
+    from pipeline.queue_changes import pause_job
 
     spool, name = place(job, output)
-    _entry(spool, name)  # before the lock, which would make a folder where there is none
-    with spool.locked():
-        entry = _entry(spool, name)
-        if entry.wish is Wish.NONE:
-            raise PipelineError(f"{name} has failed, and does not run; see: pipeline queue")
-        spool.change(name, wish=Wish.PAUSE, note="asked to pause")
-    runs = _state(spool, entry) == "running"
+    runs = pause_job(spool, name)
     click.echo(f"{name} {'pauses as soon as what runs is finished' if runs else 'pauses'}")
     click.echo(f"continue with: pipeline resume {_shown(spool, name)}")
 
@@ -133,9 +127,10 @@ def cancel(job: str, output: Path) -> None:
     \b
     pipeline cancel quickstart
     """
+    from pipeline.queue_changes import cancel_job
+
     spool, name = place(job, output)
-    if not spool.is_there() or not spool.drop(name):
-        raise _not_queued(spool, name)
+    cancel_job(spool, name)
     click.echo(f"{name} is cancelled; what is finished stays in {_shown(spool, name)}")
 
 
@@ -151,16 +146,11 @@ def retry(job: str, output: Path, detach: bool) -> None:
     pipeline retry quickstart
     pipeline retry quickstart --detach
     """
-    from dataclasses import replace
-
     from pipeline.commands.turns import stand_in_queue
-    from pipeline.spool import Wish, new_ticket
+    from pipeline.queue_changes import another_try
 
     spool, name = place(job, output)
-    entry = _entry(spool, name)
-    if entry.wish is Wish.RUN and _state(spool, entry) != "running":
-        raise PipelineError(f"{name} waits for its turn already; see: pipeline queue")
-    again = replace(entry, ticket=new_ticket(), wish=Wish.RUN, note="", submitted=time.time(), background=detach)
+    again = another_try(spool, name, background=detach)
     sys.exit(stand_in_queue(spool, JobLayout(Path(_shown(spool, name))), again, detach=detach))
 
 
@@ -175,9 +165,10 @@ def priority(job: str, output: Path, value: int) -> None:
     pipeline priority quickstart 10
     pipeline priority quickstart -- -5
     """
+    from pipeline.queue_changes import set_priority
+
     spool, name = place(job, output)
-    _entry(spool, name)
-    spool.change(name, priority=value)
+    set_priority(spool, name, value)
     click.echo(f"{name} has priority {value}")
 
 
@@ -217,37 +208,10 @@ def place(job: str, output: Path) -> tuple[Spool, str]:
     return Spool(root.parent), root.name
 
 
-def _entry(spool: Spool, name: str) -> QueuedJob:
-    entry = spool.find(name)
-    if entry is None:
-        raise _not_queued(spool, name)
-    return entry
-
-
-def _not_queued(spool: Spool, name: str) -> PipelineError:
-    known = ", ".join(job.name for job in spool.listing().jobs)
-    return PipelineError(
-        f'"{name}" is not in the queue of {spool.farm}; {f"in it: {known}" if known else "it is empty"}'
-    )
-
-
 def _shown(spool: Spool, name: str) -> str:
     from pipeline.commands.turns import as_given
 
     return str(as_given(spool.layout(name)).root)
-
-
-def _state(spool: Spool, job: QueuedJob) -> str:
-    """One word for where a job of the queue stands."""
-    from pipeline.lease import live_holder
-    from pipeline.spool import Wish
-
-    runs = live_holder(spool.layout(job.name).lease) is not None
-    if job.wish is Wish.RUN:
-        return "running" if runs else "queued"
-    if job.wish is Wish.PAUSE:
-        return "pausing" if runs else "paused"
-    return "failed"
 
 
 def _done_of(layout: JobLayout, flaws: list[str]) -> tuple[int, int]:

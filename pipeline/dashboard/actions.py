@@ -1,0 +1,156 @@
+"""What can be asked of a job where it stands, what that will do, and doing it."""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import psutil
+
+from pipeline.dashboard.farm_view import JobCard, JobState
+from pipeline.errors import PipelineError
+from pipeline.farm import start_in_background
+from pipeline.lease import live_holder
+from pipeline.queue_changes import another_try, cancel_job, continuation, pause_job, set_priority
+from pipeline.spool import Spool
+
+MOST_PRIORITY = 1000
+"""As on the command line."""
+START_S = 60.0
+"""A runner that has not taken the queue after this time [s] does not start."""
+
+
+class Action(NamedTuple):
+    """A button.
+
+    Attributes:
+        key: names it in addresses.
+        label: what is on it.
+        hint: what it will do, in a sentence.
+        confirm: what is asked before; empty: nothing.
+    """
+
+    key: str
+    label: str
+    hint: str
+    confirm: str = ""
+
+
+def actions_of(card: JobCard, *, has_runner: bool) -> tuple[Action, ...]:
+    """What can be asked of a job.
+
+    Args:
+        card: the job.
+        has_runner: whether somebody runs the queue.
+    """
+    state, queued = card.state, card.entry is not None
+    turn = "It goes on when its turn comes." if has_runner else "Nobody runs the queue: a runner starts for it."
+    resume = Action("resume", "Resume", turn)
+    retry = Action("retry", "Retry", f"The failed tasks are tried again. {turn}")
+    pause = Action(
+        "pause",
+        "Pause",
+        "What runs is finished first, and a simulation writes a checkpoint."
+        if state is JobState.RUNNING
+        else "It waits until it is resumed; other jobs go on.",
+    )
+    what = "stops at once" if state in (JobState.RUNNING, JobState.PAUSING) else "leaves the queue"
+    cancel = Action(
+        "cancel",
+        "Cancel",
+        f"It {what}. What is finished stays.",
+        f"{card.name} {what}. What is finished stays, and resuming continues from there.",
+    )
+    match state:
+        case JobState.RUNNING if queued:
+            again = Action("retry", "Retry", "Failed tasks are tried again as soon as the others have ended.")
+            return (pause, *([again] if card.failed else []), cancel)
+        case JobState.QUEUED:
+            return (pause, cancel)
+        case JobState.PAUSED | JobState.PAUSING:
+            return (resume, cancel)
+        case JobState.FAILED if queued:
+            return (retry, cancel)
+        case JobState.FAILED | JobState.INTERRUPTED | JobState.STOPPED:
+            return (resume,)
+        case _:
+            return (cancel,) if queued else ()
+
+
+class Queue:
+    """Does what buttons say, and starts runners; of a runner that it has started it knows before that holds the lease.
+
+    Attributes:
+        spool: the farm's queue.
+    """
+
+    def __init__(self, spool: Spool) -> None:
+        self.spool = spool
+        self._started: tuple[int, float] | None = None
+
+    def act(self, name: str, action: str, value: str) -> str:
+        """Do what a button says.
+
+        Args:
+            name: the job.
+            action: an Action's key, or "priority".
+            value: of a priority.
+
+        Returns:
+            What happens now, in a sentence.
+
+        Raises:
+            PipelineError: it cannot be done; says why.
+            OSError: the farm cannot be written to.
+        """
+        match action:
+            case "pause":
+                return f"{name} pauses{' as soon as what runs is finished' if pause_job(self.spool, name) else ''}"
+            case "cancel":
+                cancel_job(self.spool, name)
+                return f"{name} is cancelled; what is finished stays"
+            case "resume":
+                self.spool.enqueue(continuation(self.spool, name))
+                return f"{name} is queued{self.run()}"
+            case "retry":
+                self.spool.enqueue(another_try(self.spool, name, background=True))
+                return f"{name} is queued to try again{self.run()}"
+            case "priority":
+                set_priority(self.spool, name, _priority(value))
+                return f"{name} has priority {_priority(value)}"
+            case _:
+                raise PipelineError(f"a job cannot be asked to {action!a:.40}")
+
+    def run(self) -> str:
+        """Start a runner in the background if there is none; returns the end of a sentence about it."""
+        if self.is_starting:
+            return "; a runner is starting"
+        pid = start_in_background(self.spool)
+        if pid is None:
+            return "; the runner takes it when its turn comes"
+        self._started = pid, time.monotonic()
+        return f"; a runner was started, process {pid}"
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether a runner that was started here lives, and may not hold the queue's lease yet."""
+        if self._started is None:
+            return False
+        pid, began = self._started
+        try:
+            lives = psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+        except psutil.NoSuchProcess:
+            lives = False
+        if not lives or time.monotonic() - began > START_S or live_holder(self.spool.lease) is not None:
+            self._started = None
+        return self._started is not None
+
+
+def _priority(text: str) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = MOST_PRIORITY + 1
+    if abs(value) > MOST_PRIORITY:
+        raise PipelineError(f"a priority is a whole number from -{MOST_PRIORITY} to {MOST_PRIORITY}")
+    return value

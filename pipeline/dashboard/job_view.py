@@ -1,0 +1,261 @@
+"""What the dashboard shows of one job: tasks by the page, one task's story, frames, its film, what works on it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from pipeline.dashboard.farm_view import JobCard, Picture, picture_of
+from pipeline.dashboard.places import NotThereError, Places
+from pipeline.errors import ManifestError
+from pipeline.layout import JobLayout
+from pipeline.manifest_glance import glance
+from pipeline.manifest_pages import TaskPage, TaskRow
+from pipeline.manifest_reader import AttemptRow, EventRow, ManifestReader
+from pipeline.task import TaskId, TaskState
+
+PAGE_TASKS = 50
+PAGE_PICTURES = 24
+EVENTS = 12
+LOG_BYTES = 24 * 1024
+LONGEST_TEXT = 200
+MOST_PAGES = 1_000_000
+
+STATE_GROUPS: Mapping[str, tuple[TaskState, ...]] = {
+    "running": (TaskState.RUNNING,),
+    "failed": (TaskState.FAILED, TaskState.UPSTREAM_FAILED),
+    "waiting": (TaskState.PENDING, TaskState.READY, TaskState.CANCELLED),
+    "done": (TaskState.SUCCEEDED, TaskState.UP_TO_DATE),
+}
+"""What the list of tasks can be narrowed down to."""
+
+FILM_SUFFIXES = (".mp4", ".mov")
+
+
+class Question(NamedTuple):
+    """What of a job is asked for, as the address of its page says.
+
+    Attributes:
+        stage: tasks of this stage only; empty: of all.
+        state: a key of STATE_GROUPS; empty: in any state.
+        text: tasks whose id contains this.
+        page: of the tasks, from 1.
+        pictures: page of the frames, from 1.
+        task: the task whose story is told; empty: none.
+        attempt: whose log is shown; 0: the last one.
+    """
+
+    stage: str = ""
+    state: str = ""
+    text: str = ""
+    page: int = 1
+    pictures: int = 1
+    task: str = ""
+    attempt: int = 0
+
+    @classmethod
+    def of(cls, query: Mapping[str, str]) -> Question:
+        """Read an address's query; what makes no sense counts as not said."""
+        state = query.get("state", "")
+        return cls(
+            stage=query.get("stage", "")[:LONGEST_TEXT],
+            state=state if state in STATE_GROUPS else "",
+            text=query.get("text", "").strip()[:LONGEST_TEXT],
+            page=_number(query.get("page", ""), 1),
+            pictures=_number(query.get("pictures", ""), 1),
+            task=query.get("task", "")[:LONGEST_TEXT],
+            attempt=_number(query.get("attempt", ""), 0),
+        )
+
+
+class Film(NamedTuple):
+    """A film that can be played.
+
+    Attributes:
+        path: relative to the job's folder.
+        version: changes with it.
+        finished: whether it is the whole film, not what there is so far.
+        size: [bytes].
+        is_playable: whether browsers play it; ProRes they do not.
+    """
+
+    path: str
+    version: int
+    finished: bool
+    size: int
+    is_playable: bool
+
+
+class Work(NamedTuple):
+    """A running attempt. `share` is how far it is by its mean so far [-], None if that is not known."""
+
+    task: TaskId
+    attempt: int
+    host: str
+    elapsed_s: float
+    share: float | None
+
+
+class Story(NamedTuple):
+    """One task: its row, its attempts, last first, and the end of a log, with the size of all of it [bytes]."""
+
+    row: TaskRow
+    attempts: list[AttemptRow]
+    shown: int
+    log: str
+    log_bytes: int
+
+
+@dataclass(frozen=True)
+class JobDetail:
+    """A job as its page shows it.
+
+    Attributes:
+        card: what the list knows of it.
+        question: what was asked for.
+        tasks: the asked page of its tasks.
+        story: of the asked task; None if none was asked for, or there is none of the name.
+        pictures: the asked page of its frames, newest first.
+        film: the film, or what there is of it.
+        has_report: whether its report has been written.
+        events: the last ones, newest first.
+        work: what is being worked on.
+    """
+
+    card: JobCard
+    question: Question
+    tasks: TaskPage
+    story: Story | None
+    pictures: list[Picture]
+    film: Film | None
+    has_report: bool
+    events: list[EventRow]
+    work: list[Work]
+
+    @property
+    def task_pages(self) -> int:
+        """How many pages its tasks have."""
+        return max(1, -(-self.tasks.total // PAGE_TASKS))
+
+    @property
+    def picture_pages(self) -> int:
+        """How many pages its frames have."""
+        return max(1, -(-self.card.record.pictures // PAGE_PICTURES))
+
+
+class _Found(NamedTuple):
+    tasks: TaskPage
+    pictures: list[Picture]
+    events: list[EventRow]
+    row: TaskRow | None
+    attempts: list[AttemptRow]
+
+
+_NOTHING = _Found(TaskPage([], 0), [], [], None, [])
+
+
+def look_at_job(places: Places, card: JobCard, question: Question) -> JobDetail:
+    """Look at a job's folder; of a record that cannot be read nothing is shown, the card says why."""
+    layout = JobLayout(places.farm / card.name)
+    found = _NOTHING
+    if not card.flaw and card.total:
+        try:
+            found = glance(layout.manifest, lambda manifest: _ask(manifest, question))
+        except (ManifestError, OSError, ValueError):
+            found = _NOTHING  # changed since the card was made; the next look says what it is
+    return JobDetail(
+        card=card,
+        question=question,
+        tasks=found.tasks,
+        story=_story(places, card, question, found),
+        pictures=found.pictures,
+        film=film_of(places, card),
+        has_report=_is_file(places, card.name, layout.report.name),
+        events=found.events[::-1],
+        work=_work(card),
+    )
+
+
+def _ask(manifest: ManifestReader, question: Question) -> _Found:
+    states = STATE_GROUPS.get(question.state, ())
+    tasks = manifest.task_page(
+        stage=question.stage or None,
+        states=states,
+        text=question.text,
+        limit=PAGE_TASKS,
+        offset=(question.page - 1) * PAGE_TASKS,
+    )
+    pictures = manifest.newest_in("frames", ".png", limit=PAGE_PICTURES, offset=(question.pictures - 1) * PAGE_PICTURES)
+    row = None
+    if question.task:
+        row = next((row for row in tasks.rows if row.task == question.task), None) or next(
+            (row for row in manifest.task_page(text=question.task, limit=500).rows if row.task == question.task), None
+        )
+    return _Found(
+        tasks=tasks,
+        pictures=[picture for each in pictures if (picture := picture_of(*each)) is not None],
+        events=manifest.events(limit=EVENTS),
+        row=row,
+        attempts=[] if row is None else manifest.history(row.task)[::-1],
+    )
+
+
+def _story(places: Places, card: JobCard, question: Question, found: _Found) -> Story | None:
+    if found.row is None:
+        return None
+    shown = next((each for each in found.attempts if each.number == question.attempt), None)
+    shown = shown or (found.attempts[0] if found.attempts else None)
+    log, size = "", 0
+    if shown is not None and shown.log:
+        try:
+            log, size = places.tail(card.name, shown.log, LOG_BYTES)
+        except (NotThereError, OSError):
+            log = ""  # cleaned away, or not begun
+    return Story(found.row, found.attempts, 0 if shown is None else shown.number, log, size)
+
+
+def _work(card: JobCard) -> list[Work]:
+    now = time.time()
+    stages = {stage.name: stage for stage in card.record.stages}
+    work = []
+    for attempt in card.record.running:
+        stage = stages.get(attempt.task.partition("/")[0])
+        elapsed_s = max(0.0, now - attempt.started)
+        share = None
+        if stage is not None and stage.frames is not None:
+            share = stage.frames[0] / max(1, stage.frames[1])
+        elif stage is not None and stage.mean_s:
+            share = min(0.97, elapsed_s / stage.mean_s)  # a mean is no promise
+        work.append(Work(attempt.task, attempt.number, attempt.host, elapsed_s, share))
+    return work
+
+
+def film_of(places: Places, card: JobCard) -> Film | None:
+    """The finished film of a job that is done, else the newer one of a film and the film so far."""
+    try:
+        root = places.job(card.name)
+        names = [str(JobLayout.movie(suffix)) for suffix in FILM_SUFFIXES]
+        names += sorted(path.name for path in root.glob("[!.]*-so-far.mp4"))[:1]
+        films = []
+        for name in names:
+            if _is_file(places, card.name, name):
+                status = (root / name).stat()
+                finished = not name.endswith("-so-far.mp4")
+                films.append(Film(name, status.st_mtime_ns, finished, status.st_size, not name.endswith(".mov")))
+    except (OSError, NotThereError):
+        return None  # one goes in this moment, as at the end of a run
+    return max(films, key=lambda film: (card.state == "done" and film.finished, film.version), default=None)
+
+
+def _is_file(places: Places, name: str, relative: str) -> bool:
+    try:
+        places.file(name, relative)
+    except NotThereError:
+        return False
+    return True
+
+
+def _number(text: str, least: int) -> int:
+    return min(max(int(text), least), MOST_PAGES) if text.isascii() and text.isdecimal() and len(text) < 9 else least

@@ -1,0 +1,92 @@
+"""How busy this machine is, and the processes of a job on it."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+
+from pipeline.lease import LeaseHolder
+
+LEAST_BYTES = 16 * 2**20
+"""Smaller processes only mind the others'; they compute nothing."""
+
+
+class Load(NamedTuple):
+    """The machine at a moment: shares [-], free disk space [bytes], cores."""
+
+    processor: float
+    memory: float
+    disk_used: float
+    disk_free: int
+    cores: int
+
+
+class Process(NamedTuple):
+    """A process of a run: what it takes of the processor [cores] and of the memory [bytes]."""
+
+    pid: int
+    role: str
+    cores: float
+    memory_bytes: int
+
+
+@dataclass
+class Machine:
+    """Looks at this machine; processor time is that since the look before."""
+
+    farm: Path
+    _seconds: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._counted = _counted()
+
+    def load(self) -> Load:
+        """How busy it is. Raises OSError if the farm's disk does not answer."""
+        disk = shutil.disk_usage(self.farm)
+        before, self._counted = self._counted, _counted()
+        busy, all_of_it = (now - then for now, then in zip(self._counted, before, strict=True))
+        return Load(
+            processor=min(1.0, max(0.0, busy / all_of_it)) if all_of_it > 0 else 0.0,
+            memory=psutil.virtual_memory().percent / 100.0,
+            disk_used=disk.used / disk.total if disk.total else 0.0,
+            disk_free=disk.free,
+            cores=psutil.cpu_count() or 1,
+        )
+
+    def processes(self, holder: LeaseHolder | None) -> list[Process]:
+        """The runner that holds a job and its workers; none if it runs on another machine."""
+        if holder is None or holder.host != platform.node():
+            return []
+        now, found, seen = time.monotonic(), [], {}
+        try:
+            runner = psutil.Process(holder.pid)
+            for process in (runner, *runner.children(recursive=True)):
+                times = process.cpu_times()
+                spent = times.user + times.system
+                before = self._seconds.get(process.pid, (now, spent))
+                cores = (spent - before[1]) / (now - before[0]) if now > before[0] else 0.0
+                seen[process.pid] = now, spent
+                role = "runner" if process.pid == holder.pid else "worker"
+                memory_bytes = process.memory_info().rss
+                if memory_bytes >= LEAST_BYTES:
+                    found.append(Process(process.pid, role, max(0.0, cores), memory_bytes))
+        except psutil.Error:
+            pass  # one that ends in this moment; the next look sees the others
+        self._seconds = {pid: counted for pid, counted in (self._seconds | seen).items() if psutil.pid_exists(pid)}
+        return found
+
+
+def _counted() -> tuple[float, float]:
+    """Processor time of all cores since the start [s]: busy, and all of it.
+
+    Not psutil's own percentage: that counts by the thread that asks, and requests come in ever other threads.
+    """
+    times = psutil.cpu_times()._asdict()
+    whole = sum(seconds for name, seconds in times.items() if not name.startswith("guest"))  # which user has, too
+    return whole - times["idle"] - times.get("iowait", 0.0), whole

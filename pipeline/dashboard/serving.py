@@ -1,0 +1,108 @@
+"""Listening, and serving until somebody ends it."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import logging
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+import uvicorn
+from starlette.types import ASGIApp
+
+from pipeline.dashboard.access import is_address
+from pipeline.errors import PipelineError
+
+GRACE_S = 2
+"""So long an answer may still take once the end is asked for [s]; a film that is played would take for ever."""
+MOST_CONNECTIONS = 512
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens on an address; port 0: on any free one.
+
+    Raises:
+        PipelineError: the port is taken, or the address is none of this machine; names what would do.
+    """
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except (socket.gaierror, UnicodeError) as error:
+        raise PipelineError(f"--host {host}: no such address") from error
+    listening = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(address)
+        listening.listen(128)
+    except OSError as error:
+        listening.close()
+        if error.errno == errno.EADDRINUSE:
+            free = listen(host, 0)
+            with free:
+                number = free.getsockname()[1]
+            raise PipelineError(f"port {port} is taken; {number} is free: --port {number}, or --port 0") from error
+        if error.errno == errno.EACCES:
+            raise PipelineError(f"port {port} may not be used by this user; use one from 1024 on") from error
+        raise PipelineError(f"cannot listen on {host}: {error.strerror}") from error
+    return listening
+
+
+def serve(application: ASGIApp, listening: socket.socket, ready: Callable[[], None] = lambda: None) -> None:
+    """Answer requests until Ctrl-C or a signal TERM; returns then.
+
+    Args:
+        application: answers them.
+        listening: where they arrive; closed at the end.
+        ready: called when the first one would be answered.
+    """
+    config = uvicorn.Config(
+        application,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        ws="none",
+        lifespan="off",
+        limit_concurrency=MOST_CONNECTIONS,
+        timeout_graceful_shutdown=GRACE_S,
+        proxy_headers=False,
+    )
+    with listening:
+        Server(config, ready).run(sockets=[listening])
+
+
+class Server(uvicorn.Server):
+    """A server that a signal ends as any other work: in order, and without being killed by that signal afterwards."""
+
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._ready = ready
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to answer."""
+        await super().startup(sockets)
+        self._ready()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Take note of a signal. What is cut off now, such as a film that is played, is no error to be told of."""
+        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
+        super().handle_exit(sig, frame)
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Take SIGINT and SIGTERM for the wish to end, inside the block."""
+        before = {number: signal.signal(number, self.handle_exit) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def address_of(listening: socket.socket, host: str) -> str:
+    """The address of the farm's page, as a browser takes it."""
+    stands_for_all = is_address(host) and ipaddress.ip_address(host).is_unspecified
+    shown = socket.gethostname() if stands_for_all else host
+    return f"http://{f'[{shown}]' if ':' in shown else shown}:{listening.getsockname()[1]}/"

@@ -1,0 +1,286 @@
+"""What the dashboard is made of: glances at records, estimates, places, small pictures, who may use it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from dashboards import draw_frame, frame_job
+
+from pipeline.dashboard.access import Access, host_of
+from pipeline.dashboard.estimates import LongTask, remaining, stage_rows
+from pipeline.dashboard.farm_view import Kept, read_record
+from pipeline.dashboard.machine import Machine
+from pipeline.dashboard.places import NotThereError, Places
+from pipeline.dashboard.thumbnails import Thumbnails
+from pipeline.errors import ManifestError
+from pipeline.layout import JobLayout
+from pipeline.manifest import Manifest
+from pipeline.manifest_glance import glance
+from pipeline.manifest_pages import StagePace
+from pipeline.manifest_reader import ManifestReader, StageSummary
+from pipeline.task import FailureKind, TaskId, TaskState
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> JobLayout:
+    return JobLayout(tmp_path / "film")
+
+
+# --- glances ---
+def test_a_glance_makes_no_file_and_sees_what_a_runner_wrote_last(layout: JobLayout) -> None:
+    tasks = frame_job(layout, 3)
+    before = sorted(layout.root.iterdir())
+    assert len(glance(layout.manifest, ManifestReader.states)) == 3
+    assert sorted(layout.root.iterdir()) == before
+    with Manifest(layout.manifest) as manifest:
+        manifest.set_states({tasks[1].id: TaskState.RUNNING})
+        assert glance(layout.manifest, ManifestReader.states)[tasks[1].id] is TaskState.RUNNING
+
+
+def test_a_record_that_changes_during_a_glance_is_read_once_more(layout: JobLayout) -> None:
+    tasks = frame_job(layout, 3)
+    seen = []
+
+    def query(manifest: ManifestReader) -> TaskState:
+        seen.append(manifest.states()[tasks[0].id])
+        if len(seen) == 1:
+            with Manifest(layout.manifest) as runner:
+                runner.set_states({tasks[0].id: TaskState.FAILED})
+        return seen[-1]
+
+    assert glance(layout.manifest, query) is TaskState.FAILED
+    assert seen == [TaskState.PENDING, TaskState.FAILED]
+
+
+def test_a_record_that_is_damaged_is_so_after_one_try(layout: JobLayout) -> None:
+    frame_job(layout, 3)
+    layout.manifest.write_bytes(b"SQLite format 3\0" + bytes(4096))
+    with pytest.raises(ManifestError, match="damaged"):
+        glance(layout.manifest, ManifestReader.states)
+
+
+def test_readers_in_many_threads_never_keep_a_runner_from_writing(layout: JobLayout) -> None:
+    tasks = frame_job(layout, 200)
+    ended, counts = threading.Event(), []
+
+    def look() -> None:
+        while not ended.is_set():
+            counts.append(glance(layout.manifest, lambda manifest: read_record(manifest, runs=True)).stages[0].total)
+
+    threads = [threading.Thread(target=look) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for task in tasks[:40]:
+        with Manifest(layout.manifest) as manifest:  # opened and closed again: its log comes and goes
+            number = manifest.start_attempt(task.id)
+            manifest.finish_attempt(task.id, number, state=TaskState.SUCCEEDED)
+    ended.set()
+    for thread in threads:
+        thread.join()
+    assert set(counts) == {200}
+    assert glance(layout.manifest, lambda manifest: read_record(manifest, runs=False)).stages[0].done == 40
+
+
+def test_a_page_of_tasks_has_their_last_attempts_in_the_order_of_the_plan(layout: JobLayout) -> None:
+    tasks = frame_job(layout, 30)
+    with Manifest(layout.manifest) as manifest:
+        for failure in (FailureKind.TIMED_OUT, FailureKind.FAILED):
+            number = manifest.start_attempt(tasks[12].id)
+            manifest.finish_attempt(tasks[12].id, number, failure=failure, message=failure, state=TaskState.FAILED)
+        page = manifest.task_page(limit=10, offset=10)
+        assert ([row.task for row in page.rows], page.total) == ([task.id for task in tasks[10:20]], 30)
+        assert (page.rows[2].attempt, page.rows[2].message) == (2, "failed")
+        assert page.rows[3].attempt is None
+        assert [row.task for row in manifest.task_page(states=(TaskState.FAILED,)).rows] == [tasks[12].id]
+        assert manifest.task_page(text="00001").total == 11
+        assert manifest.task_page(text="%").total == manifest.task_page(stage="other").total == 0
+
+
+def test_the_newest_frames_come_first_and_only_those_right_in_the_folder(layout: JobLayout) -> None:
+    tasks = frame_job(layout, 5)
+    with Manifest(layout.manifest) as manifest:
+        for k in (1, 3, 0):
+            draw_frame(layout, manifest, tasks[k])
+        found = manifest.newest_in("frames", ".png", limit=2)
+        assert [path for path, _ in found] == ["frames/000000.png", "frames/000003.png"]
+        assert manifest.newest_and_count_in("frames", ".png") == (found[0], 3)
+        assert (
+            manifest.newest_and_count_in("frame", ".png") == manifest.newest_and_count_in("frames", ".exr") == (None, 0)
+        )
+
+
+def test_a_stage_s_pace_is_that_of_its_attempts_and_its_work_that_of_a_span(layout: JobLayout) -> None:
+    tasks = frame_job(layout, 5)
+    with Manifest(layout.manifest) as manifest:
+        assert manifest.stage_paces(0.0, 1e10) == {}
+        for k, failure in enumerate((None, None, FailureKind.FAILED)):
+            number = manifest.start_attempt(tasks[k].id)
+            manifest.finish_attempt(tasks[k].id, number, failure=failure, seconds=2.0 + 2.0 * k)
+        manifest.start_attempt(tasks[3].id)
+        for k, (started, finished) in enumerate(((0.0, 90.0), (95.0, 110.0), (104.0, 109.0), (108.0, None))):
+            manifest._connection.execute(
+                "UPDATE attempt SET started = ?, finished = ? WHERE task = ?", (started, finished, tasks[k].id)
+            )
+        [pace] = manifest.stage_paces(100.0, 112.0).values()
+    assert (pace.ended_well, pace.mean_seconds) == (2, 3.0)
+    assert (pace.busy_s, pace.busy_since) == (10.0 + 5.0 + 4.0, 100.0)
+
+
+# --- estimates ---
+def test_what_is_left_is_shared_by_those_that_work_beside_each_other() -> None:
+    summaries = [StageSummary("render", {TaskState.SUCCEEDED: 10, TaskState.RUNNING: 2, TaskState.PENDING: 8})]
+    paces = {"render": StagePace("render", 10, 6.0)}
+    rows = stage_rows(summaries, paces, {}, {"render": 240.0}, 120.0)
+    assert rows[0].work_s == 60.0  # ten of six seconds
+    assert rows[0].remaining_s == 30.0  # two at once
+    left = remaining(rows, {"render": 240.0}, 120.0)
+    assert left is not None
+    assert (left.seconds, left.at_least) == (30.0, False)
+
+
+def test_a_stage_without_a_pace_makes_it_at_least() -> None:
+    summaries = [
+        StageSummary("render", {TaskState.SUCCEEDED: 1, TaskState.RUNNING: 1}),
+        StageSummary("movie", {TaskState.PENDING: 1}),
+    ]
+    left = remaining(stage_rows(summaries, {"render": StagePace("render", 1, 6.0)}, {}, {}, 0.0), {}, 0.0)
+    assert left is not None
+    assert (left.seconds, left.at_least) == (6.0, True)
+    assert remaining(stage_rows(summaries[1:], {}, {}, {}, 0.0), {}, 0.0) is None
+
+
+def test_a_simulation_is_as_far_as_its_frames_and_as_fast_as_this_attempt() -> None:
+    continued = LongTask(made=60, made_now=10, of=100, elapsed_s=20.0)
+    assert (continued.share, continued.remaining_s) == (0.6, 80.0)
+    assert continued._replace(made_now=1).remaining_s is None
+    [row] = stage_rows([StageSummary("simulate", {TaskState.RUNNING: 1})], {}, {"simulate": continued}, {}, 0.0)
+    assert (row.share, row.frames, row.remaining_s) == (0.6, (60, 100), 80.0)
+
+
+def test_what_failed_is_no_work_that_is_left() -> None:
+    counts = {TaskState.SUCCEEDED: 1, TaskState.FAILED: 2, TaskState.UPSTREAM_FAILED: 3}
+    [row] = stage_rows([StageSummary("render", counts)], {"render": StagePace("render", 1, 6.0)}, {}, {}, 0.0)
+    assert (row.done, row.failed, row.blocked, row.waiting, row.work_s) == (1, 2, 3, 0, 0.0)
+
+
+def test_a_long_task_is_known_by_the_record_of_its_job(layout: JobLayout) -> None:
+    from benchmarks.dashboard import build, plan
+
+    build(layout, plan(21), 0.0, runs=True)
+    with Manifest(layout.manifest) as manifest:
+        assert manifest.artifacts_of(TaskId("simulate")) == (0, 0)
+        assert manifest.frame_count() == 10
+        record = read_record(manifest, runs=True)
+    assert sum(stage.running for stage in record.stages) == len(record.running) == 8
+    assert all(stage.running == 0 for stage in read_record_at_rest(layout))
+
+
+def read_record_at_rest(layout: JobLayout) -> tuple:
+    return glance(layout.manifest, lambda manifest: read_record(manifest, runs=False)).stages
+
+
+def test_many_who_ask_at_once_find_out_once() -> None:
+    asked: list[int] = []
+    kept = Kept(lambda: asked.append(1) or len(asked), 3600.0)
+    threads = [threading.Thread(target=kept.get) for _ in range(20)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert asked == [1]
+    kept.forget()
+    assert kept.get() == 2
+
+
+def test_the_load_is_told_to_whatever_thread_asks(tmp_path: Path) -> None:
+    machine, told = Machine(tmp_path), []
+    until = time.monotonic() + 0.5
+    while time.monotonic() < until:
+        pass  # one core at least is busy
+    asking = threading.Thread(target=lambda: told.append(machine.load()))
+    asking.start()
+    asking.join()
+    # Half of that, as somebody else may have had the core.
+    assert told[0].processor > 0.5 / told[0].cores
+
+
+# --- places ---
+@pytest.mark.parametrize("name", ["", ".", "..", ".farm", "a/b", "../a", "a\0b", "nobody", "x" * 300, "\ud800"])
+def test_names_that_are_no_job_lead_nowhere(tmp_path: Path, name: str) -> None:
+    (tmp_path / "farm" / "a" / "b").mkdir(parents=True)
+    (tmp_path / "farm" / ".farm").mkdir()
+    with pytest.raises(NotThereError):
+        Places(tmp_path / "farm").job(name)
+
+
+@pytest.mark.parametrize(
+    "relative", ["", ".", "..", "../b/file", "/etc/hostname", "a\0b", "folder", "loop", "out", "fi\nle"]
+)
+def test_paths_out_of_a_job_lead_nowhere(tmp_path: Path, relative: str) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name / "folder").mkdir(parents=True)
+        (tmp_path / name / "file").write_text("content")
+    (tmp_path / "a" / "loop").symlink_to("loop")
+    (tmp_path / "a" / "out").symlink_to(tmp_path / "b" / "file")
+    places = Places(tmp_path)
+    assert places.file("a", "file") == tmp_path / "a" / "file"
+    with pytest.raises(NotThereError):
+        places.file("a", relative)
+
+
+def test_the_end_of_a_log_begins_with_a_line(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "log").write_text("first\nsecond\nthird ü\n")
+    assert Places(tmp_path).tail("a", "log", 1000) == ("first\nsecond\nthird ü\n", 22)
+    assert Places(tmp_path).tail("a", "log", 12)[0] == "third ü\n"
+
+
+# --- small pictures ---
+def test_small_pictures_are_kept_up_to_a_limit(layout: JobLayout, monkeypatch: pytest.MonkeyPatch) -> None:
+    tasks = frame_job(layout, 4)
+    with Manifest(layout.manifest) as manifest:
+        paths = [draw_frame(layout, manifest, task) for task in tasks]
+    thumbnails = Thumbnails(kept_bytes=1)
+    first = thumbnails.get(paths[0], "small")
+    assert thumbnails.get(paths[0], "small") is not first
+    assert thumbnails.get(paths[0], "small").content is thumbnails.get(paths[0], "small").content  # the last one stays
+    for path in paths:
+        thumbnails.get(path, "small")
+    assert len(thumbnails._kept) == 1
+    monkeypatch.setattr("pipeline.dashboard.thumbnails.MOST_PIXELS", 1000)
+    with pytest.raises(NotThereError, match="too large"):
+        thumbnails.get(paths[0], "large")
+
+
+# --- access ---
+@pytest.mark.parametrize(
+    ("header", "name"),
+    [("a.b:1", "a.b"), ("A.B", "a.b"), ("[::1]:80", "::1"), ("[::1]", "::1"), ("::1", "::1"), ("", "")],
+)
+def test_hosts_are_read_from_headers(header: str, name: str) -> None:
+    assert host_of(header) == name
+
+
+def test_sessions_are_signed_and_forms_belong_to_one() -> None:
+    access = Access("127.0.0.1", 80, None)
+    cookie, other = access.new_session(), access.new_session()
+    session = access.session(cookie)
+    assert session is not None
+    assert access.is_form_token(session, access.form_token(session))
+    assert not access.is_form_token(access.session(other) or "", access.form_token(session))
+    assert not access.is_form_token(session, cookie.partition(".")[2])  # a session's signature opens no form
+    for forged in (None, "", ".", session, f"{session}.", f"x{cookie}", cookie[:-1], "ü.ü"):
+        assert access.session(forged) is None
+    assert Access("127.0.0.1", 80, None).session(cookie) is None  # of another start
+
+
+def test_only_addresses_and_own_names_are_known_hosts() -> None:
+    near, far = Access("127.0.0.1", 80, None), Access("192.168.1.5", 80, "t" * 20)
+    assert near.knows_host("127.0.0.1:80")
+    assert not near.knows_host("192.168.1.5:80")
+    assert far.knows_host("192.168.1.5:80")
+    assert not far.knows_host("studio.example:80")
+    assert Access("studio.example", 80, "t" * 20).knows_host("Studio.example:80")
