@@ -18,6 +18,7 @@ from pipeline.commands.previewing import animatic, still
 from pipeline.commands.queueing import cancel, pause, priority, queue, retry, watch, work
 from pipeline.commands.running import rerun, resume, submit
 from pipeline.commands.showing import compare, loop, report, sheet
+from pipeline.commands.steering import live
 from pipeline.errors import PLACE_TROUBLES, DiskFullError, PipelineError
 from pipeline.executors.failures import is_disk_full
 
@@ -55,7 +56,24 @@ def main() -> None:
 
 
 for command in (
-    *(submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report, still, animatic, compare, loop),
+    *(
+        submit,
+        plan,
+        status,
+        rerun,
+        resume,
+        logs,
+        explain,
+        verify,
+        clean,
+        sheet,
+        report,
+        still,
+        animatic,
+        compare,
+        loop,
+        live,
+    ),
     *(queue, watch, pause, cancel, retry, priority, work),
     *(export, run_stage),
 ):
