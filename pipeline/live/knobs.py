@@ -81,12 +81,22 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
             value = getattr(cloth, key)
             if value is not None:
                 name, paths = f"cloth.{cloth.name}.{key}", (("cloth", number, key),)
-                found.append(_knob(name, label, f"Cloth {cloth.name}", paths, kind, low, high, value))
+                found.append(
+                    _knob(name, label, f"Cloth {cloth.name}", paths=paths, kind=kind, ends=(low, high), start=value)
+                )
     for number, body in enumerate(job.rigid):
         if body.density is not None and not body.ballast:
             name, paths = f"rigid.{body.name}.density", (("rigid", number, "density"),)
             found.append(
-                _knob(name, "density [kg/m³]", f"Body {body.name}", paths, "decades", 10.0, 2.0e4, body.density)
+                _knob(
+                    name,
+                    "density [kg/m³]",
+                    f"Body {body.name}",
+                    paths=paths,
+                    kind="decades",
+                    ends=(10.0, 2.0e4),
+                    start=body.density,
+                )
             )
     return tuple(found)
 
@@ -95,22 +105,42 @@ def _shared_knobs(job: Job) -> list[Knob]:
     """Gravity, which fluids are sized for when they are built; the step of cloth, which explicit springs dictate."""
     found = []
     if not job.fluid:
-        found.append(_knob("gravity", "gravity [m/s²]", "Scene", (("gravity",),), "vector", -30.0, 30.0, job.gravity))
+        found.append(
+            _knob(
+                "gravity",
+                "gravity [m/s²]",
+                "Scene",
+                paths=(("gravity",),),
+                kind="vector",
+                ends=(-30.0, 30.0),
+                start=job.gravity,
+            )
+        )
     if job.cloth and job.cloth[0].integrator == "xpbd":
         paths = tuple(("cloth", number, "substeps") for number in range(len(job.cloth)))
         count = job.cloth[0].substeps or DEFAULT_SUBSTEPS
-        found.append(_knob("cloth.substeps", "substeps a frame", "Scene", paths, "whole", 2, 60, count))
+        found.append(
+            _knob("cloth.substeps", "substeps a frame", "Scene", paths=paths, kind="whole", ends=(2, 60), start=count)
+        )
     return found
 
 
 def _knob(
-    name: str, label: str, folder: str, paths: tuple[KeyPath, ...], kind: Kind, low: float, high: float, start: Value
+    name: str,
+    label: str,
+    folder: str,
+    *,
+    paths: tuple[KeyPath, ...],
+    kind: Kind,
+    ends: tuple[float, float],
+    start: Value,
 ) -> Knob:
+    """A knob whose range has room for where it starts."""
     numbers = () if kind == "switch" else start if isinstance(start, tuple) else (float(start),)
     largest = max((abs(each) for each in numbers), default=0.0)
-    if kind == "decades":
-        low = min(low, largest) if largest > 0.0 else low
-    return Knob(name, label, folder, paths, kind, low, max(high, largest), start)
+    low = min(ends[0], largest) if kind == "decades" and largest > 0.0 else ends[0]
+    low = min(low, -largest) if kind == "vector" else low
+    return Knob(name, label, folder, paths, kind, low, max(ends[1], largest), start)
 
 
 def turn(world: World, job: Job, knob: Knob, value: Value, *, before: Value) -> None:

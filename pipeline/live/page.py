@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.live.drawing import SceneDrawing
 from pipeline.live.knobs import Knob, Value
 from pipeline.live.session import Session, Status
+from pipeline.live.take import Recorder
 
 if TYPE_CHECKING:
     import viser
@@ -25,7 +27,7 @@ class LivePage:
         session: the scene.
         title: heads the page.
         save: writes the job with the present values, and returns where.
-        record: begins or ends a recording, and returns whether one runs; None: there is no such button.
+        recorder: makes takes.
     """
 
     def __init__(
@@ -34,11 +36,11 @@ class LivePage:
         session: Session,
         *,
         title: str,
-        save: Callable[[], str],
-        record: Callable[[], bool] | None = None,
+        save: Callable[[], Path],
+        recorder: Recorder,
     ) -> None:
         self._server, self._session = server, session
-        self._save, self._record = save, record
+        self._save, self._recorder = save, recorder
         self._sliders: dict[str, tuple[Knob, Any]] = {}
         self._revision = session.revision
         self._said = ""
@@ -72,6 +74,7 @@ class LivePage:
     def tell(self, status: Status) -> None:
         """Show how it goes, and where knobs are after something other than the page has turned them."""
         self._pause.label = "Go on" if status.is_paused else "Pause"
+        self._record.label = "Stop recording" if self._recorder.is_recording else "Record"
         written = _written(status, self._session.speed)
         if written != self._said:
             self._said = written
@@ -97,16 +100,11 @@ class LivePage:
         speed = gui.add_slider("speed", 0.05, 1.0, 0.05, 1.0, hint="1: real time, where the machine keeps up")
         speed.on_update(lambda _: session.ask(session.set_speed, float(speed.value)))
         gui.add_button("Save as job").on_click(lambda _: session.ask(self._do_save))
-        if self._record is not None:
-            self._recorder = gui.add_button("Record")
-            self._recorder.on_click(lambda _: session.ask(self._do_record))
+        self._record = gui.add_button("Record")
+        self._record.on_click(lambda _: session.ask(self._recorder.toggle))
 
     def _do_save(self) -> None:
         self._session.message = f"wrote {self._save()}"
-
-    def _do_record(self) -> None:
-        assert self._record is not None
-        self._recorder.label = "Stop recording" if self._record() else "Record"
 
     def _add_knob(self, gui: Any, knob: Knob) -> None:
         start = self._session.values[knob.name]

@@ -11,6 +11,7 @@ from pipeline.live.loop import run
 from pipeline.live.saving import save_job
 from pipeline.live.serving import open_server
 from pipeline.live.session import Session
+from pipeline.live.take import Recorder
 
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
@@ -60,15 +61,21 @@ def show_live(
         from pipeline.live.page import LivePage
 
         try:
-            initialize(job.device, threads=threads)
+            device = initialize(job.device, threads=threads)
             session = Session(job)
         except DeviceUnavailableError as error:
             raise StageUnavailableError(str(error)) from error
         except (ShapeError, ValueError) as error:
             raise PipelineError(f"{job.name}: {error}") from error
         session.is_paused = paused
-        page = LivePage(server, session, title=job.name, save=lambda: str(save_job(loaded, session.values, folder)))
+        recorder = Recorder(loaded, session, output, device=device)
+        page = LivePage(
+            server, session, title=job.name, recorder=recorder, save=lambda: save_job(loaded, session.values, folder)
+        )
         say(f"http://{address.host}:{server.get_port()}")
-        run(session, page, ends=ends)
+        try:
+            run(session, page, ends=ends)
+        finally:
+            recorder.stop()
     finally:
         server.stop()

@@ -126,7 +126,7 @@ class Session:
 
     # --- from any thread --------------------------------------------------------------------------------------------
 
-    def ask(self, request: Callable[..., None], *arguments: Any) -> None:
+    def ask(self, request: Callable[..., object], *arguments: Any) -> None:
         """Have a method called between two frames; an error that is meant for people becomes the message."""
         self._requests.put(lambda: request(*arguments))
 
@@ -200,8 +200,8 @@ class Session:
 
     def reset(self) -> None:
         """Begin anew, with the knobs where they are."""
-        self._begin_anew(dict(self.values))
         self.message = ""
+        self._begin_anew(dict(self.values))
 
     def turn(self, name: str, value: object) -> None:
         """Turn a knob.
@@ -349,6 +349,7 @@ class Session:
             cause = f"In hand: {', '.join(held)}"
         else:
             cause = "Nothing had been turned; the job may need more substeps"
+        self.message = ""
         self._begin_anew({} if moment is None else moment.values)
         if moment is None:
             self.is_paused = True
@@ -358,7 +359,7 @@ class Session:
             self.world.restore(moment.frame, moment.arrays)
             self._moments.append(moment)
         place = "the start, with the job's values" if moment is None else f"{self.world.time_s:.2f} s"
-        self.message = f"It blew up: {what}. {cause}. Back at {place}."
+        self.message = f"It blew up: {what}. {cause}. Back at {place}. {self.message}".rstrip()
 
 
 def _require_sound(report: FrameReport) -> None:

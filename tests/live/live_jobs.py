@@ -20,7 +20,7 @@ position = [0.0, 0.0, 0.62]
 [[rigid]]
 name = "post"
 shape = { type = "box", size = [0.05, 0.05, 0.1] }
-position = [0.6, 0.0, 0.05]
+position = [0.4, 0.0, 0.05]
 
 [[cloth]]
 name = "sheet"

@@ -20,6 +20,7 @@ from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job
 from pipeline.live.serving import open_server
 from pipeline.live.session import Session
+from pipeline.live.take import Recorder
 
 LOOKED_AT = (
     BALL_OVER_SHEET.replace("counts = [17, 17]", "counts = [9, 9]")
@@ -84,6 +85,10 @@ def play(address: str, session: Session, folder: Path) -> None:
         page.get_by_role("button", name="Save as job").click()
         until((folder / "drape-live.toml").exists, "nothing was saved")
         page.get_by_text("drape-live.toml").wait_for()
+        page.get_by_role("button", name="Record").click()
+        page.get_by_role("button", name="Stop recording").click()
+        page.get_by_text("frames: pipeline submit").wait_for()
+        assert len(list((folder / "renders" / "drape-take" / "cache").glob("*.h5"))) > 1
 
 
 @needs_browser
@@ -94,9 +99,12 @@ def test_a_page_draws_and_takes_drags_buttons_and_sliders_to_the_scene(tmp_path)
     session.advance()  # kernels
     session.reset()
     session.is_paused = True
+    recorder = Recorder(read, session, tmp_path / "renders", device="cpu")
     server = open_server("127.0.0.1", 0)
     try:
-        page = LivePage(server, session, title="drape", save=lambda: str(save_job(read, session.values, tmp_path)))
+        page = LivePage(
+            server, session, title="drape", save=lambda: save_job(read, session.values, tmp_path), recorder=recorder
+        )
         with ThreadPoolExecutor(1) as browser:
             playing = browser.submit(play, f"http://127.0.0.1:{server.get_port()}", session, tmp_path)
             run(session, page, ends=playing.done)

@@ -11,7 +11,7 @@ from pipeline.live.session import FRAMES_TO_TRUST, Session
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
-WITHOUT_BALL = BALL_OVER_SHEET.replace("position = [0.0, 0.0, 0.62]", "position = [0.5, 0.5, 0.08]")
+WITHOUT_BALL = BALL_OVER_SHEET.replace("position = [0.0, 0.0, 0.62]", "position = [0.4, 0.4, 0.08]")
 
 
 def session_of(folder: Path, text: str = BALL_OVER_SHEET) -> Session:
@@ -35,17 +35,17 @@ def place(session: Session, name: str) -> np.ndarray:
 def test_softer_cloth_sags_deeper_and_gravity_can_be_turned_around(tmp_path):
     session = session_of(tmp_path, WITHOUT_BALL)
     session.ask(session.turn, "cloth.sheet.stretch_stiffness", 20.0)
-    run(session, 20)
+    run(session, 12)
     sagged = lowest(session)
     session.ask(session.reset)
     session.ask(session.turn, "cloth.sheet.stretch_stiffness", 5000.0)
-    run(session, 20)
-    assert session.world.frame == 20
+    run(session, 12)
+    assert session.world.frame == 12
     assert sagged < lowest(session) - 0.005
-    session.ask(session.turn, "gravity", (0.0, 0.0, 9.81))
-    run(session, 20)
+    session.ask(session.turn, "gravity", (0.0, 0.0, 20.0))
+    run(session, 12)
     assert session.bodies()["sheet"].arrays["position"][:, 2].max() > 0.5005  # above its edges
-    assert place(session, "ball")[2] > 0.3
+    assert place(session, "ball")[2] > 0.2
 
 
 def test_a_heavier_ball_presses_the_sheet_deeper(tmp_path):
@@ -76,7 +76,7 @@ def test_a_ball_that_is_dragged_down_pushes_the_cloth_and_let_go_is_thrown_back(
 
 def test_a_body_that_rests_can_be_led_and_stays_where_it_is_let_go(tmp_path):
     session = session_of(tmp_path)
-    session.ask(session.grab_body, "post", (0.6, 0.0, 0.1))
+    session.ask(session.grab_body, "post", (0.4, 0.0, 0.1))
     session.ask(session.drag, "body", "post", (0.5, 0.1, 0.2))
     run(session, 30)
     session.ask(session.let_go, "body", "post")
@@ -103,9 +103,9 @@ def test_cloth_is_pulled_up_by_a_node_and_pins_can_be_moved(tmp_path):
 
 
 def test_a_blow_up_goes_back_to_what_was_sound_and_names_what_was_turned(tmp_path):
-    session = session_of(tmp_path)
-    session.turn("cloth.substeps", 2)
+    session = session_of(tmp_path, BALL_OVER_SHEET[: BALL_OVER_SHEET.index("[[cloth]]")])
     run(session, FRAMES_TO_TRUST + 32)
+    sound = place(session, "ball")
     session.turn("gravity", (0.0, 0.0, -20.0))
     run(session, 2)
     session.world.solvers["rigid"].bodies.velocity[0] = (0.0, 0.0, 1e6)
@@ -114,13 +114,30 @@ def test_a_blow_up_goes_back_to_what_was_sound_and_names_what_was_turned(tmp_pat
     assert session.values["gravity"] == (0.0, 0.0, -9.81)
     assert "blew up" in session.message
     assert "Turned last: gravity = (0.0, 0.0, -20.0)" in session.message
-    run(session, 3)  # and it goes on
-    assert np.isfinite(session.bodies()["sheet"].arrays["position"]).all()
-    # Again, before anything can be trusted: from the start, and it stands still.
+    run(session, FRAMES_TO_TRUST + 2)  # and it goes on, as it had gone
+    np.testing.assert_allclose(place(session, "ball"), sound, atol=1e-9)
+    session.reset()
+    # Before anything can be trusted: from the start, and it stands still.
+    run(session, 10)
     session.world.solvers["rigid"].bodies.velocity[0] = (np.nan, 0.0, 0.0)
     run(session, 1)
     assert session.world.frame == 0
     assert session.is_paused
+    assert "Nothing had been turned" in session.message
+
+
+def test_cloth_with_values_that_are_no_numbers_goes_back_too(tmp_path):
+    session = session_of(tmp_path)
+    run(session, 1)
+    session.turn("cloth.sheet.bend_stiffness", 1.0e-3)
+    cloth = session.world.solvers["cloth"]
+    spoilt = cloth.state.velocity.to_numpy()
+    spoilt[100] = np.nan
+    cloth.state.velocity.from_numpy(spoilt)
+    run(session, 1)
+    assert "Turned last: cloth.sheet.bend_stiffness = 0.001" in session.message
+    run(session, 2)
+    assert np.isfinite(session.bodies()["sheet"].arrays["position"]).all()
 
 
 def test_what_cannot_be_is_refused_with_a_message_and_changes_nothing(tmp_path):
