@@ -70,11 +70,10 @@ class SceneDrawing:
             self._keep("cloth", cloth.name, handle)
         for fluid in job.fluid:
             arrays, radius = bodies[fluid.name].arrays, fluid.particle_radius
-            handle = scene.add_point_cloud(
+            self._handles[fluid.name] = scene.add_point_cloud(
                 f"/fluid/{fluid.name}", arrays["position"], _color(job, fluid.name, FLUID_COLOR),
                 point_size=2.0 * radius, point_shape="circle", precision="float32",
             )  # fmt: skip
-            self._handles[fluid.name] = handle
 
     def add_pins(self, pins: list[tuple[str, NDArray[np.int64]]]) -> None:
         """A ball at the middle of each pin's nodes, which leads them."""

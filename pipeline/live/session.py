@@ -107,7 +107,7 @@ class Session:
         self.on_frame: Callable[[FrameReport, Mapping[str, Snapshot]], None] | None = None
         self.on_jump: Callable[[], None] | None = None
         self.dt = 1.0 / job.fps
-        self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._hands: dict[tuple[str, str], tuple[Hand, int]] = {}  # by what is held: and by which browser
         self._frame_ms = 0.0
         self._substeps: Mapping[str, int] = {}

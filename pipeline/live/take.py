@@ -48,7 +48,7 @@ class Recorder:
     def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:
         self._loaded, self._session, self._output, self._device = loaded, session, output, device
         self._take: _Take | None = None
-        session.on_frame, session.on_jump = self._add, self.stop
+        session.on_jump = self.stop
 
     @property
     def is_recording(self) -> bool:
@@ -68,12 +68,13 @@ class Recorder:
         self._take = _Take(self._loaded, self._session, self._output, device=self._device)
         self._session.message = f"recording into {self._take.layout.root}"
         now = FrameReport(world.frame, world.time_s, {}, {}, world.diagnostics())
+        self._session.on_frame = self._add
         self._add(now, self._session.bodies())
         return self.is_recording
 
     def stop(self) -> None:
         """End the take, if one is being made, and say how to go on with it."""
-        take, self._take = self._take, None
+        take = self._forget()
         if take is None:
             return
         try:
@@ -89,8 +90,14 @@ class Recorder:
         try:
             self._take.add(report, bodies)
         except (OSError, PipelineError, WriterLostError) as error:
-            self._take = None
+            self._forget()
             self._session.message = f"the take ends early: {error}"
+
+    def _forget(self) -> _Take | None:
+        """Record no more; returns the take that was being made."""
+        take, self._take = self._take, None
+        self._session.on_frame = None
+        return take
 
 
 class _Take:

@@ -4,9 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from live_jobs import BALL_OVER_SHEET, loaded
 
 from pipeline.cache import read_frame
+from pipeline.cli import main
 from pipeline.job.checks import load_checked_job
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
@@ -78,6 +80,9 @@ def test_a_take_is_a_job_whose_frames_are_there_and_are_never_simulated_again(tm
     (failed,) = run("simulate").failures
     assert "no computation can make it anew" in failed.message
     assert not layout.path(layout.frame_cache(2)).exists()
+    again = CliRunner().invoke(main, ["rerun", str(folder), "--stage", "simulate"])
+    assert again.exit_code == 1
+    assert "it cannot be simulated again" in again.output
 
 
 def test_a_reset_ends_a_take_with_what_was_before_it(tmp_path):
