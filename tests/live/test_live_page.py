@@ -65,12 +65,15 @@ def play(address: str, session: Session, folder: Path) -> None:
         page.get_by_role("button", name="Reset").click()
         until(lambda: session.world.frame == 0, "it was not reset")
 
-        page.mouse.move(*middle)  # onto the ball, which is in the middle of the picture
-        page.mouse.down()
-        for share in np.linspace(0.0, 1.0, 8):
-            page.mouse.move(middle[0], middle[1] - 60.0 * share)
-            time.sleep(0.05)
-        until(lambda: session.is_holding, "the ball is not in hand")
+        def take_ball() -> None:
+            page.mouse.move(*middle)  # onto the ball, which is in the middle of the picture
+            page.mouse.down()
+            for share in np.linspace(0.0, 1.0, 8):
+                page.mouse.move(middle[0], middle[1] - 60.0 * share)
+                time.sleep(0.05)
+            until(lambda: session.is_holding, "the ball is not in hand")
+
+        take_ball()
         page.get_by_role("button", name="Go on").focus()
         page.keyboard.press("Enter")
         until(lambda: session.world.solvers["rigid"].bodies.position[0, 2] > 0.68, "the ball does not follow")
@@ -89,6 +92,12 @@ def play(address: str, session: Session, folder: Path) -> None:
         page.get_by_role("button", name="Stop recording").click()
         page.get_by_text("frames: pipeline submit").wait_for()
         assert len(list((folder / "renders" / "drape-take" / "cache").glob("*.h5"))) > 1
+
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_role("button", name="Reset").click()
+        until(lambda: session.world.frame == 0, "it was not reset")
+        time.sleep(1.0)  # until the ball is seen where it was
+        take_ball()  # and the browser is closed
 
 
 @needs_browser
@@ -109,6 +118,9 @@ def test_a_page_draws_and_takes_drags_buttons_and_sliders_to_the_scene(tmp_path)
             playing = browser.submit(play, f"http://127.0.0.1:{server.get_port()}", session, tmp_path)
             run(session, page, ends=playing.done)
             playing.result()
+        gone = time.monotonic() + PATIENCE_S
+        run(session, page, ends=lambda: not session.is_holding or time.monotonic() > gone)
+        assert not session.is_holding
     finally:
         server.stop()
 
