@@ -44,7 +44,6 @@ cell_size = 0.1
 [[smoke.source]]
 shape = { type = "sphere", radius = 0.1 }
 position = [0.0, 0.0, 0.2]
-rate = 1.0
 """
     with pytest.raises(PipelineError, match="smoke does not run live"):
         live_job(loaded(tmp_path, BALL_OVER_SHEET + smoke).job)
