@@ -19,6 +19,7 @@ from pipeline.commands.previewing import animatic, still
 from pipeline.commands.queueing import cancel, pause, priority, queue, retry, watch, work
 from pipeline.commands.running import rerun, resume, submit
 from pipeline.commands.showing import compare, loop, report, sheet
+from pipeline.commands.steering import live
 from pipeline.commands.viewing import view
 from pipeline.errors import PLACE_TROUBLES, DiskFullError, PipelineError
 from pipeline.executors.failures import is_disk_full
@@ -58,8 +59,8 @@ def main() -> None:
 
 for command in (
     *(submit, plan, status, rerun, resume, logs, explain, verify, clean, sheet, report, still, animatic, compare, loop),
-    *(queue, watch, pause, cancel, retry, priority, work, dashboard),
-    *(export, run_stage, view),
+    *(queue, watch, pause, cancel, retry, priority, work),
+    *(live, view, dashboard, export, run_stage),
 ):
     main.add_command(command)
 

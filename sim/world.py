@@ -51,6 +51,10 @@ class World:
     what became of the second when all have had theirs. The second solver of a loose coupling keeps its own steps: the
     solvers that it is coupled to go ahead to the end of its step, in as many substeps as they need, then it takes it.
 
+    Attributes:
+        frame: number of the frame that was reached last.
+        max_substeps_per_frame: a frame that needs more counts as diverged; may be changed between frames.
+
     All land exactly on the frame: with dt_max stable, the rest of the frame is cut into n = ceil(rest / dt_max) equal
     steps, one is taken, and the division is made anew for what is left; in the same way substeps land on a longer step.
     """
@@ -64,6 +68,7 @@ class World:
         static_bodies: Sequence[StaticBody] = (),
     ) -> None:
         self.frame = 0
+        self.max_substeps_per_frame = MAX_SUBSTEPS_PER_FRAME
         self._frames_per_second = frames_per_second
         self._solvers = {solver.name: solver for solver in solvers}
         self._couplings = tuple(couplings)
@@ -83,6 +88,11 @@ class World:
     def solvers(self) -> Mapping[str, Solver]:
         """All solvers by name; what they let change may be changed between frames."""
         return MappingProxyType(self._solvers)
+
+    def tell_couplings(self) -> None:
+        """Tell the couplings what was changed between frames: how bodies move now, and how easily."""
+        for coupling in self._couplings:
+            coupling.resume()
 
     def advance_frame(self) -> FrameReport:
         """Advance to the next frame.
@@ -152,7 +162,7 @@ class World:
 
     def _steps_left(self, team: _Team, remaining: float, elapsed_s: float) -> int:
         stable_dt = min(solver.stable_dt() for solver in team.solvers)
-        if not stable_dt > 0.0 or team.taken + remaining / stable_dt > MAX_SUBSTEPS_PER_FRAME:
+        if not stable_dt > 0.0 or team.taken + remaining / stable_dt > self.max_substeps_per_frame:
             self._check(team, elapsed_s)
             raise SimulationDivergedError(
                 " + ".join(solver.name for solver in team.solvers),

@@ -190,6 +190,8 @@ def rerun(job: str, output: Path, stages: tuple[str, ...], frames: str | None, o
     layout = find_job(job, output)
     selection = Selection(frozenset(stages), None if frames is None else parse_frames(frames))
     submitted = _job_in(layout)
+    if submitted.recorded is not None and "simulate" in stages:
+        raise PipelineError(f"{submitted.name} is a live take ({submitted.recorded}): it cannot be simulated again")
     selection.of(plan_job(submitted, layout, STAGES))  # what is not in the plan is told now, not when its turn comes
     run(submitted, layout, frozenset(stage.name for stage in STAGES), options=options, rerun=selection)
 

@@ -53,6 +53,11 @@ class Job(SceneParameters):
     duration: Annotated[float, Field(gt=0.0)] | None = Field(
         default=None, description="Length of the film [s]; give this or frames."
     )
+    recorded: Annotated[str, Field(pattern=NAME_PATTERN)] | None = Field(
+        default=None,
+        description="The live take that its simulated frames are, as `pipeline live` writes it: nothing can compute "
+        "them anew, and nothing tries.",
+    )
     whitewater: dict[str, WhitewaterParameters] = Field(
         default_factory=dict,
         description="Spray, foam and bubbles of a fluid, by its name: [whitewater.water]; none if omitted.",

@@ -59,7 +59,10 @@ class SimulateStage:
     version = 6
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
-        """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""
+        """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one.
+
+        A live take's frames are those of the take, whatever the job says of its scene.
+        """
         scene = {name: getattr(job, name) for name in SceneParameters.model_fields}
         return [
             Task(
@@ -67,7 +70,9 @@ class SimulateStage:
                 stage=self.name,
                 inputs=(),
                 outputs=tuple(layout.frame_cache(frame) for frame in range(job.frame_count)),
-                parameters=ParameterSet.of(
+                parameters=self._parameters_of_take(job)
+                if job.recorded is not None
+                else ParameterSet.of(
                     stage=self.name,
                     version=self.version,
                     tools={name: tool_version(name) for name in ("taichi", "libigl", "numpy", "scipy", "trimesh")},
@@ -78,6 +83,10 @@ class SimulateStage:
                 checkpointed=True,
             )
         ]
+
+    def _parameters_of_take(self, job: Job) -> ParameterSet:
+        """A take was made once, by hand: no version of anything makes another one of it."""
+        return ParameterSet.of(stage=self.name, version=0, tools={}, fps=job.fps, recorded=job.recorded)
 
     def obstacles(self, job: Job) -> list[str]:
         """A device that does not work here."""
@@ -94,9 +103,15 @@ class SimulateStage:
 
         Raises:
             SimulationDivergedError: the state became unphysical; the last good checkpoint is kept.
-            StageUnavailableError: the frames so far come from another kind of device.
+            StageUnavailableError: the frames so far come from another kind of device, or from a live take.
         """
         missing = [k for k, output in enumerate(context.task.outputs) if not context.is_committed(output)]
+        if missing and context.job.recorded is not None:
+            raise StageUnavailableError(
+                f"frame {missing[0]} of the live take {context.job.recorded} is not there as it was recorded, and no "
+                "computation can make it anew: bring its file and receipt back, ask for fewer frames, or remove "
+                '"recorded" to simulate the job as it is written'
+            )
         if missing:
             _Simulation(context).run(missing)
 

@@ -131,6 +131,24 @@ class ClothSolver:
             self._adopt(before)  # what explicit springs bear is known once they have their stiffness
             raise
 
+    def take_substeps(self, count: int) -> None:
+        """Take so many substeps a frame from now on, all cloths of the scene, as they share them; between frames.
+
+        Raises:
+            ValueError: below 1, or too few for explicit springs; nothing has changed then.
+        """
+        before = self.parameters
+        try:
+            self._adopt(
+                tuple(
+                    ClothParameters.model_validate({**cloth.model_dump(exclude_unset=True), "substeps": count})
+                    for cloth in before
+                )
+            )
+        except ValueError:
+            self._adopt(before)
+            raise
+
     def hold(
         self, name: str, nodes: Sequence[int], *, shift: Vector3 = (0.0, 0.0, 0.0), within_s: float | None = None
     ) -> None:

@@ -84,7 +84,7 @@ class RigidSolver:
         gravity: Vector3,
     ) -> None:
         self.name = SOLVER_NAME
-        self.gravity = np.asarray(gravity, dtype=np.float64)
+        self.gravity = np.array(gravity, dtype=np.float64)  # its own, which contacts share
         self._geometries = _geometries_of(parameters)
         self.paths: dict[int, Path] = {
             number: path_of(body) for number, body in enumerate(parameters) if body.kind == "kinematic"
@@ -207,6 +207,23 @@ class RigidSolver:
         now = self.paths[number].at(self.time_s)
         self.paths[number] = path_onwards(now, self.time_s, position, rotation_deg, within_s)
         self._place_kinematic_bodies(self.time_s)  # couplings see how it moves from now on
+
+    def scale_mass(self, name: str, factor: float) -> None:
+        """Make a dynamic body so many times heavier, between frames; no checkpoint knows of it.
+
+        Raises:
+            ValueError: there is no such dynamic body, or the factor is not finite and positive.
+        """
+        number = self.bodies.names.index(name) if name in self.bodies.names else -1
+        if number < 0 or not self.bodies.is_dynamic[number]:
+            raise ValueError(f'no dynamic body is named "{name}"; only such bodies have a mass')
+        if not 0.0 < factor < math.inf:
+            raise ValueError(f'the mass of "{name}" can only be scaled by a finite number above 0, got {factor:g}')
+        self.bodies.scale_mass(number, factor)
+
+    def set_gravity(self, gravity: Vector3) -> None:
+        """Change gravity [m/s²] between frames, for contacts as well; no checkpoint knows of it."""
+        self.gravity[:] = gravity
 
     def _find_contacts(self, dt: float) -> Contacts:
         return self._detector.find(

@@ -86,6 +86,13 @@ class MovingBodies:
         """[1/kg], (n,); 0 for kinematic and lost bodies."""
         return np.where(self.is_free, 1.0 / self.mass, 0.0)
 
+    def scale_mass(self, number: int, factor: float) -> None:
+        """Make a dynamic body so many times heavier, with the same shape and velocities."""
+        self.mass[number] *= factor
+        self._tensor[number] *= factor
+        self._inverse_tensor[number] /= factor
+        self.principal_moments[number] *= factor
+
     def rotation(self) -> Array:
         """Rotation matrices, body axes to world axes, (n, 3, 3)."""
         return rotation.matrices(self.orientation)

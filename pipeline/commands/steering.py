@@ -1,0 +1,78 @@
+"""Commands that run a scene while somebody steers it: live."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+
+import click
+
+from pipeline.commands.arguments import job_options, output_option, print_warnings, require_own_programs
+
+
+@click.command()
+@job_options
+@output_option
+@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0 takes a free one.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at; the page has no password.")
+@click.option("--substeps", type=click.IntRange(1, 200), help="Steps a frame of cloth: fewer are faster and softer.")
+@click.option("--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all if omitted.")
+@click.option("--paused", is_flag=True, help="Begin standing still.")
+@click.option("--anyway", is_flag=True, help="Run a scene that is too large to steer, too.")
+def live(
+    job_file: Path,
+    *,
+    overrides: tuple[str, ...],
+    preview: bool,
+    output: Path,
+    port: int,
+    host: str,
+    substeps: int | None,
+    cores: int | None,
+    paused: bool,
+    anyway: bool,
+) -> None:
+    """Run cloth, rigid bodies or a small fluid in a browser, as fast as this machine can, and play with it.
+
+    Bodies, pins and cloth are dragged with the mouse; sliders change what they are made of. "Save as job" writes the
+    values into a new job file in the present folder; "Record" makes frames that `pipeline submit` renders. Ends with
+    Ctrl-C.
+
+    \b
+    pipeline live jobs/ball_into_cloth.toml
+    pipeline live jobs/cloth_over_sphere.toml --set cloth.sheet.shape.counts=[65,65] --substeps 10
+    pipeline live dam.toml --preview --port 0
+    """
+    from pipeline.job.checks import load_checked_job
+    from pipeline.job.loading import read_job
+    from pipeline.live.scene import live_job, require_small
+    from pipeline.live.serving import require_viser
+    from pipeline.resources import machine_capacity
+    from sim.runtime import resolve_device
+
+    require_viser()
+    loaded = read_job(job_file, overrides, preview=preview)
+    require_own_programs(loaded, overrides)
+    job = live_job(loaded.job, substeps=substeps)
+    if not anyway:
+        require_small(job, cores=cores or machine_capacity().cores, on_gpu=resolve_device(job.device) != "cpu")
+    loaded, _ = load_checked_job(job_file, overrides, preview=preview)
+    print_warnings(loaded.warnings)
+
+    from pipeline.live.running import Address, show_live
+
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    show_live(
+        loaded,
+        job,
+        Address(host, port),
+        output=output,
+        folder=Path.cwd(),
+        threads=cores,
+        paused=paused,
+        say=lambda address: click.echo(f"{address} runs {job.name}; Ctrl-C ends it"),
+        ends=stop.is_set,
+    )

@@ -1,0 +1,182 @@
+"""What of a scene may be turned while it runs: which keys of the job, in which range, and how the solvers take them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from pipeline.job.overrides import Override
+from pipeline.job.positions import KeyPath
+from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+    from sim.world import World
+
+Value = float | bool | tuple[float, float, float]
+Kind = Literal["number", "decades", "whole", "switch", "vector"]
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One thing to turn.
+
+    Attributes:
+        name: unique; how messages call it, as `--set` would: "cloth.sheet.friction".
+        label: on the page, with the unit.
+        folder: under which heading.
+        paths: the keys of the job that it stands for; several where bodies share the value.
+        kind: number: a slider; decades: one over the powers of ten; whole: of whole numbers; switch; vector: three.
+        low, high: ends of the range, in the key's unit.
+        start: the job's value.
+    """
+
+    name: str
+    label: str
+    folder: str
+    paths: tuple[KeyPath, ...]
+    kind: Kind
+    low: float
+    high: float
+    start: Value
+
+    def checked(self, value: object) -> Value:
+        """The value, as one of this knob's kind.
+
+        Raises:
+            ValueError: it is none, or out of range.
+        """
+        if self.kind == "switch":
+            return bool(value)
+        numbers = value if isinstance(value, tuple | list) else (value,)
+        if len(numbers) != (3 if self.kind == "vector" else 1) or not all(
+            isinstance(each, int | float) and math.isfinite(each) and self.low <= each <= self.high for each in numbers
+        ):
+            raise ValueError(f"{self.name} must lie between {self.low:g} and {self.high:g}, got {value}")
+        if self.kind == "vector":
+            return (float(numbers[0]), float(numbers[1]), float(numbers[2]))
+        return round(numbers[0]) if self.kind == "whole" else float(numbers[0])
+
+
+_CLOTH: tuple[tuple[str, str, Kind, float, float], ...] = (
+    ("stretch_stiffness", "stretch stiffness [N/m]", "decades", 10.0, 1.0e5),
+    ("shear_stiffness", "shear stiffness [N/m]", "decades", 1.0, 1.0e5),
+    ("bend_stiffness", "bend stiffness [N m]", "decades", 1.0e-8, 1.0e-1),
+    ("damping", "damping [s]", "number", 0.0, 0.05),
+    ("bend_damping", "bend damping [s]", "number", 0.0, 0.1),
+    ("mass_per_area", "mass [kg/m²]", "decades", 0.01, 10.0),
+    ("friction", "friction", "number", 0.0, 2.0),
+    ("self_collision", "collides with itself", "switch", 0.0, 1.0),
+    ("wind", "wind [m/s]", "vector", -30.0, 30.0),
+)
+
+
+def knobs_of(job: Job) -> tuple[Knob, ...]:
+    """All that can be turned in the scene of a job. A value outside of a range widens it."""
+    found = list(_shared_knobs(job))
+    for number, cloth in enumerate(job.cloth):
+        for key, label, kind, low, high in _CLOTH:
+            value = getattr(cloth, key)
+            if value is not None:
+                name, paths = f"cloth.{cloth.name}.{key}", (("cloth", number, key),)
+                found.append(
+                    _knob(name, label, f"Cloth {cloth.name}", paths=paths, kind=kind, ends=(low, high), start=value)
+                )
+    for number, body in enumerate(job.rigid):
+        if body.density is not None and not body.ballast:
+            name, paths = f"rigid.{body.name}.density", (("rigid", number, "density"),)
+            found.append(
+                _knob(
+                    name,
+                    "density [kg/m³]",
+                    f"Body {body.name}",
+                    paths=paths,
+                    kind="decades",
+                    ends=(10.0, 2.0e4),
+                    start=body.density,
+                )
+            )
+    return tuple(found)
+
+
+def _shared_knobs(job: Job) -> list[Knob]:
+    """Gravity, which fluids are sized for when they are built; the step of cloth, which explicit springs dictate."""
+    found = []
+    if not job.fluid:
+        found.append(
+            _knob(
+                "gravity",
+                "gravity [m/s²]",
+                "Scene",
+                paths=(("gravity",),),
+                kind="vector",
+                ends=(-30.0, 30.0),
+                start=job.gravity,
+            )
+        )
+    if job.cloth and job.cloth[0].integrator == "xpbd":
+        paths = tuple(("cloth", number, "substeps") for number in range(len(job.cloth)))
+        count = job.cloth[0].substeps or DEFAULT_SUBSTEPS
+        found.append(
+            _knob("cloth.substeps", "substeps a frame", "Scene", paths=paths, kind="whole", ends=(2, 60), start=count)
+        )
+    return found
+
+
+def _knob(
+    name: str,
+    label: str,
+    folder: str,
+    *,
+    paths: tuple[KeyPath, ...],
+    kind: Kind,
+    ends: tuple[float, float],
+    start: Value,
+) -> Knob:
+    """A knob whose range has room for where it starts."""
+    numbers = () if kind == "switch" else start if isinstance(start, tuple) else (float(start),)
+    largest = max((abs(each) for each in numbers), default=0.0)
+    low = min(ends[0], largest) if kind == "decades" and largest > 0.0 else ends[0]
+    low = min(low, -largest) if kind == "vector" else low
+    return Knob(name, label, folder, paths, kind, low, max(ends[1], largest), start)
+
+
+def turn(world: World, job: Job, knob: Knob, value: Value, *, before: Value) -> None:
+    """Make the solvers step with another value from the next frame on.
+
+    Raises:
+        ValueError: a solver cannot have it; nothing has changed then.
+    """
+    solvers: Mapping[str, Any] = world.solvers
+    first, key = knob.paths[0][0], knob.paths[0][-1]
+    if first == "gravity":
+        if "cloth" in solvers:
+            solvers["cloth"].gravity = value
+        if "rigid" in solvers:
+            solvers["rigid"].set_gravity(value)
+    elif first == "rigid":
+        assert isinstance(value, float)
+        assert isinstance(before, float)
+        solvers["rigid"].scale_mass(job.rigid[int(knob.paths[0][1])].name, value / before)
+    elif key == "substeps":
+        solvers["cloth"].take_substeps(value)
+    else:
+        solvers["cloth"].change(job.cloth[int(knob.paths[0][1])].name, **{str(key): value})
+    world.tell_couplings()
+
+
+def overrides_of(knobs: tuple[Knob, ...], values: Mapping[str, Value]) -> list[Override]:
+    """The changes that make the job that has these values, of those that differ from its own."""
+    return [
+        Override(path, list(value) if isinstance(value, tuple) else value, "live")
+        for knob in knobs
+        if (value := values[knob.name]) != knob.start
+        for path in knob.paths
+    ]
+
+
+def with_substeps(cloth: tuple[ClothParameters, ...], count: int) -> tuple[ClothParameters, ...]:
+    """The same cloths in another number of substeps a frame."""
+    return tuple(each.model_copy(update={"substeps": count}) for each in cloth)

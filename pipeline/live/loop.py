@@ -1,0 +1,52 @@
+"""The loop of `pipeline live`: requests, a frame, what is to be seen of it, and the wait until the next is due."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from pipeline.live.session import Session, Status
+
+SHOWN_EVERY_S = 1.0 / 30.0
+TOLD_EVERY_S = 0.2
+LONGEST_WAIT_S = 0.05
+"""While time stands still or is slow: how long requests may wait, and the end."""
+
+
+class Shows(Protocol):
+    """Where a session is shown."""
+
+    def show(self) -> None:
+        """Show where the scene is."""
+
+    def tell(self, status: Status) -> None:
+        """Show how it goes."""
+
+
+def run(session: Session, page: Shows, *, ends: Callable[[], bool]) -> None:
+    """Run a session until it `ends`: in real time, or as fast as it gets where that is slower.
+
+    Lost time is not made up for: after a slow frame the next is due at once, and no earlier ones are owed.
+    """
+    due = shown_at = told_at = time.perf_counter()
+    shown = (-1, -1)
+    while not ends():
+        now = time.perf_counter()
+        session.meet_requests(0.0 if not session.is_paused and now >= due else _wait(session, now, due))
+        now = time.perf_counter()
+        if not session.is_paused and now >= due:
+            session.advance()
+            due = max(due + session.dt / session.speed, time.perf_counter())
+        now = time.perf_counter()
+        moment = (session.revision, session.world.frame)
+        if moment != shown and now - shown_at >= SHOWN_EVERY_S:
+            page.show()
+            shown, shown_at = moment, now
+        if now - told_at >= TOLD_EVERY_S:
+            page.tell(session.status())
+            told_at = now
+
+
+def _wait(session: Session, now: float, due: float) -> float:
+    return LONGEST_WAIT_S if session.is_paused else min(LONGEST_WAIT_S, max(due - now, 1e-4))

@@ -1,0 +1,81 @@
+"""`pipeline live`, put together: the scene in this thread, its page beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from pipeline.errors import PipelineError, StageUnavailableError
+from pipeline.live.loop import run
+from pipeline.live.saving import save_job
+from pipeline.live.serving import open_server
+from pipeline.live.session import Session
+from pipeline.live.take import Recorder
+
+if TYPE_CHECKING:
+    from pipeline.job.loading import LoadedJob
+    from pipeline.job.models import Job
+
+
+class Address(NamedTuple):
+    """Where a page is."""
+
+    host: str
+    port: int
+
+
+def show_live(
+    loaded: LoadedJob,
+    job: Job,
+    address: Address,
+    *,
+    output: Path,
+    folder: Path,
+    threads: int | None,
+    paused: bool,
+    say: Callable[[str], None],
+    ends: Callable[[], bool],
+) -> None:
+    """Run a scene until it `ends`, and show it.
+
+    Args:
+        loaded: the job as it was read.
+        job: as it is simulated, `pipeline.live.scene.live_job`.
+        address: to listen at.
+        output: where recordings become jobs' folders.
+        folder: where jobs are saved.
+        threads: of the processor; all if omitted.
+        paused: begin standing still.
+        say: is told the page's address.
+        ends: whether it is over.
+
+    Raises:
+        PipelineError: the port is taken, or the scene cannot be built.
+    """
+    from sim.runtime import DeviceUnavailableError, initialize
+    from sim.shapes.solid import ShapeError
+
+    server = open_server(address.host, address.port)
+    try:
+        from pipeline.live.page import LivePage
+
+        try:
+            device = initialize(job.device, threads=threads)
+            session = Session(job)
+        except DeviceUnavailableError as error:
+            raise StageUnavailableError(str(error)) from error
+        except (ShapeError, ValueError) as error:
+            raise PipelineError(f"{job.name}: {error}") from error
+        session.is_paused = paused
+        recorder = Recorder(loaded, session, output, device=device)
+        page = LivePage(
+            server, session, title=job.name, recorder=recorder, save=lambda: save_job(loaded, session.values, folder)
+        )
+        say(f"http://{address.host}:{server.get_port()}")
+        try:
+            run(session, page, ends=ends)
+        finally:
+            recorder.stop()
+    finally:
+        server.stop()

@@ -1,0 +1,81 @@
+"""Which jobs can run live, how large they may be, and what is made of them for that."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.errors import PipelineError
+from pipeline.live.knobs import with_substeps
+from pipeline.stages.inputs import estimated_cloth_nodes, most_particles
+from sim.cloth.parameters import DEFAULT_SUBSTEPS
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+
+NODE_SUBSTEP_S = 1.4e-6
+"""Core time of a node in a substep of cloth in contact [s]: 10 000 nodes, 20 substeps, 0.28 s (docs/live.md)."""
+
+PARTICLE_STEP_S = {"wcsph": 0.45e-6, "dfsph": 1.7e-6, "pcisph": 1.7e-6}
+"""Core time of a particle in a step [s] (docs/performance.md)."""
+
+STEPS_A_SECOND = {"wcsph": 1800.0, "dfsph": 700.0, "pcisph": 700.0}
+"""Steps in a simulated second; their number grows with the speed and as particles get smaller."""
+
+GPU_CORES = 20
+"""A GPU counts as so many cores: scenes that fit here are too small to fill it."""
+
+MOST_FRAME_S = 0.25
+"""What a frame may take [s]: slower than four pictures a second nobody can steer anything."""
+
+
+def live_job(job: Job, *, substeps: int | None = None) -> Job:
+    """The job as it is simulated live: bodies that rest can be moved where there is no fluid, and steps are as asked.
+
+    Raises:
+        PipelineError: live does not run what the job has.
+    """
+    if job.smoke:
+        raise PipelineError(f"{job.name}: smoke does not run live; `pipeline animatic` draws it fast")
+    if not (job.cloth or job.fluid or job.moving_bodies):
+        raise PipelineError(f"{job.name}: nothing moves in it; live runs cloth, rigid bodies and fluids")
+    changes: dict[str, object] = {}
+    if substeps is not None:
+        if not job.cloth or job.cloth[0].integrator != "xpbd":
+            raise PipelineError(f'{job.name}: --substeps is for cloth with integrator = "xpbd"')
+        changes["cloth"] = with_substeps(job.cloth, substeps)
+    if not job.fluid:
+        changes["rigid"] = tuple(
+            body.model_copy(update={"kind": "kinematic"}) if body.kind == "static" else body for body in job.rigid
+        )
+    return job.model_copy(update=changes)
+
+
+def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
+    """Refuse a scene whose frames would take too long.
+
+    Raises:
+        PipelineError: says about how long a frame takes, and what would fit.
+    """
+    nodes, particles = estimated_cloth_nodes(job), most_particles(job)
+    power = GPU_CORES if on_gpu else cores
+    substeps = (job.cloth[0].substeps or DEFAULT_SUBSTEPS) if job.cloth else 0
+    cloth_s = nodes * substeps * NODE_SUBSTEP_S / power
+    fluid_s = 0.0
+    if job.fluid:
+        kind = job.fluid[0].solver
+        fluid_s = particles * STEPS_A_SECOND[kind] / job.fps * PARTICLE_STEP_S[kind] / power
+    if cloth_s + fluid_s <= MOST_FRAME_S:
+        return
+    share = MOST_FRAME_S / (cloth_s + fluid_s)
+    sizes, remedies = [], []
+    if nodes:
+        sizes.append(f"{nodes:,} cloth nodes at {substeps} substeps a frame")
+        remedies.append(f"about {int(nodes * share):,} nodes fit, or --substeps {max(1, int(substeps * share))}")
+    if particles:
+        sizes.append(f"up to {particles:,.0f} particles")
+        remedies.append(f"about {particles * share:,.0f} particles fit")
+    where = "the GPU" if on_gpu else f"{cores} cores"
+    raise PipelineError(
+        f"{job.name} is too large to steer: {' and '.join(sizes)} take some {cloth_s + fluid_s:.2g} s a frame on "
+        f"{where}, {MOST_FRAME_S:g} s at most; {', '.join(remedies)} (--preview may do); --anyway runs it"
+    )

@@ -1,0 +1,185 @@
+"""Takes: what happens in a session, as the simulated frames of a job of its own, which then is rendered as any other.
+
+The job's file names the take in `recorded`, and its simulation's fingerprint is the take's. So frames are receipted
+as simulated ones are, every later stage finds them, and nothing ever simulates over them or claims that it could.
+"""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.artifacts import committing
+from pipeline.cache import validate_frame, write_frame
+from pipeline.errors import PipelineError
+from pipeline.files import replace_durably
+from pipeline.fingerprint import task_fingerprint
+from pipeline.job.loading import job_of_text
+from pipeline.job.overrides import Override
+from pipeline.layout import JobLayout
+from pipeline.live.saving import text_with_values
+from pipeline.live.session import Session
+from pipeline.provenance import maker
+from pipeline.stages.ordered_writer import OrderedWriter, WriterLostError
+from pipeline.stages.simulate import SimulateStage
+from sim.world import FrameReport
+
+if TYPE_CHECKING:
+    from pipeline.job.loading import LoadedJob
+    from sim.snapshots import Snapshot
+
+
+class Recorder:
+    """Records a session, take after take, each into a folder NAME-take, NAME-take-2, ... of its own.
+
+    Args:
+        loaded: the job that is played with, as it was read.
+        session: the scene.
+        output: where jobs' folders lie.
+        device: that computes the frames.
+    """
+
+    def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:
+        self._loaded, self._session, self._output, self._device = loaded, session, output, device
+        self._take: _Take | None = None
+        session.on_jump = self.stop
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether a take is being made."""
+        return self._take is not None
+
+    def toggle(self) -> bool:
+        """Begin a take with the frame that is there now, or end it; returns whether one is being made.
+
+        Raises:
+            PipelineError, OSError: its folder cannot be made.
+        """
+        if self._take is not None:
+            self.stop()
+            return False
+        world = self._session.world
+        self._take = _Take(self._loaded, self._session, self._output, device=self._device)
+        self._session.message = f"recording into {self._take.layout.root}"
+        now = FrameReport(world.frame, world.time_s, {}, {}, world.diagnostics())
+        self._session.on_frame = self._add
+        self._add(now, self._session.bodies())
+        return self.is_recording
+
+    def stop(self) -> None:
+        """End the take, if one is being made, and say how to go on with it."""
+        take = self._forget()
+        if take is None:
+            return
+        try:
+            take.end()
+        except (OSError, PipelineError, WriterLostError) as error:
+            self._session.message = f"the take ends early: {error}"
+            return
+        self._session.message = f"{take.frames} frames: pipeline submit {take.layout.job_file}"
+
+    def _add(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
+        if self._take is None:
+            return
+        try:
+            self._take.add(report, bodies)
+        except (OSError, PipelineError, WriterLostError) as error:
+            self._forget()
+            self._session.message = f"the take ends early: {error}"
+
+    def _forget(self) -> _Take | None:
+        """Record no more; returns the take that was being made."""
+        take, self._take = self._take, None
+        self._session.on_frame = None
+        return take
+
+
+class _Take:
+    """One take on its way to the disk."""
+
+    def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:
+        self._loaded, self._session, self._device = loaded, session, device
+        self._name = f"live-{uuid.uuid4().hex[:12]}"
+        self.layout = JobLayout(_new_folder(output, f"{loaded.job.name}-take"))
+        self.frames = 0
+        self._values = {"first": dict(session.values)}
+        self._write_job(frames=1)
+        job = job_of_text(self._text(frames=1), self.layout.job_file)
+        self._dt = 1.0 / job.fps
+        (self._task,) = SimulateStage().plan(job, self.layout)
+        self._fingerprint = task_fingerprint(self._task, {})
+        self._writer = OrderedWriter()
+        self._writer.__enter__()
+
+    def add(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
+        """Have a frame written; waits while another one waits."""
+        mine = replace(report, frame=self.frames, time_s=self.frames * self._dt)
+        self._writer.submit(partial(self._commit, mine, bodies))
+        self.frames += 1
+
+    def end(self) -> None:
+        """Wait for all frames, and write what the take is."""
+        self._writer.__exit__(None, None, None)
+        self._write_job(frames=self.frames)
+        story = {
+            "take": self._name,
+            "job": self._loaded.job.name,
+            "frames": self.frames,
+            "device": self._device,
+            "maker": maker(),
+            "values": {**self._values, "last": dict(self._session.values)},
+            "note": "Steered by hand: no job file makes these frames again.",
+        }
+        replace_durably(self.layout.root / "take.json", json.dumps(story, indent=2, ensure_ascii=False) + "\n")
+
+    def _commit(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
+        commit = committing(
+            self.layout,
+            self.layout.frame_cache(report.frame),
+            task=self._task,
+            attempt=1,
+            fingerprint=self._fingerprint,
+            validate=validate_frame,
+        )
+        with commit:
+            write_frame(commit.path, bodies, report, device=self._device)
+
+    def _write_job(self, *, frames: int) -> None:
+        replace_durably(self.layout.job_file, self._text(frames=frames))
+
+    def _text(self, *, frames: int) -> str:
+        """The job with the present values, and bodies as they could be moved: the renderer asks the frames for them."""
+        job = self._loaded.job
+        length = ("duration", frames / job.fps) if job.duration is not None else ("frames", frames)
+        changes: list[tuple[tuple[str | int, ...], object]] = [
+            (("name",), self.layout.root.name),
+            (("recorded",), self._name),
+            ((length[0],), length[1]),
+        ]
+        for number, (written, lived) in enumerate(zip(job.rigid, self._session.job.rigid, strict=True)):
+            if written.kind != lived.kind:
+                changes.append((("rigid", number, "kind"), lived.kind))
+        overrides = [Override(path, value, "live") for path, value in changes]
+        return text_with_values(self._loaded, self._session.values, overrides)
+
+
+def _new_folder(output: Path, stem: str) -> Path:
+    """A folder that nobody has, made.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    for number in count(1):
+        folder = output / (stem if number == 1 else f"{stem}-{number}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return folder
+    raise AssertionError("numbers do not end")

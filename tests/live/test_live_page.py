@@ -1,0 +1,134 @@
+"""The page in a real browser: it draws, and what a mouse does there reaches the scene."""
+
+from __future__ import annotations
+
+import io
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import needs_browser, open_page
+from live_jobs import BALL_OVER_SHEET, loaded
+from PIL import Image
+
+from pipeline.errors import PipelineError
+from pipeline.live.loop import run
+from pipeline.live.page import LivePage
+from pipeline.live.saving import save_job
+from pipeline.live.scene import live_job
+from pipeline.live.serving import open_server
+from pipeline.live.session import Session
+from pipeline.live.take import Recorder
+
+LOOKED_AT = (
+    BALL_OVER_SHEET.replace("counts = [17, 17]", "counts = [9, 9]")
+    + """
+[camera]
+position = [0.0, -1.6, 0.62]
+look_at = [0.0, 0.0, 0.62]
+"""
+)
+PATIENCE_S = 60.0
+"""Browsers that draw on the CPU take seconds for a picture where others compute."""
+
+
+def until(condition, what: str) -> None:
+    ends = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < ends, what
+        time.sleep(0.05)
+
+
+def play(address: str, session: Session, folder: Path) -> None:
+    """What somebody does at the page."""
+    with open_page(760, 480) as page:
+        page.set_default_timeout(1e3 * PATIENCE_S)
+        page.goto(address)
+        page.get_by_text("paused").wait_for()
+        canvas = page.locator("canvas").first
+        box = canvas.bounding_box()
+        middle = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
+
+        def colors() -> int:
+            pixels = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB"))
+            return len(np.unique(pixels.reshape(-1, 3), axis=0))
+
+        until(lambda: colors() > 200, "nothing is drawn")
+        assert session.is_paused
+        page.get_by_role("button", name="Go on").click()
+        until(lambda: session.world.frame > 2, "time stands still")
+        page.get_by_role("button", name="Reset").click()
+        page.get_by_role("button", name="Pause").click()
+        until(lambda: session.is_paused, "it goes on")
+        page.get_by_role("button", name="Reset").click()
+        until(lambda: session.world.frame == 0, "it was not reset")
+
+        def take_ball() -> None:
+            page.mouse.move(*middle)  # onto the ball, which is in the middle of the picture
+            page.mouse.down()
+            for share in np.linspace(0.0, 1.0, 8):
+                page.mouse.move(middle[0], middle[1] - 60.0 * share)
+                time.sleep(0.05)
+            until(lambda: session.is_holding, "the ball is not in hand")
+
+        take_ball()
+        page.get_by_role("button", name="Go on").focus()
+        page.keyboard.press("Enter")
+        until(lambda: session.world.solvers["rigid"].bodies.position[0, 2] > 0.68, "the ball does not follow")
+        page.mouse.up()
+        until(lambda: not session.is_holding, "the ball is not let go")
+
+        before = session.values["cloth.sheet.stretch_stiffness"]
+        page.get_by_role("slider").nth(2).focus()
+        for _ in range(10):
+            page.keyboard.press("ArrowLeft")
+        until(lambda: session.values["cloth.sheet.stretch_stiffness"] < 0.8 * before, "the slider does nothing")
+        page.get_by_role("button", name="Save as job").click()
+        until((folder / "drape-live.toml").exists, "nothing was saved")
+        page.get_by_text("drape-live.toml").wait_for()
+        page.get_by_role("button", name="Record").click()
+        page.get_by_role("button", name="Stop recording").click()
+        page.get_by_text("frames: pipeline submit").wait_for()
+        assert len(list((folder / "renders" / "drape-take" / "cache").glob("*.h5"))) > 1
+
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_role("button", name="Reset").click()
+        until(lambda: session.world.frame == 0, "it was not reset")
+        time.sleep(1.0)  # until the ball is seen where it was
+        take_ball()  # and the browser is closed
+
+
+@needs_browser
+@pytest.mark.usefixtures("taichi")
+def test_a_page_draws_and_takes_drags_buttons_and_sliders_to_the_scene(tmp_path):
+    read = loaded(tmp_path, LOOKED_AT)
+    session = Session(live_job(read.job))
+    session.advance()  # kernels
+    session.reset()
+    session.is_paused = True
+    recorder = Recorder(read, session, tmp_path / "renders", device="cpu")
+    server = open_server("127.0.0.1", 0)
+    try:
+        page = LivePage(
+            server, session, title="drape", save=lambda: save_job(read, session.values, tmp_path), recorder=recorder
+        )
+        with ThreadPoolExecutor(1) as browser:
+            playing = browser.submit(play, f"http://127.0.0.1:{server.get_port()}", session, tmp_path)
+            run(session, page, ends=playing.done)
+            playing.result()
+        gone = time.monotonic() + PATIENCE_S
+        run(session, page, ends=lambda: not session.is_holding or time.monotonic() > gone)
+        assert not session.is_holding
+    finally:
+        server.stop()
+
+
+def test_a_port_that_is_taken_is_told():
+    server = open_server("127.0.0.1", 0)
+    try:
+        with pytest.raises(PipelineError, match=f"cannot listen at 127.0.0.1:{server.get_port()}: .*--port"):
+            open_server("127.0.0.1", server.get_port())
+    finally:
+        server.stop()

@@ -1,0 +1,167 @@
+"""A scene that is played with, without a page: knobs and hands change what happens, and a blow-up is no end."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_jobs import BALL_OVER_SHEET, loaded
+
+from pipeline.live.scene import live_job
+from pipeline.live.session import FRAMES_TO_TRUST, Session
+
+pytestmark = pytest.mark.usefixtures("taichi")
+
+WITHOUT_BALL = BALL_OVER_SHEET.replace("position = [0.0, 0.0, 0.62]", "position = [0.4, 0.4, 0.08]")
+
+
+def session_of(folder: Path, text: str = BALL_OVER_SHEET) -> Session:
+    return Session(live_job(loaded(folder, text).job))
+
+
+def run(session: Session, frames: int) -> None:
+    for _ in range(frames):
+        session.meet_requests()
+        session.advance()
+
+
+def lowest(session: Session) -> float:
+    return float(session.bodies()["sheet"].arrays["position"][:, 2].min())
+
+
+def place(session: Session, name: str) -> np.ndarray:
+    return np.asarray(session.bodies()[name].arrays["position"])
+
+
+def test_softer_cloth_sags_deeper_and_gravity_can_be_turned_around(tmp_path):
+    session = session_of(tmp_path, WITHOUT_BALL)
+    session.ask(session.turn, "cloth.sheet.stretch_stiffness", 20.0)
+    run(session, 12)
+    sagged = lowest(session)
+    session.ask(session.reset)
+    session.ask(session.turn, "cloth.sheet.stretch_stiffness", 5000.0)
+    run(session, 12)
+    assert session.world.frame == 12
+    assert sagged < lowest(session) - 0.005
+    session.ask(session.turn, "gravity", (0.0, 0.0, 20.0))
+    run(session, 12)
+    assert session.bodies()["sheet"].arrays["position"][:, 2].max() > 0.5005  # above its edges
+    assert place(session, "ball")[2] > 0.2
+
+
+def test_a_heavier_ball_presses_the_sheet_deeper(tmp_path):
+    depths = []
+    for density in (100.0, 2000.0):
+        session = session_of(tmp_path)
+        session.turn("rigid.ball.density", density)
+        run(session, 16)
+        depths.append(lowest(session))
+    assert depths[1] < depths[0] - 0.01
+
+
+def test_a_ball_that_is_dragged_down_pushes_the_cloth_and_let_go_is_thrown_back(tmp_path):
+    session = session_of(tmp_path)
+    session.ask(session.grab_body, "ball", (0.0, 0.0, 0.7), 7)
+    run(session, 5)
+    assert place(session, "ball")[2] == pytest.approx(0.62, abs=0.005)  # in hand, it does not fall
+    session.ask(session.drag, "body", "ball", (0.0, 0.0, 0.45))
+    run(session, 25)
+    pressed = place(session, "ball")[2]
+    assert pressed < 0.45  # its centre below where the sheet was
+    assert lowest(session) < pressed - 0.07  # and the sheet under it, not around it
+    session.ask(session.let_go_all, 7)  # its browser is gone
+    run(session, 15)
+    assert not session.is_holding
+    assert place(session, "ball")[2] > pressed + 0.03
+
+
+def test_a_body_that_rests_can_be_led_and_stays_where_it_is_let_go(tmp_path):
+    session = session_of(tmp_path)
+    session.ask(session.grab_body, "post", (0.4, 0.0, 0.1))
+    session.ask(session.drag, "body", "post", (0.5, 0.1, 0.2))
+    run(session, 30)
+    session.ask(session.let_go, "body", "post")
+    run(session, 5)
+    np.testing.assert_allclose(place(session, "post"), [0.5, 0.1, 0.15], atol=4e-3)
+
+
+def test_cloth_is_pulled_up_by_a_node_and_pins_can_be_moved(tmp_path):
+    session = session_of(tmp_path, WITHOUT_BALL)
+    session.ask(session.grab_cloth, "sheet", (0.0, 0.0, 0.5))
+    session.ask(session.drag, "cloth", "sheet", (0.0, 0.0, 0.6))
+    run(session, 25)
+    assert session.bodies()["sheet"].arrays["position"][144, 2] == pytest.approx(0.6, abs=5e-3)
+    session.ask(session.let_go, "cloth", "sheet")
+    session.ask(session.grab_cloth, "sheet", (0.0, -0.2, 0.5))  # a node of the first pin: the whole pin
+    session.ask(session.drag, "cloth", "sheet", (0.0, -0.15, 0.55))
+    run(session, 25)
+    session.ask(session.let_go, "cloth", "sheet")
+    run(session, 5)
+    edge = session.bodies()["sheet"].arrays["position"][:17]
+    np.testing.assert_allclose(edge[:, 2], 0.55, atol=2e-3)
+    np.testing.assert_allclose(edge[:, 1], -0.15, atol=2e-3)
+    assert session.bodies()["sheet"].arrays["position"][144, 2] < 0.56
+
+
+def test_a_blow_up_goes_back_to_what_was_sound_and_names_what_was_turned(tmp_path):
+    session = session_of(tmp_path, BALL_OVER_SHEET[: BALL_OVER_SHEET.index("[[cloth]]")])
+    run(session, FRAMES_TO_TRUST + 32)
+    sound = place(session, "ball")
+    session.turn("gravity", (0.0, 0.0, -20.0))
+    run(session, 2)
+    session.world.solvers["rigid"].bodies.velocity[0] = (0.0, 0.0, 1e6)
+    run(session, 1)
+    assert session.world.frame == 30
+    assert session.values["gravity"] == (0.0, 0.0, -9.81)
+    assert "blew up" in session.message
+    assert "Turned last: gravity = (0.0, 0.0, -20.0)" in session.message
+    run(session, FRAMES_TO_TRUST + 2)  # and it goes on, as it had gone
+    np.testing.assert_allclose(place(session, "ball"), sound, atol=1e-9)
+    session.reset()
+    # Before anything can be trusted: from the start, and it stands still.
+    run(session, 10)
+    session.world.solvers["rigid"].bodies.velocity[0] = (np.nan, 0.0, 0.0)
+    run(session, 1)
+    assert session.world.frame == 0
+    assert session.is_paused
+    assert "Nothing had been turned" in session.message
+
+
+def test_cloth_with_values_that_are_no_numbers_goes_back_too(tmp_path):
+    session = session_of(tmp_path)
+    run(session, 1)
+    session.turn("cloth.sheet.bend_stiffness", 1.0e-3)
+    cloth = session.world.solvers["cloth"]
+    spoilt = cloth.state.velocity.to_numpy()
+    spoilt[100] = np.nan
+    cloth.state.velocity.from_numpy(spoilt)
+    run(session, 1)
+    assert "Turned last: cloth.sheet.bend_stiffness = 0.001" in session.message
+    run(session, 2)
+    assert np.isfinite(session.bodies()["sheet"].arrays["position"]).all()
+
+
+def test_what_cannot_be_is_refused_with_a_message_and_changes_nothing(tmp_path):
+    session = session_of(tmp_path)
+    for request in (
+        (session.turn, "cloth.sheet.friction", -1.0),
+        (session.turn, "cloth.sheet.friction", float("nan")),
+        (session.turn, "nothing", 1.0),
+        (session.grab_body, "nobody", (0.0, 0.0, 0.0)),
+        (session.set_speed, 0.0),
+    ):
+        session.message = ""
+        session.ask(*request)
+        session.meet_requests()
+        assert session.message
+    session.ask(session.drag, "body", "ball", (0.0, 0.0, 0.0))  # in no hand: nothing happens
+    session.meet_requests()
+    assert session.values == {name: knob.start for name, knob in session.knobs.items()}
+
+
+def test_a_single_step_stands_still_after_it(tmp_path):
+    session = session_of(tmp_path)
+    session.ask(session.step)
+    session.meet_requests()
+    assert session.world.frame == 1
+    assert session.is_paused
+    assert session.status().real_time == 0.0
