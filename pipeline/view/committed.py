@@ -59,7 +59,6 @@ class CommittedFrames:
         folder_stamp = self._settled_time_of_folder()
         if folder_stamp is not None and folder_stamp == self._folder_stamp:
             return False
-        self._folder_stamp = folder_stamp
         seen: dict[str, _Seen] = {}
         paths = sorted(self.folder.glob("[0-9]*.h5.json"))
         for path in paths:
@@ -72,6 +71,7 @@ class CommittedFrames:
             else:
                 artifact = ArtifactPath(path.relative_to(self._layout.receipts).as_posix().removesuffix(".json"))
                 seen[path.name] = _Seen(stamp, read_receipt(self._layout, artifact))
+        self._folder_stamp = folder_stamp  # only now: what could not be read is tried again
         if seen == self._seen:
             return False
         self._seen = seen
@@ -93,6 +93,28 @@ class CommittedFrames:
         """
         stamp = stamp_of(self.folder)
         return stamp[0] if stamp is not None and time.time_ns() - stamp[0] > SETTLED_NS else None
+
+    def known_hash(self, frame: int) -> str | None:
+        """Hash of a cached frame as it was when it was last looked for; None if it was not there."""
+        receipt = self._receipts.get(frame)
+        return None if receipt is None else receipt.hash
+
+    def bounds_are_known(self, job: Job, frame: int) -> bool:
+        """Whether the film's bounds are there, and not those of an earlier simulation: of this frame and the last one.
+
+        They are made when the whole film is simulated, from bounds of each frame, and those from the cached frames.
+        """
+        film = read_receipt(self._layout, self._layout.film_bounds())
+        if film is None:
+            return False
+        for number in (frame, job.frame_count - 1):
+            own = read_receipt(self._layout, self._layout.frame_bounds(number))
+            cached = self._receipts.get(number)
+            if own is None or cached is None or own.inputs.get(cached.artifact) != cached.hash:
+                return False
+            if film.inputs.get(own.artifact) != own.hash:
+                return False
+        return True
 
     def derived(self, frame: int, artifact: ArtifactPath) -> bool:
         """Whether a file that is made from a frame is there, and was made from the frame as it is now."""
@@ -118,12 +140,20 @@ def artifacts_of_frame(job: Job, layout: JobLayout, frame: int | None) -> list[A
         layout.frame_cache(frame),
         *(layout.surface(fluid.name, frame) for fluid in job.fluid),
         *(layout.whitewater(fluid, frame) for fluid in job.whitewater),
-        *([layout.film_bounds()] if job.camera.frames_action else []),
+        *(
+            [layout.film_bounds(), layout.frame_bounds(frame), layout.frame_bounds(job.frame_count - 1)]
+            if job.camera.frames_action
+            else []
+        ),
     ]
 
 
 def stamp_of(path: Path) -> tuple[int, int] | None:
-    """Modification time [ns] and size of a file, None if there is none."""
+    """Modification time [ns] and size of a file, None if there is none.
+
+    Raises:
+        OSError: the file system does not say.
+    """
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -180,7 +180,7 @@ def _read(
         try:
             if surfaces and committed.derived(frame, surface):
                 mesh = read_ply(layout.path(surface))
-                meshes[fluid.name] = SurfaceMesh(mesh.vertices, mesh.faces)
+                meshes[fluid.name] = SurfaceMesh(_own(mesh.vertices), _own(mesh.faces))
             if fluid.name in job.whitewater and committed.derived(frame, cloud):
                 whitewater[fluid.name] = _whitewater(layout, fluid.name, frame, most_particles)
         except (InvalidFileError, OSError) as error:
@@ -209,14 +209,14 @@ def _particles(body: Snapshot, most: int) -> Particles:
     else:
         chosen = slice(None, None, step)
     values = {
-        name: np.ascontiguousarray(array[chosen], np.float32)
+        name: _own(np.asarray(array[chosen], np.float32))
         for name, array in body.arrays.items()
         if array.shape == (count,) and np.issubdtype(array.dtype, np.floating)
     }
     if "velocity" in body.arrays:
         values[SPEED] = np.linalg.norm(_floats(body, "velocity")[chosen], axis=1).astype(np.float32)
     rest_density = body.number("rest_density") if "rest_density" in body.attributes else None
-    return Particles(position[chosen], values, body.number("particle_radius"), rest_density, count)
+    return Particles(_own(position[chosen]), values, body.number("particle_radius"), rest_density, count)
 
 
 def _whitewater(layout: JobLayout, fluid: str, frame: int, most: int) -> Particles:
@@ -225,14 +225,14 @@ def _whitewater(layout: JobLayout, fluid: str, frame: int, most: int) -> Particl
     chosen = slice(None, None, every(count, most))
     radius = float(cloud.radius.mean()) if count else 0.0
     speed = np.linalg.norm(cloud.velocity[chosen], axis=1).astype(np.float32)
-    return Particles(cloud.position[chosen], {SPEED: speed}, radius, None, count)
+    return Particles(_own(cloud.position[chosen]), {SPEED: speed}, radius, None, count)
 
 
 def _view(
     job: Job, layout: JobLayout, committed: CommittedFrames, frame: int, poses: Mapping[str, Pose]
 ) -> View | None:
     """The camera's view at a frame; None as long as the film's bounds are not known, which it may frame."""
-    if job.camera.frames_action and not committed.is_there(layout.film_bounds()):
+    if job.camera.frames_action and not committed.bounds_are_known(job, frame):
         return None
     try:
         path = camera_path(job, framed_points(job, layout))
@@ -241,6 +241,12 @@ def _view(
     if any(name not in poses for name in path.bodies):
         return None
     return path.view(frame / job.fps, {name: poses[name].position.tolist() for name in path.bodies})
+
+
+def _own(array: NDArray[Any]) -> NDArray[Any]:
+    """An array that keeps no larger one in memory."""
+    base = array.base
+    return array if base is None or (isinstance(base, np.ndarray) and base.nbytes == array.nbytes) else array.copy()
 
 
 def _floats(body: Snapshot, name: str) -> Floats:

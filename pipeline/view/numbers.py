@@ -120,7 +120,7 @@ def plot(frames: Sequence[int], values: Sequence[float], *, current: int | None,
     """
     if not frames:
         return '<div style="padding:0 .8em;opacity:.6;font-size:12px">nothing to plot yet</div>'
-    low, high = min(0.0, *values), max(values)
+    low, high = min(0.0, *values), max(0.0, *values)
     if high - low <= 1e-12 * max(abs(low), abs(high), 1e-290):
         high = low + 1.0
     width, height = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
@@ -131,13 +131,16 @@ def plot(frames: Sequence[int], values: Sequence[float], *, current: int | None,
 
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*each) for each in _thinned(frames, values)))
     base = place(0, 0.0)[1]
+    labels = {base: "0", TOP + 7: f"{high:.3g}"} if high > 0.0 else {TOP + 7: "0", TOP + height: f"{low:.3g}"}
     parts = [
         f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" style="display:block;width:100%;font:10px system-ui" '
         f'fill="currentColor" role="img">',
         f'<line x1="{LEFT:g}" x2="{WIDTH - RIGHT:g}" y1="{base:.1f}" y2="{base:.1f}" stroke="currentColor" '
         'opacity=".3"/>',
-        f'<text x="{LEFT - 5:g}" y="{TOP + 7:g}" text-anchor="end" opacity=".7">{high:.3g}</text>',
-        f'<text x="{LEFT - 5:g}" y="{base:.1f}" text-anchor="end" opacity=".7">0</text>',
+        *(
+            f'<text x="{LEFT - 5:g}" y="{y:.1f}" text-anchor="end" opacity=".7">{text}</text>'
+            for y, text in labels.items()
+        ),
         f'<text x="{LEFT:g}" y="{HEIGHT - 6:g}" opacity=".7">frame 0</text>',
         f'<text x="{WIDTH - RIGHT:g}" y="{HEIGHT - 6:g}" text-anchor="end" opacity=".7">{last}</text>',
         f'<polyline points="{line}" fill="none" stroke="#3f97e0" stroke-width="1.6" stroke-linejoin="round"/>',

@@ -64,7 +64,7 @@ class ViewPage:
         self._loaded = LoadedFrames(most_bytes)
         self._series, self._extents = SolverSeries(), Extents()
         self._spoilt: dict[int, tuple[str, str]] = {}  # by frame: the hash it should have, and what is wrong
-        self._job_trouble = ""
+        self._job_trouble = self._files_trouble = ""
         self._drawing = Drawing(server)
         self.playback = Playback(rate=float(min(self._job.fps, 60)))
         self._drawn: tuple[object, ...] = ()
@@ -119,12 +119,18 @@ class ViewPage:
             except Empty:
                 break
             command(now)
-        if now >= self._next_look:
-            self._look()
-            self._next_look = now + LOOK_S
-        pending = self._read_numbers(time.monotonic() + NUMBERS_S)
-        frame = self.playback.advance(now)
-        self._show(frame)
+        try:
+            if now >= self._next_look:
+                self._next_look = now + LOOK_S
+                self._look()
+            pending = self._read_numbers(time.monotonic() + NUMBERS_S)
+            frame = self.playback.advance(now)
+            self._files_trouble = ""
+            self._show(frame)
+        except OSError as error:  # a right that was taken away, or a server of files that is gone: it may come back
+            self._files_trouble = f"{self._layout.root} cannot be read now: {error}"
+            self._tell(self.playback.frame, self._controls.shown(), self._series.largest("max_speed"))
+            return LOOK_S
         due = self.playback.wait(now)
         waits = [self._next_look - now, *([] if due is None else [due]), *([0.0] if pending else [])]
         return max(0.0, min(waits))
@@ -177,8 +183,15 @@ class ViewPage:
         """Whether a frame could not be read, and was not simulated anew since."""
         return frame in self._spoilt and self._spoilt[frame][0] == self._committed.receipt(frame).hash
 
+    def _known(self, frame: int) -> tuple[str | None, ...]:
+        """What is known of a frame, and of the last one, on which the camera may depend.
+
+        Receipts may be newer: then a frame is read again when this has caught up.
+        """
+        return tuple(self._committed.known_hash(number) for number in (frame, self._job.frame_count - 1))
+
     def _load(self, frame: int, stamp: Stamp, *, surfaces: bool) -> ShownFrame | None:
-        state = (stamp, surfaces)
+        state = (stamp, self._known(frame), surfaces)
         shown = self._loaded.get(frame, state)
         if shown is None:
             try:
@@ -204,7 +217,7 @@ class ViewPage:
         settings = self._controls.shown()
         top_speed = self._series.largest("max_speed")
         stamp = self._committed.stamp(artifacts_of_frame(self._job, self._layout, frame))
-        wanted = (frame, stamp, settings, top_speed)
+        wanted = (frame, stamp, None if frame is None else self._known(frame), settings, top_speed)
         if wanted != self._drawn:
             shown = None if frame is None else self._load(frame, stamp, surfaces=SURFACES in settings.layers)
             self._scene.draw(self._drawing, shown, settings, self._extents, top_speed=top_speed)
@@ -233,7 +246,7 @@ class ViewPage:
             controls.table.content = "" if numbers is None else table(numbers)
 
     def _troubles(self, frame: int | None, settings: Shown) -> list[str]:
-        troubles = [self._job_trouble] if self._job_trouble else []
+        troubles = [trouble for trouble in (self._job_trouble, self._files_trouble) if trouble]
         if frame is None:
             where = f"{self._layout.root} has no frame yet; they appear here as soon as they are simulated"
             return [*troubles, where]

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
+from pipeline.task import ArtifactPath
 from pipeline.view.colors import BODY as BODY_COLOR
 from pipeline.view.colors import CLOTH, PIN, SURFACE, WHITEWATER, Colors, ramp, srgb
-from pipeline.view.committed import CommittedFrames
+from pipeline.view.committed import CommittedFrames, Stamp
 from pipeline.view.drawing import Drawing, Rgb, box_edges
 from pipeline.view.frames import SPEED, Particles, Pose, ShownFrame
 from pipeline.view.smoke_pictures import cut, points
@@ -111,7 +112,7 @@ class JobScene:
 
     def __init__(self, job: Job, layout: JobLayout, committed: CommittedFrames) -> None:
         self._job, self._layout, self._committed = job, layout, committed
-        self._meshes: dict[str, SurfaceMesh] = {}
+        self._meshes: dict[ArtifactPath, tuple[Stamp, SurfaceMesh]] = {}
         self._standing = {
             body.name: Pose(np.array(body.position), from_degrees(body.rotation_deg))
             for body in job.rigid
@@ -205,12 +206,20 @@ class JobScene:
     def _mesh(self, body: str, part: str) -> SurfaceMesh | None:
         """The mesh of a part of a body; None before it is made."""
         artifact = self._layout.body_mesh(body, part)
-        if artifact not in self._meshes and self._committed.is_there(artifact):
-            try:
-                self._meshes[artifact] = read_ply(self._layout.path(artifact))
-            except (InvalidFileError, OSError) as error:
-                self.troubles.append(f"{error}; see: pipeline verify")
-        return self._meshes.get(artifact)
+        stamp = self._committed.stamp([artifact])
+        kept = self._meshes.get(artifact)
+        if kept is not None and kept[0] == stamp:
+            return kept[1]
+        self._meshes.pop(artifact, None)
+        if not self._committed.is_there(artifact):
+            return None
+        try:
+            mesh = read_ply(self._layout.path(artifact))
+        except (InvalidFileError, OSError) as error:
+            self.troubles.append(f"{error}; see: pipeline verify")
+            return None
+        self._meshes[artifact] = stamp, mesh
+        return mesh
 
     def _draw_pins(self, drawing: Drawing, frame: ShownFrame) -> None:
         try:
@@ -223,6 +232,9 @@ class JobScene:
             held = [nodes for nodes, release_s in pins if frame.numbers.time_s < release_s]
             if sheet is not None and held:
                 nodes = np.unique(np.concatenate(held))
+                if nodes[-1] >= len(sheet.position):  # the frame is of an earlier version of the job
+                    self.troubles.append(f"pins of {name} are not shown: this frame has fewer nodes than the job")
+                    continue
                 drawing.points(f"/pins/{name}", sheet.position[nodes], PIN, radius=self._size / 250.0)
 
     def _pins(self) -> dict[str, list[tuple[NDArray[np.int64], float]]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import socket
 import sys
 from pathlib import Path
@@ -21,7 +22,7 @@ from pipeline.view.committed import CommittedFrames, artifacts_of_frame
 from pipeline.view.drawing import box_edges, camera_orientation, vertical_fov
 from pipeline.view.frames import ShownFrame, Smoke, read_shown_frame
 from pipeline.view.loaded import LoadedFrames
-from pipeline.view.numbers import SolverSeries, plot, table
+from pipeline.view.numbers import HEIGHT, SolverSeries, plot, table
 from pipeline.view.playback import Playback
 from pipeline.view.scene import Extents
 from pipeline.view.serving import address, page_server
@@ -150,6 +151,20 @@ def test_a_camera_that_frames_the_action_is_unknown_until_the_film_is(tmp_path):
     assert shown(layout, 0).view is None
 
 
+def test_the_camera_of_a_film_is_unknown_while_that_is_simulated_anew(tmp_path):
+    layout = viewed_job.submitted(tmp_path / "action", frames=3, camera='framing = "action"')
+    for frame in range(3):
+        viewed_job.commit(layout, frame)
+    viewed_job.commit_bounds(layout, 3)
+    assert shown(layout, 0).view is not None
+    for frame in range(3):
+        viewed_job.commit(layout, frame, fingerprint="anew", energy=7.0)
+        assert shown(layout, frame).view is None
+        assert shown(layout, 0).view is None
+    viewed_job.commit_bounds(layout, 3)
+    assert shown(layout, 0).view is not None
+
+
 @pytest.mark.parametrize("aspect", [16 / 9, 1.0, 0.5])
 def test_the_frustum_is_what_the_film_sees(aspect):
     view = View((2.0, -3.0, 1.5), (0.1, 0.2, 0.3), 35.0, 3.0)
@@ -189,6 +204,20 @@ def test_kept_frames_stay_below_their_limit_and_the_oldest_go_first(layout):
     assert kept.get(0, ()) is None
     assert kept.get(3, ()) is frames[3]
     assert kept.get(3, ((1, 1),)) is None  # its files were replaced
+
+
+@pytest.mark.parametrize("most", [1, 200])
+def test_a_kept_frame_keeps_no_array_in_memory_that_is_larger_than_what_is_shown(layout, most):
+    cached = viewed_job.commit(layout, 0)
+    viewed_job.commit_surface(layout, cached, 0)
+    viewed_job.commit_spray(layout, cached, 0, points=500)
+    frame = shown(layout, 0, most=most)
+    arrays = [frame.surfaces["water"].vertices, frame.surfaces["water"].faces]
+    for cloud in (frame.fluids["water"], frame.whitewater["water"]):
+        assert len(cloud.position) < 500
+        arrays += [cloud.position, *cloud.values.values()]
+    for array in arrays:
+        assert array.base is None or array.base.nbytes == array.nbytes
 
 
 # --- playing -------------------------------------------------------------------------------------------------------
@@ -320,6 +349,11 @@ def test_numbers_are_told_and_plotted_with_a_mark_at_the_frame(layout):
     assert ">4</text>" in svg
     assert 'fill="#f08a3c"' in svg
     assert "nothing to plot" in plot([], [], current=None, last=9)
+    svg = plot([0, 1], [-5.0, -3.0], current=0, last=1)
+    heights = [float(y) for y in re.findall(r'y[12]?="([-\d.]+)"', svg)]
+    assert min(heights) >= 0.0
+    assert max(heights) <= HEIGHT
+    assert ">-5</text>" in svg
     html = table(read_numbers(layout.path(layout.frame_cache(3))))
     assert "kinetic energy" in html
     assert "9 J" in html

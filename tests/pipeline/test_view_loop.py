@@ -13,10 +13,14 @@ import numpy as np
 import pytest
 import viewed_job
 import viser
+from inline_tasks import run_task
 from scipy.spatial.transform import Rotation
 from websockets.sync.client import connect
 
+from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
+from pipeline.receipts import read_receipt
+from pipeline.stages.bodies import BodiesStage
 from pipeline.view.drawing import Drawing
 from pipeline.view.frames import Smoke
 from pipeline.view.page import ViewPage
@@ -100,6 +104,79 @@ def test_a_frame_that_is_simulated_anew_is_read_anew(server, layout):
     page.turn(10.0)
     assert page.frames == (0,)
     assert "123 J" in page.table
+
+
+def test_a_surface_of_the_frame_before_goes_when_the_frame_is_simulated_anew(server, layout):
+    receipt = read_receipt(layout, layout.frame_cache(0))
+    viewed_job.commit_surface(layout, receipt, 0)
+    page = page_of(server, layout)
+    page._controls._layers["Surfaces"].value = True
+    page.turn(0.1)
+    assert "/surfaces/water" in page.things
+    time.sleep(0.01)
+    viewed_job.commit(layout, 0, fingerprint="other", energy=123.0)
+    page.turn(0.2)  # before it looks for new frames
+    page.turn(10.0)
+    assert page.frames == (0,)
+    assert "/surfaces/water" not in page.things
+
+
+def test_a_body_that_is_made_anew_is_drawn_anew(server, layout):
+    page = page_of(server, layout)
+
+    def radius() -> float:
+        return float(server.scene.get_handle_by_name("/bodies/ball").vertices.max())
+
+    assert radius() == pytest.approx(0.1, rel=0.01)
+    text = layout.job_file.read_text()
+    layout.job_file.write_text(
+        text.replace(
+            '"sphere", radius = 0.1 }\nposition = [0.7, 0.3', '"sphere", radius = 0.25 }\nposition = [0.7, 0.3'
+        )
+    )
+    page.turn(10.0)
+    assert radius() == pytest.approx(0.1, rel=0.01)  # as long as there is no other mesh
+    time.sleep(0.01)
+    for task in BodiesStage().plan(load_job(layout.job_file), layout):
+        run_task(task, layout)
+    page.turn(20.0)
+    assert radius() == pytest.approx(0.25, rel=0.01)
+
+
+def test_pins_of_a_finer_cloth_than_the_frame_has_are_a_line(server, layout):
+    text = layout.job_file.read_text()
+    layout.job_file.write_text(text.replace("counts = [5, 5]", "counts = [9, 9]"))
+    page = page_of(server, layout)
+    assert page.frame == 0
+    assert "pins of flag are not shown" in page.notice
+    assert "/cloths/flag" in page.things
+
+
+def test_files_that_cannot_be_read_for_a_while_are_a_line(server, layout):
+    page = page_of(server, layout)
+    # A folder in the place of a receipt cannot be read, and a file in that of a folder not be looked into.
+    viewed_job.commit(layout, 6)
+    receipt = layout.receipt(layout.frame_cache(6))
+    good = receipt.read_bytes()
+    receipt.unlink()
+    receipt.mkdir()
+    page.turn(10.0)
+    assert "cannot be read now" in page.notice
+    assert page.frame == 0
+    receipt.rmdir()
+    receipt.write_bytes(good)
+    page.turn(20.0)
+    assert "cannot be read now" not in page.notice
+    assert page.frames == tuple(range(7))
+    meshes = layout.receipt(layout.body_mesh("ball", "body")).parent
+    meshes.rename(meshes.with_name("elsewhere"))
+    meshes.write_text("")
+    page.turn(30.0)
+    assert "cannot be read now" in page.notice
+    meshes.unlink()
+    meshes.with_name("elsewhere").rename(meshes)
+    page.turn(40.0)
+    assert "cannot be read now" not in page.notice
 
 
 def test_a_slice_is_a_picture_whose_axes_are_those_of_the_cut_and_goes_when_it_is_not_drawn(server):

@@ -13,9 +13,10 @@ from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.parameter_set import ParameterSet
-from pipeline.receipts import Receipt
+from pipeline.receipts import Receipt, read_receipt
 from pipeline.stages.bodies import BodiesStage
 from pipeline.task import Task, TaskId
+from render.bounds import Reach, reach_of_box, validate_bounds, write_bounds
 from render.meshes import validate_ply, write_ply
 from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
 from sim.snapshots import Snapshot
@@ -172,6 +173,25 @@ def commit_spray(layout: JobLayout, cached: Receipt, frame: int, *, points: int 
     ) as new:
         write_point_cloud(new.path, PointCloud(places, places * 0, ones, ones, np.zeros(points, np.uint8)))
     return new.receipt
+
+
+def commit_bounds(layout: JobLayout, frames: int) -> None:
+    """Bounds of so many frames as they are now, and of the film."""
+    reach = {"action": reach_of_box(np.array([[0.1, 0.1, 0.1], [0.9, 0.9, 0.9]]))}
+    hashes = {}
+    for frame in range(frames):
+        cached = read_receipt(layout, layout.frame_cache(frame))
+        hashes |= _commit_reach(layout, layout.frame_bounds(frame), {cached.artifact: cached.hash}, reach)
+    _commit_reach(layout, layout.film_bounds(), hashes, reach)
+
+
+def _commit_reach(layout: JobLayout, path: str, inputs: dict[str, str], reach: dict[str, Reach]) -> dict[str, str]:
+    task = _task(f"bounds/{path}", "bounds", path)
+    with committing(
+        layout, path, task=task, attempt=1, fingerprint="b", validate=validate_bounds, inputs=inputs
+    ) as new:
+        write_bounds(new.path, reach)
+    return {path: new.receipt.hash}
 
 
 def _task(name: str, stage: str, output: str) -> Task:
