@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from pipeline.layout import JobLayout
-from pipeline.manifest_reader import ArtifactRow
 from pipeline.origins import origins_of
 from pipeline.receipts import read_receipt
 from pipeline.task import ArtifactPath
@@ -32,25 +31,24 @@ class MadeWith:
     files: int
 
 
-def made_with(
-    layout: JobLayout, artifacts: Mapping[ArtifactPath, ArtifactRow], *, stages: Sequence[str]
-) -> list[MadeWith]:
-    """What made which files; of those with the same parameters the receipt of one is read.
+def made_with(layout: JobLayout, artifacts: Iterable[ArtifactPath], *, stages: Sequence[str]) -> list[MadeWith]:
+    """What made which files, as the receipt of each tells: files of one version may come from several machines.
 
     Args:
         layout: the job's folder.
         artifacts: every artifact on record.
         stages: in the order in which they are told; others come last.
     """
-    groups: dict[str, list[ArtifactPath]] = {}
-    for path, row in artifacts.items():
-        groups.setdefault(row.parameters, []).append(path)
+    tools: dict[str, tuple[tuple[str, str], ...]] = {}
     files: Counter[tuple[str, tuple[tuple[str, str], ...], str, str]] = Counter()
-    for paths in groups.values():
-        receipt = read_receipt(layout, paths[-1])
-        if receipt is not None:
+    for path in artifacts:
+        receipt = read_receipt(layout, path)
+        if receipt is None:
+            continue
+        if receipt.parameters not in tools:
             (origin,) = origins_of(layout, [receipt])
-            files[receipt.stage, tuple((origin.tools or {}).items()), receipt.maker, receipt.host] += len(paths)
+            tools[receipt.parameters] = tuple((origin.tools or {}).items())
+        files[receipt.stage, tools[receipt.parameters], receipt.maker, receipt.host] += 1
     found = [MadeWith(stage, dict(tools), maker, host, count) for (stage, tools, maker, host), count in files.items()]
     place = {stage: index for index, stage in enumerate(stages)}
     return sorted(found, key=lambda each: place.get(each.stage, len(place)))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import socket
+from dataclasses import replace
 from pathlib import Path
 
 import drawing_stages
@@ -14,6 +16,7 @@ from PIL import Image
 
 from pipeline.errors import MissingInputError
 from pipeline.layout import JobLayout
+from pipeline.receipts import Receipt
 from pipeline.report import film
 from pipeline.report.job_report import JobReport, gather
 from pipeline.report.writing import write_report
@@ -99,6 +102,15 @@ def test_a_report_whose_job_lacks_a_file_of_its_own_says_that_versions_cannot_be
     assert report.film.remark == "Whether movie.mp4 is of the job as it is now cannot be told."
     assert report.sheet is None
     assert "duck.obj" in report.sheet_remark
+
+
+def test_every_machine_is_told_with_the_files_that_it_made(layout):
+    for frame in (1, 4):
+        path = layout.receipt(layout.picture(frame))
+        receipt = Receipt.from_json(path.read_text())
+        path.write_text(replace(receipt, host="studio-3").to_json())
+    drawn = {each.host: each.files for each in report_of(layout).versions if each.stage == "render"}
+    assert drawn == {socket.gethostname(): 4, "studio-3": 2}
 
 
 @needs_browser
