@@ -2,22 +2,23 @@
 
     python -m benchmarks.gallery renders --machine "32 cores and two NVIDIA H200" [-o docs] [--hero dam_break=60]
 
-Takes the frames that are there of each job of jobs/, and what its record says of the time they took; a job may be drawn
-in part, with `render.order = "spread"`. Jobs without frames are left out, and named.
+Takes the frames that are there of each job of jobs/, as it was submitted, and the time that they took by its record;
+a job may be drawn in part, with `render.order = "spread"`. Jobs without frames are left out, and named.
 """
 
 from __future__ import annotations
 
 import argparse
-import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
 from PIL import Image
 
 from pipeline.committed_pictures import committed_pictures
+from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
-from pipeline.manifest_reader import ManifestReader, StageTiming
+from pipeline.manifest_reader import ManifestReader
+from pipeline.task import ArtifactPath
 from render.sheet import contact_sheet
 
 JOBS = Path(__file__).resolve().parent.parent / "jobs"
@@ -32,7 +33,7 @@ STAGES = ("simulate", "surface", "volume", "render")
 
 
 class Shot(NamedTuple):
-    """What the gallery says of a job."""
+    """What the gallery says of a job; `seconds` are those of a frame, by stage."""
 
     name: str
     text: str
@@ -40,7 +41,7 @@ class Shot(NamedTuple):
     quality: str
     drawn: int
     frames: int
-    timings: dict[str, StageTiming]
+    seconds: dict[str, float]
 
 
 def description(job_file: Path) -> str:
@@ -57,15 +58,27 @@ def description(job_file: Path) -> str:
 
 def shot_of(job_file: Path, layout: JobLayout) -> tuple[Shot, list[Path]]:
     """What there is to tell of a job, and its frames."""
-    job = tomllib.loads(job_file.read_text(encoding="utf-8"))
-    frames = committed_pictures(layout)
+    job = load_job(layout.job_file)
+    pictures = committed_pictures(layout)
     with ManifestReader.open_readonly(layout.manifest) as reader:
-        timings = {timing.stage: timing for timing in reader.stage_timings()}
-    render = job["render"]
-    width, height = render["resolution"]
-    drawn = timings["render"].artifacts
-    shot = Shot(job_file.stem, description(job_file), (width, height), render["quality"], drawn, job["frames"], timings)
-    return shot, frames
+        frames: dict[str, set[str]] = {}
+        for path, row in reader.artifacts().items():
+            frames.setdefault(row.task.partition("/")[0], set()).update(frame_of(path))
+        seconds = {
+            timing.stage: timing.seconds / len(frames[timing.stage])
+            for timing in reader.stage_timings()
+            if frames.get(timing.stage) and timing.seconds
+        }
+    render = job.render
+    drawn = sum(int(picture.stem) < job.frame_count for picture in pictures)
+    text = description(job_file)
+    return Shot(job_file.stem, text, render.resolution, render.quality, drawn, job.frame_count, seconds), pictures
+
+
+def frame_of(artifact: ArtifactPath) -> list[str]:
+    """The frame that a file belongs to, of which there may be several files; empty if it belongs to none."""
+    stem = Path(artifact).stem
+    return [stem] if stem.isdigit() else []
 
 
 def nearest(frames: list[Path], wanted: int) -> Path:
@@ -94,18 +107,15 @@ def write_pictures(shot: Shot, frames: list[Path], images: Path, hero: int) -> N
 def section(shot: Shot) -> str:
     """A job in Markdown."""
     width, height = shot.resolution
-    times = "; ".join(
-        f"{stage} {figure(timing.seconds / timing.artifacts)} s"
-        for stage in STAGES
-        if (timing := shot.timings.get(stage)) and timing.artifacts
-    )
+    times = "; ".join(f"{stage} {figure(shot.seconds[stage])} s" for stage in STAGES if stage in shot.seconds)
+    took = f" A frame took: {times}." if times else ""
     drawn = "all" if shot.drawn == shot.frames else str(shot.drawn)
     return f"""## {shot.name}
 ![{shot.name}](images/gallery-{shot.name}.webp)
 
 {shot.text}
 
-{width}x{height}, {shot.quality} quality; {drawn} of {shot.frames} frames drawn. A frame took: {times}.
+{width}x{height}, {shot.quality} quality; {drawn} of {shot.frames} frames drawn.{took}
 
 ![frames of {shot.name}](images/gallery-{shot.name}-sheet.webp)
 """

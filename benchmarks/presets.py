@@ -15,6 +15,7 @@ import json
 import sys
 import tempfile
 import time
+from contextlib import closing
 from pathlib import Path
 
 from render.blender import open_renderer
@@ -31,13 +32,13 @@ def measure(folder: Path, *, frame: int, changes: dict[str, object], threads: in
     # Beside the job's own, as its paths start there.
     with tempfile.NamedTemporaryFile(dir=folder, suffix=".json") as file, tempfile.TemporaryDirectory() as scratch:
         changed.write(Path(file.name))
-        renderer = open_renderer(Path(file.name), threads=threads, blender=None)
-        for number in range(repeats + 1):
-            wall, processor = time.perf_counter(), time.process_time()
-            renderer.render(frame, Path(scratch) / "frame.png")
-            seconds = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - processor}
-            if number or not repeats:
-                least = {key: min(least[key], value) for key, value in seconds.items()}
+        with closing(open_renderer(Path(file.name), threads=threads, blender=None)) as renderer:
+            for number in range(repeats + 1):
+                wall, processor = time.perf_counter(), time.process_time()
+                renderer.render(frame, Path(scratch) / "frame.png")
+                seconds = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - processor}
+                if number or not repeats:
+                    least = {key: min(least[key], value) for key, value in seconds.items()}
     return {key: round(value, 2) for key, value in least.items()}
 
 
