@@ -9,6 +9,7 @@ import json
 import os
 import platform
 import sys
+import time
 from contextlib import suppress
 from dataclasses import asdict
 from functools import lru_cache
@@ -35,6 +36,10 @@ _VISIBILITY = (
 """Environment variables that hide GPUs from a process, or change their order."""
 _DEVICE_FILES = ("nvidia*", "dri/renderD*", "kfd", "dxg")
 """Through which programs reach GPUs on Linux: NVIDIA's, Intel's and AMD's, AMD's for computing, those of WSL."""
+
+
+TROUBLE_KEPT_S = 3600.0
+"""How long an answer that was cut short is kept [s]: a driver that hangs costs two minutes each time it is asked."""
 
 
 def render_gpus(job: Job) -> tuple[Gpu, ...]:
@@ -81,7 +86,7 @@ def known_gpus(blender: str | None) -> Probe:
     """All GPUs of this machine, as a Blender finds them.
 
     Asked in a child process. The answer is kept in the user's cache folder until Blender, the driver or the visible
-    devices change; one that was cut short is kept for this process only.
+    devices change; one that was cut short is kept for `TROUBLE_KEPT_S`, and by this process.
 
     Args:
         blender: path of a Blender executable, or None for the bpy module.
@@ -109,12 +114,12 @@ def _answer(blender: str | None, key: str) -> Probe:
     if remembered is not None:
         return remembered
     probe = find_gpus(blender)
-    if not probe.trouble:
-        # A cache folder that cannot be written costs the next process another look, nothing else.
-        with suppress(OSError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as part:
-                part.write_text(json.dumps({"key": key, "gpus": [asdict(gpu) for gpu in probe.gpus]}, indent=1))
+    answer = {"key": key, "asked_at": time.time(), **asdict(probe)}
+    # A cache folder that cannot be written costs the next process another look, nothing else.
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as part:
+            part.write_text(json.dumps(answer, indent=1), encoding="utf-8")
     return probe
 
 
@@ -124,10 +129,11 @@ def _remembered(path: Path, key: str) -> Probe | None:
 
     try:
         remembered = json.loads(path.read_text(encoding="utf-8"))
-        if remembered["key"] == key:
-            return Probe(
-                tuple(Gpu(str(gpu["backend"]), str(gpu["name"]), str(gpu["id"])) for gpu in remembered["gpus"])
-            )
+        trouble = str(remembered["trouble"])
+        age_s = time.time() - float(remembered["asked_at"])
+        if remembered["key"] == key and (not trouble or 0.0 <= age_s < TROUBLE_KEPT_S):
+            gpus = (Gpu(str(gpu["backend"]), str(gpu["name"]), str(gpu["id"])) for gpu in remembered["gpus"])
+            return Probe(tuple(gpus), trouble)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return None
