@@ -10,6 +10,7 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import lru_cache
@@ -24,10 +25,12 @@ from sim.runtime import cache_folder
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
+    from pipeline.task import Task
     from render.gpus import Gpu, Probe
 
 OWN_GPUS = "PIPELINE_GPUS"
-"""Environment variable that leaves this process some of the machine's GPUs only, as `0,2`: places in Cycles' list."""
+"""Environment variable that leaves this process some of the machine's GPUs only, as `0,2`: places in Cycles' list.
+Empty: none of them."""
 
 _VISIBILITY = (
     *("CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES"),
@@ -51,7 +54,7 @@ def render_gpus(job: Job) -> tuple[Gpu, ...]:
 
 
 def own_gpus() -> tuple[int, ...] | None:
-    """The places in that list which this process may use; None: all.
+    """The places in that list which this process may use, each once, in their order; None: all.
 
     Raises:
         PipelineError: the variable cannot be read.
@@ -59,16 +62,31 @@ def own_gpus() -> tuple[int, ...] | None:
     text = os.environ.get(OWN_GPUS)
     if text is None:
         return None
+    form = f"{OWN_GPUS}={text}: must be places of GPUs, from 0 on, with commas between them, as 0,1"
     try:
-        return tuple(int(place) for place in text.split(",") if place.strip())
+        places = sorted({int(place) for place in text.split(",") if place.strip()})
     except ValueError:
-        raise PipelineError(f"{OWN_GPUS}={text}: must be places of GPUs with commas between them, as 0,1") from None
+        raise PipelineError(form) from None
+    if places and places[0] < 0:
+        raise PipelineError(form)
+    return tuple(places)
 
 
-def first_gpu() -> int:
-    """The place of the GPU that a task gets where tasks run one after another."""
+def first_gpu(task: Task) -> int:
+    """The place of the GPU that a task gets where tasks run one after another.
+
+    Raises:
+        PipelineError: none is left to this process.
+    """
     own = own_gpus()
-    return own[0] if own else 0
+    return 0 if own is None or task.on_first_gpu else require_some(own)[0]
+
+
+def require_some(places: Sequence[int]) -> Sequence[int]:
+    """The places, or PipelineError where there are none: a task that needs a GPU got past the obstacles."""
+    if not places:
+        raise PipelineError(f"{OWN_GPUS} leaves this process none of the machine's GPUs, and a task needs one")
+    return places
 
 
 def usable_gpus(job: Job) -> tuple[Gpu, ...]:

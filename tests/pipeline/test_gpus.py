@@ -195,6 +195,36 @@ def test_a_process_uses_those_gpus_only_that_are_left_to_it(machine, monkeypatch
     assert usable_gpus(job("auto")) == CARDS
     monkeypatch.setenv(gpus.OWN_GPUS, "1,5")
     assert usable_gpus(job("auto")) == CARDS[1:]
+    monkeypatch.setenv(gpus.OWN_GPUS, "")
+    assert usable_gpus(job("auto")) == ()
+    assert [gpus_a_frame(device) for device in ("cpu", "auto", "gpu")] == [{0}, {0}, {1}]
+
+
+@pytest.mark.parametrize(
+    ("own", "device", "sentence"),
+    [
+        ("1,5", "auto", "PIPELINE_GPUS names GPU 5, but Cycles finds only the GPUs 0 to 1 here"),
+        ("1,5", "gpu", "PIPELINE_GPUS names GPU 5, but Cycles finds only the GPUs 0 to 1 here"),
+        ("1,5", "cpu", None),
+        ("1", "optix", None),
+        ("", "auto", None),
+        ("", "gpu", 'render.device is "gpu", but PIPELINE_GPUS leaves this process no GPU; use "auto" or "cpu"'),
+    ],
+)
+@needs_bpy
+def test_a_place_that_is_not_there_and_none_at_all_stop_a_job_before_any_work(
+    machine, monkeypatch, own, device, sentence
+):
+    monkeypatch.setenv(gpus.OWN_GPUS, own)
+    assert RenderStage().obstacles(job(device)) == ([] if sentence is None else [sentence])
+
+
+@needs_bpy
+def test_a_machine_without_gpus_draws_on_the_processor_whatever_place_is_left_to_it(machine, monkeypatch):
+    machine.probe = Probe()
+    monkeypatch.setenv(gpus.OWN_GPUS, "0")
+    assert RenderStage().obstacles(job("auto")) == []
+    assert gpus_a_frame("auto") == {0}
 
 
 @pytest.mark.parametrize(
