@@ -29,9 +29,9 @@ from pipeline.live.loop import run
 from pipeline.live.page import LivePage
 from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job
-from pipeline.live.serving import open_server
 from pipeline.live.session import Session, Status
 from pipeline.live.take import Recorder
+from pipeline.view.serving import open_server
 from sim.runtime import initialize
 
 JOB = """

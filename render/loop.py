@@ -31,7 +31,7 @@ def write_loop(pictures: Sequence[Path], output: Path, *, fps: float, width: int
 
     Raises:
         InvalidFileError: a picture is damaged.
-        ValueError: there are no pictures, or a GIF is to be faster than it can be.
+        ValueError: there are no pictures, or of several sizes, or a GIF is to be faster than it can be.
         OSError: it cannot be written.
     """
     suffix = output.suffix.lower()
@@ -43,6 +43,9 @@ def write_loop(pictures: Sequence[Path], output: Path, *, fps: float, width: int
     count = max(1, round(len(pictures) / fps * loop_fps))
     chosen = [pictures[min(int(number * fps / loop_fps + 1e-6), len(pictures) - 1)] for number in range(count)]
     frames = [_fitted(path, width) for path in chosen]
+    for path, frame in zip(chosen, frames, strict=True):
+        if frame.size != frames[0].size:
+            raise ValueError(f"{path} is of another size than {chosen[0]}")
     tick = _GIF_TICK_MS if suffix == ".gif" else 1
     ends = [tick * round(1000.0 * (number + 1) / loop_fps / tick) for number in range(count)]
     durations = [end - start for start, end in zip([0, *ends], ends, strict=False)]
@@ -51,15 +54,18 @@ def write_loop(pictures: Sequence[Path], output: Path, *, fps: float, width: int
         # One palette for all: with one a frame, still backgrounds would flicker.
         palette = _palette_of(frames)
         frames = [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in frames]
-    frames[0].save(
-        output,
-        format=suffix[1:],
-        save_all=True,
-        append_images=frames[1:],
-        duration=durations,
-        loop=0,
-        **options,
-    )
+    try:
+        frames[0].save(
+            output,
+            format=suffix[1:],
+            save_all=True,
+            append_images=frames[1:],
+            duration=durations,
+            loop=0,
+            **options,
+        )
+    except RuntimeError as error:  # what Pillow raises where libwebp refuses
+        raise ValueError(f"the pictures do not make a loop: {error}") from error
     return count
 
 

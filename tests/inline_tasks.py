@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 from pipeline.executors.base import Assignment, TaskEvent
 from pipeline.executors.inline import InlineExecutor
 from pipeline.layout import JobLayout
-from pipeline.task import Task
+from pipeline.task import ArtifactPath, Task
 
 
-def run_task(task: Task, layout: JobLayout, *, attempt: int = 1, threads: int = 1) -> TaskEvent:
+def run_task(
+    task: Task,
+    layout: JobLayout,
+    *,
+    attempt: int = 1,
+    threads: int = 1,
+    fingerprint: str = "f",
+    inputs: Mapping[ArtifactPath, str] = MappingProxyType({}),
+    stages: str = "pipeline.stages:STAGES",
+) -> TaskEvent:
     """Run a task of a real stage, whose inputs are there; returns how it ended."""
     assignment = Assignment(
         task=task,
         attempt=attempt,
-        fingerprint="f",
-        inputs={},
+        fingerprint=fingerprint,
+        inputs=inputs,
         threads=threads,
         job_file=layout.job_file,
         root=layout.root,
-        stages="pipeline.stages:STAGES",
+        stages=stages,
     )
     with InlineExecutor() as executor:
         executor.submit(assignment)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -27,8 +27,7 @@ from pipeline.layout import JobLayout
 from pipeline.task import TaskId, TaskState
 
 if TYPE_CHECKING:
-    from pipeline.job.models import Job
-    from pipeline.manifest_reader import AttemptRow, ManifestReader, StageCost, StageSummary
+    from pipeline.manifest_reader import AttemptRow, ManifestReader, StageSummary
     from pipeline.plan import Assessment
 
 FOLLOW_INTERVAL_S = 0.5
@@ -51,6 +50,7 @@ def plan(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path
     pipeline plan jobs/quickstart.toml
     pipeline plan dam.toml --set 'camera.position=[0, -3, 1]'
     """
+    from pipeline.assessing import assess_job
     from pipeline.job.checks import load_checked_job
     from pipeline.job.loading import read_job
     from pipeline.plan import Verdict, estimate, summarize
@@ -183,6 +183,7 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
     pipeline explain quickstart frames/000012.png
     pipeline explain quickstart simulate --json
     """
+    from pipeline.assessing import assess_job
     from pipeline.job.loading import load_job
     from pipeline.manifest_reader import ManifestReader
     from pipeline.origins import origins_of
@@ -234,42 +235,6 @@ def explain(job: str, output: Path, task: str, as_json: bool) -> None:
         click.echo(_attempt_line(attempt))
     for event in events:
         click.echo(f"  {wording.moment(event.time)}  {event.kind}: {event.message}")
-
-
-class JobAssessment(NamedTuple):
-    """How a job stands.
-
-    Attributes:
-        assessments: what would run, and why.
-        costs: what the stages have taken so far.
-        at_rest: whether a run would find nothing at all to do or to put right: neither in the record nor in the files.
-    """
-
-    assessments: list[Assessment]
-    costs: Mapping[str, StageCost]
-    at_rest: bool
-
-
-def assess_job(job: Job, layout: JobLayout) -> JobAssessment:
-    """Hold a job against its record and its files; changes nothing."""
-    from pipeline.manifest_reader import ManifestReader
-    from pipeline.plan import Verdict, assess, plan_job
-    from pipeline.reconcile import inspect_files
-    from pipeline.stages import STAGES
-
-    tasks = plan_job(job, layout, STAGES)
-    if not layout.manifest.exists():
-        return JobAssessment(assess(tasks, {}, {}, parameters=lambda _: None), {}, at_rest=False)
-    with ManifestReader.open_readonly(layout.manifest) as manifest:
-        rows = manifest.artifacts()
-        found = inspect_files(layout, rows)
-        assessments = assess(tasks, rows, found.problems, parameters=manifest.parameters)
-        at_rest = (
-            not (found.problems or found.new_mtimes_ns or found.newer_receipts)
-            and all(each.verdict is Verdict.UP_TO_DATE for each in assessments)
-            and manifest.is_at_rest(len(tasks))
-        )
-        return JobAssessment(assessments, dict(manifest.stage_costs()), at_rest)
 
 
 def _state(manifest: ManifestReader, task: TaskId) -> TaskState | None:

@@ -35,7 +35,7 @@ from pipeline.executors.failures import is_disk_full
 from pipeline.layout import JobLayout
 
 if TYPE_CHECKING:
-    from pipeline.commands.inspecting import JobAssessment
+    from pipeline.assessing import JobAssessment
     from pipeline.disk import Size
     from pipeline.job.loading import LoadedJob
     from pipeline.job.models import Job
@@ -292,7 +292,7 @@ def _say_what_it_takes(state: JobAssessment, size: Size, layout: JobLayout, rese
 
 def _look_at(job: Job, layout: JobLayout) -> JobAssessment | None:
     """How a job stands, by its record and its files; None if only a run can tell."""
-    from pipeline.commands.inspecting import assess_job
+    from pipeline.assessing import assess_job
 
     try:
         return assess_job(job, layout)

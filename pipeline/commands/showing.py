@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,6 +11,7 @@ from pipeline.commands.arguments import find_job, output_option, submitted_job_a
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
+    from pipeline.committed_pictures import CurrentPictures
     from pipeline.job.models import Job
     from pipeline.layout import JobLayout
 
@@ -29,19 +30,20 @@ def sheet(job: str, output: Path, pictures: int, columns: int, target: Path | No
     """
     from PIL import Image
 
-    from pipeline.committed_pictures import committed_pictures, evenly_spread
+    from pipeline.committed_pictures import evenly_spread
+    from pipeline.job.loading import load_job
     from render.errors import InvalidFileError
     from render.sheet import contact_sheet
 
     layout = find_job(job, output)
-    frames = committed_pictures(layout)
-    if not frames:
-        raise PipelineError(f"no frame of {layout.root} has been rendered yet")
+    frames = _current_pictures(load_job(layout.job_file), layout)
+    if not frames.all:
+        raise PipelineError(f"no frame of {layout.root} has been rendered yet{frames.others}")
     path = layout.root / "sheet.png" if target is None else target
     if path.suffix.lower() not in Image.registered_extensions():
         raise PipelineError(f'{path}: "{path.suffix}" is no kind of picture; use .png, .jpg or .webp')
     try:
-        contact_sheet(evenly_spread(frames, pictures), path, columns=columns)
+        contact_sheet(evenly_spread(frames.all, pictures), path, columns=columns)
     except (InvalidFileError, ValueError, OSError) as error:
         raise PipelineError(f"cannot make {path}: {error}") from error
     click.echo(path)
@@ -99,13 +101,14 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
     films = []
     for layout in (find_job(job, output) for job in jobs):
         submitted = load_job(layout.job_file)
-        pictures, others = _finished_frames(submitted, layout)
+        frames = _current_pictures(submitted, layout)
+        pictures = frames.unbroken
         if not pictures:
-            raise PipelineError(f"the first frame of {layout.root} has not been rendered yet{others}")
+            raise PipelineError(f"the first frame of {layout.root} has not been rendered yet{frames.others}")
         films.append(Film(submitted.name, pictures, submitted.movie.playback_fps or submitted.fps))
         if len(pictures) < submitted.frame_count:
             there = f"{len(pictures)} of {submitted.frame_count} frames are there"
-            click.echo(f"{submitted.name}: {there}{others}", err=True)
+            click.echo(f"{submitted.name}: {there}{frames.others}", err=True)
     try:
         with replacing(target) as part:
             count = compare_films(films, part, width=width, threads=machine_capacity().cores)
@@ -137,14 +140,15 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
         raise PipelineError(f'{target}: "{target.suffix}" is no loop; use {" or ".join(FORMATS)}')
     layout = find_job(job, output)
     submitted = load_job(layout.job_file)
-    pictures, others = _finished_frames(submitted, layout)
+    frames = _current_pictures(submitted, layout)
+    pictures = frames.unbroken
     last = submitted.frame_count - 1 if last is None else last
     if not first <= last < submitted.frame_count:
         raise PipelineError(f"{submitted.name} has the frames 0-{submitted.frame_count - 1}, not {first}-{last}")
     if last >= len(pictures):
         there = f"only 0-{len(pictures) - 1}" if pictures else "none"
         raise PipelineError(
-            f"of the frames {first}-{last} of {submitted.name} {there} are rendered{others}; choose with --until"
+            f"of the frames {first}-{last} of {submitted.name} {there} are rendered{frames.others}; choose with --until"
         )
     try:
         with replacing(target) as part:
@@ -160,32 +164,9 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
     click.echo(f"{target}: {count} frames, {target.stat().st_size / 1e6:.2g} MB")
 
 
-class _FinishedFrames(NamedTuple):
-    """The frames of a job that can be shown one after the other.
-
-    Attributes:
-        pictures: from the first frame on, up to the first one that is not finished.
-        others: what to say of frames that are there and do not count; empty if there are none.
-    """
-
-    pictures: list[Path]
-    others: str
-
-
-def _finished_frames(job: Job, layout: JobLayout) -> _FinishedFrames:
+def _current_pictures(job: Job, layout: JobLayout) -> CurrentPictures:
     """The frames that the film would be made of: those of the job as it is now, by the record and the files."""
-    from pipeline.commands.inspecting import assess_job
-    from pipeline.committed_pictures import committed_pictures
-    from pipeline.plan import Verdict
+    from pipeline.assessing import assess_job
+    from pipeline.committed_pictures import current_pictures
 
-    current = {
-        output
-        for each in assess_job(job, layout).assessments
-        if each.verdict is Verdict.UP_TO_DATE
-        for output in each.task.outputs
-    }
-    planned = [layout.picture(frame) for frame in range(job.frame_count)]
-    first_gap = next((frame for frame, picture in enumerate(planned) if picture not in current), len(planned))
-    earlier = {layout.path(picture) for picture in planned if picture not in current} & {*committed_pictures(layout)}
-    others = f" ({len(earlier)} more are of an earlier version of it)" if earlier else ""
-    return _FinishedFrames([layout.path(picture) for picture in planned[:first_gap]], others)
+    return current_pictures(job, layout, assess_job(job, layout).current)

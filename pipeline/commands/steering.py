@@ -47,8 +47,8 @@ def live(
     from pipeline.job.checks import load_checked_job
     from pipeline.job.loading import read_job
     from pipeline.live.scene import live_job, require_small
-    from pipeline.live.serving import require_viser
     from pipeline.resources import machine_capacity
+    from pipeline.view.serving import require_viser
     from sim.runtime import resolve_device
 
     require_viser()

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 from pipeline.errors import PipelineError, StageUnavailableError
 from pipeline.live.loop import run
 from pipeline.live.saving import save_job
-from pipeline.live.serving import open_server
 from pipeline.live.session import Session
 from pipeline.live.take import Recorder
+from pipeline.view.serving import address as address_of
+from pipeline.view.serving import close_server, open_server
 
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
@@ -72,10 +73,10 @@ def show_live(
         page = LivePage(
             server, session, title=job.name, recorder=recorder, save=lambda: save_job(loaded, session.values, folder)
         )
-        say(f"http://{address.host}:{server.get_port()}")
+        say(address_of(server))
         try:
             run(session, page, ends=ends)
         finally:
             recorder.stop()
     finally:
-        server.stop()
+        close_server(server)

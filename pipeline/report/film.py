@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import tempfile
 from base64 import b64encode
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.committed_pictures import committed_pictures, evenly_spread
+from pipeline.committed_pictures import evenly_spread
 from pipeline.errors import PipelineError
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -29,7 +30,7 @@ class ReportFilm:
         content: its bytes.
         mime: what they are.
         width, height: of its picture [pixels].
-        remark: why it is not the film itself; empty if it is.
+        remark: why it is not the film itself, or not that of the job as it is now; empty if it is.
     """
 
     content: bytes
@@ -44,30 +45,43 @@ class ReportFilm:
         return f"data:{self.mime};base64,{b64encode(self.content).decode()}"
 
 
-def film_of(layout: JobLayout, job: Job) -> ReportFilm | None:
+def film_of(
+    layout: JobLayout, job: Job, *, current: Set[ArtifactPath] | None, pictures: Sequence[Path]
+) -> ReportFilm | None:
     """The film that was committed; None before there is one.
+
+    Args:
+        layout: the job's folder.
+        job: the job.
+        current: the files that are of the job as it is now; None if that cannot be told.
+        pictures: frames of the job as it is now from the first on, of which a loop is made where one is needed.
 
     Raises:
         PipelineError: a loop is needed, and a picture is damaged.
         OSError: a file cannot be read.
     """
     path = layout.film
-    if read_receipt(layout, ArtifactPath(path.relative_to(layout.root).as_posix())) is None or not path.is_file():
+    artifact = ArtifactPath(path.relative_to(layout.root).as_posix())
+    if read_receipt(layout, artifact) is None or not path.is_file():
         return None
+    remark = ""
+    if current is None:
+        remark = f"Whether {path.name} is of the job as it is now cannot be told."
+    elif artifact not in current:
+        remark = f"{path.name} is of an earlier version of the job."
     width, height = job.render.resolution
     size = path.stat().st_size
     if job.movie.codec in PLAYABLE and size <= MOST_BYTES:
-        return ReportFilm(path.read_bytes(), "video/mp4", width, height)
+        return ReportFilm(path.read_bytes(), "video/mp4", width, height, remark)
     why = f"too large for this page, {size / 1e6:.0f} MB" if job.movie.codec in PLAYABLE else "not played by browsers"
-    return _loop(layout, job, f"{path.name} is {why}; this is a small loop of it.")
+    told = f"{path.name} is {why}; this is a small loop of the job's frames."
+    return _loop(layout, job, pictures, " ".join(filter(None, [remark, told])))
 
 
-def _loop(layout: JobLayout, job: Job, remark: str) -> ReportFilm | None:
+def _loop(layout: JobLayout, job: Job, pictures: Sequence[Path], remark: str) -> ReportFilm | None:
     from render.errors import InvalidFileError
     from render.loop import write_loop
 
-    whole = [path for number, path in enumerate(committed_pictures(layout)) if int(path.stem) == number]
-    pictures = whole[: job.frame_count]
     if not pictures:
         return None
     chosen = evenly_spread(pictures, LOOP_PICTURES)

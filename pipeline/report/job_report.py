@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import tempfile
 from base64 import b64encode
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from pipeline.committed_pictures import committed_pictures, evenly_spread
-from pipeline.errors import PipelineError
+from pipeline.assessing import assess_job
+from pipeline.committed_pictures import CurrentPictures, current_pictures, evenly_spread
+from pipeline.errors import MissingInputError, PipelineError, StageUnavailableError
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -42,6 +44,7 @@ class JobReport:
         unreadable_whitewater: files of whitewater that cannot.
         drawn_on: number of frames by the device that drew them.
         sheet: its pictures side by side, as the bytes of a WebP picture; None before there are any.
+        sheet_remark: why frames that are there are not on it; empty if all are.
         film: None before there is one.
         versions: what made its files.
         text: of its job file, as submitted.
@@ -59,6 +62,7 @@ class JobReport:
     unreadable_whitewater: tuple[ArtifactPath, ...]
     drawn_on: dict[str, int]
     sheet: bytes | None
+    sheet_remark: str
     film: ReportFilm | None
     versions: tuple[MadeWith, ...]
     text: str
@@ -135,6 +139,7 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         artifacts = manifest.artifacts()
     finished = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
     simulation = simulation_numbers(layout, history=True)
+    frames, current, sheet_remark = _frames_that_count(job, layout)
     return JobReport(
         job=job,
         title=title,
@@ -147,8 +152,9 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         unreadable=simulation.unreadable,
         unreadable_whitewater=simulation.unreadable_whitewater,
         drawn_on=drawn_on,
-        sheet=_sheet(layout, picture_width=job.render.resolution[0]),
-        film=film_of(layout, job),
+        sheet=_sheet(layout, frames.all, picture_width=job.render.resolution[0]),
+        sheet_remark=sheet_remark,
+        film=film_of(layout, job, current=current, pictures=frames.unbroken),
         versions=tuple(made_with(layout, artifacts, stages=[timing.stage for timing in timings])),
         text=layout.job_file.read_text(encoding="utf-8"),
     )
@@ -159,11 +165,25 @@ def as_data(picture: bytes) -> str:
     return f"data:image/webp;base64,{b64encode(picture).decode()}"
 
 
-def _sheet(layout: JobLayout, *, picture_width: int) -> bytes | None:
+def _frames_that_count(job: Job, layout: JobLayout) -> tuple[CurrentPictures, frozenset[ArtifactPath] | None, str]:
+    """The frames of the job as it is now, all such files, and what to say of the other frames.
+
+    A report tells all else also where nobody can say what is up to date: when a mesh of the job was moved away, or its
+    Blender is not on this machine.
+    """
+    try:
+        current = assess_job(job, layout).current
+    except (MissingInputError, StageUnavailableError) as error:
+        return CurrentPictures({}, 0), None, f"Which frames are of the job as it is now cannot be told: {error}"
+    frames = current_pictures(job, layout, current)
+    left_out = f"{frames.earlier} frames are of an earlier version of the job, and not shown." if frames.earlier else ""
+    return frames, current, left_out
+
+
+def _sheet(layout: JobLayout, pictures: Sequence[Path], *, picture_width: int) -> bytes | None:
     from render.errors import InvalidFileError
     from render.sheet import contact_sheet
 
-    pictures = committed_pictures(layout)
     if not pictures:
         return None
     chosen = evenly_spread(pictures, SHEET_PICTURES)

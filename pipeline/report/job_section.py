@@ -32,10 +32,12 @@ def job_section(report: JobReport, *, headed: bool) -> str:
         parts.insert(0, f"<h2>{escape(report.title)}</h2>")
     if report.timings:
         parts += ["<h3>Where the time went</h3>", _shares(report.timings), _timings(report.timings)]
+    if report.sheet is not None or report.sheet_remark:
+        parts.append("<h3>Frames</h3>")
     if report.sheet is not None:
-        parts.append(
-            f'<h3>Frames</h3><img class="sheet" src="{as_data(report.sheet)}" alt="frames of {escape(report.title)}">'
-        )
+        parts.append(f'<img class="sheet" src="{as_data(report.sheet)}" alt="frames of {escape(report.title)}">')
+    if report.sheet_remark:
+        parts.append(f'<p class="quiet">{escape(report.sheet_remark)}</p>')
     return f"<section>{''.join(parts)}</section>"
 
 

@@ -18,9 +18,9 @@ from pipeline.live.loop import run
 from pipeline.live.page import LivePage
 from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job
-from pipeline.live.serving import open_server
 from pipeline.live.session import Session
 from pipeline.live.take import Recorder
+from pipeline.view.serving import open_server
 
 LOOKED_AT = (
     BALL_OVER_SHEET.replace("counts = [17, 17]", "counts = [9, 9]")
@@ -128,7 +128,7 @@ def test_a_page_draws_and_takes_drags_buttons_and_sliders_to_the_scene(tmp_path)
 def test_a_port_that_is_taken_is_told():
     server = open_server("127.0.0.1", 0)
     try:
-        with pytest.raises(PipelineError, match=f"cannot listen at 127.0.0.1:{server.get_port()}: .*--port"):
+        with pytest.raises(PipelineError, match=f"port {server.get_port()} of 127.0.0.1 is taken.*--port"):
             open_server("127.0.0.1", server.get_port())
     finally:
         server.stop()

@@ -37,7 +37,7 @@ class DrawStage:
     version = 1
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
-        parameters = ParameterSet.of(stage=self.name, version=self.version, tools={}, gravity=job.gravity)
+        parameters = ParameterSet.of(stage=self.name, version=self.version, tools={"brush": "7.1"}, gravity=job.gravity)
         return [
             Task(
                 id=TaskId(f"render/{frame:06d}"),

@@ -17,6 +17,7 @@ from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.plan import plan_job
+from render.loop import write_loop
 from render.pictures import read_picture
 
 SIZE = (96, 64)
@@ -158,6 +159,15 @@ def test_what_cannot_be_compared_is_told(tmp_path, jobs, target, sentence):
     assert result.exit_code in (1, 2)
     assert sentence in result.stderr
     assert not (tmp_path / target).exists()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_pictures_of_several_sizes_are_no_loop_and_told_in_a_line(tmp_path, order):
+    small, large = tmp_path / "small.png", tmp_path / "large.png"
+    Image.new("RGB", (48, 32)).save(small)
+    Image.new("RGB", SIZE).save(large)
+    with pytest.raises(ValueError, match="is of another size than"):
+        write_loop([small, large][::order], tmp_path / "loop.webp", fps=15.0, width=640, loop_fps=15.0)
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])

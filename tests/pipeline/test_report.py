@@ -8,13 +8,13 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
+import drawing_stages
 import numpy as np
 import pytest
 from command_line import pipeline
+from drawn_films import draw_film
 from numbered_frames import commit, commit_whitewater, submitted, whitewater_task
-from PIL import Image
 
-from pipeline.artifacts import committing
 from pipeline.cache import FrameNumbers
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
@@ -247,11 +247,10 @@ class Page(HTMLParser):
 
 @pytest.fixture
 def layout(tmp_path) -> JobLayout:
-    """A job with three frames, one picture, and a task that took two attempts."""
+    """A job with three frames, and a task that took two attempts."""
     layout = submitted(tmp_path / "tank")
     for frame in range(3):
         commit(layout, frame, kinetic_energy=float(frame), potential_energy=2.0, not_converged=float(frame == 2))
-    render(layout)
     task = Task(TaskId("simulate"), "simulate", (), (), ParameterSet.of(stage="simulate", version=1, tools={}))
     with Manifest(layout.manifest) as manifest:
         manifest.begin_run("tank")
@@ -264,19 +263,14 @@ def layout(tmp_path) -> JobLayout:
     return layout
 
 
-def render(layout: JobLayout) -> None:
-    picture = layout.picture(0)
-    task = Task(TaskId("render/000000"), "render", (), (picture,), ParameterSet.of(stage="render", version=1, tools={}))
-    with committing(layout, picture, task=task, attempt=1, fingerprint="p", validate=lambda _: None) as new:
-        Image.fromarray(np.full((9, 16, 3), 200, np.uint8)).save(new.path, format="PNG")
-
-
 def read(path: Path) -> tuple[str, Page]:
     text = path.read_text(encoding="utf-8")
     return text, Page(text)
 
 
-def test_the_report_is_one_file_that_needs_no_other(layout):
+def test_the_report_is_one_file_that_needs_no_other(layout, monkeypatch):
+    monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES)
+    draw_film(layout, frames=1)
     result = pipeline("report", layout.root)
     assert result.exit_code == 0, result.output
     text, page = read(layout.report)

@@ -2,77 +2,58 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
-import numpy as np
+import drawing_stages
 import pytest
 from browser import needs_browser, open_page
+from drawn_films import draw_film
 from numbered_frames import commit, submitted
 from PIL import Image
 
-from pipeline.artifacts import committing
-from pipeline.job.loading import load_job
+from pipeline.errors import MissingInputError
 from pipeline.layout import JobLayout
-from pipeline.manifest import Manifest
-from pipeline.parameter_set import ParameterSet
 from pipeline.report import film
-from pipeline.report.film import film_of
+from pipeline.report.job_report import JobReport, gather
 from pipeline.report.writing import write_report
-from pipeline.task import ArtifactPath, Task, TaskId, TaskState
-from render.movie import encode_segment
-from render.parameters import MovieParameters
+from pipeline.task import ArtifactPath, Task
 
-SIZE = (64, 36)
+SIZE = drawing_stages.SIZE
 FRAMES = 6
 
 
-def put(layout: JobLayout, artifact: str, stage: str, make) -> None:
-    """Commit a file of a stage, and put it on record."""
-    path = ArtifactPath(artifact)
-    task = Task(
-        TaskId(f"{stage}/{Path(artifact).stem}"), stage, (), (path,),
-        ParameterSet.of(stage=stage, version=1, tools={"brush": "7.1"}),
-    )  # fmt: skip
-    with committing(layout, path, task=task, attempt=1, fingerprint="x", validate=lambda _: None) as new:
-        make(new.path)
-    with Manifest(layout.manifest) as manifest:
-        manifest.record_plan([task])
-        attempt = manifest.start_attempt(task.id)
-        manifest.record_artifact(new.receipt)
-        manifest.finish_attempt(task.id, attempt, seconds=3.0)
-        manifest.set_states({task.id: TaskState.SUCCEEDED})
-
-
-def picture(frame: int):
-    def make(path: Path) -> None:
-        pixels = np.full((SIZE[1], SIZE[0], 3), (200, 40 + 30 * frame, 20), np.uint8)
-        Image.fromarray(pixels).save(path, format="PNG")
-
-    return make
-
-
 @pytest.fixture
-def layout(tmp_path: Path) -> JobLayout:
+def layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobLayout:
     """A job with pictures and a film; its file has a comment that looks like markup."""
+    monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES)
     layout = submitted(tmp_path / "tank")
-    with layout.job_file.open("a") as file:
-        file.write(f'# <script src="https://example.org/x.js"></script>\n[render]\nresolution = {list(SIZE)}\n')
+    text = layout.job_file.read_text().replace("frames = 30", f"frames = {FRAMES}\ngravity = [0.0, 0.0, -9.0]")
+    text += f'# <script src="https://example.org/x.js"></script>\n[render]\nresolution = {list(SIZE)}\n'
+    layout.job_file.write_text(text)
     for frame in range(FRAMES):
         commit(layout, frame, kinetic_energy=float(frame), potential_energy=2.0, momentum_x=0.1 * frame)
-        put(layout, layout.picture(frame), "render", picture(frame))
-    pictures = [layout.path(layout.picture(frame)) for frame in range(FRAMES)]
-    parameters = MovieParameters()
-    put(layout, "movie.mp4", "movie", lambda path: encode_segment(pictures, path, fps=60, parameters=parameters))
+    draw_film(layout)
     return layout
 
 
+def report_of(layout: JobLayout) -> JobReport:
+    return gather(layout, title="tank")
+
+
+def change(layout: JobLayout, old: str, new: str) -> None:
+    """Submit another version of the job."""
+    text = layout.job_file.read_text()
+    assert old in text
+    layout.job_file.write_text(text.replace(old, new))
+
+
 def test_the_film_is_in_the_page_and_a_large_one_is_a_loop(layout, monkeypatch):
-    job = load_job(layout.job_file)
-    whole = film_of(layout, job)
+    whole = report_of(layout).film
     assert whole is not None
-    assert (whole.mime, whole.content) == ("video/mp4", layout.film.read_bytes())
+    assert (whole.mime, whole.content, whole.remark) == ("video/mp4", layout.film.read_bytes(), "")
     monkeypatch.setattr(film, "MOST_BYTES", len(whole.content) - 1)
-    loop = film_of(layout, job)
+    loop = report_of(layout).film
     assert loop is not None
     assert (loop.mime, loop.width, loop.height) == ("image/webp", *SIZE)
     assert "too large for this page" in loop.remark
@@ -80,7 +61,44 @@ def test_the_film_is_in_the_page_and_a_large_one_is_a_loop(layout, monkeypatch):
 
 def test_a_film_without_a_receipt_is_not_shown(layout):
     layout.receipt(ArtifactPath("movie.mp4")).unlink()
-    assert film_of(layout, load_job(layout.job_file)) is None
+    assert report_of(layout).film is None
+
+
+def test_a_film_and_frames_of_an_earlier_version_of_the_job_are_told_from_those_of_this_one(layout, monkeypatch):
+    change(layout, "-9.0", "-20.0")
+    old = report_of(layout)
+    assert old.film is not None
+    assert old.film.remark == "movie.mp4 is of an earlier version of the job."
+    assert old.sheet is None
+    assert old.sheet_remark == "6 frames are of an earlier version of the job, and not shown."
+    # Pictures of another size: WebP does not take both into one loop.
+    monkeypatch.setattr(drawing_stages, "SIZE", (120, 80))
+    monkeypatch.setattr(film, "MOST_BYTES", 10)
+    draw_film(layout, frames=2)
+    new = report_of(layout)
+    assert new.film is not None
+    assert new.film.mime == "image/webp"
+    assert "of an earlier version of the job" in new.film.remark
+    with Image.open(io.BytesIO(new.film.content)) as loop:
+        assert loop.n_frames <= 2
+        red, green, _ = loop.convert("RGB").getpixel((40, 20))
+    assert green > 150 > red
+    assert new.sheet is not None
+    assert new.sheet_remark == "4 frames are of an earlier version of the job, and not shown."
+    write_report([layout], layout.report)
+    assert new.sheet_remark in layout.report.read_text()
+
+
+def test_a_report_whose_job_lacks_a_file_of_its_own_says_that_versions_cannot_be_told(layout, monkeypatch):
+    def plan(*_: object) -> list[Task]:
+        raise MissingInputError("the mesh duck.obj is not there")
+
+    monkeypatch.setattr(drawing_stages.DrawStage, "plan", plan)
+    report = report_of(layout)
+    assert report.film is not None
+    assert report.film.remark == "Whether movie.mp4 is of the job as it is now cannot be told."
+    assert report.sheet is None
+    assert "duck.obj" in report.sheet_remark
 
 
 @needs_browser

@@ -4,37 +4,60 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import drawing_stages
 import pytest
 from command_line import pipeline
+from drawn_films import draw_film
 from PIL import Image
 
 from pipeline.committed_pictures import evenly_spread
+from pipeline.layout import JobLayout
+
+JOB = """
+name = "film"
+frames = 10
+gravity = [0.0, 0.0, {gravity}]
+[[rigid]]
+name = "ball"
+shape = {{ type = "sphere", radius = 0.1 }}
+"""
 
 
 @pytest.fixture
-def job(tmp_path: Path) -> Path:
+def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A job's folder with ten frames, of which the last has no receipt: it is being written."""
-    folder = tmp_path / "film"
-    (folder / "frames").mkdir(parents=True)
-    (folder / ".receipts" / "frames").mkdir(parents=True)
-    (folder / "job.toml").write_text('name = "film"\n')
-    (folder / "manifest.db").touch()
-    for frame in range(10):
-        Image.new("RGB", (32, 18), (20 * frame, 90, 60)).save(folder / "frames" / f"{frame:06d}.png")
-        if frame < 9:
-            (folder / ".receipts" / "frames" / f"{frame:06d}.png.json").write_text("{}")
-    return folder
+    monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES)
+    layout = JobLayout(tmp_path / "film")
+    layout.root.mkdir()
+    layout.job_file.write_text(JOB.format(gravity=-9.0))
+    draw_film(layout, frames=9)
+    layout.path(layout.picture(9)).write_bytes(layout.path(layout.picture(8)).read_bytes()[:50])
+    return layout.root
+
+
+def colors(sheet: Path) -> set[tuple[int, ...]]:
+    with Image.open(sheet) as picture:
+        return {color for _, color in picture.convert("RGB").getcolors(maxcolors=1 << 20)}
 
 
 def test_a_sheet_shows_the_finished_frames(job):
-    result = pipeline("sheet", job, "--pictures", "9", "--columns", "3")
+    result = pipeline("sheet", job, "--pictures", "10", "--columns", "3")
     assert result.exit_code == 0, result.output
-    with Image.open(job / "sheet.png") as sheet:
-        colours = sheet.convert("RGB").getcolors(maxcolors=1 << 20)
-    shown = {colour for _, colour in colours}
-    # Reds of the frames: 0, 20, ... 160 are shown, 180 is the frame that has no receipt yet.
-    assert {(20 * frame, 90, 60) for frame in range(9)} <= shown
-    assert (180, 90, 60) not in shown
+    shown = colors(job / "sheet.png")
+    assert {(8 * frame, 90, 20) for frame in range(9)} <= shown
+    assert (72, 90, 20) not in shown
+
+
+def test_a_sheet_shows_no_frame_of_an_earlier_version_of_the_job(job):
+    (job / "job.toml").write_text(JOB.format(gravity=-20.0))
+    result = pipeline("sheet", job)
+    assert result.exit_code == 1
+    assert "has been rendered yet (9 more are of an earlier version of it)" in result.output
+    draw_film(JobLayout(job), frames=2)
+    assert pipeline("sheet", job).exit_code == 0
+    shown = colors(job / "sheet.png")
+    assert {(0, 200, 20), (8, 200, 20)} <= shown
+    assert not {(8 * frame, 90, 20) for frame in range(9)} & shown
 
 
 def test_a_sheet_of_an_unknown_kind_is_refused(job):
@@ -44,8 +67,8 @@ def test_a_sheet_of_an_unknown_kind_is_refused(job):
 
 
 def test_a_job_without_frames_says_so(job):
-    for receipt in (job / ".receipts" / "frames").iterdir():
-        receipt.unlink()
+    for picture in (job / "frames").iterdir():
+        picture.unlink()
     result = pipeline("sheet", job)
     assert result.exit_code == 1
     assert "no frame of" in result.output

@@ -346,7 +346,7 @@ def test_an_address_of_another_machine_is_told():
 def test_without_viser_a_line_says_what_to_install(layout, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     result = pipeline("view", layout.root)
-    assert result.exit_code == 1
+    assert result.exit_code == 3
     assert "pip install viser" in result.output
 
 
