@@ -27,7 +27,7 @@ from pipeline.executors.worker_process import THREAD_VARIABLES
 from pipeline.film_so_far_child import Request
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
-from pipeline.plan import Assessment, Verdict
+from pipeline.plan import NEVER_MADE, Assessment, Verdict
 from pipeline.run_events import RunEnded, RunEvent, RunStarted, StateChanged
 from pipeline.scheduler_events import JobOutcome
 from pipeline.task import ArtifactPath, TaskId, TaskState
@@ -48,11 +48,13 @@ class FilmSoFar:
     """An observer of a run, and a context manager around it, that keeps `JobLayout.film_so_far` up to date.
 
     The film is there from some seconds after the first frame until the whole film is committed. A run that is stopped
-    or fails leaves it.
+    or fails leaves it. One of an earlier version of the job goes when a run begins. A job that does without the film
+    has one removed that was made before.
     """
 
     def __init__(self, job: Job, layout: JobLayout, say: Callable[[str], None], warn: Callable[[str], None]) -> None:
         """Args are the job, its folder, and who takes sentences and warnings for the user, from another thread."""
+        self._making = job.movie.so_far
         self._job = job
         self._layout = layout
         self._say = say
@@ -100,7 +102,11 @@ class FilmSoFar:
                     self._drawn.add(frame)
         # The job is ours by now; these are of a run that was killed.
         shutil.rmtree(self._layout.so_far_scratch, ignore_errors=True)
-        if len(self._drawn) < len(self._frame_of_task):
+        if not self._drawn or any(
+            _may_show_another(each) for each in assessments if each.task.id in self._frame_of_task
+        ):
+            self._unlink()
+        if self._making and len(self._drawn) < len(self._frame_of_task):
             self._thread.start()
 
     def _add(self, frame: int) -> None:
@@ -111,6 +117,9 @@ class FilmSoFar:
     def _remove(self) -> None:
         """The whole film is there, and this one of no use any more."""
         self._end()
+        self._unlink()
+
+    def _unlink(self) -> None:
         try:
             self._layout.film_so_far.unlink(missing_ok=True)
         except OSError as error:
@@ -198,6 +207,12 @@ class FilmSoFar:
             raise _ChildError(lines[-1] or f"its process ended with code {child.returncode}")
         Path(request.output).replace(layout.film_so_far)
         return float(lines[-1])
+
+
+def _may_show_another(assessment: Assessment) -> bool:
+    """Whether a film so far may hold a frame of the task as an earlier version of the job had it."""
+    never_made = assessment.verdict is Verdict.STALE and all(each.group == NEVER_MADE for each in assessment.reasons)
+    return assessment.verdict is not Verdict.UP_TO_DATE and not never_made
 
 
 class _ChildError(Exception):

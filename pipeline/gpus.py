@@ -9,6 +9,8 @@ import json
 import os
 import platform
 import sys
+import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import lru_cache
@@ -23,10 +25,12 @@ from sim.runtime import cache_folder
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
+    from pipeline.task import Task
     from render.gpus import Gpu, Probe
 
 OWN_GPUS = "PIPELINE_GPUS"
-"""Environment variable that leaves this process some of the machine's GPUs only, as `0,2`: places in Cycles' list."""
+"""Environment variable that leaves this process some of the machine's GPUs only, as `0,2`: places in Cycles' list.
+Empty: none of them."""
 
 _VISIBILITY = (
     *("CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES"),
@@ -35,6 +39,10 @@ _VISIBILITY = (
 """Environment variables that hide GPUs from a process, or change their order."""
 _DEVICE_FILES = ("nvidia*", "dri/renderD*", "kfd", "dxg")
 """Through which programs reach GPUs on Linux: NVIDIA's, Intel's and AMD's, AMD's for computing, those of WSL."""
+
+
+TROUBLE_KEPT_S = 3600.0
+"""How long an answer that was cut short is kept [s]: a driver that hangs costs two minutes each time it is asked."""
 
 
 def render_gpus(job: Job) -> tuple[Gpu, ...]:
@@ -46,7 +54,7 @@ def render_gpus(job: Job) -> tuple[Gpu, ...]:
 
 
 def own_gpus() -> tuple[int, ...] | None:
-    """The places in that list which this process may use; None: all.
+    """The places in that list which this process may use, each once, in their order; None: all.
 
     Raises:
         PipelineError: the variable cannot be read.
@@ -54,16 +62,31 @@ def own_gpus() -> tuple[int, ...] | None:
     text = os.environ.get(OWN_GPUS)
     if text is None:
         return None
+    form = f"{OWN_GPUS}={text}: must be places of GPUs, from 0 on, with commas between them, as 0,1"
     try:
-        return tuple(int(place) for place in text.split(",") if place.strip())
+        places = sorted({int(place) for place in text.split(",") if place.strip()})
     except ValueError:
-        raise PipelineError(f"{OWN_GPUS}={text}: must be places of GPUs with commas between them, as 0,1") from None
+        raise PipelineError(form) from None
+    if places and places[0] < 0:
+        raise PipelineError(form)
+    return tuple(places)
 
 
-def first_gpu() -> int:
-    """The place of the GPU that a task gets where tasks run one after another."""
+def first_gpu(task: Task) -> int:
+    """The place of the GPU that a task gets where tasks run one after another.
+
+    Raises:
+        PipelineError: none is left to this process.
+    """
     own = own_gpus()
-    return own[0] if own else 0
+    return 0 if own is None or task.on_first_gpu else require_some(own)[0]
+
+
+def require_some(places: Sequence[int]) -> Sequence[int]:
+    """The places, or PipelineError where there are none: a task that needs a GPU got past the obstacles."""
+    if not places:
+        raise PipelineError(f"{OWN_GPUS} leaves this process none of the machine's GPUs, and a task needs one")
+    return places
 
 
 def usable_gpus(job: Job) -> tuple[Gpu, ...]:
@@ -81,7 +104,7 @@ def known_gpus(blender: str | None) -> Probe:
     """All GPUs of this machine, as a Blender finds them.
 
     Asked in a child process. The answer is kept in the user's cache folder until Blender, the driver or the visible
-    devices change; one that was cut short is kept for this process only.
+    devices change; one that was cut short is kept for `TROUBLE_KEPT_S`, and by this process.
 
     Args:
         blender: path of a Blender executable, or None for the bpy module.
@@ -109,12 +132,12 @@ def _answer(blender: str | None, key: str) -> Probe:
     if remembered is not None:
         return remembered
     probe = find_gpus(blender)
-    if not probe.trouble:
-        # A cache folder that cannot be written costs the next process another look, nothing else.
-        with suppress(OSError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as part:
-                part.write_text(json.dumps({"key": key, "gpus": [asdict(gpu) for gpu in probe.gpus]}, indent=1))
+    answer = {"key": key, "asked_at": time.time(), **asdict(probe)}
+    # A cache folder that cannot be written costs the next process another look, nothing else.
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as part:
+            part.write_text(json.dumps(answer, indent=1), encoding="utf-8")
     return probe
 
 
@@ -124,10 +147,11 @@ def _remembered(path: Path, key: str) -> Probe | None:
 
     try:
         remembered = json.loads(path.read_text(encoding="utf-8"))
-        if remembered["key"] == key:
-            return Probe(
-                tuple(Gpu(str(gpu["backend"]), str(gpu["name"]), str(gpu["id"])) for gpu in remembered["gpus"])
-            )
+        trouble = str(remembered["trouble"])
+        age_s = time.time() - float(remembered["asked_at"])
+        if remembered["key"] == key and (not trouble or 0.0 <= age_s < TROUBLE_KEPT_S):
+            gpus = (Gpu(str(gpu["backend"]), str(gpu["name"]), str(gpu["id"])) for gpu in remembered["gpus"])
+            return Probe(tuple(gpus), trouble)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return None

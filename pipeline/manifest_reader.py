@@ -230,11 +230,15 @@ class ManifestReader(PageQueries):
         return [EventRow._make(row) for row in reversed(rows)]
 
     def devices(self, stage: str) -> dict[str, int]:
-        """What computed the artifacts of a stage, with the number of tasks; those that do not say are left out."""
+        """What computed the artifacts of a stage, with the number of tasks; those that do not say are left out.
+
+        Neither do those count that are to be made anew.
+        """
         rows = self._rows(
             "SELECT device, count(DISTINCT artifact.task) FROM artifact JOIN task ON task.id = artifact.task"
-            " WHERE device != '' AND position IS NOT NULL AND stage = ? GROUP BY device ORDER BY device",
-            (stage,),
+            " WHERE device != '' AND position IS NOT NULL AND stage = ? AND state IN (?, ?)"
+            " GROUP BY device ORDER BY device",
+            (stage, TaskState.SUCCEEDED, TaskState.UP_TO_DATE),
         )
         return {str(device): int(tasks) for device, tasks in rows}
 

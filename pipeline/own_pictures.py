@@ -13,10 +13,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from blake3 import blake3
-
 from pipeline.files import replacing
 from pipeline.job.input_files import split_blend
+from pipeline.parameter_set import digest_of
+from pipeline.receipts import hash_file
 from sim.runtime import cache_folder
 
 if TYPE_CHECKING:
@@ -63,9 +63,7 @@ def _texture_bytes(file: str, name: str, blender: str | None, _size: int, _mtime
     from render.blender import BlenderUnavailableError
     from render.errors import InvalidFileError
 
-    content = blake3(Path(file).read_bytes())
-    content.update(f"\n{name}".encode())
-    kept = cache_folder() / "blend-textures" / content.hexdigest(length=16)
+    kept = cache_folder() / "blend-textures" / digest_of(f"{hash_file(Path(file))}\n{name}")
     with suppress(OSError, ValueError):
         return int(kept.read_text(encoding="ascii"))
     try:

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from pipeline.stages.base import Stage
 
 
+NEVER_MADE = "never made"
+"""The reason of outputs that are not on record, as a group of reasons says it."""
+
+
 class FileCondition(StrEnum):
     """What is wrong with a recorded artifact's file."""
 
@@ -256,7 +260,7 @@ class _Assessor:
         """Why one output does not count; `fingerprint` is None if an input will be made anew."""
         row = self._rows.get(output)
         if row is None:
-            return (Reason(f"{output} was never made", "never made"),)
+            return (Reason(f"{output} was never made", NEVER_MADE),)
         if output in self._problems:
             problem = self._problems[output]
             return (Reason(f"{output}: {problem.reason}", _CONDITION_WORDING[problem.condition]),)

@@ -139,7 +139,7 @@ def _assignment(task: Task, layout: JobLayout, *, capacity: Resources, stages: s
         root=layout.root,
         stages=stages,
         need=need,
-        gpu=first_gpu() if need.gpus else None,
+        gpu=first_gpu(task) if need.gpus else None,
     )
 
 

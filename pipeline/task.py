@@ -41,6 +41,7 @@ class Task:
         frame: the frame it is about, or None for the whole job.
         resources: what it occupies.
         checkpointed: it commits its outputs one by one and continues where it stopped.
+        on_first_gpu: if it needs a GPU, it computes on the machine's first one and cannot be given another.
     """
 
     id: TaskId
@@ -52,6 +53,7 @@ class Task:
     frame: int | None = None
     resources: Resources = field(default=Resources())
     checkpointed: bool = False
+    on_first_gpu: bool = False
 
 
 class TaskState(StrEnum):

@@ -34,6 +34,21 @@ class BlenderKilledError(BlenderUnavailableError):
     """The Blender executable was ended by a signal while it started: the machine's fault, which may be gone by now."""
 
 
+class BlenderHungError(BlenderUnavailableError):
+    """A script did not end in time.
+
+    Attributes:
+        told: what it had written to its standard output by then.
+    """
+
+    def __init__(self, message: str, told: str = "") -> None:
+        super().__init__(message, told)
+        self.told = told
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class FrameRenderError(RuntimeError):
     """A frame could not be drawn.
 
@@ -302,14 +317,18 @@ def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subpro
         purpose: what it was to do, to be told then.
 
     Raises:
-        BlenderUnavailableError: it cannot be started, or does not end in time.
+        BlenderHungError: it does not end in time.
+        BlenderUnavailableError: it cannot be started.
     """
     try:
-        return subprocess.run(argv, capture_output=True, text=True, timeout=timeout_s, check=False)
+        return subprocess.run(
+            argv, capture_output=True, encoding="utf-8", errors="replace", timeout=timeout_s, check=False
+        )
     except OSError as error:
         raise BlenderUnavailableError(f"cannot start {argv[0]}: {error.strerror}") from error
     except subprocess.TimeoutExpired as error:
-        raise BlenderUnavailableError(f"Blender took more than {timeout_s:g} s to {purpose}") from error
+        told = (error.stdout or b"").decode(errors="replace")  # bytes, whatever was asked for
+        raise BlenderHungError(f"Blender took more than {timeout_s:g} s to {purpose}", told) from error
 
 
 def parse_blender_version(text: str) -> tuple[int, int, int] | None:
@@ -326,7 +345,12 @@ def require_supported_executable(blender: str) -> tuple[int, int, int]:
     """
     try:
         completed = subprocess.run(
-            [blender, "--version"], capture_output=True, text=True, timeout=_STARTUP_VERSION_TIMEOUT_S, check=False
+            [blender, "--version"],
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=_STARTUP_VERSION_TIMEOUT_S,
+            check=False,
         )
     except OSError as error:
         raise BlenderUnavailableError(f"cannot start the Blender executable {blender}: {error.strerror}") from error

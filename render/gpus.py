@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from render.blender import BlenderUnavailableError, run_script, script_argv
+from render.blender import BlenderHungError, BlenderUnavailableError, run_script, script_argv
 
 PROBE_TIMEOUT_S = 120.0
 ANY_KIND = ("auto", "gpu")
@@ -36,7 +36,7 @@ class Probe:
 
     Attributes:
         gpus: those that Cycles finds, its preferred back end first, each back end's in the driver's order.
-        trouble: why there may be more of them, or "": the process was ended before it had tried all back ends.
+        trouble: why there may be more of them, or "": the process ended, or hung, before it had tried all back ends.
     """
 
     gpus: tuple[Gpu, ...] = ()
@@ -58,6 +58,8 @@ def find_gpus(blender: str | None) -> Probe:
     """
     try:
         completed = run_script(script_argv(blender, "gpus.py", []), timeout_s=PROBE_TIMEOUT_S, purpose="look for GPUs")
+    except BlenderHungError as error:
+        return Probe(read_answer(error.told.splitlines()), str(error))
     except BlenderUnavailableError as error:
         return Probe(trouble=str(error))
     lines = completed.stdout.splitlines()

@@ -128,7 +128,7 @@ def open_machines(
 
     match choice.kind:
         case "processes":
-            with ProcessExecutor() as processes:
+            with ProcessExecutor(gpus=here.gpus) as processes:
                 yield Machines(processes, here)
         case "inline":
             with InlineExecutor() as inline:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pipeline.committed_pictures import CurrentPictures
     from pipeline.job.models import Job
     from pipeline.layout import JobLayout
+    from pipeline.picture_set import PictureSet
 
 
 @click.command()
@@ -83,13 +84,15 @@ def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
 def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> None:
     """Put the films of jobs side by side into one, each with its name under it.
 
-    Of the frames that are finished; as long as the shortest. Frames of the same time stand beside each other.
+    Of the frames that were made alike, from the first one on; as long as the shortest. Frames of the same time stand
+    beside each other.
 
     \b
     pipeline compare bunny-wcsph bunny-dfsph -o solvers.mp4
     """
     from pipeline.files import replacing
     from pipeline.job.loading import load_job
+    from pipeline.picture_set import picture_set
     from pipeline.resources import machine_capacity
     from render.errors import InvalidFileError
     from render.side_by_side import Film, compare_films
@@ -101,7 +104,7 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
     films = []
     for layout in (find_job(job, output) for job in jobs):
         submitted = load_job(layout.job_file)
-        frames = _current_pictures(submitted, layout)
+        frames = picture_set(submitted, layout)
         pictures = frames.unbroken
         if not pictures:
             raise PipelineError(f"the first frame of {layout.root} has not been rendered yet{frames.others}")
@@ -109,6 +112,7 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
         if len(pictures) < submitted.frame_count:
             there = f"{len(pictures)} of {submitted.frame_count} frames are there"
             click.echo(f"{submitted.name}: {there}{frames.others}", err=True)
+        _say_remark(submitted, frames)
     try:
         with replacing(target) as part:
             count = compare_films(films, part, width=width, threads=machine_capacity().cores)
@@ -133,6 +137,7 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
     """
     from pipeline.files import replacing
     from pipeline.job.loading import load_job
+    from pipeline.picture_set import picture_set
     from render.errors import InvalidFileError
     from render.loop import FORMATS, write_loop
 
@@ -140,7 +145,7 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
         raise PipelineError(f'{target}: "{target.suffix}" is no loop; use {" or ".join(FORMATS)}')
     layout = find_job(job, output)
     submitted = load_job(layout.job_file)
-    frames = _current_pictures(submitted, layout)
+    frames = picture_set(submitted, layout)
     pictures = frames.unbroken
     last = submitted.frame_count - 1 if last is None else last
     if not first <= last < submitted.frame_count:
@@ -150,6 +155,7 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
         raise PipelineError(
             f"of the frames {first}-{last} of {submitted.name} {there} are rendered{frames.others}; choose with --until"
         )
+    _say_remark(submitted, frames)
     try:
         with replacing(target) as part:
             count = write_loop(
@@ -162,6 +168,11 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
     except (InvalidFileError, ValueError, OSError) as error:
         raise PipelineError(f"cannot make {target}: {error}") from error
     click.echo(f"{target}: {count} frames, {target.stat().st_size / 1e6:.2g} MB")
+
+
+def _say_remark(job: Job, frames: PictureSet) -> None:
+    if frames.remark:
+        click.echo(f"{job.name}: {frames.remark}", err=True)
 
 
 def _current_pictures(job: Job, layout: JobLayout) -> CurrentPictures:

@@ -197,8 +197,7 @@ def _run_once(
         observers: list[Observer] = [progress, SolverWatch(layout, warn)]
         if observer is not None:
             observers.append(observer)
-        if job.movie.so_far:
-            observers.append(stack.enter_context(FilmSoFar(job, layout, progress.display.say, warn)))
+        observers.append(stack.enter_context(FilmSoFar(job, layout, progress.display.say, warn)))
         return run_job(
             job,
             layout,

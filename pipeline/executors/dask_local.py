@@ -62,7 +62,9 @@ def local_cluster(shares: list[Resources]) -> Iterator[str]:
 
 def gpu_places(shares: list[Resources]) -> list[list[int]]:
     """Which of the machine's GPUs each share has, so that no two have the same."""
-    own = own_gpus() or range(sum(share.gpus for share in shares))
+    own = own_gpus()
+    if own is None:
+        own = tuple(range(sum(share.gpus for share in shares)))
     ends = [sum(each.gpus for each in shares[: index + 1]) for index in range(len(shares))]
     return [[*own[end - share.gpus : end]] for share, end in zip(shares, ends, strict=True)]
 

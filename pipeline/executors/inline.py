@@ -26,7 +26,7 @@ class InlineExecutor(ShutDownOnExit):
 
     def submit(self, assignment: Assignment) -> None:
         """Put the attempt into the queue."""
-        self._queue.append(replace(assignment, gpu=first_gpu()) if assignment.need.gpus else assignment)
+        self._queue.append(replace(assignment, gpu=first_gpu(assignment.task)) if assignment.need.gpus else assignment)
 
     def wait(self, timeout_s: float) -> list[TaskEvent]:
         """Run the next assignment to its end, however long that takes."""

@@ -69,8 +69,10 @@ class ProcessExecutor(ShutDownOnExit):
     from one that lives as long as the run; the main one is best.
     """
 
-    def __init__(self, limits: WorkerLimits | None = None) -> None:
+    def __init__(self, limits: WorkerLimits | None = None, *, gpus: int | None = None) -> None:
+        """`gpus` is how many there are for tasks, where that is known."""
         self._limits = limits or WorkerLimits()
+        self._gpus = gpus
         memory_bytes = machine_memory_bytes()
         self._memory_limit = self._limits.resident_memory_bytes or memory_bytes // 4
         self._task_memory_limit = self._limits.task_memory_bytes or int(memory_bytes * MEMORY_SHARE)
@@ -94,7 +96,8 @@ class ProcessExecutor(ShutDownOnExit):
     def submit(self, assignment: Assignment) -> None:
         """Give the attempt to a warm worker of its stage, or to a new one."""
         if assignment.need.gpus:
-            assignment = replace(assignment, gpu=self._places.take(self._warm_places(assignment)))
+            first, warm = assignment.task.on_first_gpu, self._warm_places(assignment)
+            assignment = replace(assignment, gpu=self._places.take(warm, first=first, there=self._gpus))
         key = (assignment.task.stage, assignment.threads, assignment.gpu)
         worker = next((worker for worker in self._workers if worker.idle and worker.key == key), None)
         if worker is None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.cache import read_frame
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
 from pipeline.gpu_kernels import compiled_once
-from pipeline.gpus import known_gpus, render_gpus
+from pipeline.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
 from pipeline.job.input_files import split_blend
 from pipeline.job.looks import BODY, parts_of
 from pipeline.job.models import Job
@@ -185,19 +185,27 @@ class RenderStage:
 
 def _draws_on_gpus(job: Job) -> bool:
     """Whether each frame has a GPU for itself. One that the job names is wanted wherever the frames are drawn."""
-    return bool(render_gpus(job)) if job.render.device == "auto" else job.render.device != "cpu"
+    return bool(usable_gpus(job)) if job.render.device == "auto" else job.render.device != "cpu"
 
 
 def _missing_gpus(job: Job) -> Iterator[str]:
-    """A kind of GPU that the job names and Cycles does not find here."""
-    device = job.render.device
-    if device in ("auto", "cpu") or render_gpus(job):
+    """A kind of GPU that the job names and Cycles does not find here, or a place that the environment names."""
+    device, found, own = job.render.device, render_gpus(job), own_gpus() or ()
+    absent = [place for place in own if place >= len(found)]
+    if found and absent:
+        places = "only GPU 0" if len(found) == 1 else f"only the GPUs 0 to {len(found) - 1}"
+        yield f"{OWN_GPUS} names GPU {', '.join(map(str, absent))}, but Cycles finds {places} here"
+        return
+    if device in ("auto", "cpu") or usable_gpus(job):
+        return
+    if found:
+        yield f'render.device is "{device}", but {OWN_GPUS} leaves this process no GPU; use "auto" or "cpu"'
         return
     probe = known_gpus(job.render.blender)
     there = ", ".join(f"{gpu.name} ({gpu.backend.lower()})" for gpu in probe.gpus)
-    found = f"finds only {there}" if there else "finds no GPU"
+    finds = f"finds only {there}" if there else "finds no GPU"
     trouble = f" ({probe.trouble})" if probe.trouble else ""
-    yield f'render.device is "{device}", but Cycles {found} here{trouble}; use "auto" or "cpu"'
+    yield f'render.device is "{device}", but Cycles {finds} here{trouble}; use "auto" or "cpu"'
 
 
 def _missing_materials(job: Job) -> Iterator[str]:

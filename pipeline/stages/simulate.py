@@ -81,6 +81,7 @@ class SimulateStage:
                 ),
                 resources=_resources(job),
                 checkpointed=True,
+                on_first_gpu=True,  # Taichi's own choice
             )
         ]
 

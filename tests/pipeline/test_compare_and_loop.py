@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import av
@@ -124,12 +126,32 @@ def test_frames_of_an_earlier_version_of_a_job_are_not_compared(tmp_path):
         assert frame[32, 152].argmax() == 1  # green, as drawn last
 
 
-def test_a_job_of_which_all_frames_are_of_an_earlier_version_is_not_compared(tmp_path):
+def test_a_film_that_would_be_made_otherwise_now_is_shown_and_that_is_told(tmp_path):
     red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
     change(blue, 0)
     result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
-    assert result.exit_code == 1
-    assert "has not been rendered yet (12 more are of an earlier version of it)" in result.stderr
+    assert result.exit_code == 0, result.output
+    assert result.stderr == "blue: its frames are not as the job would be made now; what differs: render\n"
+    assert len(decode(tmp_path / "both.mp4")[0]) == 12
+    result = pipeline("loop", blue, "-o", tmp_path / "blue.webp")
+    assert result.exit_code == 0, result.output
+    assert result.stderr == "blue: its frames are not as the job would be made now; what differs: render\n"
+
+
+@pytest.mark.parametrize("record", ["gone", "old"])
+def test_frames_of_which_there_are_receipts_only_or_an_old_record_are_shown(tmp_path, record):
+    red = film(tmp_path / "red", (160, 20, 20))
+    manifest = JobLayout(red).manifest
+    if record == "gone":  # as `run-stage` and OpenJobDescription leave them
+        manifest.unlink()
+    else:
+        with closing(sqlite3.connect(manifest)) as connection:
+            connection.execute("PRAGMA user_version = 1")
+    for command in (("loop", red, "-o", tmp_path / "red.webp"), ("compare", red, red, "-o", tmp_path / "both.mp4")):
+        result = pipeline(*command)
+        assert result.exit_code == 0, result.output
+        assert result.stderr == ""
+    assert len(decode(tmp_path / "both.mp4")[0]) == 12
 
 
 def test_frames_of_an_earlier_version_of_a_job_are_not_looped(tmp_path):

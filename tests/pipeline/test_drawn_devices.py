@@ -16,7 +16,7 @@ from pipeline.origins import origins_of
 from pipeline.parameter_set import ParameterSet
 from pipeline.receipts import Receipt
 from pipeline.report.writing import write_report
-from pipeline.task import ArtifactPath, Task, TaskId
+from pipeline.task import ArtifactPath, Task, TaskId, TaskState
 
 GPU = "OPTIX: NVIDIA H100"
 WARNING = f"the film's frames were drawn by devices that round differently: 1 on CPU, 2 on {GPU}; "
@@ -39,7 +39,7 @@ def draw(layout: JobLayout, *devices: str) -> list[Receipt]:
             receipts.append(commit.receipt)
     with Manifest(layout.manifest) as manifest:
         manifest.begin_run("tank")
-        manifest.record_plan(tasks)
+        manifest.record_plan(tasks, {task.id: TaskState.SUCCEEDED for task in tasks})
         manifest.record_artifacts(receipts)
         manifest.end_run()
     return receipts
@@ -67,6 +67,14 @@ def test_frames_that_are_no_part_of_the_film_any_more_do_not_count(layout):
     draw(layout, "CPU")
     with Manifest(layout.manifest) as manifest:
         assert manifest.devices("render") == {"CPU": 1}
+
+
+@pytest.mark.parametrize("state", [TaskState.PENDING, TaskState.RUNNING, TaskState.FAILED])
+def test_frames_that_are_about_to_be_replaced_do_not_count(layout, state):
+    draw(layout, "CPU", GPU, "CPU")
+    with Manifest(layout.manifest) as manifest:
+        manifest.set_states({TaskId("render/000000"): state, TaskId("render/000002"): TaskState.UP_TO_DATE})
+        assert manifest.devices("render") == {"CPU": 1, GPU: 1}
 
 
 def test_the_report_tells_and_warns_too(layout):

@@ -24,7 +24,7 @@ from pipeline.film_so_far import FilmSoFar
 from pipeline.frame_order import spread_turns
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
-from pipeline.plan import Assessment, Verdict, plan_job
+from pipeline.plan import NEVER_MADE, Assessment, Reason, Verdict, plan_job
 from pipeline.receipts import Receipt
 from pipeline.run_events import RunStarted, StateChanged
 from pipeline.stages import STAGES
@@ -130,6 +130,30 @@ def test_a_job_can_do_without(tmp_path):
     assert "the film so far" not in result.output
 
 
+def test_the_film_so_far_of_an_earlier_run_goes_with_one_that_does_without(tmp_path):
+    write_job(tmp_path)
+    result, layout = submit(tmp_path, wait=6, fail=7)
+    assert result.exit_code == 5, result.output
+    assert layout.film_so_far.exists()
+    write_job(tmp_path, more="movie.so_far = false")
+    result, _ = submit(tmp_path)
+    assert result.exit_code == 0, result.output
+    assert not layout.film_so_far.exists()
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_a_film_so_far_is_not_shown_as_that_of_a_later_version_of_the_job(tmp_path, changed):
+    write_job(tmp_path)
+    assert submit(tmp_path, wait=6, fail=7)[0].exit_code == 5
+    write_job(tmp_path, gravity=-20.0 if changed else -9.0)
+    result, layout = submit(tmp_path, fail=0 if changed else 7)
+    assert result.exit_code == 5, result.output
+    if changed:
+        assert not layout.film_so_far.exists()
+    else:
+        assert {gravity for _, gravity in colors(layout.film_so_far)} == {-9}
+
+
 def test_the_key_runs_nothing_again(tmp_path):
     layout = JobLayout(tmp_path)
     write_job(tmp_path)
@@ -192,6 +216,26 @@ def test_a_frame_that_turns_out_up_to_date_is_shown(tmp_path):
         wait_until(
             lambda: [frame for frame, _ in colors(JobLayout(tmp_path).film_so_far)] == [0, 0, 2, 2], "it does not grow"
         )
+
+
+def test_a_film_that_may_hold_frames_of_an_earlier_version_goes_when_a_run_begins(tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.film_so_far.SHORTEST_PAUSE_S", 600.0)
+    _, _, assessments = watched(tmp_path, frames=4, drawn=2)
+    film = JobLayout(tmp_path).film_so_far
+    never = (Reason("never made", NEVER_MADE),)
+    changed = (Reason("gravity changed", "gravity changed"),)
+
+    def left_by(*reasons: tuple[Reason, ...]) -> bool:
+        film.write_bytes(b"an earlier one")
+        with FilmSoFar(load_job(JobLayout(tmp_path).job_file), JobLayout(tmp_path), print, print) as observer:
+            stale = [
+                Assessment(each.task, Verdict.STALE, why) for each, why in zip(assessments[2:4], reasons, strict=True)
+            ]
+            observer.notify(RunStarted([*assessments[:2], *stale, *assessments[4:]]))
+        return film.exists()
+
+    assert left_by(never, never)
+    assert not left_by(never, changed)
 
 
 def test_a_film_takes_a_small_share_of_the_time(tmp_path, monkeypatch):

@@ -87,6 +87,25 @@ def test_what_was_told_before_a_driver_ended_blender_counts_and_the_end_is_told(
     assert probe.trouble.startswith("Blender ended with exit code -11 while it looked for GPUs")
 
 
+def test_what_was_told_before_a_driver_hung_counts_and_the_hang_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr("render.gpus.PROBE_TIMEOUT_S", 1.0)
+    blender = tmp_path / "blender"
+    told = json.dumps({"backend": "OPTIX", "devices": [{"name": gpu.name, "id": gpu.id} for gpu in CARDS]})
+    blender.write_text(f"#!/bin/sh\necho 'GPUS {told}'\nexec sleep 60\n")
+    blender.chmod(0o755)
+    assert find_gpus(str(blender)) == Probe(CARDS, "Blender took more than 1 s to look for GPUs")
+
+
+def test_names_of_drivers_and_files_in_any_encoding_are_read(tmp_path):
+    blender = tmp_path / "blender"
+    told = json.dumps({"backend": "HIP", "devices": [{"name": "Vidéo", "id": "0"}]}, ensure_ascii=False)
+    blender.write_bytes(b"#!/bin/sh\necho 'cannot open M\xfcller.so'\n" + f"echo 'GPUS {told}'\n".encode())
+    with blender.open("a") as file:
+        file.write("echo GPUS_DONE\\ 5.0.1\n")
+    blender.chmod(0o755)
+    assert find_gpus(str(blender)) == Probe((Gpu("HIP", "Vidéo", "0"),))
+
+
 def test_lines_of_blender_itself_tell_of_no_gpu():
     assert read_answer(["Color management: warning", 'GPUS {"backend": "HIP", "devices": []}', "GPUS_DONE 5.0.1"]) == ()
 
@@ -115,12 +134,17 @@ def test_the_answer_is_remembered_until_driver_or_visible_devices_change(machine
     assert machine.asked == 3
 
 
-def test_an_answer_that_was_cut_short_is_remembered_by_this_process_only(machine):
-    machine.probe = Probe(trouble="Blender ended with exit code -11")
-    assert [known_gpus(None), known_gpus(None)] == [machine.probe] * 2
+def test_an_answer_that_was_cut_short_is_remembered_for_an_hour(machine, tmp_path):
+    cut_short = machine.probe = Probe(CARDS, trouble="Blender took more than 120 s to look for GPUs")
+    for _ in range(2):
+        start_anew()
+        assert known_gpus(None) == cut_short
     assert machine.asked == 1
-    start_anew()
     machine.probe = Probe(ALL)
+    path = tmp_path / "physics-pipeline" / "render-gpus.json"
+    remembered = json.loads(path.read_text())
+    path.write_text(json.dumps(remembered | {"asked_at": remembered["asked_at"] - gpus.TROUBLE_KEPT_S}))
+    start_anew()
     assert known_gpus(None) == Probe(ALL)
 
 
@@ -171,6 +195,36 @@ def test_a_process_uses_those_gpus_only_that_are_left_to_it(machine, monkeypatch
     assert usable_gpus(job("auto")) == CARDS
     monkeypatch.setenv(gpus.OWN_GPUS, "1,5")
     assert usable_gpus(job("auto")) == CARDS[1:]
+    monkeypatch.setenv(gpus.OWN_GPUS, "")
+    assert usable_gpus(job("auto")) == ()
+    assert [gpus_a_frame(device) for device in ("cpu", "auto", "gpu")] == [{0}, {0}, {1}]
+
+
+@pytest.mark.parametrize(
+    ("own", "device", "sentence"),
+    [
+        ("1,5", "auto", "PIPELINE_GPUS names GPU 5, but Cycles finds only the GPUs 0 to 1 here"),
+        ("1,5", "gpu", "PIPELINE_GPUS names GPU 5, but Cycles finds only the GPUs 0 to 1 here"),
+        ("1,5", "cpu", None),
+        ("1", "optix", None),
+        ("", "auto", None),
+        ("", "gpu", 'render.device is "gpu", but PIPELINE_GPUS leaves this process no GPU; use "auto" or "cpu"'),
+    ],
+)
+@needs_bpy
+def test_a_place_that_is_not_there_and_none_at_all_stop_a_job_before_any_work(
+    machine, monkeypatch, own, device, sentence
+):
+    monkeypatch.setenv(gpus.OWN_GPUS, own)
+    assert RenderStage().obstacles(job(device)) == ([] if sentence is None else [sentence])
+
+
+@needs_bpy
+def test_a_machine_without_gpus_draws_on_the_processor_whatever_place_is_left_to_it(machine, monkeypatch):
+    machine.probe = Probe()
+    monkeypatch.setenv(gpus.OWN_GPUS, "0")
+    assert RenderStage().obstacles(job("auto")) == []
+    assert gpus_a_frame("auto") == {0}
 
 
 @pytest.mark.parametrize(
@@ -202,6 +256,7 @@ def test_that_gpus_cannot_be_told_is_said_of_a_job_that_would_take_them(machine)
     machine.probe = Probe(trouble="Blender crashed")
     assert [render_trouble(job(device)) for device in ("auto", "cpu")] == ["Blender crashed", ""]
     start_anew()
+    gpus.cache_folder().joinpath("render-gpus.json").unlink()
     machine.probe = Probe(CARDS, trouble="another driver crashed")
     assert render_trouble(job("auto")) == ""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from math import prod
 from pathlib import Path
 
@@ -138,3 +139,17 @@ def test_what_cannot_be_read_counts_for_nothing(tmp_path):
     (tmp_path / "text.blend").write_text("no Blender file")
     assert needed(tmp_path / "absent.hdr", a=f"{tmp_path / 'absent.blend'}:Wall") == 0
     assert needed(a=f"{tmp_path / 'text.blend'}:Wall") == 0
+
+
+def test_a_large_blend_file_is_not_read_into_memory(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    size = 64_000_000
+    blend = tmp_path / "large.blend"
+    with blend.open("wb") as file:
+        file.truncate(size)
+    tracemalloc.start()
+    try:
+        assert needed(a=f"{blend}:Wall") == 0
+        assert tracemalloc.get_traced_memory()[1] < size / 4  # it is read in pieces of 4 MiB
+    finally:
+        tracemalloc.stop()
