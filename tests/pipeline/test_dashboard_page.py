@@ -6,12 +6,15 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 from dashboards import dashboard, draw_frame, frame_job
 from farm_processes import Farm, wait_until
 from playwright.sync_api import Page
 
 from pipeline.manifest import Manifest
+from pipeline.report.film import ReportFilm
 from pipeline.spool import Wish, submission
 from tests.browser import needs_browser, open_page
 
@@ -78,6 +81,29 @@ def test_frames_appear_as_they_arrive_and_open_in_full(farm: Farm) -> None:
         assert not page.locator("#viewer").is_visible()
         assert page.evaluate("window.untouched")
     assert faults == []  # nor did the policy keep anything of ours from working
+
+
+def test_the_film_in_a_report_is_let_through(farm: Farm) -> None:
+    layout = farm.layout("film")
+    frame_job(layout, 1)
+    film = farm.folder / "film.mp4"
+    with av.open(film, "w") as container:
+        stream = container.add_stream("libx264", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        picture = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 90, np.uint8), format="rgb24")
+        container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    address = ReportFilm(film.read_bytes(), "video/mp4", 64, 48).address
+    layout.report.write_text(f'<!doctype html><title>film</title><video preload="auto" src="{address}"></video>')
+    with dashboard(farm) as (client, _), open_page() as page:
+        page.goto(f"http://{client.place}/jobs/film/report")
+        until(page, "document.querySelector('video').readyState || document.querySelector('video').error")
+        assert page.evaluate(
+            "[document.querySelector('video').videoWidth, !document.querySelector('video').error]"
+        ) == [
+            64,
+            True,
+        ]
 
 
 def test_tasks_are_found_and_their_logs_read_while_what_is_typed_stays(farm: Farm) -> None:
