@@ -20,6 +20,9 @@ from farm_processes import Farm
 from PIL import Image
 
 from pipeline.cli import main
+from pipeline.dashboard.farm_view import FarmView
+from pipeline.dashboard.job_view import film_of
+from pipeline.dashboard.places import Places
 from pipeline.layout import JobLayout
 from pipeline.lease import live_holder
 from pipeline.manifest import Manifest
@@ -166,6 +169,28 @@ def test_the_film_so_far_then_the_film_in_ranges(farm: Farm) -> None:
         (layout.root / "movie.mp4").write_bytes(b"finished")
         whole = client.ask("/jobs/film/film")
         assert (whole.status, whole.body, whole.headers["content-type"]) == (200, b"finished", "video/mp4")
+
+
+def test_only_films_that_browsers_play_are_offered_to_be_played(farm: Farm) -> None:
+    layout = farm.layout("film")
+    frame_job(layout, 1)
+    places = Places(farm.spool.farm)
+
+    def is_playable(job_file: str) -> bool:
+        layout.job_file.write_text(job_file)
+        film = film_of(places, FarmView(places, farm.spool).job("film"))
+        assert film is not None
+        return film.is_playable
+
+    (layout.root / "movie-so-far.mp4").write_bytes(b"so far")
+    assert is_playable('movie.codec = "h265"')
+    (layout.root / "movie-so-far.mp4").unlink()
+    (layout.root / "movie.mp4").write_bytes(b"finished")
+    assert not is_playable('name = "film"\n[movie]\ncodec = "h265"')
+    for text in ("", '[movie]\ncodec = "av1"', "[movie]\ncrf = 12", "movie = 3", "no TOML", "a = " + "[" * 5000):
+        assert is_playable(text), text[:40]
+    (layout.root / "movie.mp4").rename(layout.root / "movie.mov")
+    assert not is_playable('movie.codec = "prores"')
 
 
 # --- what it does ---
