@@ -24,7 +24,7 @@ from pipeline.dashboard.gate import REPORT_POLICY, Gate, form_of
 from pipeline.dashboard.job_view import STATE_GROUPS, Question, film_of, look_at_job
 from pipeline.dashboard.machine import Machine
 from pipeline.dashboard.pages import FARM_PARTS, JOB_PARTS, Pages, Part, job_url
-from pipeline.dashboard.places import NotThereError, Places
+from pipeline.dashboard.places import NotThereError, Places, printable
 from pipeline.dashboard.thumbnails import WIDTHS, Thumbnails
 from pipeline.errors import PipelineError
 from pipeline.layout import JobLayout
@@ -231,7 +231,7 @@ class Dashboard:
     # --- what went wrong ---
     def _message(self, request: Request, status: int, sentence: str) -> Response:
         if _wants_json(request):
-            return JSONResponse({"message": sentence}, status)
+            return JSONResponse({"message": printable(sentence)}, status)
         return HTMLResponse(self.pages.draw("message.html", status=status, sentence=sentence, farm=""), status)
 
     def _ask(self, request: Request, sentence: str) -> Response:

@@ -490,6 +490,26 @@ def test_records_that_cannot_be_read_are_told_and_the_page_lives(farm: Farm) -> 
             page_of(client, name, "?task=render/000000&page=3")
 
 
+def test_names_that_are_not_utf_8_are_shown_and_take_no_page_down(farm: Farm) -> None:
+    folder = os.fsdecode(b"r\xe9nders")
+    frame_job(farm.layout("good"), 1)
+    shutil.copytree(farm.layout("good").root, farm.spool.farm / os.fsdecode(b"caf\xe9"))
+    (farm.spool.folder / "queue").mkdir(parents=True)
+    (farm.spool.folder / "queue" / "odd.json").write_text("{")
+    farm.spool.farm.rename(farm.folder / folder)
+    with dashboard(farm, folder=folder) as (client, _):
+        listed = client.ask("/").text
+        assert ">good</a>" in listed
+        assert "caf\\udce9" in listed
+        assert "not UTF-8" in listed
+        assert "r\\udce9nders/.farm/queue/odd.json" in listed
+        assert '"pill is-unknown"' in listed
+        assert "0 of 1 tasks" in page_of(client, "good")
+        assert "not UTF-8" in page_of(client, "caf%5Cudce9")
+        assert client.ask("/jobs/caf%E9").status == 404
+        assert client.post("/jobs/odd/cancel").status == 404
+
+
 def test_a_job_that_goes_while_it_is_looked_at_is_told(farm: Farm) -> None:
     frame_job(farm.layout("film"), 2)
     with dashboard(farm) as (client, _):
