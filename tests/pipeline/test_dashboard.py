@@ -359,6 +359,7 @@ def test_nothing_outside_of_the_farm_is_served(farm: Farm) -> None:
             *(
                 "/jobs/film/frames/-1/small",
                 "/jobs/film/frames/99999999999999999999/small",
+                f"/jobs/film/frames/{'9' * 5000}/small",
                 "/%2e%2e/%2e%2e/etc/passwd",
             ),
         ):
@@ -508,6 +509,26 @@ def test_names_that_are_not_utf_8_are_shown_and_take_no_page_down(farm: Farm) ->
         assert "not UTF-8" in page_of(client, "caf%5Cudce9")
         assert client.ask("/jobs/caf%E9").status == 404
         assert client.post("/jobs/odd/cancel").status == 404
+
+
+def test_a_form_that_is_cut_off_asks_for_nothing_and_is_no_fault(farm: Farm) -> None:
+    queued_job(farm, "a")
+    with dashboard(farm) as (client, process):
+        head = {
+            "Host": client.place,
+            "Origin": f"http://{client.place}",
+            "X-Form-Token": client.form_token(),
+            "Cookie": client.cookie,
+            "Content-Length": "100",
+        }
+        lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
+        with socket.create_connection(client.place.split(":")) as cut:
+            cut.sendall(f"POST /jobs/a/cancel HTTP/1.1\r\n{lines}\r\nvalue=".encode())
+            time.sleep(0.2)  # so that it is waited for when it is cut off; without it, it is seen as cut off at once
+        assert client.ask("/").status == 200
+        assert farm.spool.find("a") is not None
+        process.terminate()
+        assert "Traceback" not in farm.finish(process).err
 
 
 def test_a_job_that_goes_while_it_is_looked_at_is_told(farm: Farm) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
+import zlib
 from pathlib import Path
 
 import pytest
@@ -253,6 +255,17 @@ def test_small_pictures_are_kept_up_to_a_limit(layout: JobLayout, monkeypatch: p
     monkeypatch.setattr("pipeline.dashboard.thumbnails.MOST_PIXELS", 1000)
     with pytest.raises(NotThereError, match="too large"):
         thumbnails.get(paths[0], "large")
+
+
+def test_a_picture_that_claims_to_be_vast_is_not_shown(tmp_path: Path) -> None:
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
+    vast = tmp_path / "000000.png"
+    vast.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
+    with pytest.raises(NotThereError, match="too large"):
+        Thumbnails().get(vast, "small")
 
 
 # --- access ---
