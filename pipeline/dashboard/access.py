@@ -35,6 +35,13 @@ class Access:
     port: int
     token: str | None
     key: bytes = field(default_factory=lambda: secrets.token_bytes(32), repr=False)
+    _names: frozenset[str] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        names = {"localhost", self.host.lower()}
+        if not is_loopback(self.host):  # asked once: this may ask a name server, which may take its time
+            names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
+        object.__setattr__(self, "_names", frozenset(names))
 
     @property
     def cookie(self) -> str:
@@ -46,10 +53,7 @@ class Access:
         name = host_of(header)
         if is_address(name):
             return not is_loopback(self.host) or ipaddress.ip_address(name).is_loopback
-        own = {"localhost", self.host.lower()}
-        if not is_loopback(self.host):
-            own |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-        return name in own
+        return name in self._names
 
     def is_token(self, given: str) -> bool:
         """Whether this is the token; takes the same time whatever is given."""

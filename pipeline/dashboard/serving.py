@@ -14,7 +14,7 @@ from types import FrameType
 import uvicorn
 from starlette.types import ASGIApp
 
-from pipeline.dashboard.access import is_address
+from pipeline.dashboard.access import is_address, is_loopback
 from pipeline.errors import PipelineError
 
 GRACE_S = 2
@@ -106,3 +106,14 @@ def address_of(listening: socket.socket, host: str) -> str:
     stands_for_all = is_address(host) and ipaddress.ip_address(host).is_unspecified
     shown = socket.gethostname() if stands_for_all else host
     return f"http://{f'[{shown}]' if ':' in shown else shown}:{listening.getsockname()[1]}/"
+
+
+def remark_of(listening: socket.socket, host: str) -> str:
+    """What is to be said of where it listens: that a name reaches less far than it seems to; else nothing."""
+    address = listening.getsockname()[0]
+    if is_loopback(host) or not is_loopback(address):
+        return ""
+    return (
+        f"{host} is {address} on this machine, as its /etc/hosts says, which only this machine reaches; "
+        "for others, name its address in the network: --host ADDRESS"
+    )

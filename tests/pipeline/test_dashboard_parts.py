@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import struct
 import threading
 import time
@@ -16,6 +17,7 @@ from pipeline.dashboard.estimates import LongTask, remaining, stage_rows
 from pipeline.dashboard.farm_view import Kept, read_record
 from pipeline.dashboard.machine import Machine
 from pipeline.dashboard.places import NotThereError, Places
+from pipeline.dashboard.serving import listen, remark_of
 from pipeline.dashboard.thumbnails import Thumbnails
 from pipeline.errors import ManifestError
 from pipeline.layout import JobLayout
@@ -297,3 +299,21 @@ def test_only_addresses_and_own_names_are_known_hosts() -> None:
     assert far.knows_host("192.168.1.5:80")
     assert not far.knows_host("studio.example:80")
     assert Access("studio.example", 80, "t" * 20).knows_host("Studio.example:80")
+
+
+def test_own_names_are_asked_for_once_and_not_by_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(socket, "getfqdn", lambda: asked.append(1) or "Studio-3.Example")
+    access = Access("0.0.0.0", 80, "t" * 20)  # noqa: S104
+    assert [access.knows_host(name) for name in ("studio-3.example:80", "other.example", "a.b")] == [True, False, False]
+    assert asked == [1]
+    Access("127.0.0.1", 80, None)
+    assert asked == [1]
+
+
+def test_a_name_that_stands_for_the_loopback_is_remarked_on() -> None:
+    with listen("127.0.1.1", 0) as listening:  # as Debian lets a machine's own name stand for
+        assert "studio-3 is 127.0.1.1 on this machine" in remark_of(listening, "studio-3")
+        assert remark_of(listening, "127.0.1.1") == remark_of(listening, "localhost") == ""
+    with listen("0.0.0.0", 0) as listening:  # noqa: S104
+        assert remark_of(listening, "studio-3") == ""
