@@ -125,6 +125,22 @@ def test_tasks_are_found_and_their_logs_read_while_what_is_typed_stays(farm: Far
         until(page, "!document.querySelector('.log')")
 
 
+def test_the_priority_that_is_shown_is_the_one_that_it_is(farm: Farm) -> None:
+    farm.spool.enqueue(submission("dam", text=farm.job("dam").read_text()))
+    with dashboard(farm) as (client, _), open_page() as page:
+        page.goto(f"http://{client.place}/jobs/dam")
+        field = page.get_by_label("Priority")
+        field.fill("7")
+        page.get_by_role("button", name="Set").click()
+        page.get_by_text("dam has priority 7").wait_for(timeout=PATIENCE_MS)
+        farm.spool.change("dam", priority=3)  # by somebody else
+        until(page, "document.querySelector('input[type=number]').value === '3'")
+        field.fill("9")
+        farm.spool.change("dam", priority=4)
+        page.wait_for_timeout(1500)
+        assert field.input_value() == "9"  # somebody types
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_it_fits_a_phone(farm: Farm, scheme: str) -> None:
     layout = farm.layout("a-film-with-a-name-that-is-much-longer-than-any-telephone-is-wide-" + "x" * 60)
