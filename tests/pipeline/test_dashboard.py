@@ -376,6 +376,7 @@ def test_nothing_outside_of_the_farm_is_served(farm: Farm) -> None:
 def token_file(tmp_path: Path) -> Path:
     path = tmp_path / "token"
     path.write_text("a-token-that-nobody-guesses\n")
+    path.chmod(0o600)
     return path
 
 
@@ -413,7 +414,8 @@ def test_another_address_than_the_loopback_has_a_token_of_its_own(farm: Farm) ->
 def test_a_token_that_can_be_guessed_is_refused(farm: Farm, tmp_path: Path) -> None:
     farm.spool.farm.mkdir()
     (tmp_path / "short").write_text("1234\n")
-    assert "must hold 16 characters" in farm.run("dashboard", "--token-file", "short", "--port", "0", code=1).err
+    (tmp_path / "short").chmod(0o600)
+    assert "must hold 22 characters" in farm.run("dashboard", "--token-file", "short", "--port", "0", code=1).err
     assert "cannot be read" in farm.run("dashboard", "--token-file", "missing", "--port", "0", code=1).err
 
 

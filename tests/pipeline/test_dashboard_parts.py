@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import secrets
 import socket
 import struct
 import threading
@@ -18,7 +19,7 @@ from dashboards import draw_frame, frame_job
 from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 
-from pipeline.dashboard.access import Access, host_of
+from pipeline.dashboard.access import Access, access_of, host_of
 from pipeline.dashboard.actions import Queue
 from pipeline.dashboard.estimates import LongTask, remaining, stage_rows
 from pipeline.dashboard.farm_view import Kept, read_record
@@ -26,7 +27,7 @@ from pipeline.dashboard.machine import Machine
 from pipeline.dashboard.places import NotThereError, Places
 from pipeline.dashboard.serving import config_of, listen, remark_of
 from pipeline.dashboard.thumbnails import Thumbnails
-from pipeline.errors import ManifestError
+from pipeline.errors import ManifestError, PipelineError
 from pipeline.layout import JobLayout
 from pipeline.lease import LeaseHolder
 from pipeline.manifest import Manifest
@@ -383,7 +384,7 @@ def test_sessions_are_signed_and_forms_belong_to_one() -> None:
     assert session is not None
     assert access.is_form_token(session, access.form_token(session))
     assert not access.is_form_token(access.session(other) or "", access.form_token(session))
-    assert not access.is_form_token(session, cookie.partition(".")[2])  # a session's signature opens no form
+    assert not access.is_form_token(session, cookie.rpartition(".")[2])  # a session's signature opens no form
     for forged in (None, "", ".", session, f"{session}.", f"x{cookie}", cookie[:-1], "ü.ü"):
         assert access.session(forged) is None
     assert Access("127.0.0.1", 80, None).session(cookie) is None  # of another start
@@ -414,3 +415,42 @@ def test_a_name_that_stands_for_the_loopback_is_remarked_on() -> None:
         assert remark_of(listening, "127.0.1.1") == remark_of(listening, "localhost") == ""
     with listen("0.0.0.0", 0) as listening:
         assert remark_of(listening, "studio-3") == ""
+
+
+def test_a_session_ends_and_its_end_is_signed(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1e9]
+    monkeypatch.setattr("pipeline.dashboard.access.time", SimpleNamespace(time=lambda: now[0]), raising=False)
+    access = Access("127.0.0.1", 80, None)
+    cookie = access.new_session()
+    name, end, signature = cookie.split(".")
+    now[0] += 6 * 24 * 3600
+    assert access.session(cookie) == f"{name}.{end}"
+    assert access.session(f"{name}.{int(end) + 10**6}.{signature}") is None
+    now[0] += 25 * 3600
+    assert access.session(cookie) is None
+
+
+@pytest.mark.parametrize(
+    "token", ["a" * 40, "password" * 3, "0123456789abcdef01234", "12" * 30, "x" * 9000, "a b\nc" * 9]
+)
+def test_tokens_that_can_be_guessed_are_refused(tmp_path: Path, token: str) -> None:
+    path = tmp_path / "token"
+    path.write_text(token)
+    path.chmod(0o600)
+    with pytest.raises(PipelineError, match="22 characters at least, drawn at random"):
+        access_of("127.0.0.1", 80, path)
+
+
+def test_a_token_that_others_can_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "token"
+    path.write_text(f"{secrets.token_urlsafe(32)}\n")
+    for mode in (0o640, 0o604, 0o620, 0o602):
+        path.chmod(mode)
+        with pytest.raises(PipelineError, match="chmod 600"):
+            access_of("127.0.0.1", 80, path)
+    path.chmod(0o600)
+    first, again = access_of("127.0.0.1", 80, path), access_of("127.0.0.1", 80, path)
+    assert again.session(first.new_session()) is not None  # sessions outlive the program
+    for token in (secrets.token_urlsafe(32), secrets.token_hex(16)):
+        path.write_text(token)
+        assert access_of("127.0.0.1", 80, path).is_token(token)
