@@ -130,6 +130,7 @@ def test_the_priority_that_is_shown_is_the_one_that_it_is(farm: Farm) -> None:
     with dashboard(farm) as (client, _), open_page() as page:
         page.goto(f"http://{client.place}/jobs/dam")
         field = page.get_by_label("Priority")
+        page.evaluate("document.querySelector('input[type=number]').isOurs = true")
         for typed in ("7", "8"):
             field.fill(typed)
             page.get_by_role("button", name="Set").click()
@@ -141,6 +142,7 @@ def test_the_priority_that_is_shown_is_the_one_that_it_is(farm: Farm) -> None:
         farm.spool.change("dam", priority=4)
         page.wait_for_timeout(1500)
         assert field.input_value() == "9"  # somebody types
+        assert page.evaluate("document.querySelector('input[type=number]').isOurs")  # no change took it away
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
