@@ -15,6 +15,7 @@ import errno
 import fcntl
 import json
 import os
+import threading
 import time
 import unicodedata
 import uuid
@@ -167,12 +168,13 @@ class Listing:
 
 
 class Spool:
-    """The spool of one farm. Reading needs no lock; changes take it by themselves, or join `locked`."""
+    """The spool of one farm, for any threads. Reading needs no lock; changes take it by themselves, or join `locked`."""
 
     def __init__(self, farm: Path) -> None:
         self.farm = farm
         self.folder = farm / ".farm"
-        self._locks = 0
+        self._mutex = threading.RLock()
+        self._is_locked = False
         self._read: dict[str, tuple[tuple[int, int, int], QueuedJob]] = {}
 
     @property
@@ -207,19 +209,26 @@ class Spool:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Exclude every other change of the queue, in all processes, for the block; may be nested in one thread.
+        """Exclude every other change of the queue, in all processes and threads, for the block; a thread may nest it.
 
         Raises:
             SpoolError: the farm cannot be written to, or its file system has no locks.
             OSError: another trouble of the disk.
         """
-        if self._locks:
-            self._locks += 1
+        with self._mutex:  # the kernel's lock keeps processes out, not the threads of this one
+            if self._is_locked:
+                yield
+                return
+            descriptor = self._lock()
+            self._is_locked = True
             try:
                 yield
             finally:
-                self._locks -= 1
-            return
+                self._is_locked = False
+                os.close(descriptor)
+
+    def _lock(self) -> int:
+        """A descriptor whose closing drops the lock that keeps other processes out."""
         try:
             self.make()
             descriptor = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -231,17 +240,13 @@ class Spool:
                 "jobs' folders must be writable"
             ) from error
         try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX)
-            except OSError as error:
-                if error.errno not in NO_LOCKS:
-                    raise
-                raise SpoolError(f"{self.farm}: this file system has no locks (flock); use another folder") from error
-            self._locks = 1
-            yield
-        finally:
-            self._locks = 0
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except BaseException as error:
             os.close(descriptor)
+            if isinstance(error, OSError) and error.errno in NO_LOCKS:
+                raise SpoolError(f"{self.farm}: this file system has no locks (flock); use another folder") from error
+            raise
+        return descriptor
 
     # --- looking ---
     def listing(self) -> Listing:

@@ -42,7 +42,7 @@ def dashboard(output: Path, host: str, port: int, token_file: Path | None) -> No
         )
     from pipeline.dashboard.access import access_of
     from pipeline.dashboard.app import Dashboard
-    from pipeline.dashboard.serving import address_of, listen, serve
+    from pipeline.dashboard.serving import address_of, listen, remark_of, serve
 
     if not output.is_dir():
         raise PipelineError(f"there is no folder {output}; name the one that holds the jobs' folders with --output")
@@ -54,6 +54,8 @@ def dashboard(output: Path, host: str, port: int, token_file: Path | None) -> No
 
     def say() -> None:
         click.echo(address)
+        if remark := remark_of(listening, host):
+            click.echo(remark, err=True)
         if token_file is not None:
             click.echo(f"it asks for the token in {token_file}", err=True)
         click.echo("Ctrl-C ends the page; the jobs go on", err=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import NamedTuple
 
@@ -80,12 +81,15 @@ def actions_of(card: JobCard, *, has_runner: bool) -> tuple[Action, ...]:
 class Queue:
     """Does what buttons say, and starts runners; of a runner that it has started it knows before that holds the lease.
 
+    Safe to share between threads.
+
     Attributes:
         spool: the farm's queue.
     """
 
     def __init__(self, spool: Spool) -> None:
         self.spool = spool
+        self._starting = threading.Lock()
         self._started: tuple[int, float] | None = None
 
     def act(self, name: str, action: str, value: str) -> str:
@@ -123,27 +127,27 @@ class Queue:
 
     def run(self) -> str:
         """Start a runner in the background if there is none; returns the end of a sentence about it."""
-        if self.is_starting:
-            return "; a runner is starting"
-        pid = start_in_background(self.spool)
-        if pid is None:
-            return "; the runner takes it when its turn comes"
-        self._started = pid, time.monotonic()
+        with self._starting:
+            if self.is_starting:
+                return "; a runner is starting"
+            pid = start_in_background(self.spool)
+            if pid is None:
+                return "; the runner takes it when its turn comes"
+            self._started = pid, time.monotonic()
         return f"; a runner was started, process {pid}"
 
     @property
     def is_starting(self) -> bool:
         """Whether a runner that was started here lives, and may not hold the queue's lease yet."""
-        if self._started is None:
+        started = self._started
+        if started is None:
             return False
-        pid, began = self._started
+        pid, began = started
         try:
             lives = psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
         except psutil.NoSuchProcess:
             lives = False
-        if not lives or time.monotonic() - began > START_S or live_holder(self.spool.lease) is not None:
-            self._started = None
-        return self._started is not None
+        return lives and time.monotonic() - began <= START_S and live_holder(self.spool.lease) is None
 
 
 def _priority(text: str) -> int:

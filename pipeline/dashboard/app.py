@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,7 @@ from pipeline.dashboard.gate import REPORT_POLICY, Gate, form_of
 from pipeline.dashboard.job_view import STATE_GROUPS, Question, film_of, look_at_job
 from pipeline.dashboard.machine import Machine
 from pipeline.dashboard.pages import FARM_PARTS, JOB_PARTS, Pages, Part, job_url
-from pipeline.dashboard.places import NotThereError, Places
+from pipeline.dashboard.places import NotThereError, Places, printable
 from pipeline.dashboard.thumbnails import WIDTHS, Thumbnails
 from pipeline.errors import PipelineError
 from pipeline.layout import JobLayout
@@ -36,6 +37,7 @@ THUMBNAILS_AT_ONCE = 2
 SETTLED_SHOWN = 24
 """So many finished jobs are listed before "show all"."""
 FOR_EVER = "private, max-age=31536000, immutable"
+FRAME_NUMBER = re.compile("[0-9]{1,9}")
 FILM_TYPES = {".mp4": "video/mp4", ".mov": "video/quicktime"}
 
 
@@ -65,7 +67,7 @@ class Dashboard:
             Route("/static/{name}", self.static),
             Route("/jobs/{name}", self.job_page),
             Route("/jobs/{name}/parts", self.job_parts),
-            Route("/jobs/{name}/frames/{frame:int}/{size}", self.frame),
+            Route("/jobs/{name}/frames/{frame}/{size}", self.frame),
             Route("/jobs/{name}/film", self.film),
             Route("/jobs/{name}/report", self.report),
             Route("/jobs/{name}/{action}", self.action, methods=["POST"]),
@@ -156,12 +158,12 @@ class Dashboard:
 
     async def frame(self, request: Request) -> Response:
         """A small version of a committed frame, as WebP."""
-        name, size = request.path_params["name"], request.path_params["size"]
-        if size not in WIDTHS:
+        name, size, number = (request.path_params[each] for each in ("name", "size", "frame"))
+        if size not in WIDTHS or not FRAME_NUMBER.fullmatch(number):
             raise HTTPException(404)
         if self._limiter is None:
             self._limiter = anyio.CapacityLimiter(THUMBNAILS_AT_ONCE)
-        answer = partial(self._frame, request, name, request.path_params["frame"], size)
+        answer = partial(self._frame, request, name, int(number), size)
         return await anyio.to_thread.run_sync(answer, limiter=self._limiter)
 
     def _frame(self, request: Request, name: str, frame: int, size: str) -> Response:
@@ -231,7 +233,7 @@ class Dashboard:
     # --- what went wrong ---
     def _message(self, request: Request, status: int, sentence: str) -> Response:
         if _wants_json(request):
-            return JSONResponse({"message": sentence}, status)
+            return JSONResponse({"message": printable(sentence)}, status)
         return HTMLResponse(self.pages.draw("message.html", status=status, sentence=sentence, farm=""), status)
 
     def _ask(self, request: Request, sentence: str) -> Response:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
 from pipeline.dashboard.estimates import LongTask, Remaining, StageRow, remaining, stage_rows
-from pipeline.dashboard.places import NotThereError, Places
+from pipeline.dashboard.places import NotThereError, Places, printable
 from pipeline.errors import ManifestError
 from pipeline.layout import JobLayout
 from pipeline.lease import LeaseHolder, live_holder
@@ -237,7 +237,10 @@ class FarmView:
             # Before its first run a queued job has no folder yet.
             waits = entry is not None and entry.text is not None and not os.path.lexists(self.places.farm / name)
             state = JobState.UNKNOWN if entry is None else JobState(state_of(entry, runs=False))
-            return JobCard(name, state, entry, None, Record(), "" if waits else str(error), submitted)
+            shown, flaw = printable(name), "" if waits else printable(str(error))
+            if shown != name:
+                flaw = "the name of its folder is not UTF-8, so it can be no job's; rename it"
+            return JobCard(shown, state, entry, None, Record(), flaw, submitted)
 
     def _card_of(self, name: str, entry: QueuedJob | None, layout: JobLayout, submitted: float) -> JobCard:
         """Raises OSError if its folder cannot be read."""

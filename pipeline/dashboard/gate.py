@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs
 
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from pipeline.dashboard.access import Access
@@ -27,8 +28,10 @@ POLICY = "; ".join(
         "frame-ancestors 'none'",
     )
 )
-REPORT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
-"""A report carries its own style and pictures. It lies in a job's folder, so nothing in it is run."""
+REPORT_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:; frame-ancestors 'none'; sandbox"
+)
+"""A report carries its own style, pictures and film. It lies in a job's folder, so nothing in it is run."""
 HEADERS = {
     "content-security-policy": POLICY,
     "x-content-type-options": "nosniff",
@@ -89,19 +92,21 @@ class Gate:
             await send(message)
 
         answer: ASGIApp
-        answer, cookie = await self._decide(request)
-        await answer(scope, request.receive, send_with_headers)
+        with suppress(ClientDisconnect):  # in the middle of a form: nothing was asked, and nobody waits for an answer
+            answer, cookie = await self._decide(request)
+            await answer(scope, request.receive, send_with_headers)
 
     async def _decide(self, request: Request) -> tuple[ASGIApp, str | None]:
         """What answers a request, and the cookie of a new session, if it begins one."""
         refusal = self._refusal(request)
         if refusal is not None:
             return refusal, None
-        if request.url.path.startswith("/static/"):  # the same for everybody
+        path = request.scope["path"]  # what is routed by; that of `request.url` comes of the Host header, too
+        if path.startswith("/static/"):  # the same for everybody
             return self._app, None
         access = self._access
         if access.token is not None:
-            if request.url.path == "/enter" and request.method == "POST":
+            if path == "/enter" and request.method == "POST":
                 return await self._enter((await form_of(request)).get("token", ""), request)
             if "token" in request.query_params and request.method == "GET":
                 return await self._enter(request.query_params["token"], request)
@@ -134,7 +139,11 @@ class Gate:
 
 
 async def form_of(request: Request) -> dict[str, str]:
-    """The fields of a form that was sent; what is longer than any form of ours counts as empty."""
+    """The fields of a form that was sent; what is longer than any form of ours counts as empty.
+
+    Raises:
+        ClientDisconnect: it was cut off.
+    """
     body = b""
     async for chunk in request.stream():
         body += chunk

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import time
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.dashboard.farm_view import JobCard, Picture, picture_of
 from pipeline.dashboard.places import NotThereError, Places
 from pipeline.errors import ManifestError
+from pipeline.job.loading import MAX_BYTES
 from pipeline.layout import JobLayout
 from pipeline.manifest_glance import glance
 from pipeline.manifest_pages import TaskPage, TaskRow
 from pipeline.manifest_reader import AttemptRow, EventRow, ManifestReader
+from pipeline.report.film import PLAYABLE
 from pipeline.task import TaskId, TaskState
 
 PAGE_TASKS = 50
@@ -32,6 +37,8 @@ STATE_GROUPS: Mapping[str, tuple[TaskState, ...]] = {
 """What the list of tasks can be narrowed down to."""
 
 FILM_SUFFIXES = (".mp4", ".mov")
+USUAL_CODEC = "h264"
+"""Of a job that names none; see `render.parameters.MovieParameters`."""
 
 
 class Question(NamedTuple):
@@ -78,7 +85,7 @@ class Film(NamedTuple):
         version: changes with it.
         finished: whether it is the whole film, not what there is so far.
         size: [bytes].
-        is_playable: whether browsers play it; ProRes they do not.
+        is_playable: whether browsers play it; H.265 and ProRes they do not.
     """
 
     path: str
@@ -243,10 +250,34 @@ def film_of(places: Places, card: JobCard) -> Film | None:
             if _is_file(places, card.name, name):
                 status = (root / name).stat()
                 finished = not name.endswith("-so-far.mp4")
-                films.append(Film(name, status.st_mtime_ns, finished, status.st_size, not name.endswith(".mov")))
+                # The film so far is H.264.
+                is_playable = not finished or (not name.endswith(".mov") and _codec(places, card.name) in PLAYABLE)
+                films.append(Film(name, status.st_mtime_ns, finished, status.st_size, is_playable))
     except (OSError, NotThereError):
         return None  # one goes in this moment, as at the end of a run
     return max(films, key=lambda film: (card.state == "done" and film.finished, film.version), default=None)
+
+
+def _codec(places: Places, name: str) -> str:
+    """What a job's film is encoded with, as its job file says; the usual one where that says nothing."""
+    try:
+        path = places.file(name, JobLayout(places.farm / name).job_file.name)
+        status = path.stat()
+        return _codec_in(path, (status.st_ino, status.st_mtime_ns, status.st_size))
+    except (NotThereError, OSError):
+        return USUAL_CODEC
+
+
+@lru_cache(maxsize=256)
+def _codec_in(path: Path, _version: tuple[int, int, int]) -> str:
+    """As it is asked for each second, a job file is read once a version. Raises OSError."""
+    with path.open("rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    try:
+        movie = tomllib.loads(content.decode("utf-8-sig")).get("movie")
+    except (ValueError, RecursionError):  # none of ours; whether its film is played the browser finds out
+        return USUAL_CODEC
+    return str(movie.get("codec", USUAL_CODEC)) if isinstance(movie, dict) else USUAL_CODEC
 
 
 def _is_file(places: Places, name: str, relative: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import shutil
+import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,8 @@ from pipeline.lease import LeaseHolder
 
 LEAST_BYTES = 16 * 2**20
 """Smaller processes only mind the others'; they compute nothing."""
+LEAST_INTERVAL_S = 0.5
+"""A process is counted anew this long after the look before at the earliest [s], however many pages ask."""
 
 
 class Load(NamedTuple):
@@ -36,12 +39,21 @@ class Process(NamedTuple):
     memory_bytes: int
 
 
+class _Counted(NamedTuple):
+    """A process at a look [s]: when that was, its processor time until then, and the cores that it took before it."""
+
+    when: float
+    spent: float
+    cores: float
+
+
 @dataclass
 class Machine:
-    """Looks at this machine; processor time is that since the look before."""
+    """Looks at this machine; processor time is that since the look before. Safe to share between threads."""
 
     farm: Path
-    _seconds: dict[int, tuple[float, float]] = field(default_factory=dict)
+    _seen: dict[int, _Counted] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
         self._counted = _counted()
@@ -63,23 +75,31 @@ class Machine:
         """The runner that holds a job and its workers; none if it runs on another machine."""
         if holder is None or holder.host != platform.node():
             return []
-        now, found, seen = time.monotonic(), [], {}
-        try:
-            runner = psutil.Process(holder.pid)
-            for process in (runner, *runner.children(recursive=True)):
-                times = process.cpu_times()
-                spent = times.user + times.system
-                before = self._seconds.get(process.pid, (now, spent))
-                cores = (spent - before[1]) / (now - before[0]) if now > before[0] else 0.0
-                seen[process.pid] = now, spent
-                role = "runner" if process.pid == holder.pid else "worker"
-                memory_bytes = process.memory_info().rss
-                if memory_bytes >= LEAST_BYTES:
-                    found.append(Process(process.pid, role, max(0.0, cores), memory_bytes))
-        except psutil.Error:
-            pass  # one that ends in this moment; the next look sees the others
-        self._seconds = {pid: counted for pid, counted in (self._seconds | seen).items() if psutil.pid_exists(pid)}
+        found = []
+        with self._lock:
+            try:
+                runner = psutil.Process(holder.pid)
+                for process in (runner, *runner.children(recursive=True)):
+                    cores = self._cores(process)
+                    role = "runner" if process.pid == holder.pid else "worker"
+                    memory_bytes = process.memory_info().rss
+                    if memory_bytes >= LEAST_BYTES:
+                        found.append(Process(process.pid, role, cores, memory_bytes))
+            except psutil.Error:
+                pass  # one that ends in this moment; the next look sees the others
+            self._seen = {pid: counted for pid, counted in self._seen.items() if psutil.pid_exists(pid)}
         return found
+
+    def _cores(self, process: psutil.Process) -> float:
+        """What a process takes of the processor [cores]; over a shorter time its ticks of 10 ms would show."""
+        times, now = process.cpu_times(), time.monotonic()
+        spent = times.user + times.system
+        before = self._seen.get(process.pid)
+        if before is None:
+            self._seen[process.pid] = _Counted(now, spent, 0.0)
+        elif now - before.when >= LEAST_INTERVAL_S:
+            self._seen[process.pid] = _Counted(now, spent, max(0.0, (spent - before.spent) / (now - before.when)))
+        return self._seen[process.pid].cores
 
 
 def _counted() -> tuple[float, float]:

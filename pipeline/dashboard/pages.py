@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from pipeline import wording
 from pipeline.dashboard.job_view import Question
+from pipeline.dashboard.places import printable
 from pipeline.manifest_pages import TaskRow
 from pipeline.task import TaskState
 
@@ -44,6 +45,7 @@ class Pages:
             loader=PackageLoader("pipeline.dashboard"),
             autoescape=True,
             undefined=StrictUndefined,
+            finalize=_in_utf_8,
             trim_blocks=True,
             lstrip_blocks=True,
             auto_reload=False,
@@ -117,6 +119,11 @@ _REASONS = {
     TaskState.UP_TO_DATE: "was there already",
     TaskState.CANCELLED: "was stopped",
 }
+
+
+def _in_utf_8(value: Any) -> Any:
+    """What a page shows of a value: messages may name paths that are not UTF-8."""
+    return printable(value) if type(value) is str else value  # markup is made of what was printable
 
 
 def _static_files() -> dict[str, Static]:

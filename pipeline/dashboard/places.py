@@ -66,3 +66,8 @@ class Places:
         if size > byte_count:
             content = content.partition(b"\n")[2] or content
         return content.decode("utf-8", errors="replace"), size
+
+
+def printable(text: str) -> str:
+    """A text that a page can hold: bytes of a file's name that are no UTF-8 are written out, as in `caf\\udce9`."""
+    return text.encode(errors="backslashreplace").decode()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import ipaddress
 import logging
@@ -11,15 +12,19 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+import h11
 import uvicorn
 from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from pipeline.dashboard.access import is_address
+from pipeline.dashboard.access import is_address, is_loopback
 from pipeline.errors import PipelineError
 
 GRACE_S = 2
 """So long an answer may still take once the end is asked for [s]; a film that is played would take for ever."""
 MOST_CONNECTIONS = 512
+REQUEST_S = 10.0
+"""A connection whose request is not in after this time [s] is closed; ours are a few KB."""
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -58,8 +63,15 @@ def serve(application: ASGIApp, listening: socket.socket, ready: Callable[[], No
         listening: where they arrive; closed at the end.
         ready: called when the first one would be answered.
     """
-    config = uvicorn.Config(
+    with listening:
+        Server(config_of(application), ready).run(sockets=[listening])
+
+
+def config_of(application: ASGIApp) -> uvicorn.Config:
+    """How requests are taken."""
+    return uvicorn.Config(
         application,
+        http=Connection,
         log_level="error",
         access_log=False,
         server_header=False,
@@ -69,8 +81,38 @@ def serve(application: ASGIApp, listening: socket.socket, ready: Callable[[], No
         timeout_graceful_shutdown=GRACE_S,
         proxy_headers=False,
     )
-    with listening:
-        Server(config, ready).run(sockets=[listening])
+
+
+class Connection(H11Protocol):
+    """A connection that is closed when a request does not come to its end, so that none is held open for nothing."""
+
+    _patience: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for the first request."""
+        super().connection_made(transport)
+        self._wait_or_not()
+
+    def data_received(self, data: bytes) -> None:
+        """Take a piece of a request; the time counts from its first piece, or from the connection's beginning."""
+        super().data_received(data)
+        self._wait_or_not()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait no more."""
+        super().connection_lost(exc)
+        self._stop_waiting()
+
+    def _wait_or_not(self) -> None:
+        if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
+            self._stop_waiting()
+        elif self._patience is None:
+            self._patience = self.loop.call_later(REQUEST_S, self.transport.close)
+
+    def _stop_waiting(self) -> None:
+        if self._patience is not None:
+            self._patience.cancel()
+            self._patience = None
 
 
 class Server(uvicorn.Server):
@@ -106,3 +148,14 @@ def address_of(listening: socket.socket, host: str) -> str:
     stands_for_all = is_address(host) and ipaddress.ip_address(host).is_unspecified
     shown = socket.gethostname() if stands_for_all else host
     return f"http://{f'[{shown}]' if ':' in shown else shown}:{listening.getsockname()[1]}/"
+
+
+def remark_of(listening: socket.socket, host: str) -> str:
+    """What is to be said of where it listens: that a name reaches less far than it seems to; else nothing."""
+    address = listening.getsockname()[0]
+    if is_loopback(host) or not is_loopback(address):
+        return ""
+    return (
+        f"{host} is {address} on this machine, as its /etc/hosts says, which only this machine reaches; "
+        "for others, name its address in the network: --host ADDRESS"
+    )

@@ -83,6 +83,8 @@ def _make(path: Path, width: int) -> bytes:
             small = small.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=2.0)
         written = io.BytesIO()
         small.save(written, "WEBP", quality=QUALITY, method=3)
+    except Image.DecompressionBombError as error:
+        raise NotThereError(f"{path.name} is too large to be shown") from error
     except (OSError, UnidentifiedImageError, ValueError, SyntaxError) as error:  # SyntaxError: a broken chunk
         raise NotThereError(f"{path.name} is no picture") from error
     return written.getvalue()

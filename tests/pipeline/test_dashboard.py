@@ -20,6 +20,9 @@ from farm_processes import Farm
 from PIL import Image
 
 from pipeline.cli import main
+from pipeline.dashboard.farm_view import FarmView
+from pipeline.dashboard.job_view import film_of
+from pipeline.dashboard.places import Places
 from pipeline.layout import JobLayout
 from pipeline.lease import live_holder
 from pipeline.manifest import Manifest
@@ -168,6 +171,28 @@ def test_the_film_so_far_then_the_film_in_ranges(farm: Farm) -> None:
         assert (whole.status, whole.body, whole.headers["content-type"]) == (200, b"finished", "video/mp4")
 
 
+def test_only_films_that_browsers_play_are_offered_to_be_played(farm: Farm) -> None:
+    layout = farm.layout("film")
+    frame_job(layout, 1)
+    places = Places(farm.spool.farm)
+
+    def is_playable(job_file: str) -> bool:
+        layout.job_file.write_text(job_file)
+        film = film_of(places, FarmView(places, farm.spool).job("film"))
+        assert film is not None
+        return film.is_playable
+
+    (layout.root / "movie-so-far.mp4").write_bytes(b"so far")
+    assert is_playable('movie.codec = "h265"')
+    (layout.root / "movie-so-far.mp4").unlink()
+    (layout.root / "movie.mp4").write_bytes(b"finished")
+    assert not is_playable('name = "film"\n[movie]\ncodec = "h265"')
+    for text in ("", '[movie]\ncodec = "av1"', "[movie]\ncrf = 12", "movie = 3", "no TOML", "a = " + "[" * 5000):
+        assert is_playable(text), text[:40]
+    (layout.root / "movie.mp4").rename(layout.root / "movie.mov")
+    assert not is_playable('movie.codec = "prores"')
+
+
 # --- what it does ---
 def test_a_running_job_is_paused_resumed_and_cancelled(farm: Farm) -> None:
     farm.job("a", frames=60, pause_s=0.3)
@@ -291,7 +316,8 @@ def test_answers_carry_a_policy_and_pages_name_no_other_place(farm: Farm) -> Non
             assert "://" not in answer.text
             assert " style=" not in answer.text
             assert "<script>" not in answer.text
-        assert "; sandbox" in client.ask("/jobs/a/report").headers["content-security-policy"]
+        policy = client.ask("/jobs/a/report").headers["content-security-policy"].split("; ")
+        assert {"default-src 'none'", "img-src data:", "media-src data:", "sandbox"} <= set(policy)
         for name in ("page.js", "morph.js", "viewer.js", "page.css"):
             assert "://" not in client.ask(f"/static/{name}").text
 
@@ -333,6 +359,7 @@ def test_nothing_outside_of_the_farm_is_served(farm: Farm) -> None:
             *(
                 "/jobs/film/frames/-1/small",
                 "/jobs/film/frames/99999999999999999999/small",
+                f"/jobs/film/frames/{'9' * 5000}/small",
                 "/%2e%2e/%2e%2e/etc/passwd",
             ),
         ):
@@ -349,6 +376,7 @@ def test_nothing_outside_of_the_farm_is_served(farm: Farm) -> None:
 def token_file(tmp_path: Path) -> Path:
     path = tmp_path / "token"
     path.write_text("a-token-that-nobody-guesses\n")
+    path.chmod(0o600)
     return path
 
 
@@ -386,7 +414,8 @@ def test_another_address_than_the_loopback_has_a_token_of_its_own(farm: Farm) ->
 def test_a_token_that_can_be_guessed_is_refused(farm: Farm, tmp_path: Path) -> None:
     farm.spool.farm.mkdir()
     (tmp_path / "short").write_text("1234\n")
-    assert "must hold 16 characters" in farm.run("dashboard", "--token-file", "short", "--port", "0", code=1).err
+    (tmp_path / "short").chmod(0o600)
+    assert "must hold 22 characters" in farm.run("dashboard", "--token-file", "short", "--port", "0", code=1).err
     assert "cannot be read" in farm.run("dashboard", "--token-file", "missing", "--port", "0", code=1).err
 
 
@@ -462,6 +491,46 @@ def test_records_that_cannot_be_read_are_told_and_the_page_lives(farm: Farm) -> 
             page_of(client, name)
             assert client.ask(f"/jobs/{name}/frames/0/small").status == 404
             page_of(client, name, "?task=render/000000&page=3")
+
+
+def test_names_that_are_not_utf_8_are_shown_and_take_no_page_down(farm: Farm) -> None:
+    folder = os.fsdecode(b"r\xe9nders")
+    frame_job(farm.layout("good"), 1)
+    shutil.copytree(farm.layout("good").root, farm.spool.farm / os.fsdecode(b"caf\xe9"))
+    (farm.spool.folder / "queue").mkdir(parents=True)
+    (farm.spool.folder / "queue" / "odd.json").write_text("{")
+    farm.spool.farm.rename(farm.folder / folder)
+    with dashboard(farm, folder=folder) as (client, _):
+        listed = client.ask("/").text
+        assert ">good</a>" in listed
+        assert "caf\\udce9" in listed
+        assert "not UTF-8" in listed
+        assert "r\\udce9nders/.farm/queue/odd.json" in listed
+        assert '"pill is-unknown"' in listed
+        assert "0 of 1 tasks" in page_of(client, "good")
+        assert "not UTF-8" in page_of(client, "caf%5Cudce9")
+        assert client.ask("/jobs/caf%E9").status == 404
+        assert client.post("/jobs/odd/cancel").status == 404
+
+
+def test_a_form_that_is_cut_off_asks_for_nothing_and_is_no_fault(farm: Farm) -> None:
+    queued_job(farm, "a")
+    with dashboard(farm) as (client, process):
+        head = {
+            "Host": client.place,
+            "Origin": f"http://{client.place}",
+            "X-Form-Token": client.form_token(),
+            "Cookie": client.cookie,
+            "Content-Length": "100",
+        }
+        lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
+        with socket.create_connection(client.place.split(":")) as cut:
+            cut.sendall(f"POST /jobs/a/cancel HTTP/1.1\r\n{lines}\r\nvalue=".encode())
+            time.sleep(0.2)  # so that it is waited for when it is cut off; without it, it is seen as cut off at once
+        assert client.ask("/").status == 200
+        assert farm.spool.find("a") is not None
+        process.terminate()
+        assert "Traceback" not in farm.finish(process).err
 
 
 def test_a_job_that_goes_while_it_is_looked_at_is_told(farm: Farm) -> None:

@@ -6,12 +6,15 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 from dashboards import dashboard, draw_frame, frame_job
 from farm_processes import Farm, wait_until
 from playwright.sync_api import Page
 
 from pipeline.manifest import Manifest
+from pipeline.report.film import ReportFilm
 from pipeline.spool import Wish, submission
 from tests.browser import needs_browser, open_page
 
@@ -80,6 +83,29 @@ def test_frames_appear_as_they_arrive_and_open_in_full(farm: Farm) -> None:
     assert faults == []  # nor did the policy keep anything of ours from working
 
 
+def test_the_film_in_a_report_is_let_through(farm: Farm) -> None:
+    layout = farm.layout("film")
+    frame_job(layout, 1)
+    film = farm.folder / "film.mp4"
+    with av.open(film, "w") as container:
+        stream = container.add_stream("libx264", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        picture = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 90, np.uint8), format="rgb24")
+        container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    address = ReportFilm(film.read_bytes(), "video/mp4", 64, 48).address
+    layout.report.write_text(f'<!doctype html><title>film</title><video preload="auto" src="{address}"></video>')
+    with dashboard(farm) as (client, _), open_page() as page:
+        page.goto(f"http://{client.place}/jobs/film/report")
+        until(page, "document.querySelector('video').readyState || document.querySelector('video').error")
+        assert page.evaluate(
+            "[document.querySelector('video').videoWidth, !document.querySelector('video').error]"
+        ) == [
+            64,
+            True,
+        ]
+
+
 def test_tasks_are_found_and_their_logs_read_while_what_is_typed_stays(farm: Farm) -> None:
     farm.job("bad")
     farm.faults("bad", {"double/000002": ["fail"]})
@@ -97,6 +123,26 @@ def test_tasks_are_found_and_their_logs_read_while_what_is_typed_stays(farm: Far
         assert page.get_by_placeholder("Find a task").input_value() == "double/00000"
         page.go_back()
         until(page, "!document.querySelector('.log')")
+
+
+def test_the_priority_that_is_shown_is_the_one_that_it_is(farm: Farm) -> None:
+    farm.spool.enqueue(submission("dam", text=farm.job("dam").read_text()))
+    with dashboard(farm) as (client, _), open_page() as page:
+        page.goto(f"http://{client.place}/jobs/dam")
+        field = page.get_by_label("Priority")
+        page.evaluate("document.querySelector('input[type=number]').isOurs = true")
+        for typed in ("7", "8"):
+            field.fill(typed)
+            page.get_by_role("button", name="Set").click()
+            page.get_by_text(f"dam has priority {typed}").wait_for(timeout=PATIENCE_MS)
+            until(page, f"document.querySelector('input[type=number]').getAttribute('value') === '{typed}'")
+        farm.spool.change("dam", priority=3)  # by somebody else
+        until(page, "document.querySelector('input[type=number]').value === '3'")
+        field.fill("9")
+        farm.spool.change("dam", priority=4)
+        page.wait_for_timeout(1500)
+        assert field.input_value() == "9"  # somebody types
+        assert page.evaluate("document.querySelector('input[type=number]').isOurs")  # no change took it away
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
+import secrets
+import socket
+import struct
 import threading
 import time
+import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
+import psutil
 import pytest
 from dashboards import draw_frame, frame_job
+from starlette.types import Receive, Scope, Send
+from uvicorn.server import ServerState
 
-from pipeline.dashboard.access import Access, host_of
+from pipeline.dashboard.access import Access, access_of, host_of
+from pipeline.dashboard.actions import Queue
 from pipeline.dashboard.estimates import LongTask, remaining, stage_rows
 from pipeline.dashboard.farm_view import Kept, read_record
 from pipeline.dashboard.machine import Machine
 from pipeline.dashboard.places import NotThereError, Places
+from pipeline.dashboard.serving import config_of, listen, remark_of
 from pipeline.dashboard.thumbnails import Thumbnails
-from pipeline.errors import ManifestError
+from pipeline.errors import ManifestError, PipelineError
 from pipeline.layout import JobLayout
+from pipeline.lease import LeaseHolder
 from pipeline.manifest import Manifest
 from pipeline.manifest_glance import glance
 from pipeline.manifest_pages import StagePace
 from pipeline.manifest_reader import ManifestReader, StageSummary
+from pipeline.spool import Spool
 from pipeline.task import FailureKind, TaskId, TaskState
 
 
@@ -207,6 +221,94 @@ def test_the_load_is_told_to_whatever_thread_asks(tmp_path: Path) -> None:
     assert told[0].processor > 0.5 / told[0].cores
 
 
+def test_the_cores_of_a_process_do_not_depend_on_how_many_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine, holder = Machine(tmp_path), LeaseHolder.this_process()
+    now, spent = [100.0], [7.0]
+    monkeypatch.setattr("pipeline.dashboard.machine.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(psutil.Process, "cpu_times", lambda _: SimpleNamespace(user=spent[0], system=0.0))
+    monkeypatch.setattr(psutil.Process, "children", lambda _, **_options: [])
+
+    def cores() -> float:
+        return machine.processes(holder)[0].cores
+
+    assert cores() == 0.0
+    now[0], spent[0] = 101.0, 9.0
+    assert cores() == 2.0
+    now[0] = 101.001  # another tab, before the process's count has gone on
+    assert cores() == 2.0
+    now[0], spent[0] = 102.0, 9.5
+    assert cores() == 0.5
+
+
+# --- runners ---
+def test_presses_at_once_start_one_runner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started, all_press = [], threading.Barrier(4)
+
+    def start(_: Spool) -> int:
+        time.sleep(0.05)  # as long as a press of somebody else needs
+        started.append(os.getpid())
+        return os.getpid()
+
+    monkeypatch.setattr("pipeline.dashboard.actions.start_in_background", start)
+    queue, told = Queue(Spool(tmp_path)), []
+
+    def press() -> None:
+        all_press.wait()
+        told.append(queue.run())
+
+    threads = [threading.Thread(target=press) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(started) == 1
+    assert told.count("; a runner is starting") == 3
+    assert queue.is_starting
+
+
+# --- connections ---
+def test_a_connection_without_a_whole_request_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.dashboard.serving.REQUEST_S", 0.3, raising=False)
+
+    async def answer(_scope: Scope, _receive: Receive, send: Send) -> None:
+        await asyncio.sleep(0.6)  # a slow answer is none of its business
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"2")]})
+        await send({"type": "http.response.body", "body": b"ok"})
+
+    async def try_all() -> list[bytes]:
+        config = config_of(answer)
+        config.load()
+        protocol, state = config.http_protocol_class, ServerState()
+        loop = asyncio.get_running_loop()
+        server = await loop.create_server(
+            lambda: protocol(config=config, server_state=state, app_state={}), "127.0.0.1", 0
+        )
+        port = server.sockets[0].getsockname()[1]
+
+        async def said_to(request: bytes) -> bytes:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(request)
+            said = await asyncio.wait_for(reader.read(), 4.0)  # to the connection's end
+            writer.close()
+            return said
+
+        head = b"/ HTTP/1.1\r\nHost: a\r\n"
+        requests = (
+            b"",
+            b"GET " + head,
+            b"GET " + head + b"Connection: close\r\n\r\n",
+            b"POST " + head + b"Content-Length: 9\r\nConnection: close\r\n\r\nx",
+        )
+        said = await asyncio.gather(*map(said_to, requests))
+        server.close()
+        return said
+
+    said = asyncio.run(try_all())
+    assert said[0] == said[1] == said[3] == b""
+    assert said[2].startswith(b"HTTP/1.1 200")
+    assert said[2].endswith(b"ok")
+
+
 # --- places ---
 @pytest.mark.parametrize("name", ["", ".", "..", ".farm", "a/b", "../a", "a\0b", "nobody", "x" * 300, "\ud800"])
 def test_names_that_are_no_job_lead_nowhere(tmp_path: Path, name: str) -> None:
@@ -255,6 +357,17 @@ def test_small_pictures_are_kept_up_to_a_limit(layout: JobLayout, monkeypatch: p
         thumbnails.get(paths[0], "large")
 
 
+def test_a_picture_that_claims_to_be_vast_is_not_shown(tmp_path: Path) -> None:
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
+    vast = tmp_path / "000000.png"
+    vast.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
+    with pytest.raises(NotThereError, match="too large"):
+        Thumbnails().get(vast, "small")
+
+
 # --- access ---
 @pytest.mark.parametrize(
     ("header", "name"),
@@ -271,7 +384,7 @@ def test_sessions_are_signed_and_forms_belong_to_one() -> None:
     assert session is not None
     assert access.is_form_token(session, access.form_token(session))
     assert not access.is_form_token(access.session(other) or "", access.form_token(session))
-    assert not access.is_form_token(session, cookie.partition(".")[2])  # a session's signature opens no form
+    assert not access.is_form_token(session, cookie.rpartition(".")[2])  # a session's signature opens no form
     for forged in (None, "", ".", session, f"{session}.", f"x{cookie}", cookie[:-1], "ü.ü"):
         assert access.session(forged) is None
     assert Access("127.0.0.1", 80, None).session(cookie) is None  # of another start
@@ -284,3 +397,60 @@ def test_only_addresses_and_own_names_are_known_hosts() -> None:
     assert far.knows_host("192.168.1.5:80")
     assert not far.knows_host("studio.example:80")
     assert Access("studio.example", 80, "t" * 20).knows_host("Studio.example:80")
+
+
+def test_own_names_are_asked_for_once_and_not_by_requests(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(socket, "getfqdn", lambda: asked.append(1) or "Studio-3.Example")
+    access = Access("0.0.0.0", 80, "t" * 20)
+    assert [access.knows_host(name) for name in ("studio-3.example:80", "other.example", "a.b")] == [True, False, False]
+    assert asked == [1]
+    Access("127.0.0.1", 80, None)
+    assert asked == [1]
+
+
+def test_a_name_that_stands_for_the_loopback_is_remarked_on() -> None:
+    with listen("127.0.1.1", 0) as listening:  # as Debian lets a machine's own name stand for
+        assert "studio-3 is 127.0.1.1 on this machine" in remark_of(listening, "studio-3")
+        assert remark_of(listening, "127.0.1.1") == remark_of(listening, "localhost") == ""
+    with listen("0.0.0.0", 0) as listening:
+        assert remark_of(listening, "studio-3") == ""
+
+
+def test_a_session_ends_and_its_end_is_signed(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1e9]
+    monkeypatch.setattr("pipeline.dashboard.access.time", SimpleNamespace(time=lambda: now[0]), raising=False)
+    access = Access("127.0.0.1", 80, None)
+    cookie = access.new_session()
+    name, end, signature = cookie.split(".")
+    now[0] += 6 * 24 * 3600
+    assert access.session(cookie) == f"{name}.{end}"
+    assert access.session(f"{name}.{int(end) + 10**6}.{signature}") is None
+    now[0] += 25 * 3600
+    assert access.session(cookie) is None
+
+
+@pytest.mark.parametrize(
+    "token", ["a" * 40, "password" * 3, "0123456789abcdef01234", "12" * 30, "x" * 9000, "a b\nc" * 9]
+)
+def test_tokens_that_can_be_guessed_are_refused(tmp_path: Path, token: str) -> None:
+    path = tmp_path / "token"
+    path.write_text(token)
+    path.chmod(0o600)
+    with pytest.raises(PipelineError, match="22 characters at least, drawn at random"):
+        access_of("127.0.0.1", 80, path)
+
+
+def test_a_token_that_others_can_read_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "token"
+    path.write_text(f"{secrets.token_urlsafe(32)}\n")
+    for mode in (0o640, 0o604, 0o620, 0o602):
+        path.chmod(mode)
+        with pytest.raises(PipelineError, match="chmod 600"):
+            access_of("127.0.0.1", 80, path)
+    path.chmod(0o600)
+    first, again = access_of("127.0.0.1", 80, path), access_of("127.0.0.1", 80, path)
+    assert again.session(first.new_session()) is not None  # sessions outlive the program
+    for token in (secrets.token_urlsafe(32), secrets.token_hex(16)):
+        path.write_text(token)
+        assert access_of("127.0.0.1", 80, path).is_token(token)

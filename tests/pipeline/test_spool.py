@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import random
@@ -10,6 +11,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -242,6 +244,29 @@ while True:
     spool.put(submission("other"))
     spool.drop("other")
 """
+
+
+def test_threads_that_overlap_exclude_each_other_and_leave_the_lock_whole(spool: Spool) -> None:
+    is_in, order = threading.Event(), []
+
+    def second() -> None:
+        is_in.set()
+        with spool.locked():
+            order.append("second")
+
+    overlapping = threading.Thread(target=second)
+    with spool.locked():
+        overlapping.start()
+        is_in.wait()
+        overlapping.join(timeout=0.2)  # as long as it would need many times over, were it let in
+        order.append("first")
+    overlapping.join()
+    assert order == ["first", "second"]
+    with spool.locked():
+        other = os.open(spool.folder / "lock", os.O_RDWR)
+        with pytest.raises(BlockingIOError):  # another description of the file stands for another process
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.close(other)
 
 
 @pytest.mark.slow

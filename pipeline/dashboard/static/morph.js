@@ -22,6 +22,7 @@ function become(old, wanted) {
   if (old === document.activeElement && old.matches("input, select, textarea")) return; // somebody types
   const atEnd = old.hasAttribute("data-follow") && old.scrollTop + old.clientHeight >= old.scrollHeight - 4;
   takeAttributes(wanted, old);
+  if (old.matches("input[type=number]")) old.value = wanted.value; // else what was typed hides what it is now
   morph(old, wanted);
   if (atEnd) old.scrollTop = old.scrollHeight;
 }

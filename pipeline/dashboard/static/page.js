@@ -86,6 +86,7 @@ async function act(form, button) {
       body: new URLSearchParams(new FormData(form)),
     });
     toast((await answer.json()).message, !answer.ok);
+    if (!answer.ok) form.reset(); // to what it is still
   } catch {
     toast("The dashboard does not answer; nothing was changed.", true);
   }
