@@ -168,7 +168,7 @@ class Listing:
 
 
 class Spool:
-    """The spool of one farm, for any threads. Reading needs no lock; changes take it by themselves, or join `locked`."""
+    """The spool of one farm, for any threads. Reading needs no lock; changes take it themselves, or join `locked`."""
 
     def __init__(self, farm: Path) -> None:
         self.farm = farm
