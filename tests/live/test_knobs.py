@@ -7,9 +7,9 @@ from pipeline.live.knobs import knobs_of
 from pipeline.live.page import LivePage
 from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job
-from pipeline.live.serving import open_server
 from pipeline.live.session import Session
 from pipeline.live.take import Recorder
+from pipeline.view.serving import page_server
 
 ODD = ("stretch_stiffness = 3e5", "bend_stiffness = 2e-9", "bend_stiffness = 0.0", "friction = 3.0", "damping = 0.7",
        "wind = [0.0, -55.0, 1.0]", "mass_per_area = 1e-3")  # fmt: skip
@@ -29,8 +29,7 @@ def test_a_page_has_odd_values_and_tells_what_happens_while_time_stands_still(tm
     read = loaded(tmp_path, BALL_OVER_SHEET.replace("stretch_stiffness = 500.0   # soft", odd))
     session = Session(live_job(read.job, substeps=1))
     session.is_paused = True
-    server = open_server("127.0.0.1", 0)
-    try:
+    with page_server(port=0, label="drape") as server:
         recorder = Recorder(read, session, tmp_path, device="cpu")
         page = LivePage(
             server, session, title="drape", save=lambda: save_job(read, session.values, tmp_path), recorder=recorder
@@ -43,5 +42,3 @@ def test_a_page_has_odd_values_and_tells_what_happens_while_time_stands_still(tm
         page.tell(session.status())
         assert page._notice.content == ""
         assert tuple(server.initial_camera.up) == (0.0, 0.0, 1.0)
-    finally:
-        server.stop()
