@@ -91,7 +91,8 @@ class Recorder:
         except _TROUBLES as error:
             trouble = f"the take ends early: {error}; "
         if take.frames:
-            became = f"{take.frames} frames: pipeline submit {shlex.quote(str(take.layout.job_file))}"
+            frames = "1 frame" if take.frames == 1 else f"{take.frames} frames"
+            became = f"{frames}: pipeline submit {shlex.quote(str(take.layout.job_file))}"
         else:
             became = f"none of its frames is in {take.layout.root}"
         self._session.message = f"{trouble}{became}"

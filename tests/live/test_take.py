@@ -3,6 +3,7 @@
 import errno
 import json
 import shlex
+import signal
 import threading
 
 import numpy as np
@@ -21,6 +22,7 @@ from pipeline.live.session import Session
 from pipeline.live.take import Recorder
 from pipeline.resources import machine_capacity
 from pipeline.stage_run import run_stage
+from sim import runtime
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -208,3 +210,24 @@ def test_a_job_that_another_session_saves_meanwhile_is_not_overwritten(tmp_path,
     monkeypatch.setattr(saving, "text_with_values", while_they_save)
     assert save_job(read, values, tmp_path).path == tmp_path / "drape-live-2.toml"
     assert theirs.read_bytes() == b""
+
+
+def test_ctrl_c_ends_a_take_tells_what_became_of_it_and_leaves_signals_as_they_were(tmp_path, monkeypatch):
+    from pipeline.live import running
+
+    class Interrupted(Recorder):
+        """One that is recording when Ctrl-C comes."""
+
+        def __init__(self, *arguments, **options) -> None:
+            super().__init__(*arguments, **options)
+            self.toggle()
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(running, "Recorder", Interrupted)
+    loaded(tmp_path)
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    options = ["--port", "0", "--output", str(tmp_path), "--cores", str(runtime._in_use.get("threads", 1))]
+    ended = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml"), *options])
+    assert ended.exit_code == 0
+    assert f"1 frame: pipeline submit {tmp_path / 'drape-take' / 'job.toml'}\n" in ended.output
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
