@@ -105,7 +105,7 @@ class Session:
         self.message = FIRST
         self.revision = 0
         self.on_frame: Callable[[FrameReport, Mapping[str, Snapshot]], None] | None = None
-        self.on_jump: Callable[[], object] | None = None
+        self.on_jump: Callable[[], None] | None = None
         self.dt = 1.0 / job.fps
         self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._hands: dict[tuple[str, str], tuple[Hand, int]] = {}  # by what is held: and by which browser

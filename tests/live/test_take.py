@@ -148,7 +148,7 @@ def test_what_is_printed_of_a_take_works_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / "away")
     _, _, printed = session.message.partition("pipeline submit ")
     (job_file,) = shlex.split(printed)
-    planned = CliRunner().invoke(main, ["plan", job_file, "--output", str(layout.root.parent), "--json"])
+    planned = CliRunner().invoke(main, ["plan", job_file, "--json"])
     assert planned.exit_code == 0
     verdicts = {each["task"]: each["verdict"] for each in json.loads(planned.output)}
     assert verdicts["simulate"] == "up to date"
