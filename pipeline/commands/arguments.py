@@ -107,6 +107,20 @@ def require_plannable(loaded: LoadedJob) -> None:
         raise JobFileError(loaded.source.describe_all(findings.errors))
 
 
+def submission_folder(job_file: Path, name: str, output: Path, *, is_changed: bool) -> JobLayout:
+    """The folder that submitting a job file fills: its own, if it is the job file of a job's folder as it stands.
+
+    Args:
+        job_file: as it was named.
+        name: of the job.
+        output: the folder that jobs' folders lie in.
+        is_changed: whether options change the job.
+    """
+    own_folder = JobLayout(job_file.parent)
+    is_own = output == DEFAULT_OUTPUT and job_file.name == "job.toml" and not is_changed
+    return own_folder if is_own and own_folder.manifest.exists() else JobLayout(output / name)
+
+
 def job_folder(job: str, output: Path) -> JobLayout:
     """The folder that a job has, or will have when its first run begins.
 

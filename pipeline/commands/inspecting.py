@@ -20,6 +20,7 @@ from pipeline.commands.arguments import (
     output_option,
     print_warnings,
     require_own_programs,
+    submission_folder,
     submitted_job_argument,
 )
 from pipeline.errors import PipelineError
@@ -57,7 +58,7 @@ def plan(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path
 
     require_own_programs(read_job(job_file, overrides, preview=preview), overrides)
     loaded, _ = load_checked_job(job_file, overrides, preview=preview)
-    layout = JobLayout(output / loaded.job.name)
+    layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
     assessments, estimates, _ = assess_job(loaded.job, layout)
     if as_json:
         click.echo(json.dumps([_assessment_as_json(each) for each in assessments], indent=1))

@@ -198,7 +198,12 @@ def _remove_chosen(layout: JobLayout, choice: _Choice, *, really: bool) -> None:
     unknown = sorted(choice.stages - set(known))
     if unknown:
         raise PipelineError(f'no stage "{unknown[0]}"; the stages are {", ".join(known)}')
-    tasks = plan_job(load_job(layout.job_file), layout, STAGES)
+    job = load_job(layout.job_file)
+    if job.recorded is not None and "simulate" in choice.stages:
+        raise PipelineError(
+            f"{job.name} is a live take ({job.recorded}): nothing can make its frames anew; --all removes the folder"
+        )
+    tasks = plan_job(job, layout, STAGES)
     planned = {output for task in tasks for output in task.outputs}
     theirs = {task.id for task in tasks if task.stage in choice.stages}
     with Manifest(layout.manifest) as manifest:
@@ -207,7 +212,7 @@ def _remove_chosen(layout: JobLayout, choice: _Choice, *, really: bool) -> None:
             for artifact, row in manifest.artifacts().items()
             if row.task in theirs
             or row.task.split("/")[0] in choice.stages
-            or (choice.superseded and artifact not in planned)
+            or (choice.superseded and artifact not in planned and (job.recorded is None or row.task != "simulate"))
         ]
         others: list[Path] = []
         if choice.checkpoints or "simulate" in choice.stages:

@@ -12,7 +12,6 @@ import click
 
 from pipeline import wording
 from pipeline.commands.arguments import (
-    DEFAULT_OUTPUT,
     PRIORITY,
     find_job,
     job_options,
@@ -22,6 +21,7 @@ from pipeline.commands.arguments import (
     print_warnings,
     require_own_programs,
     require_plannable,
+    submission_folder,
     submitted_job_argument,
 )
 from pipeline.commands.executing import ExecutorChoice, executor_options, require_named_devices, require_possible
@@ -121,9 +121,7 @@ def submit(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
     loaded = read_job(job_file, overrides, preview=preview)
     require_own_programs(loaded, overrides)
     require_plannable(loaded)
-    in_its_folder = output == DEFAULT_OUTPUT and job_file.name == "job.toml" and not overrides and not preview
-    own_folder = JobLayout(job_file.parent)
-    layout = own_folder if in_its_folder and own_folder.manifest.exists() else JobLayout(output / loaded.job.name)
+    layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
     state = _look_at(loaded.job, layout)
     todo = _stages_to_run(state)
     if todo:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from pathlib import Path
 
 import click
 
 from pipeline.commands.arguments import job_options, output_option, print_warnings, require_own_programs
+from pipeline.commands.stopping import told_to_stop
 
 
 @click.command()
@@ -62,17 +61,16 @@ def live(
 
     from pipeline.live.running import Address, show_live
 
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    show_live(
-        loaded,
-        job,
-        Address(host, port),
-        output=output,
-        folder=Path.cwd(),
-        threads=cores,
-        paused=paused,
-        say=lambda address: click.echo(f"{address} runs {job.name}; Ctrl-C ends it"),
-        ends=stop.is_set,
-    )
+    with told_to_stop() as stop:
+        show_live(
+            loaded,
+            job,
+            Address(host, port),
+            output=output,
+            folder=Path.cwd(),
+            threads=cores,
+            paused=paused,
+            say=lambda address: click.echo(f"{address} runs {job.name}; Ctrl-C ends it"),
+            tell=click.echo,
+            ends=stop.is_set,
+        )

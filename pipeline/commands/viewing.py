@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
 from pipeline.commands.arguments import find_job, parse_size, submitted_job_argument
+from pipeline.commands.stopping import told_to_stop
 
 
 @click.command()
@@ -46,15 +43,3 @@ def view(job: str, *, output: Path, port: int, host: str, particles: int, memory
             say=lambda address: click.echo(f"{address} shows {layout.root}; Ctrl-C ends it"),
             stop=stop,
         )
-
-
-@contextmanager
-def told_to_stop() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set, for the time of the block."""
-    stop = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -73,6 +73,13 @@ def apply_overrides(text: str, overrides: Iterable[Override]) -> str:
         raise OverrideError(f"cannot edit the job file: {error}") from error
 
 
+def without_key(text: str, key: str) -> str:
+    """The TOML text without a key of its first level; comments and order of the others stay."""
+    document = tomlkit.parse(text)
+    document.pop(key, None)
+    return tomlkit.dumps(document)
+
+
 def _put(document: Any, override: Override) -> None:
     table = document
     for part in override.path[:-1]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.job.looks import parts_of
+from pipeline.view.colors import BODY, CLOTH, PIN, SURFACE, srgb
 
 if TYPE_CHECKING:
     import viser
@@ -20,12 +21,7 @@ Rgb = tuple[int, int, int]
 Drag = Callable[[str, str, Any], None]
 """Called with the kind of the thing, its name and viser's event."""
 
-BODY_COLORS: tuple[Rgb, ...] = ((206, 152, 92), (120, 140, 165), (150, 170, 120), (170, 120, 150))
-CLOTH_COLORS: tuple[Rgb, ...] = ((178, 74, 62), (64, 98, 148), (88, 128, 92))
-FLUID_COLOR: Rgb = (70, 130, 200)
-PIN_COLOR: Rgb = (255, 178, 40)
 FLOOR_COLOR: Rgb = (170, 176, 184)
-"""Of what the job gives no colour."""
 
 PIN_SHARE = 0.012
 """Radius of a pin's handle, in diagonals of what is there."""
@@ -58,12 +54,13 @@ class SceneDrawing:
             camera.look_at = middle if job.camera.look_at is None else np.asarray(job.camera.look_at)
         else:
             camera.position, camera.look_at = middle + self._size * np.array([0.35, -0.8, 0.35]), middle
+        camera.up = (0.0, 0.0, 1.0)
         camera.fov = float(np.radians(45.0))
         for number, body in enumerate(job.rigid):
             self._add_body(job, number, body.name)
-        for number, cloth in enumerate(job.cloth):
+        for cloth in job.cloth:
             arrays = bodies[cloth.name].arrays
-            color = _color(job, cloth.name, CLOTH_COLORS[number % len(CLOTH_COLORS)])
+            color = _color(job, cloth.name, CLOTH)
             handle = scene.add_mesh_simple(
                 f"/cloth/{cloth.name}", arrays["position"], arrays["triangles"], color=color, side="double"
             )
@@ -71,7 +68,7 @@ class SceneDrawing:
         for fluid in job.fluid:
             arrays, radius = bodies[fluid.name].arrays, fluid.particle_radius
             self._handles[fluid.name] = scene.add_point_cloud(
-                f"/fluid/{fluid.name}", arrays["position"], _color(job, fluid.name, FLUID_COLOR),
+                f"/fluid/{fluid.name}", arrays["position"], _color(job, fluid.name, SURFACE),
                 point_size=2.0 * radius, point_shape="circle", precision="float32",
             )  # fmt: skip
 
@@ -79,7 +76,7 @@ class SceneDrawing:
         """A ball at the middle of each pin's nodes, which leads them."""
         for number, (cloth, nodes) in enumerate(pins):
             handle = self._server.scene.add_icosphere(
-                f"/pin/{number}", radius=PIN_SHARE * self._size, color=PIN_COLOR, subdivisions=2
+                f"/pin/{number}", radius=PIN_SHARE * self._size, color=PIN, subdivisions=2
             )
             self._keep("pin", str(number), handle, named=False)
             self._pins.append((cloth, nodes, handle))
@@ -117,7 +114,7 @@ class SceneDrawing:
         self._handles[name] = frame
         for part in parts_of(parameters.shape.type):
             piece = mesh.piece(part)
-            color = _color(job, name, BODY_COLORS[number % len(BODY_COLORS)], part)
+            color = _color(job, name, BODY, part)
             handle = self._server.scene.add_mesh_simple(
                 f"/body/{name}/{part}", piece.vertices.astype(np.float32), piece.faces, color=color
             )
@@ -137,11 +134,6 @@ class SceneDrawing:
 
 
 def _color(job: Job, body: str, usual: Rgb, part: str = "body") -> Rgb:
-    """The job's colour of a body, which is linear, for a screen; a usual one where it gives none."""
-    material = job.material_of(body, part)
-    if material.color is None:
-        return usual
-    values = np.clip(np.asarray(material.color), 0.0, 1.0)
-    encoded = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1.0 / 2.4) - 0.055)
-    red, green, blue = (round(255.0 * value) for value in encoded.tolist())
-    return red, green, blue
+    """The job's colour of a body, for a screen; a usual one where it gives none."""
+    color = job.material_of(body, part).color
+    return usual if color is None else srgb(color)

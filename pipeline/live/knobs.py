@@ -43,13 +43,15 @@ class Knob:
     start: Value
 
     def checked(self, value: object) -> Value:
-        """The value, as one of this knob's kind.
+        """The value, as one of this knob's kind; where it starts is always one.
 
         Raises:
             ValueError: it is none, or out of range.
         """
         if self.kind == "switch":
             return bool(value)
+        if value == self.start:  # a bend stiffness of 0 has no place among powers of ten
+            return self.start
         numbers = value if isinstance(value, tuple | list) else (value,)
         if len(numbers) != (3 if self.kind == "vector" else 1) or not all(
             isinstance(each, int | float) and math.isfinite(each) and self.low <= each <= self.high for each in numbers
@@ -137,10 +139,14 @@ def _knob(
 ) -> Knob:
     """A knob whose range has room for where it starts."""
     numbers = () if kind == "switch" else start if isinstance(start, tuple) else (float(start),)
-    largest = max((abs(each) for each in numbers), default=0.0)
-    low = min(ends[0], largest) if kind == "decades" and largest > 0.0 else ends[0]
-    low = min(low, -largest) if kind == "vector" else low
-    return Knob(name, label, folder, paths, kind, low, max(ends[1], largest), start)
+    low, high = min((ends[0], *numbers)), max((ends[1], *numbers))
+    if kind == "decades" and low <= 0.0:
+        low = ends[0]
+    if kind == "vector":
+        low, high = min(low, -high), max(high, -low)
+    if kind == "whole":
+        low, high = int(low), int(high)
+    return Knob(name, label, folder, paths, kind, low, high, start)
 
 
 def turn(world: World, job: Job, knob: Knob, value: Value, *, before: Value) -> None:

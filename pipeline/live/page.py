@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.live.drawing import SceneDrawing
 from pipeline.live.knobs import Knob, Value
+from pipeline.live.saving import Saved
 from pipeline.live.session import Session, Status
 from pipeline.live.take import Recorder
 
@@ -26,7 +26,7 @@ class LivePage:
         server: viser's.
         session: the scene.
         title: heads the page.
-        save: writes the job with the present values, and returns where.
+        save: writes the job with the present values.
         recorder: makes takes.
     """
 
@@ -36,14 +36,14 @@ class LivePage:
         session: Session,
         *,
         title: str,
-        save: Callable[[], Path],
+        save: Callable[[], Saved],
         recorder: Recorder,
     ) -> None:
         self._server, self._session = server, session
         self._save, self._recorder = save, recorder
         self._sliders: dict[str, tuple[Knob, Any]] = {}
         self._revision = session.revision
-        self._said = ""
+        self._said = self._noticed = ""
         gui = server.gui
         gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
@@ -79,6 +79,8 @@ class LivePage:
         if written != self._said:
             self._said = written
             self._state.content = written
+        if status.message != self._noticed:
+            self._noticed = status.message
             self._notice.content = f"**{_plain(status.message)}**" if status.message else ""
         if self._session.revision != self._revision:
             self._revision = self._session.revision
@@ -104,7 +106,8 @@ class LivePage:
         self._record.on_click(lambda _: session.ask(self._recorder.toggle))
 
     def _do_save(self) -> None:
-        self._session.message = f"wrote {self._save()}"
+        path, note = self._save()
+        self._session.message = f"wrote {path}{note}"
 
     def _add_knob(self, gui: Any, knob: Knob) -> None:
         start = self._session.values[knob.name]
@@ -144,17 +147,17 @@ class LivePage:
                 grab = session.grab_body if kind == "body" else session.grab_cloth
                 session.ask(grab, name, event.start_position, event.client_id)
         if event.phase == "end":
-            session.ask(session.let_go, kind, name)
+            session.ask(session.let_go, kind, name, event.client_id)
         else:
-            session.ask(session.drag, kind, name, event.end_position)
+            session.ask(session.drag, kind, name, event.end_position, event.client_id)
 
 
 def _shown(knob: Knob, value: Value) -> Any:
-    """How a widget has a value."""
+    """How a widget has a value: no rounding leads past the ends, which a slider refuses."""
     if knob.kind != "decades":
         return value
     assert isinstance(value, float)
-    return round(min(max(math.log10(max(value, 1e-300)), math.log10(knob.low)), math.log10(knob.high)), 2)
+    return min(max(round(math.log10(max(value, 1e-300)), 2), math.log10(knob.low)), math.log10(knob.high))
 
 
 def _label(knob: Knob, value: object) -> str:

@@ -36,6 +36,7 @@ def show_live(
     threads: int | None,
     paused: bool,
     say: Callable[[str], None],
+    tell: Callable[[str], None],
     ends: Callable[[], bool],
 ) -> None:
     """Run a scene until it `ends`, and show it.
@@ -49,6 +50,7 @@ def show_live(
         threads: of the processor; all if omitted.
         paused: begin standing still.
         say: is told the page's address.
+        tell: is told what became of a take that was being made at the end.
         ends: whether it is over.
 
     Raises:
@@ -77,6 +79,8 @@ def show_live(
         try:
             run(session, page, ends=ends)
         finally:
-            recorder.stop()
+            if recorder.is_recording:
+                recorder.stop()
+                tell(session.message)
     finally:
         close_server(server)

@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from pipeline.files import replace_durably
+from pipeline.files import sync
 from pipeline.job.loading import changed_text, job_of_text
-from pipeline.job.overrides import Override
+from pipeline.job.overrides import Override, without_key
 from pipeline.live.knobs import Value, knobs_of, overrides_of
 
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
+
+TAKE_STORY = "take.json"
+"""Beside a take's job file: what the take is."""
+
+
+class Saved(NamedTuple):
+    """A job that was saved.
+
+    Attributes:
+        path: its file.
+        note: what is to be known about it, or "".
+    """
+
+    path: Path
+    note: str
 
 
 def text_with_values(loaded: LoadedJob, values: Mapping[str, Value], changes: Sequence[Override] = ()) -> str:
@@ -32,16 +48,51 @@ def text_with_values(loaded: LoadedJob, values: Mapping[str, Value], changes: Se
     return text
 
 
-def save_job(loaded: LoadedJob, values: Mapping[str, Value], folder: Path) -> Path:
-    """Write the job into a new file NAME-live.toml, NAME-live-2.toml, ... of the same name; returns its path.
+def save_job(loaded: LoadedJob, values: Mapping[str, Value], folder: Path) -> Saved:
+    """Write the job into a new file NAME-live.toml, NAME-live-2.toml, ... of the same name.
+
+    Of a take's job it becomes one that is simulated: without `recorded`, and bodies rest that rested before the take.
 
     Raises:
         JobFileError: the values make no job.
         OSError: it cannot be written.
     """
-    path = next(path for path in _names(folder, f"{loaded.job.name}-live", ".toml") if not path.exists())
-    replace_durably(path, text_with_values(loaded, values, [Override(("name",), path.stem, "live")]))
-    return path
+    led = bodies_led_before(loaded)
+    at_rest = [
+        Override(("rigid", number, "kind"), "static", "live")
+        for number, body in enumerate(loaded.job.rigid)
+        if led is not None and body.name in led
+    ]
+    for path in _names(folder, f"{loaded.job.name}-live", ".toml"):
+        text = text_with_values(loaded, values, [Override(("name",), path.stem, "live"), *at_rest])
+        if loaded.job.recorded is not None:
+            text = without_key(text, "recorded")
+        try:
+            file = path.open("x", encoding="utf-8")  # another session may write here as well
+        except FileExistsError:
+            continue
+        try:
+            with file:
+                file.write(text)
+            sync(path)
+        except BaseException:
+            path.unlink()
+            raise
+        note = f"; {TAKE_STORY} is not there, so bodies that rested before the take may be kinematic in it"
+        return Saved(path, note if led is None and loaded.job.rigid else "")
+    raise AssertionError("numbers do not end")
+
+
+def bodies_led_before(loaded: LoadedJob) -> list[str] | None:
+    """Bodies that are kinematic only because a take, whose job this is, could lead them; None if nothing tells."""
+    if loaded.job.recorded is None:
+        return []
+    try:
+        story = json.loads((loaded.path.parent / TAKE_STORY).read_text(encoding="utf-8"))
+        led = story["led"] if story["take"] == loaded.job.recorded else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return led if isinstance(led, list) else None
 
 
 def _names(folder: Path, stem: str, suffix: str) -> Iterator[Path]:

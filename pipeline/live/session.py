@@ -263,23 +263,17 @@ class Session:
         name, nodes = self.pins[number]
         self._take(("pin", str(number)), Nodes(self._solvers["cloth"], name, nodes, stays=True), holder)
 
-    def drag(self, kind: str, name: str, target: tuple[float, float, float]) -> None:
-        """Lead what is held to a place [m]; nothing if it is held no more."""
+    def drag(self, kind: str, name: str, target: tuple[float, float, float], holder: int = 0) -> None:
+        """Lead what a browser holds to a place [m]; nothing if it holds it no more."""
         place = np.asarray(target, dtype=np.float64)
         if not np.isfinite(place).all():
             return
-        held = self._hands.get((kind, name))
-        if held is None and kind == "cloth":  # it was a pin that the mouse got hold of
-            held = next((each for (what, _), each in self._hands.items() if what == "pin"), None)
-        if held is not None:
-            held[0].target = place
+        for key in self._held_by(holder, kind, name):
+            self._hands[key][0].target = place
 
-    def let_go(self, kind: str, name: str) -> None:
-        """Let go what is held."""
-        keys = [(kind, name)] if (kind, name) in self._hands else []
-        if not keys and kind == "cloth":
-            keys = [key for key in self._hands if key[0] == "pin"]
-        for key in keys:
+    def let_go(self, kind: str, name: str, holder: int = 0) -> None:
+        """Let go what a browser holds."""
+        for key in self._held_by(holder, kind, name):
             self._hands.pop(key)[0].release()
 
     def let_go_all(self, holder: int | None = None) -> None:
@@ -296,6 +290,13 @@ class Session:
 
     # --- inside -----------------------------------------------------------------------------------------------------
 
+    def _held_by(self, holder: int, kind: str, name: str) -> list[tuple[str, str]]:
+        """What a browser means by a thing: of a cloth, it may be a pin that its mouse got hold of."""
+        mine = [key for key, (_, whose) in self._hands.items() if whose == holder]
+        if (kind, name) in mine or kind != "cloth":
+            return [key for key in mine if key == (kind, name)]
+        return [key for key in mine if key[0] == "pin" and self.pins[int(key[1])][0] == name]
+
     def _take(self, key: tuple[str, str], hand: Hand, holder: int) -> None:
         if key in self._hands:
             self._hands.pop(key)[0].release()
@@ -310,32 +311,43 @@ class Session:
 
     def _pins(self) -> list[tuple[str, NDArray[np.int64]]]:
         """Cloth and nodes, in its own numbers, of every pin."""
-        from sim.cloth.sheet import build_sheet
-        from sim.cloth.start import pinned_nodes, start_positions
+        from sim.cloth.start import pins_of
 
-        found = []
-        for cloth in self.job.cloth:
-            if cloth.pin:
-                sheet = build_sheet(cloth.shape)
-                position = start_positions(cloth, sheet)
-                found += [(cloth.name, pinned_nodes(pin, sheet, position)) for pin in cloth.pin]
-        return found
+        return [(cloth.name, nodes) for cloth in self.job.cloth for nodes in pins_of(cloth)]
 
     def _moment(self) -> _Moment:
         paths = dict(self._solvers["rigid"].paths) if "rigid" in self._solvers else {}
         return _Moment(self.world.frame, self.world.checkpoint(), paths, dict(self.values))
 
     def _begin_anew(self, values: Mapping[str, Value]) -> None:
-        """Build the scene again, with these values of its knobs, and nothing held."""
+        """Build the scene again, with these values of its knobs, and nothing held; a value that is refused is told."""
         self.revision += 1
         self._hands.clear()
         if self.on_jump is not None:
             self.on_jump()
         self.values = {name: knob.start for name, knob in self.knobs.items()}
         self._build()
-        for name, value in values.items():
-            self.turn(name, value)
+        refused = self._turn_all(values)
+        if refused:
+            self.message = f"{self.message} Not taken over: {'; '.join(refused)}.".lstrip()
         self._begins.clear()
+
+    def _turn_all(self, values: Mapping[str, Value]) -> list[str]:
+        """Turn knobs; returns what was refused, and why.
+
+        What explicit springs bear hangs on several knobs together, so that one may have to wait for another.
+        """
+        left, count = dict(values), len(values) + 1
+        refused: dict[str, str] = {}
+        while left and len(left) < count:
+            count, refused = len(left), {}
+            for name, value in list(left.items()):
+                try:
+                    self.turn(name, value)
+                    del left[name]
+                except ValueError as error:
+                    refused[name] = f"{name} = {value} ({error})"
+        return list(refused.values())
 
     def _go_back(self, what: str) -> None:
         """Go back to the newest moment that can be trusted; else to the start with the job's own values, and stop."""

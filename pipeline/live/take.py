@@ -7,6 +7,8 @@ as simulated ones are, every later stage finds them, and nothing ever simulates 
 from __future__ import annotations
 
 import json
+import shlex
+import sqlite3
 import uuid
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,16 +25,21 @@ from pipeline.fingerprint import task_fingerprint
 from pipeline.job.loading import job_of_text
 from pipeline.job.overrides import Override
 from pipeline.layout import JobLayout
-from pipeline.live.saving import text_with_values
+from pipeline.lease import Lease
+from pipeline.live.saving import TAKE_STORY, bodies_led_before, text_with_values
 from pipeline.live.session import Session
 from pipeline.provenance import maker
-from pipeline.stages.ordered_writer import OrderedWriter, WriterLostError
+from pipeline.reconcile import rebuild_manifest
+from pipeline.stages.ordered_writer import OrderedWriter
 from pipeline.stages.simulate import SimulateStage
 from sim.world import FrameReport
 
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
     from sim.snapshots import Snapshot
+
+_TROUBLES = (OSError, PipelineError, RuntimeError, sqlite3.Error)
+"""What writing a take may meet: the disk, a folder that somebody else uses, HDF5, a lost writer, the record."""
 
 
 class Recorder:
@@ -74,40 +81,44 @@ class Recorder:
 
     def stop(self) -> None:
         """End the take, if one is being made, and say how to go on with it."""
-        take = self._forget()
+        take, self._take = self._take, None
+        self._session.on_frame = None
         if take is None:
             return
+        trouble = ""
         try:
             take.end()
-        except (OSError, PipelineError, WriterLostError) as error:
-            self._session.message = f"the take ends early: {error}"
-            return
-        self._session.message = f"{take.frames} frames: pipeline submit {take.layout.job_file}"
+        except _TROUBLES as error:
+            trouble = f"the take ends early: {error}; "
+        if take.frames:
+            frames = "1 frame" if take.frames == 1 else f"{take.frames} frames"
+            became = f"{frames}: pipeline submit {shlex.quote(str(take.layout.job_file))}"
+        else:
+            became = f"none of its frames is in {take.layout.root}"
+        self._session.message = f"{trouble}{became}"
 
     def _add(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
         if self._take is None:
             return
         try:
             self._take.add(report, bodies)
-        except (OSError, PipelineError, WriterLostError) as error:
-            self._forget()
-            self._session.message = f"the take ends early: {error}"
-
-    def _forget(self) -> _Take | None:
-        """Record no more; returns the take that was being made."""
-        take, self._take = self._take, None
-        self._session.on_frame = None
-        return take
+        except _TROUBLES:
+            self.stop()  # the writer tells it what it has told here
 
 
 class _Take:
-    """One take on its way to the disk."""
+    """One take on its way to the disk.
+
+    Attributes:
+        layout: its folder.
+        frames: how many are committed; the writer's thread counts them.
+    """
 
     def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:
         self._loaded, self._session, self._device = loaded, session, device
         self._name = f"live-{uuid.uuid4().hex[:12]}"
         self.layout = JobLayout(_new_folder(output, f"{loaded.job.name}-take"))
-        self.frames = 0
+        self.frames = self._handed_in = 0
         self._values = {"first": dict(session.values)}
         self._write_job(frames=1)
         job = job_of_text(self._text(frames=1), self.layout.job_file)
@@ -119,14 +130,23 @@ class _Take:
 
     def add(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
         """Have a frame written; waits while another one waits."""
-        mine = replace(report, frame=self.frames, time_s=self.frames * self._dt)
+        mine = replace(report, frame=self._handed_in, time_s=self._handed_in * self._dt)
         self._writer.submit(partial(self._commit, mine, bodies))
-        self.frames += 1
+        self._handed_in += 1
 
     def end(self) -> None:
-        """Wait for all frames, and write what the take is."""
-        self._writer.__exit__(None, None, None)
-        self._write_job(frames=self.frames)
+        """Wait for all frames, and write what the take is: of those that were committed, also if one could not be.
+
+        Raises:
+            OSError, PipelineError, RuntimeError, sqlite3.Error: something of it could not be written.
+        """
+        try:
+            self._writer.__exit__(None, None, None)
+        finally:
+            self._write_what_it_is()
+
+    def _write_what_it_is(self) -> None:
+        self._write_job(frames=max(1, self.frames))  # no job has none
         story = {
             "take": self._name,
             "job": self._loaded.job.name,
@@ -134,9 +154,18 @@ class _Take:
             "device": self._device,
             "maker": maker(),
             "values": {**self._values, "last": dict(self._session.values)},
+            "led": self._led(),
             "note": "Steered by hand: no job file makes these frames again.",
         }
-        replace_durably(self.layout.root / "take.json", json.dumps(story, indent=2, ensure_ascii=False) + "\n")
+        replace_durably(self.layout.root / TAKE_STORY, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
+        with Lease.acquire(self.layout.lease):
+            rebuild_manifest(self.layout)  # without a record, commands take the folder for none of a job's
+
+    def _led(self) -> list[str]:
+        """Bodies that the job has at rest, and that could be led here."""
+        lived = zip(self._loaded.job.rigid, self._session.job.rigid, strict=True)
+        here = [written.name for written, led in lived if written.kind != led.kind]
+        return [*(bodies_led_before(self._loaded) or ()), *here]
 
     def _commit(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
         commit = committing(
@@ -149,6 +178,7 @@ class _Take:
         )
         with commit:
             write_frame(commit.path, bodies, report, device=self._device)
+        self.frames += 1
 
     def _write_job(self, *, frames: int) -> None:
         replace_durably(self.layout.job_file, self._text(frames=frames))

@@ -5,6 +5,7 @@ Frames and checkpoints are written while the next frame is computed; see docs/de
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +21,8 @@ from pipeline.files import sync
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
+from pipeline.provenance import read_text
+from pipeline.receipts import read_receipt
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import (
     bodies_by_content,
@@ -29,7 +32,7 @@ from pipeline.stages.inputs import (
     tool_version,
 )
 from pipeline.stages.ordered_writer import WAITING, OrderedWriter
-from pipeline.task import Resources, Task, TaskId
+from pipeline.task import ArtifactPath, Resources, Task, TaskId
 from sim.scene import SceneParameters
 from sim.snapshots import Snapshot
 from sim.world import FrameReport, World
@@ -108,13 +111,31 @@ class SimulateStage:
         """
         missing = [k for k, output in enumerate(context.task.outputs) if not context.is_committed(output)]
         if missing and context.job.recorded is not None:
-            raise StageUnavailableError(
-                f"frame {missing[0]} of the live take {context.job.recorded} is not there as it was recorded, and no "
-                "computation can make it anew: bring its file and receipt back, ask for fewer frames, or remove "
-                '"recorded" to simulate the job as it is written'
-            )
+            raise _no_take_anew(context, missing[0])
         if missing:
             _Simulation(context).run(missing)
+
+
+def _no_take_anew(context: TaskContext, frame: int) -> StageUnavailableError:
+    job = context.job
+    recorded_fps = _recorded_fps(context.layout, context.task.outputs[frame])
+    if recorded_fps not in (None, job.fps):
+        return StageUnavailableError(
+            f"the live take {job.recorded} was recorded at {recorded_fps} frames a second, and the job asks for "
+            f"{job.fps}: write fps = {recorded_fps} again; no computation can make other frames of a take"
+        )
+    return StageUnavailableError(
+        f"frame {frame} of the live take {job.recorded} is not there as it was recorded, and no computation can make "
+        "it anew: bring its file and receipt back, or ask for fewer frames. To simulate the scene as it is written, "
+        'remove "recorded" in a copy of the job file under another name; here that would overwrite the take'
+    )
+
+
+def _recorded_fps(layout: JobLayout, frame: ArtifactPath) -> int | None:
+    """Frames a second of what a frame's file was recorded with; None if nothing tells."""
+    receipt = read_receipt(layout, frame)
+    text = None if receipt is None else read_text(layout.parameters_text(receipt.parameters))
+    return None if text is None else json.loads(text).get("fps")
 
 
 class _Simulation:

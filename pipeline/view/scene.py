@@ -240,19 +240,16 @@ class JobScene:
     def _pins(self) -> dict[str, list[tuple[NDArray[np.int64], float]]]:
         """Nodes that are pinned, and until when [s], by cloth: found anew from the job, as the simulation does."""
         if self._pinned is None:
-            from sim.cloth.sheet import build_sheet
-            from sim.cloth.start import pinned_nodes, start_positions
+            from sim.cloth.start import pins_of
 
-            pinned = {}
-            for cloth in self._job.cloth:
-                if cloth.pin:
-                    sheet = build_sheet(cloth.shape)
-                    position = start_positions(cloth, sheet)
-                    pinned[cloth.name] = [
-                        (pinned_nodes(pin, sheet, position), math.inf if pin.release_s is None else pin.release_s)
-                        for pin in cloth.pin
-                    ]
-            self._pinned = pinned
+            self._pinned = {
+                cloth.name: [
+                    (nodes, math.inf if pin.release_s is None else pin.release_s)
+                    for pin, nodes in zip(cloth.pin, pins_of(cloth), strict=True)
+                ]
+                for cloth in self._job.cloth
+                if cloth.pin
+            }
         return self._pinned
 
     def _draw_smoke(self, drawing: Drawing, frame: ShownFrame, shown: Shown, extents: Extents) -> None:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from sim.cloth.parameters import ClothParameters, PinParameters, SphereRegion
-from sim.cloth.sheet import RestSheet
+from sim.cloth.sheet import RestSheet, build_sheet
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -63,6 +63,19 @@ def pinned_nodes(pin: PinParameters, sheet: RestSheet, position: Floats) -> NDAr
         number = 0 if axis == "x" else 1
         within &= (i, j)[number] == (last[number] if side == "+" else 0)
     return np.flatnonzero(within)
+
+
+def pins_of(cloth: ClothParameters) -> list[NDArray[np.int64]]:
+    """The nodes that each pin of a cloth holds, in the cloth's own numbers.
+
+    Raises:
+        ShapeError, ValueError: as `build_sheet` and `pinned_nodes`.
+    """
+    if not cloth.pin:
+        return []
+    sheet = build_sheet(cloth.shape)
+    position = start_positions(cloth, sheet)
+    return [pinned_nodes(pin, sheet, position) for pin in cloth.pin]
 
 
 def _nodes_in_region(pin: PinParameters, position: Floats) -> NDArray[np.int64]:

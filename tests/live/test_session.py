@@ -63,7 +63,7 @@ def test_a_ball_that_is_dragged_down_pushes_the_cloth_and_let_go_is_thrown_back(
     session.ask(session.grab_body, "ball", (0.0, 0.0, 0.7), 7)
     run(session, 5)
     assert place(session, "ball")[2] == pytest.approx(0.62, abs=0.005)  # in hand, it does not fall
-    session.ask(session.drag, "body", "ball", (0.0, 0.0, 0.45))
+    session.ask(session.drag, "body", "ball", (0.0, 0.0, 0.45), 7)
     run(session, 25)
     pressed = place(session, "ball")[2]
     assert pressed < 0.45  # its centre below where the sheet was
@@ -165,3 +165,52 @@ def test_a_single_step_stands_still_after_it(tmp_path):
     assert session.world.frame == 1
     assert session.is_paused
     assert session.status().real_time == 0.0
+
+
+EXPLICIT = WITHOUT_BALL.replace("substeps = 8", 'integrator = "explicit"\nsubsteps = 100\nmass_per_area = 0.2')
+
+
+def test_values_that_bear_each_other_outlive_a_reset_in_whatever_order(tmp_path):
+    session = session_of(tmp_path, EXPLICIT)
+    stiff = 40.0 * session.values["cloth.sheet.stretch_stiffness"]
+    with pytest.raises(ValueError, match="substeps"):
+        session.turn("cloth.sheet.stretch_stiffness", stiff)  # too stiff for its mass
+    session.turn("cloth.sheet.mass_per_area", 8.0)
+    session.turn("cloth.sheet.stretch_stiffness", stiff)
+    session.turn("cloth.sheet.friction", 1.5)
+    turned = dict(session.values)
+    session.reset()
+    assert session.values == turned
+    assert session.message == ""
+
+
+def test_a_value_that_is_refused_at_a_reset_is_told_and_leaves_the_others(tmp_path):
+    session = session_of(tmp_path, EXPLICIT)
+    session.values["cloth.sheet.stretch_stiffness"] = 9.0e4  # as if it had been borne once
+    session.turn("cloth.sheet.friction", 1.5)
+    session.world.solvers["rigid"].bodies.velocity[0] = (np.nan, 0.0, 0.0)
+    session.ask(session.reset)
+    session.meet_requests()
+    assert session.values["cloth.sheet.friction"] == 1.5
+    assert session.values["cloth.sheet.stretch_stiffness"] == 500.0
+    assert "Not taken over: cloth.sheet.stretch_stiffness = 90000.0 (" in session.message
+    run(session, 1)
+    assert session.world.frame == 1
+
+
+def test_nobody_moves_or_drops_what_another_browser_holds(tmp_path):
+    session = session_of(tmp_path, WITHOUT_BALL)
+    first, second = (0.0, -0.2, 0.5), (0.0, 0.2, 0.5)
+    session.grab_cloth("sheet", first, 1)  # both got hold of a pin
+    session.grab_cloth("sheet", second, 2)
+    session.drag("cloth", "sheet", (0.0, 0.2, 0.6), 2)
+    session.let_go("cloth", "sheet", 3)
+    run(session, 25)
+    assert session.is_holding
+    heights = session.bodies()["sheet"].arrays["position"][:, 2]
+    assert heights[:17].max() < 0.505
+    assert heights[-17:].min() > 0.59
+    session.let_go("cloth", "sheet", 2)
+    assert session.is_holding  # the first one's
+    session.let_go("cloth", "sheet", 1)
+    assert not session.is_holding

@@ -1,6 +1,10 @@
 """What is kept of a session: the job with the values found, and takes, whose frames later stages find."""
 
+import errno
 import json
+import shlex
+import signal
+import threading
 
 import numpy as np
 import pytest
@@ -10,7 +14,7 @@ from live_jobs import BALL_OVER_SHEET, loaded
 from pipeline.cache import read_frame
 from pipeline.cli import main
 from pipeline.job.checks import load_checked_job
-from pipeline.job.loading import load_job
+from pipeline.job.loading import load_job, read_job
 from pipeline.layout import JobLayout
 from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job
@@ -18,6 +22,7 @@ from pipeline.live.session import Session
 from pipeline.live.take import Recorder
 from pipeline.resources import machine_capacity
 from pipeline.stage_run import run_stage
+from sim import runtime
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -30,7 +35,7 @@ def test_a_saved_job_has_the_values_and_all_remarks_and_passes_the_check(tmp_pat
     session.turn("cloth.sheet.stretch_stiffness", 750.0)
     session.turn("cloth.sheet.wind", (1.0, 0.0, 0.5))
     session.turn("rigid.ball.density", 900.0)
-    path = save_job(read, session.values, tmp_path)
+    path, _ = save_job(read, session.values, tmp_path)
     text = path.read_text()
     assert path.name == "drape-live.toml"
     assert "# what nobody may lose: a remark" in text
@@ -41,7 +46,7 @@ def test_a_saved_job_has_the_values_and_all_remarks_and_passes_the_check(tmp_pat
     assert job.rigid[1].kind == "static"
     again = Session(live_job(job))  # what it is saved as is what it becomes
     assert again.values == {**session.values}
-    assert save_job(read, session.values, tmp_path).name == "drape-live-2.toml"
+    assert save_job(read, session.values, tmp_path).path.name == "drape-live-2.toml"
 
 
 def test_a_take_is_a_job_whose_frames_are_there_and_are_never_simulated_again(tmp_path):
@@ -79,6 +84,7 @@ def test_a_take_is_a_job_whose_frames_are_there_and_are_never_simulated_again(tm
     layout.path(layout.frame_cache(2)).unlink()
     (failed,) = run("simulate").failures
     assert "no computation can make it anew" in failed.message
+    assert "in a copy of the job file under another name" in failed.message
     assert not layout.path(layout.frame_cache(2)).exists()
     again = CliRunner().invoke(main, ["rerun", str(folder), "--stage", "simulate"])
     assert again.exit_code == 1
@@ -96,3 +102,132 @@ def test_a_reset_ends_a_take_with_what_was_before_it(tmp_path):
     assert load_job(tmp_path / "drape-take" / "job.toml").frame_count == 2
     session.advance()  # nobody records any more
     assert len(list((tmp_path / "drape-take" / "cache").glob("[0-9]*.h5"))) == 2
+
+
+def take_of(folder, frames: int = 3, text: str = BALL_OVER_SHEET) -> tuple[Session, Recorder, JobLayout]:
+    """A take of so many frames that has been ended."""
+    read = loaded(folder, text)
+    session = Session(live_job(read.job))
+    recorder = Recorder(read, session, folder / "elsewhere", device="cpu")
+    recorder.toggle()
+    for _ in range(frames - 1):
+        session.advance()
+    recorder.toggle()
+    return session, recorder, JobLayout(folder / "elsewhere" / "drape-take")
+
+
+def test_a_take_that_cannot_be_written_on_keeps_the_frames_that_were(tmp_path, monkeypatch):
+    from pipeline.live import take
+
+    def write_two(path, bodies, report, *, device):
+        if report.frame == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_frame(path, bodies, report, device=device)
+
+    write_frame = take.write_frame
+    monkeypatch.setattr(take, "write_frame", write_two)
+    read = loaded(tmp_path)
+    session = Session(live_job(read.job))
+    recorder = Recorder(read, session, tmp_path, device="cpu")
+    recorder.toggle()
+    for _ in range(6):
+        session.advance()
+    recorder.stop()
+    assert not recorder.is_recording
+    folder = tmp_path / "drape-take"
+    assert "No space left on device" in session.message
+    assert f"2 frames: pipeline submit {folder / 'job.toml'}" in session.message
+    assert load_job(folder / "job.toml").frame_count == 2
+    assert json.loads((folder / "take.json").read_text())["frames"] == 2
+    assert not [thread for thread in threading.enumerate() if thread.name == "writer"]
+
+
+def test_what_is_printed_of_a_take_works_from_anywhere(tmp_path, monkeypatch):
+    session, _, layout = take_of(tmp_path)
+    (tmp_path / "away").mkdir()
+    monkeypatch.chdir(tmp_path / "away")
+    _, _, printed = session.message.partition("pipeline submit ")
+    (job_file,) = shlex.split(printed)
+    planned = CliRunner().invoke(main, ["plan", job_file, "--json"])
+    assert planned.exit_code == 0
+    verdicts = {each["task"]: each["verdict"] for each in json.loads(planned.output)}
+    assert verdicts["simulate"] == "up to date"
+    found = CliRunner().invoke(main, ["status", job_file])  # by its file alone, as `submit` finds it
+    assert (found.exit_code, found.output.partition(":")[0]) == (0, str(layout.root))
+
+
+def test_no_cleaning_but_of_everything_removes_the_frames_of_a_take(tmp_path):
+    _, _, layout = take_of(tmp_path)
+    job = load_job(layout.job_file)
+    refused = CliRunner().invoke(main, ["clean", str(layout.root), "--stage", "simulate", "--yes"])
+    assert refused.exit_code == 1
+    assert f"drape-take is a live take ({job.recorded}): nothing can make its frames anew; --all" in refused.output
+    layout.job_file.write_text(layout.job_file.read_text().replace("frames = 3", "frames = 1"))
+    assert CliRunner().invoke(main, ["clean", str(layout.root), "--superseded", "--yes"]).exit_code == 0
+    assert len(list((layout.root / "cache").glob("[0-9]*.h5"))) == 3
+    assert CliRunner().invoke(main, ["clean", str(layout.root), "--all", "--yes"]).exit_code == 0
+    assert not layout.root.exists()
+
+
+def test_another_rate_of_frames_of_a_take_is_told_as_such(tmp_path):
+    _, _, layout = take_of(tmp_path)
+    layout.job_file.write_text("fps = 24\n" + layout.job_file.read_text())
+    outcome = run_stage(
+        load_job(layout.job_file), layout, "simulate", capacity=machine_capacity(), stages=STAGES,
+        stop_requested=lambda: False, tell=lambda _share, _sentence: None,
+    )  # fmt: skip
+    (failed,) = outcome.failures
+    assert "recorded at 60 frames a second, and the job asks for 24: write fps = 60 again" in failed.message
+
+
+def test_a_job_that_is_saved_of_a_take_is_simulated_and_its_bodies_rest_again(tmp_path):
+    _, _, layout = take_of(tmp_path)
+    read = read_job(layout.job_file)
+    assert read.job.rigid[1].kind == "kinematic"
+    values = Session(live_job(read.job)).values
+    path, note = save_job(read, values, tmp_path)
+    saved = load_checked_job(path)[0].job
+    assert (saved.recorded, saved.rigid[1].kind, note) == (None, "static", "")
+    assert "# what nobody may lose: a remark" in path.read_text()
+    (layout.root / "take.json").unlink()
+    path, note = save_job(read, values, tmp_path)
+    assert load_job(path).recorded is None
+    assert "bodies that rested before the take may be kinematic" in note
+
+
+def test_a_job_that_another_session_saves_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
+    from pipeline.live import saving
+
+    read = loaded(tmp_path)
+    values = Session(live_job(read.job)).values
+    theirs = tmp_path / "drape-live.toml"
+
+    def while_they_save(*arguments):
+        theirs.touch()
+        return text_with_values(*arguments)
+
+    text_with_values = saving.text_with_values
+    monkeypatch.setattr(saving, "text_with_values", while_they_save)
+    assert save_job(read, values, tmp_path).path == tmp_path / "drape-live-2.toml"
+    assert theirs.read_bytes() == b""
+
+
+def test_ctrl_c_ends_a_take_tells_what_became_of_it_and_leaves_signals_as_they_were(tmp_path, monkeypatch):
+    from pipeline.live import running
+
+    class Interrupted(Recorder):
+        """One that is recording when Ctrl-C comes."""
+
+        def __init__(self, *arguments, **options) -> None:
+            super().__init__(*arguments, **options)
+            self.toggle()
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(running, "Recorder", Interrupted)
+    loaded(tmp_path)
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    options = ["--port", "0", "--output", str(tmp_path), "--cores", str(runtime._in_use.get("threads", 1))]
+    ended = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml"), *options])
+    assert ended.exit_code == 0
+    assert f"1 frame: pipeline submit {tmp_path / 'drape-take' / 'job.toml'}\n" in ended.output
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before

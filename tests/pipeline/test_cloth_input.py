@@ -176,7 +176,7 @@ def test_pins_mean_the_vertices_of_the_file_whatever_its_seams(tmp_path):
     """Two squares side by side; texture coordinates, materials and objects differ where they meet."""
     from pipeline.job.loading import read_job
     from sim.cloth.sheet import build_sheet
-    from sim.cloth.start import pinned_nodes, start_positions
+    from sim.cloth.start import pins_of, start_positions
 
     places = [[0, 0, 0], [0.2, 0, 0], [9, 9, 9], [0, 0.2, 0], [0.2, 0.2, 0], [0.4, 0, 0], [0.4, 0.2, 0]]
     faces = ["1/1/1 2/2/1 5/3/1 4/4/1\no right\nusemtl blue", "2/5/1 6/6/1 7/7/1 5/8/1"]
@@ -190,7 +190,8 @@ def test_pins_mean_the_vertices_of_the_file_whatever_its_seams(tmp_path):
     (cloth,) = read_job(tmp_path / "drape.toml").job.cloth
     sheet = build_sheet(cloth.shape)
     position = start_positions(cloth, sheet)
-    held = position[pinned_nodes(cloth.pin[0], sheet, position)]
+    (nodes,) = pins_of(cloth)
+    held = position[nodes]
     # The box of 0.4 x 0.2 m is centred at (0, 0, 0.5).
     expected = np.array(places)[[1, 4, 6]] + [-0.2, -0.1, 0.5]
     np.testing.assert_allclose(sorted(held.tolist()), sorted(expected.tolist()), atol=1e-12)

@@ -1,0 +1,63 @@
+"""Knobs and the page that has them, without a browser: whatever a job has is a place where its knobs can start."""
+
+import pytest
+from live_jobs import BALL_OVER_SHEET, loaded
+
+from pipeline.live.drawing import SceneDrawing
+from pipeline.live.knobs import knobs_of
+from pipeline.live.page import LivePage
+from pipeline.live.saving import save_job
+from pipeline.live.scene import live_job
+from pipeline.live.session import Session
+from pipeline.live.take import Recorder
+from pipeline.view.colors import BODY, CLOTH, PIN, srgb
+from pipeline.view.serving import page_server
+
+ODD = ("stretch_stiffness = 3e5", "bend_stiffness = 2e-9", "bend_stiffness = 0.0", "friction = 3.0", "damping = 0.7",
+       "wind = [0.0, -55.0, 1.0]", "mass_per_area = 1e-3")  # fmt: skip
+
+
+@pytest.mark.parametrize("odd", ODD)
+@pytest.mark.parametrize("substeps", [1, 5, 100])
+def test_a_knob_may_stay_where_the_job_has_it(tmp_path, odd: str, substeps: int):
+    text = BALL_OVER_SHEET.replace("stretch_stiffness = 500.0   # soft", odd)
+    for knob in knobs_of(live_job(loaded(tmp_path, text).job, substeps=substeps)):
+        assert knob.checked(knob.start) == knob.start
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_page_has_odd_values_and_tells_what_happens_while_time_stands_still(tmp_path):
+    odd = "stretch_stiffness = 3e5\nbend_stiffness = 2e-9\nfriction = 3.0"
+    read = loaded(tmp_path, BALL_OVER_SHEET.replace("stretch_stiffness = 500.0   # soft", odd))
+    session = Session(live_job(read.job, substeps=1))
+    session.is_paused = True
+    with page_server(port=0, label="drape") as server:
+        recorder = Recorder(read, session, tmp_path, device="cpu")
+        page = LivePage(
+            server, session, title="drape", save=lambda: save_job(read, session.values, tmp_path), recorder=recorder
+        )
+        page.tell(session.status())
+        session.message = "something new"
+        page.tell(session.status())
+        assert "something new" in page._notice.content
+        session.message = ""
+        page.tell(session.status())
+        assert page._notice.content == ""
+        assert tuple(server.initial_camera.up) == (0.0, 0.0, 1.0)
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_scene_has_the_colours_of_the_viewer(tmp_path):
+    read = loaded(tmp_path, BALL_OVER_SHEET + '\n[material.post]\nlook = "metal"\ncolor = [0.5, 0.1, 0.0]\n')
+    session = Session(live_job(read.job))
+    with page_server(port=0, label="drape") as server:
+        drawn = SceneDrawing(server, session.job, session.bodies(), lambda *_: None)
+        drawn.add_pins(session.pins)
+        nodes = server.scene._handle_from_node_name
+        expected = {
+            "/body/ball/body": BODY,
+            "/cloth/sheet": CLOTH,
+            "/pin/0": PIN,
+            "/body/post/body": srgb((0.5, 0.1, 0)),
+        }
+        assert {name: tuple(nodes[name].color) for name in expected} == expected
