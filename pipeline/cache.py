@@ -241,12 +241,13 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         file.attrs["fingerprint"] = checkpoint.fingerprint
         file.attrs["device"] = checkpoint.device
         file.attrs["digest"] = _digest(checkpoint)
+        arrays = file.create_group("arrays")  # also where nothing has a state, as of bodies that stand still
         for key, array in checkpoint.arrays.items():
             data = np.asarray(array)
             if data.ndim and data.size:
-                file.create_dataset(f"arrays/{key}", data=data, fletcher32=True)
+                arrays.create_dataset(key, data=data, fletcher32=True)
             else:
-                file.create_dataset(f"arrays/{key}", data=data)
+                arrays.create_dataset(key, data=data)
         file.attrs["complete"] = True
 
 

@@ -137,6 +137,11 @@ def test_a_checkpoint_reads_back_bit_for_bit(tmp_path):
         assert checkpoint.arrays[key].dtype == array.dtype
 
 
+def test_a_checkpoint_of_a_scene_without_state_reads_back(tmp_path):
+    write_checkpoint(tmp_path / "c.h5", Checkpoint(3, "abc", "cpu", {}))
+    assert read_checkpoint(tmp_path / "c.h5").arrays == {}
+
+
 def test_no_flipped_bit_of_a_checkpoint_goes_unnoticed(tmp_path):
     """HDF5's own checksums are about the arrays, not about the attributes and what says how to read the arrays."""
     path, chance = tmp_path / "c.h5", random.Random(2)
