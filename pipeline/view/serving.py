@@ -42,7 +42,7 @@ def require_viser() -> None:
     """
     if importlib.util.find_spec("viser") is None:
         raise StageUnavailableError(
-            "pages in a browser need viser; install it with: pip install viser, or use ./run, which installs it"
+            "pages in a browser need viser, which is not installed; ./run installs it, and so does: pip install viser"
         )
 
 

@@ -7,5 +7,5 @@ from sim import runtime
 
 @pytest.fixture(scope="session")
 def taichi() -> None:
-    """As other tests of this process have started it; else on one thread, as the stages' tests want it."""
-    runtime.initialize("auto", threads=runtime._in_use.get("threads", 1))
+    """With as many threads as every other test of this process that starts it."""
+    runtime.initialize("cpu")

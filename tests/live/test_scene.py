@@ -54,4 +54,4 @@ def test_without_viser_the_command_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     outcome = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml")])
     assert outcome.exit_code == 3
-    assert "need viser, which is not installed" in outcome.output
+    assert "pages in a browser need viser, which is not installed" in outcome.output

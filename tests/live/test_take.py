@@ -22,7 +22,6 @@ from pipeline.live.session import Session
 from pipeline.live.take import Recorder
 from pipeline.resources import machine_capacity
 from pipeline.stage_run import run_stage
-from sim import runtime
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -226,7 +225,7 @@ def test_ctrl_c_ends_a_take_tells_what_became_of_it_and_leaves_signals_as_they_w
     monkeypatch.setattr(running, "Recorder", Interrupted)
     loaded(tmp_path)
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    options = ["--port", "0", "--output", str(tmp_path), "--cores", str(runtime._in_use.get("threads", 1))]
+    options = ["--port", "0", "--output", str(tmp_path)]
     ended = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml"), *options])
     assert ended.exit_code == 0
     assert f"1 frame: pipeline submit {tmp_path / 'drape-take' / 'job.toml'}\n" in ended.output
