@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 from PIL import Image
 
-from pipeline.committed_pictures import committed_pictures
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.manifest_reader import ManifestReader
+from pipeline.picture_set import picture_set
 from pipeline.task import ArtifactPath
 from render.sheet import contact_sheet
 
@@ -59,7 +59,7 @@ def description(job_file: Path) -> str:
 def shot_of(job_file: Path, layout: JobLayout) -> tuple[Shot, list[Path]]:
     """What there is to tell of a job, and its frames."""
     job = load_job(layout.job_file)
-    pictures = committed_pictures(layout)
+    pictures = picture_set(job, layout).all
     with ManifestReader.open_readonly(layout.manifest) as reader:
         frames: dict[str, set[str]] = {}
         for path, row in reader.artifacts().items():
@@ -69,10 +69,11 @@ def shot_of(job_file: Path, layout: JobLayout) -> tuple[Shot, list[Path]]:
             for timing in reader.stage_timings()
             if frames.get(timing.stage) and timing.seconds
         }
-    render = job.render
-    drawn = sum(int(picture.stem) < job.frame_count for picture in pictures)
-    text = description(job_file)
-    return Shot(job_file.stem, text, render.resolution, render.quality, drawn, job.frame_count, seconds), pictures
+    render, text = job.render, description(job_file)
+    return (
+        Shot(job_file.stem, text, render.resolution, render.quality, len(pictures), job.frame_count, seconds),
+        pictures,
+    )
 
 
 def frame_of(artifact: ArtifactPath) -> list[str]:
@@ -139,10 +140,10 @@ def main() -> int:
     sections, missing = [], []
     for job_file in sorted(JOBS.glob("*.toml")):
         layout = JobLayout(arguments.renders / job_file.stem)
-        if not layout.manifest.exists() or not committed_pictures(layout):
+        shot, frames = shot_of(job_file, layout) if layout.manifest.exists() else (None, [])
+        if shot is None or not frames:
             missing.append(job_file.stem)
             continue
-        shot, frames = shot_of(job_file, layout)
         write_pictures(shot, frames, images, heroes.get(shot.name, shot.frames // 2))
         sections.append(section(shot))
     head = f"""# Gallery

@@ -7,7 +7,7 @@ another version of a program, with what were the defaults then, make a film as w
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -25,15 +25,25 @@ class PictureSet:
     """Frames that were made alike.
 
     Attributes:
-        unbroken: those from the first frame on, up to the first one that is not there.
+        by_frame: by their numbers, rising.
         earlier: how many others are there, that were drawn before and made otherwise.
         remark: what to say of a set that is not of the job as it would be made now; empty if nothing is known to
             differ.
     """
 
-    unbroken: list[Path]
+    by_frame: Mapping[int, Path]
     earlier: int = 0
     remark: str = ""
+
+    @property
+    def all(self) -> list[Path]:
+        """First to last."""
+        return [*self.by_frame.values()]
+
+    @property
+    def unbroken(self) -> list[Path]:
+        """Those from the first frame on, up to the first one that is not there."""
+        return [picture for number, (frame, picture) in enumerate(self.by_frame.items()) if number == frame]
 
     @property
     def others(self) -> str:
@@ -49,16 +59,24 @@ def picture_set(job: Job, layout: JobLayout) -> PictureSet:
         if receipt is not None and verify_artifact(layout, receipt) is None:
             there[frame] = receipt
     if not there:
-        return PictureSet([])
+        return PictureSet({})
     lineages = _Lineages(layout)
     newest = lineages.of(max(there.values(), key=lambda each: each.finished or each.mtime_ns / 1e9))
-    alike = {frame for frame, receipt in there.items() if _made_alike(lineages.of(receipt), newest)}
-    length = next((frame for frame in range(job.frame_count) if frame not in alike), job.frame_count)
+    alike = {frame: receipt for frame, receipt in there.items() if _made_alike(lineages.of(receipt), newest)}
     return PictureSet(
-        unbroken=[layout.path(layout.picture(frame)) for frame in range(length)],
+        {frame: layout.path(receipt.artifact) for frame, receipt in alike.items()},
         earlier=len(there) - len(alike),
-        remark=_remark(job, layout, [lineages.of(there[frame]) for frame in range(length)]),
+        remark=_remark(job, layout, map(lineages.of, alike.values())),
     )
+
+
+def evenly_spread(frames: Sequence[Path], count: int) -> list[Path]:
+    """At most so many of the frames, the first and the last among them."""
+    if len(frames) <= count:
+        return [*frames]
+    if count == 1:
+        return [frames[-1]]
+    return [frames[round(index * (len(frames) - 1) / (count - 1))] for index in range(count)]
 
 
 class _Lineage(NamedTuple):

@@ -11,9 +11,7 @@ from pipeline.commands.arguments import find_job, output_option, submitted_job_a
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
-    from pipeline.committed_pictures import CurrentPictures
     from pipeline.job.models import Job
-    from pipeline.layout import JobLayout
     from pipeline.picture_set import PictureSet
 
 
@@ -31,15 +29,16 @@ def sheet(job: str, output: Path, pictures: int, columns: int, target: Path | No
     """
     from PIL import Image
 
-    from pipeline.committed_pictures import evenly_spread
     from pipeline.job.loading import load_job
+    from pipeline.picture_set import evenly_spread, picture_set
     from render.errors import InvalidFileError
     from render.sheet import contact_sheet
 
     layout = find_job(job, output)
-    frames = _current_pictures(load_job(layout.job_file), layout)
+    submitted = load_job(layout.job_file)
+    frames = picture_set(submitted, layout)
     if not frames.all:
-        raise PipelineError(f"no frame of {layout.root} has been rendered yet{frames.others}")
+        raise PipelineError(f"no frame of {layout.root} has been rendered yet")
     path = layout.root / "sheet.png" if target is None else target
     if path.suffix.lower() not in Image.registered_extensions():
         raise PipelineError(f'{path}: "{path.suffix}" is no kind of picture; use .png, .jpg or .webp')
@@ -47,6 +46,7 @@ def sheet(job: str, output: Path, pictures: int, columns: int, target: Path | No
         contact_sheet(evenly_spread(frames.all, pictures), path, columns=columns)
     except (InvalidFileError, ValueError, OSError) as error:
         raise PipelineError(f"cannot make {path}: {error}") from error
+    _say_remark(submitted, frames)
     click.echo(path)
 
 
@@ -171,13 +171,6 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
 
 
 def _say_remark(job: Job, frames: PictureSet) -> None:
+    """Say on standard error what is to be said of the frames that are shown."""
     if frames.remark:
         click.echo(f"{job.name}: {frames.remark}", err=True)
-
-
-def _current_pictures(job: Job, layout: JobLayout) -> CurrentPictures:
-    """The frames that the film would be made of: those of the job as it is now, by the record and the files."""
-    from pipeline.assessing import assess_job
-    from pipeline.committed_pictures import current_pictures
-
-    return current_pictures(job, layout, assess_job(job, layout).current)

@@ -8,10 +8,10 @@ from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.committed_pictures import evenly_spread
 from pipeline.errors import PipelineError
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
+from pipeline.picture_set import evenly_spread
 from pipeline.receipts import read_receipt
 from pipeline.task import ArtifactPath
 
@@ -54,7 +54,7 @@ def film_of(
         layout: the job's folder.
         job: the job.
         current: the files that are of the job as it is now; None if that cannot be told.
-        pictures: frames of the job as it is now from the first on, of which a loop is made where one is needed.
+        pictures: frames that were made alike, from the first on, of which a loop is made where one is needed.
 
     Raises:
         PipelineError: a loop is needed, and a picture is damaged.

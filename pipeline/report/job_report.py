@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.assessing import assess_job
-from pipeline.committed_pictures import CurrentPictures, current_pictures, evenly_spread
 from pipeline.errors import MissingInputError, PipelineError, StageUnavailableError
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.manifest_reader import ManifestReader, StageTiming
+from pipeline.picture_set import PictureSet, evenly_spread, picture_set
 from pipeline.quantities import COUNT_OF_FLUID
 from pipeline.report.film import ReportFilm, film_of
 from pipeline.report.panels import JobNumbers
@@ -44,7 +44,7 @@ class JobReport:
         unreadable_whitewater: files of whitewater that cannot.
         drawn_on: number of frames by the device that drew them.
         sheet: its pictures side by side, as the bytes of a WebP picture; None before there are any.
-        sheet_remark: why frames that are there are not on it; empty if all are.
+        sheet_remark: what to say of the frames on it, and of those that are not; empty if there is nothing.
         film: None before there is one.
         versions: what made its files.
         text: of its job file, as submitted.
@@ -139,7 +139,7 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         artifacts = manifest.artifacts()
     finished = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
     simulation = simulation_numbers(layout, history=True)
-    frames, current, sheet_remark = _frames_that_count(job, layout)
+    frames = picture_set(job, layout)
     return JobReport(
         job=job,
         title=title,
@@ -153,8 +153,8 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         unreadable_whitewater=simulation.unreadable_whitewater,
         drawn_on=drawn_on,
         sheet=_sheet(layout, frames.all, picture_width=job.render.resolution[0]),
-        sheet_remark=sheet_remark,
-        film=film_of(layout, job, current=current, pictures=frames.unbroken),
+        sheet_remark=_remark(frames),
+        film=film_of(layout, job, current=_current(job, layout), pictures=frames.unbroken),
         versions=tuple(made_with(layout, artifacts, stages=[timing.stage for timing in timings])),
         text=layout.job_file.read_text(encoding="utf-8"),
     )
@@ -165,19 +165,18 @@ def as_data(picture: bytes) -> str:
     return f"data:image/webp;base64,{b64encode(picture).decode()}"
 
 
-def _frames_that_count(job: Job, layout: JobLayout) -> tuple[CurrentPictures, frozenset[ArtifactPath] | None, str]:
-    """The frames of the job as it is now, all such files, and what to say of the other frames.
-
-    A report tells all else also where nobody can say what is up to date: when a mesh of the job was moved away, or its
-    Blender is not on this machine.
-    """
+def _current(job: Job, layout: JobLayout) -> frozenset[ArtifactPath] | None:
+    """The files of the job as it is now; None where that cannot be told, as when a mesh of the job was moved away."""
     try:
-        current = assess_job(job, layout).current
-    except (MissingInputError, StageUnavailableError) as error:
-        return CurrentPictures({}, 0), None, f"Which frames are of the job as it is now cannot be told: {error}"
-    frames = current_pictures(job, layout, current)
-    left_out = f"{frames.earlier} frames are of an earlier version of the job, and not shown." if frames.earlier else ""
-    return frames, current, left_out
+        return assess_job(job, layout).current
+    except (MissingInputError, StageUnavailableError):
+        return None
+
+
+def _remark(frames: PictureSet) -> str:
+    """What to say of the frames on the sheet, and of those that are not on it."""
+    left_out = f"{frames.earlier} frames are of an earlier version of the job, and not shown" if frames.earlier else ""
+    return "; ".join(filter(None, [left_out, frames.remark]))
 
 
 def _sheet(layout: JobLayout, pictures: Sequence[Path], *, picture_width: int) -> bytes | None:
