@@ -218,8 +218,7 @@ class Dashboard:
 
     async def _own_form(self, request: Request) -> dict[str, str]:
         form = await form_of(request)
-        given = request.headers.get("x-form-token") or form.get("form_token", "")
-        if not self.access.is_form_token(request.scope["session"], given):
+        if not self.access.is_form_token(request.scope["session"], form.get("form_token", "")):
             raise HTTPException(403, "the dashboard was started anew; load the page again")
         return form
 
