@@ -14,7 +14,6 @@ class StagePace(NamedTuple):
     """How fast a stage's planned tasks are."""
 
     stage: str
-    ended_well: int
     mean_seconds: float | None  # of an attempt that ended well; None before there is one
     busy_s: float = 0.0  # how long attempts worked in a span of time [s]; one beside another counts twice
     busy_since: float | None = None  # when the first of these was at work in it [s since the epoch]
@@ -24,17 +23,11 @@ class TaskRow(NamedTuple):
     """A planned task with its last attempt, whose fields are None before there is one."""
 
     task: TaskId
-    stage: str
-    subject: str
-    frame: int | None
     state: TaskState
     attempt: int | None
-    started: float | None
     finished: float | None
-    outcome: str | None
     message: str | None
     seconds: float | None
-    host: str | None
 
 
 class TaskPage(NamedTuple):
@@ -58,7 +51,7 @@ class PageQueries(ABC):
             "WITH tried AS (SELECT stage, outcome = ?3 AS well, seconds,"
             "   max(started, ?1) AS began, min(coalesce(finished, ?2), ?2) AS ended"
             "   FROM attempt JOIN task ON task.id = attempt.task WHERE position IS NOT NULL)"
-            " SELECT stage, coalesce(sum(well), 0), avg(seconds) FILTER (WHERE well),"
+            " SELECT stage, avg(seconds) FILTER (WHERE well),"
             "   coalesce(sum(ended - began) FILTER (WHERE ended > began), 0.0), min(began) FILTER (WHERE ended > began)"
             " FROM tried GROUP BY stage",
             (since, until, "succeeded"),
@@ -116,11 +109,11 @@ class PageQueries(ABC):
         values = (stage, text, json.dumps([str(state) for state in states]))
         rows = self._rows(
             "WITH chosen AS MATERIALIZED ("
-            "   SELECT id, position, stage, subject, frame, state FROM task"
+            "   SELECT id, position, state FROM task"
             "   WHERE position IS NOT NULL AND (?1 IS NULL OR stage = ?1) AND instr(id, ?2)"
             "     AND (?3 = '[]' OR state IN (SELECT value FROM json_each(?3)))"
             "   ORDER BY position LIMIT ?4 OFFSET ?5)"
-            " SELECT id, stage, subject, frame, state, number, started, finished, outcome, message, seconds, host"
+            " SELECT id, state, number, finished, message, seconds"
             " FROM chosen LEFT JOIN attempt ON attempt.task = id"
             "   AND number = (SELECT max(number) FROM attempt AS later WHERE later.task = id)"
             " ORDER BY position",
@@ -131,7 +124,7 @@ class PageQueries(ABC):
             " AND (?3 = '[]' OR state IN (SELECT value FROM json_each(?3)))",
             values,
         )
-        return TaskPage([TaskRow._make(row)._replace(state=TaskState(row[4])) for row in rows], int(counted[0][0]))
+        return TaskPage([TaskRow._make(row)._replace(state=TaskState(row[1])) for row in rows], int(counted[0][0]))
 
     @abstractmethod
     def _rows(self, query: str, parameters: Sequence[object] = ()) -> list[tuple[Any, ...]]:

@@ -38,7 +38,6 @@ SETTLED_SHOWN = 24
 """So many finished jobs are listed before "show all"."""
 FOR_EVER = "private, max-age=31536000, immutable"
 FRAME_NUMBER = re.compile("[0-9]{1,9}")
-FILM_TYPES = {".mp4": "video/mp4", ".mov": "video/quicktime"}
 
 
 class Dashboard:
@@ -54,7 +53,7 @@ class Dashboard:
         self.pages = Pages()
         self._load = Kept(self.machine.load)
         self._thumbnails = Thumbnails()
-        self._limiter: anyio.CapacityLimiter | None = None
+        self._limiter = anyio.CapacityLimiter(THUMBNAILS_AT_ONCE)
         self._shown = str(farm)
         self.view.glance()
 
@@ -161,8 +160,6 @@ class Dashboard:
         name, size, number = (request.path_params[each] for each in ("name", "size", "frame"))
         if size not in WIDTHS or not FRAME_NUMBER.fullmatch(number):
             raise HTTPException(404)
-        if self._limiter is None:
-            self._limiter = anyio.CapacityLimiter(THUMBNAILS_AT_ONCE)
         answer = partial(self._frame, request, name, int(number), size)
         return await anyio.to_thread.run_sync(answer, limiter=self._limiter)
 
@@ -173,9 +170,8 @@ class Dashboard:
         if read_receipt(layout, artifact) is None:  # without one it may be half a frame
             raise NotThereError(f"frame {frame} of {name} is not there")
         path = self.places.file(name, artifact)
-        return _tagged(
-            request, self._thumbnails.tag(path, size), "image/webp", lambda: self._thumbnails.get(path, size).content
-        )
+        tag = self._thumbnails.tag(path, size)
+        return _tagged(request, tag, "image/webp", lambda: self._thumbnails.get(path, size))
 
     def film(self, request: Request) -> Response:
         """The film, or what there is of it, whole or in ranges."""
@@ -187,7 +183,6 @@ class Dashboard:
         saved = f"{name}{'' if film.finished else '-so-far'}{path.suffix}"
         return FileResponse(
             path,
-            media_type=FILM_TYPES[path.suffix],
             filename=saved,
             content_disposition_type="attachment" if "save" in request.query_params else "inline",
             headers={"cache-control": "private, no-cache"},
@@ -218,8 +213,7 @@ class Dashboard:
 
     async def _own_form(self, request: Request) -> dict[str, str]:
         form = await form_of(request)
-        given = request.headers.get("x-form-token") or form.get("form_token", "")
-        if not self.access.is_form_token(request.scope["session"], given):
+        if not self.access.is_form_token(request.scope["session"], form.get("form_token", "")):
             raise HTTPException(403, "the dashboard was started anew; load the page again")
         return form
 

@@ -55,11 +55,6 @@ class StageRow(NamedTuple):
     work_s: float | None  # one after the other, what is left [s]; None: not known yet
     remaining_s: float | None  # the same beside each other as they are now [s]; None: it does not run, or not known
 
-    @property
-    def waiting(self) -> int:
-        """Tasks that have not begun, and can."""
-        return self.total - self.done - self.running - self.failed - self.blocked
-
 
 class Remaining(NamedTuple):
     """How long a job will take yet [s]; at least so long where a stage has not shown how fast it is."""

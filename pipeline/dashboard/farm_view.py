@@ -270,9 +270,9 @@ class FarmView:
             return _Remembered(Version(None, None), runs, now, Record(), flaw)
         known = self._records.get(name)
         if known is not None and (known.version, known.runs) == (version, runs):
-            if runs and now - known.looked >= 5 * SETTLED_S:
-                pass  # what is left grows shorter though nothing is recorded
-            elif known.looked - version.changed_ns / 1e9 > SETTLED_S:
+            # Of a job that runs what is left grows shorter though nothing is recorded.
+            is_recent = not runs or now - known.looked < 5 * SETTLED_S
+            if is_recent and known.looked - version.changed_ns / 1e9 > SETTLED_S:
                 return known
         try:
             record, flaw = glance(layout.manifest, lambda manifest: read_record(manifest, runs=runs)), ""

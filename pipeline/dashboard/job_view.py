@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
+from pipeline.dashboard.estimates import DONE, LOST
 from pipeline.dashboard.farm_view import JobCard, Picture, picture_of
 from pipeline.dashboard.places import NotThereError, Places
 from pipeline.errors import ManifestError
@@ -30,13 +32,12 @@ MOST_PAGES = 1_000_000
 
 STATE_GROUPS: Mapping[str, tuple[TaskState, ...]] = {
     "running": (TaskState.RUNNING,),
-    "failed": (TaskState.FAILED, TaskState.UPSTREAM_FAILED),
+    "failed": LOST,
     "waiting": (TaskState.PENDING, TaskState.READY, TaskState.CANCELLED),
-    "done": (TaskState.SUCCEEDED, TaskState.UP_TO_DATE),
+    "done": DONE,
 }
 """What the list of tasks can be narrowed down to."""
 
-FILM_SUFFIXES = (".mp4", ".mov")
 USUAL_CODEC = "h264"
 """Of a job that names none; see `render.parameters.MovieParameters`."""
 
@@ -106,13 +107,13 @@ class Work(NamedTuple):
 
 
 class Story(NamedTuple):
-    """One task: its row, its attempts, last first, and the end of a log, with the size of all of it [bytes]."""
+    """One task: its row, its attempts, last first, and the end of a log, and whether that is not all of it."""
 
     row: TaskRow
     attempts: list[AttemptRow]
     shown: int
     log: str
-    log_bytes: int
+    is_cut: bool
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,7 @@ def _story(places: Places, card: JobCard, question: Question, found: _Found) -> 
             log, size = places.tail(card.name, shown.log, LOG_BYTES)
         except (NotThereError, OSError):
             log = ""  # cleaned away, or not begun
-    return Story(found.row, found.attempts, 0 if shown is None else shown.number, log, size)
+    return Story(found.row, found.attempts, 0 if shown is None else shown.number, log, size > LOG_BYTES)
 
 
 def _work(card: JobCard) -> list[Work]:
@@ -241,20 +242,15 @@ def _work(card: JobCard) -> list[Work]:
 
 def film_of(places: Places, card: JobCard) -> Film | None:
     """The finished film of a job that is done, else the newer one of a film and the film so far."""
-    try:
-        root = places.job(card.name)
-        names = [str(JobLayout.movie(suffix)) for suffix in FILM_SUFFIXES]
-        names += sorted(path.name for path in root.glob("[!.]*-so-far.mp4"))[:1]
-        films = []
-        for name in names:
-            if _is_file(places, card.name, name):
-                status = (root / name).stat()
-                finished = not name.endswith("-so-far.mp4")
-                # The film so far is H.264.
-                is_playable = not finished or (not name.endswith(".mov") and _codec(places, card.name) in PLAYABLE)
-                films.append(Film(name, status.st_mtime_ns, finished, status.st_size, is_playable))
-    except (OSError, NotThereError):
-        return None  # one goes in this moment, as at the end of a run
+    so_far = JobLayout(places.farm / card.name).film_so_far.name
+    films = []
+    for name in (*(str(JobLayout.movie(suffix)) for suffix in (".mp4", ".mov")), so_far):
+        with suppress(NotThereError, OSError):  # one goes in this moment, as at the end of a run
+            status = places.file(card.name, name).stat()
+            finished = name != so_far
+            # The film so far is H.264.
+            is_playable = not finished or (not name.endswith(".mov") and _codec(places, card.name) in PLAYABLE)
+            films.append(Film(name, status.st_mtime_ns, finished, status.st_size, is_playable))
     return max(films, key=lambda film: (card.state == "done" and film.finished, film.version), default=None)
 
 

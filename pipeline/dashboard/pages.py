@@ -67,8 +67,7 @@ class Pages:
         found = {}
         for name in names:
             html = self._environment.get_template(f"parts/{name}.html").render(**context)
-            # A digest that only tells versions apart.
-            found[name] = Part(Markup(html), hashlib.blake2b(html.encode(), digest_size=9).hexdigest())  # noqa: S704
+            found[name] = Part(Markup(html), _tag(html.encode()))  # noqa: S704
         return found
 
     def _static_url(self, name: str) -> str:
@@ -133,5 +132,10 @@ def _static_files() -> dict[str, Static]:
         media_type = MEDIA_TYPES.get(f".{item.name.rpartition('.')[2]}")
         if media_type is not None:
             content = item.read_bytes()
-            found[item.name] = Static(content, media_type, hashlib.blake2b(content, digest_size=9).hexdigest())
+            found[item.name] = Static(content, media_type, _tag(content))
     return found
+
+
+def _tag(content: bytes) -> str:
+    """A digest that only tells versions apart."""
+    return hashlib.blake2b(content, digest_size=9).hexdigest()

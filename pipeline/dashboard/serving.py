@@ -55,7 +55,7 @@ def listen(host: str, port: int) -> socket.socket:
     return listening
 
 
-def serve(application: ASGIApp, listening: socket.socket, ready: Callable[[], None] = lambda: None) -> None:
+def serve(application: ASGIApp, listening: socket.socket, ready: Callable[[], None]) -> None:
     """Answer requests until Ctrl-C or a signal TERM; returns then.
 
     Args:

@@ -6,7 +6,6 @@ import io
 import threading
 from collections import OrderedDict
 from pathlib import Path
-from typing import NamedTuple
 
 from pipeline.dashboard.places import NotThereError
 
@@ -18,18 +17,11 @@ MOST_PIXELS = 64 * 2**20
 """A larger picture is no frame of ours: 8K has 33 million pixels."""
 
 
-class Thumbnail(NamedTuple):
-    """A WebP picture, and its name among all versions of all frames."""
-
-    content: bytes
-    tag: str
-
-
 class Thumbnails:
     """Makes small versions, and keeps the ones that were last asked for. Safe to share between threads."""
 
     def __init__(self, kept_bytes: int = KEPT_BYTES) -> None:
-        self._kept: OrderedDict[tuple[Path, str, str], bytes] = OrderedDict()
+        self._kept: OrderedDict[tuple[Path, str], bytes] = OrderedDict()
         self._bytes = 0
         self._kept_bytes = kept_bytes
         self._lock = threading.Lock()
@@ -43,8 +35,8 @@ class Thumbnails:
             raise NotThereError("this frame is gone") from error
         return f"{status.st_mtime_ns:x}-{status.st_size:x}-{size}"
 
-    def get(self, path: Path, size: str) -> Thumbnail:
-        """The small version of a frame.
+    def get(self, path: Path, size: str) -> bytes:
+        """The small version of a frame, a WebP picture.
 
         Args:
             path: a committed picture.
@@ -53,12 +45,11 @@ class Thumbnails:
         Raises:
             NotThereError: it is gone, or no picture.
         """
-        tag = self.tag(path, size)
-        key = (path, size, tag)
+        key = (path, self.tag(path, size))
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
-                return Thumbnail(self._kept[key], tag)
+                return self._kept[key]
         content = _make(path, WIDTHS[size])
         with self._lock:
             if key not in self._kept:
@@ -67,7 +58,7 @@ class Thumbnails:
             while self._bytes > self._kept_bytes and len(self._kept) > 1:
                 _, dropped = self._kept.popitem(last=False)
                 self._bytes -= len(dropped)
-        return Thumbnail(content, tag)
+        return content
 
 
 def _make(path: Path, width: int) -> bytes:

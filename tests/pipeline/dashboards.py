@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 import numpy as np
-from farm_processes import Farm, wait_until
+from farm_processes import Farm
 from PIL import Image
 
 from pipeline.layout import JobLayout
@@ -44,6 +44,7 @@ class Client:
     def __init__(self, address: str) -> None:
         self.place = urlsplit(address).netloc
         self.cookie = ""
+        self._form_token = ""
 
     def ask(self, path: str, *, method: str = "GET", body: str | None = None, **headers: str | None) -> Answer:
         """A header of None is left out; "_" stands for "-"."""
@@ -67,17 +68,18 @@ class Client:
         return found
 
     def form_token(self) -> str:
-        found = re.search(r'name="form-token" content="([0-9a-f]+)"', self.ask("/").text)
-        assert found is not None
-        return found[1]
+        """What forms of this session have, from the first page on that has one."""
+        if not self._form_token:
+            found = re.search(r'name="form_token" value="([0-9a-f]+)"', self.ask("/").text)
+            assert found is not None
+            self._form_token = found[1]
+        return self._form_token
 
-    def post(self, path: str, **headers: str | None) -> Answer:
-        """Press a button, as a page does; headers take the place of its own."""
-        value = headers.pop("value", "") or ""
+    def post(self, path: str, *, value: str = "", token: str | None = None, **headers: str | None) -> Answer:
+        """Press a button, as a page does; a token and headers take the place of its own."""
+        form = {"value": value, "form_token": self.form_token() if token is None else token}
         usual = {"Origin": f"http://{self.place}", "Accept": "application/json"}
-        if "X_Form_Token" not in headers:
-            usual["X_Form_Token"] = self.form_token()
-        return self.ask(path, method="POST", body=urlencode({"value": value}), **(usual | headers))
+        return self.ask(path, method="POST", body=urlencode(form), **(usual | headers))
 
 
 @contextmanager
@@ -143,6 +145,3 @@ def draw_frame(layout: JobLayout, manifest: Manifest, task: Task, *, size: tuple
     manifest.record_artifact(receipt)
     manifest.finish_attempt(task.id, number, seconds=1.0, state=TaskState.SUCCEEDED)
     return path
-
-
-__all__ = ["Answer", "Client", "dashboard", "draw_frame", "frame_job", "wait_until"]

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from dashboards import Client, dashboard, draw_frame, frame_job, wait_until
-from farm_processes import Farm
+from dashboards import Client, dashboard, draw_frame, frame_job
+from farm_processes import Farm, wait_until
 from PIL import Image
 
 from pipeline.cli import main
@@ -66,7 +66,7 @@ def test_every_job_is_shown_with_its_state_tasks_reasons_and_logs(farm: Farm) ->
     with dashboard(farm) as (client, _):
         listed = client.ask("/").text
         for name, state in (("good", "done"), ("bad", "failed"), ("late", "queued")):
-            article = listed.partition(f'data-job="{name}"')[2].partition("</article>")[0]
+            article = listed.partition(f'data-key="{name}"')[2].partition("</article>")[0]
             assert f'class="pill is-{state}"' in article, article
         assert "nobody runs the queue" in listed
         assert "7 of 8 tasks" not in listed  # of the bad one six steps and frames are done, and not its film
@@ -160,7 +160,7 @@ def test_the_film_so_far_then_the_film_in_ranges(farm: Farm) -> None:
     frame_job(layout, 2)
     with dashboard(farm) as (client, _):
         assert client.ask("/jobs/film/film").status == 404
-        (layout.root / "film-so-far.mp4").write_bytes(bytes(range(100)))
+        (layout.root / "movie-so-far.mp4").write_bytes(bytes(range(100)))
         assert "The film so far" in page_of(client, "film")
         part = client.ask("/jobs/film/film", Range="bytes=10-19")
         assert (part.status, part.body) == (206, bytes(range(10, 20)))
@@ -285,17 +285,17 @@ def test_actions_need_their_own_page_and_a_post(farm: Farm) -> None:
             {"Origin": f"https://{client.place}"},
             {"Sec_Fetch_Site": "cross-site"},
             {"Sec_Fetch_Site": "same-site"},
-            {"X_Form_Token": None},
-            {"X_Form_Token": "0" * 64},
-            {"Cookie": None, "X_Form_Token": token},
-            {"Cookie": f"{client.cookie}0", "X_Form_Token": token},
+            {"token": ""},
+            {"token": "0" * 64},
+            {"Cookie": None, "token": token},
+            {"Cookie": f"{client.cookie}0", "token": token},
         ):
             assert client.post("/jobs/a/cancel", **headers).status == 403, headers
         other = Client(f"http://{client.place}")
         other.ask("/")
-        assert other.post("/jobs/a/cancel", X_Form_Token=token).status == 403  # of another session
+        assert other.post("/jobs/a/cancel", token=token).status == 403  # of another session
         for method in ("GET", "HEAD", "PUT", "DELETE"):
-            assert client.ask("/jobs/a/cancel", method=method, X_Form_Token=token).status in (404, 405), method
+            assert client.ask("/jobs/a/cancel", method=method, body=f"form_token={token}").status in (404, 405), method
         assert client.ask("/work").status == 405
         assert farm.spool.find("a") is not None
         assert client.post("/jobs/a/cancel").status == 200
@@ -343,7 +343,7 @@ def test_nothing_outside_of_the_farm_is_served(farm: Farm) -> None:
     shutil.copytree(layout.root, farm.folder / "elsewhere" / "film", symlinks=True)
     (farm.spool.farm / "linked").symlink_to(farm.folder / "elsewhere" / "film")
     (farm.spool.farm / "round").symlink_to("round")
-    os.mkfifo(layout.root / "film-so-far.mp4")
+    os.mkfifo(layout.root / "movie-so-far.mp4")
     with dashboard(farm) as (client, _):
         assert client.ask("/jobs/film/frames/1/small").status == 200
         for path in (
@@ -496,8 +496,8 @@ def test_records_that_cannot_be_read_are_told_and_the_page_lives(farm: Farm) -> 
 def test_names_that_are_not_utf_8_are_shown_and_take_no_page_down(farm: Farm) -> None:
     folder = os.fsdecode(b"r\xe9nders")
     frame_job(farm.layout("good"), 1)
+    queued_job(farm, "waiting")  # has forms
     shutil.copytree(farm.layout("good").root, farm.spool.farm / os.fsdecode(b"caf\xe9"))
-    (farm.spool.folder / "queue").mkdir(parents=True)
     (farm.spool.folder / "queue" / "odd.json").write_text("{")
     farm.spool.farm.rename(farm.folder / folder)
     with dashboard(farm, folder=folder) as (client, _):
@@ -516,16 +516,16 @@ def test_names_that_are_not_utf_8_are_shown_and_take_no_page_down(farm: Farm) ->
 def test_a_form_that_is_cut_off_asks_for_nothing_and_is_no_fault(farm: Farm) -> None:
     queued_job(farm, "a")
     with dashboard(farm) as (client, process):
+        token = client.form_token()
         head = {
             "Host": client.place,
             "Origin": f"http://{client.place}",
-            "X-Form-Token": client.form_token(),
             "Cookie": client.cookie,
             "Content-Length": "100",
         }
         lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
         with socket.create_connection(client.place.split(":")) as cut:
-            cut.sendall(f"POST /jobs/a/cancel HTTP/1.1\r\n{lines}\r\nvalue=".encode())
+            cut.sendall(f"POST /jobs/a/cancel HTTP/1.1\r\n{lines}\r\nform_token={token}&value=".encode())
             time.sleep(0.2)  # so that it is waited for when it is cut off; without it, it is seen as cut off at once
         assert client.ask("/").status == 200
         assert farm.spool.find("a") is not None

@@ -159,6 +159,7 @@ def test_it_fits_a_phone(farm: Farm, scheme: str) -> None:
             page.goto(f"http://{client.place}{path}")
             page.wait_for_load_state("networkidle")
             assert page.evaluate("document.documentElement.scrollWidth") == 390, path
+        assert page.evaluate("getComputedStyle(document.querySelector('.runner.off')).opacity") == "1"
         small = page.evaluate(
             "[...document.querySelectorAll('button')].filter(b => b.offsetParent && b.offsetHeight < 40).length"
         )
