@@ -27,7 +27,7 @@ from pipeline.cache import read_frame
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
-from pipeline.stages.render import framed_points, render_spec, write_motion
+from pipeline.stages.render_scene import framed_points, render_spec, write_motion
 from render.blender import open_renderer
 from render.camera_path import View
 from render.parameters import CameraParameters, SurfaceParameters
