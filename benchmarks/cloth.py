@@ -178,7 +178,7 @@ def measure_blender(nodes: int, arguments: argparse.Namespace) -> dict[str, Any]
     """Blender's cloth, in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.cloth_blender", str(nodes), str(arguments.frames)]
     child = subprocess.run(command, capture_output=True, text=True, check=True)
-    answer = json.loads(child.stdout.splitlines()[-1])
+    answer = json.loads(child.stdout)
     positions, triangles = np.array(answer.pop("positions")), np.array(answer.pop("triangles"))
     seconds, processor_seconds = answer.pop("seconds"), answer.pop("processor_seconds")
     return {

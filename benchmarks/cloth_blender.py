@@ -1,4 +1,4 @@
-"""Blender's own cloth in the drop of `benchmarks.cloth`; JSON in the last line of the standard output.
+"""Blender's own cloth in the drop of `benchmarks.cloth`; prints JSON.
 
     python -m benchmarks.cloth_blender NODES FRAMES
 
@@ -16,11 +16,13 @@ import bpy
 import numpy as np
 
 from benchmarks.cloth import BALL_HEIGHT, BALL_RADIUS, FLOOR, FRAMES_PER_SECOND, HEIGHT, SIDE, THICKNESS_IN_SPACINGS
+from benchmarks.json_output import keep_output_for_json
 from sim.cloth.parameters import RectangleSheet
 from sim.cloth.sheet import rectangle
 
 
 def main() -> None:
+    keep_output_for_json()
     nodes, frames = int(sys.argv[1]), int(sys.argv[2])
     bpy.ops.wm.read_factory_settings(use_empty=True)
     stage = bpy.context.scene
@@ -58,7 +60,7 @@ def main() -> None:
         "positions": positions.reshape(-1, 3).tolist(),
         "triangles": sheet.triangles.tolist(),
     }
-    sys.stdout.write("\n" + json.dumps(answer) + "\n")
+    json.dump(answer, sys.stdout)
 
 
 def add_obstacles() -> None:

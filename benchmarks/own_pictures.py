@@ -9,12 +9,13 @@ much the largest resident memory grew over the same without any: outdoors, and u
 from __future__ import annotations
 
 import argparse
-import resource
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+from benchmarks.json_output import keep_output_for_json
+from pipeline.executors.memory import peak_memory_bytes
 from render.blender import open_renderer
 from render.camera_path import CameraPath
 from render.meshes import write_ply
@@ -95,7 +96,7 @@ def peak_bytes(folder: Path, what: str) -> int:
     for frame in range(2):
         renderer.render(frame, folder / f"{what}.png")
     renderer.close()
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return peak_memory_bytes()
 
 
 def main() -> None:
@@ -108,7 +109,8 @@ def main() -> None:
         if what == "files":
             write_files(folder)
         else:
-            print("PEAK", peak_bytes(folder, what))
+            keep_output_for_json()
+            print(peak_bytes(folder, what))
         return
 
     def child(folder: str, what: str) -> str:
@@ -120,8 +122,7 @@ def main() -> None:
         for kinds in (SKIES, TEXTURES):
             without = 0
             for what, pixels in kinds.items():
-                (line,) = (each for each in child(folder, what).splitlines() if each.startswith("PEAK "))
-                peak = int(line.split()[1])
+                peak = int(child(folder, what))
                 without = without or peak
                 each = f", {(peak - without) / pixels:.1f} bytes a pixel" if pixels else ""
                 print(

@@ -18,6 +18,7 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+from benchmarks.json_output import keep_output_for_json
 from render.blender import open_renderer
 from render.spec import RenderSpec
 
@@ -52,6 +53,7 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=1)
     arguments = parser.parse_args()
+    keep_output_for_json()
     results: dict[str, dict[str, dict[str, float]]] = {}
     for folder in arguments.folders:
         for preset in arguments.presets:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.json_output import keep_output_for_json
 from render.blender import open_renderer
 from render.camera_path import CameraPath
 from render.meshes import write_ply
@@ -165,6 +166,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--triangles", type=int, default=60_000)
     options = parser.parse_args()
+    keep_output_for_json()
     with tempfile.TemporaryDirectory() as name:
         folder, frames = Path(name), list(range(options.frames + 1))
         renderer = open_renderer(write_scene(folder, frames, options), threads=options.threads, blender=None)

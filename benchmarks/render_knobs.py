@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from benchmarks.json_output import keep_output_for_json
 from render.blender import open_renderer
 
 
@@ -84,6 +85,7 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
+    keep_output_for_json()
     results = measure(arguments.folder, frame=arguments.frame, threads=arguments.threads, rounds=arguments.rounds)
     json.dump({"benchmark": "render_knobs", "frame": arguments.frame, "results": results}, sys.stdout, indent=1)
     print()

@@ -4,9 +4,9 @@
 
 Of the job's folder only the cached frame and the meshes of its bodies are read; smoke, cloth and whitewater are left
 out, and nothing is blurred. Writes `surface-looks.webp`, a strip of close-ups with the settings' names, and prints
-JSON and a Markdown table: processor seconds (median of three, one thread), the memory that meshing adds, triangles,
-volume against that of the particles, bumps of the particles' size on the body of the water (`surface_measures`), and
-how many parts are droplets and how wide their median is.
+JSON and, to the standard error, a Markdown table: processor seconds (median of three, one thread), the memory that
+meshing adds, triangles, volume against that of the particles, bumps of the particles' size on the body of the water
+(`surface_measures`), and how many parts are droplets and how wide their median is.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from benchmarks.json_output import keep_output_for_json
 from pipeline.cache import read_frame
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
-from pipeline.stages.render import framed_points, render_spec, write_motion
+from pipeline.stages.render_scene import framed_points, render_spec, write_motion
 from render.blender import open_renderer
 from render.camera_path import View
 from render.parameters import CameraParameters, SurfaceParameters
@@ -156,6 +157,7 @@ def main() -> None:
     parser.add_argument("--quality", default="draft", choices=("draft", "preview", "final"))
     parser.add_argument("--keep", type=Path, help="folder for the single pictures, as PNG")
     options = parser.parse_args()
+    keep_output_for_json()
 
     layout = JobLayout(options.folder)
     job = load_job(layout.job_file)
@@ -174,6 +176,7 @@ def main() -> None:
             radius=body.number("particle_radius"),
         )
         studio = Studio(folder, job, fluid, options)
+        print("\n".join(HEAD), file=sys.stderr, flush=True)
         for number, setting in enumerate(settings):
             results[setting.name] = measure(particles, studio.surface, setting)
             studio.draw(pictures / f"{number:02d}.png")
@@ -192,7 +195,6 @@ def main() -> None:
         "settings": {setting.name: {"options": setting.options, **results[setting.name]} for setting in settings},
     }
     print(json.dumps(document, indent=1))
-    print("\n".join([*HEAD, *(row(setting.name, results[setting.name]) for setting in settings)]))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m benchmarks.surface_measures particles.npz surface.ply '{"cube_size": 0.5, "droplet_size": 1}'
 
 What `benchmarks.surface_looks` runs for each of its settings: only the peak of a process that does nothing else is the
-memory of one meshing. Prints JSON. Reads /proc, so it needs Linux.
+memory of one meshing. Prints JSON.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeline.executors.memory import peak_memory_bytes
 from render.droplets import connected_parts
 from render.meshes import SurfaceMesh, write_ply
 from render.parameters import SurfaceParameters
@@ -56,12 +57,6 @@ def bumps_deg(mesh: SurfaceMesh, positions: NDArray[np.float32], radius: float) 
     return float(np.median(angles))
 
 
-def peak_memory_mb() -> float:
-    """Most memory that this program held so far; `getrusage` would tell its parent's where that held more."""
-    status = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) for line in status if line.startswith("VmHWM:")) / 1024
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("particles", type=Path, help="positions, velocities and radius, as .npz")
@@ -77,7 +72,7 @@ def main() -> None:
     # The first surface sizes splashsurf's thread pool and loads what is used; one particle counts little.
     reconstruct_surface(positions[:1], velocities[:1], particle_radius=radius, parameters=usual)
 
-    before = peak_memory_mb()
+    before = peak_memory_bytes()
     walls, processors = [], []
     for _ in range(arguments.repeats):
         wall, processor = time.perf_counter(), time.process_time()
@@ -86,7 +81,7 @@ def main() -> None:
         )
         walls.append(time.perf_counter() - wall)
         processors.append(time.process_time() - processor)
-    peak = peak_memory_mb()
+    peak = peak_memory_bytes()
 
     write_ply(arguments.output, mesh.vertices, mesh.faces, normals=mesh.normals, velocities=mesh.velocities)
     parts = connected_parts(mesh)[1] / (2 * radius) ** 3
@@ -97,7 +92,7 @@ def main() -> None:
             {
                 "wall_s": round(statistics.median(walls), 3),
                 "cpu_s": round(statistics.median(processors), 3),
-                "memory_mb": round(peak - before, 1),
+                "memory_mb": round((peak - before) / 2**20, 1),
                 "triangles": len(mesh.faces),
                 "volume_error": round(float(parts.sum()) / len(positions) - 1, 4),
                 "bumps_deg": None if bumps is None else round(bumps, 2),

@@ -10,7 +10,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import replacing
 from pipeline.job.loading import LoadedJob
 from pipeline.layout import JobLayout
-from pipeline.stages.render import framed_points, render_spec, write_motion
+from pipeline.stages.render_scene import framed_points, render_spec, write_motion
 from pipeline.stills import Survey, scratch_folder, survey
 from pipeline.task import Task
 from render.parameters import MovieParameters

@@ -13,7 +13,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -23,7 +22,7 @@ from types import TracebackType
 from typing import Self
 
 from pipeline.executors.base import Committed
-from pipeline.executors.worker_process import THREAD_VARIABLES
+from pipeline.executors.worker_process import THREAD_VARIABLES, python_argv
 from pipeline.film_so_far_child import Request
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
@@ -38,10 +37,6 @@ SHORTEST_PAUSE_S = 10.0
 """Before the first film, and between two [s]; a job that takes less needs none."""
 _LAST_WAIT_S = 10.0
 """How long the end of a run waits for the child that it has killed [s]: on a disk that is gone it may not end."""
-
-_BOOT = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from pipeline.film_so_far_child import main; main()"
-)
 
 
 class FilmSoFar:
@@ -184,12 +179,11 @@ class FilmSoFar:
         )
         request_file = scratch / "request.json"
         request_file.write_text(json.dumps(asdict(request)), encoding="utf-8")
-        search_path = json.dumps([str(Path(entry).absolute()) for entry in sys.path])
         with self._changed:
             if self._ended:
                 raise _ChildError("the run is over")
             self._child = subprocess.Popen(
-                [sys.executable, "-c", _BOOT, str(request_file), search_path],
+                python_argv("pipeline.film_so_far_child", str(request_file)),
                 stdin=subprocess.PIPE,  # it ends when the other end of this is gone, and with it this process
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,

@@ -40,7 +40,6 @@ _VISIBILITY = (
 _DEVICE_FILES = ("nvidia*", "dri/renderD*", "kfd", "dxg")
 """Through which programs reach GPUs on Linux: NVIDIA's, Intel's and AMD's, AMD's for computing, those of WSL."""
 
-
 TROUBLE_KEPT_S = 3600.0
 """How long an answer that was cut short is kept [s]: a driver that hangs costs two minutes each time it is asked."""
 
@@ -134,10 +133,8 @@ def _answer(blender: str | None, key: str) -> Probe:
     probe = find_gpus(blender)
     answer = {"key": key, "asked_at": time.time(), **asdict(probe)}
     # A cache folder that cannot be written costs the next process another look, nothing else.
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as part:
-            part.write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    with suppress(OSError), replacing(path) as part:
+        part.write_text(json.dumps(answer, indent=1), encoding="utf-8")
     return probe
 
 

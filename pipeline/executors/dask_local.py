@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count, islice
 
 import dask
 from distributed import Nanny, Scheduler
@@ -63,10 +64,8 @@ def local_cluster(shares: list[Resources]) -> Iterator[str]:
 def gpu_places(shares: list[Resources]) -> list[list[int]]:
     """Which of the machine's GPUs each share has, so that no two have the same."""
     own = own_gpus()
-    if own is None:
-        own = tuple(range(sum(share.gpus for share in shares)))
-    ends = [sum(each.gpus for each in shares[: index + 1]) for index in range(len(shares))]
-    return [[*own[end - share.gpus : end]] for share, end in zip(shares, ends, strict=True)]
+    left: Iterator[int] = count() if own is None else iter(own)
+    return [[*islice(left, share.gpus)] for share in shares]
 
 
 def _worker_options(share: Resources, places: list[int]) -> dict[str, object]:

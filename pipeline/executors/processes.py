@@ -261,13 +261,12 @@ class ProcessExecutor(ShutDownOnExit):
                 deadlines.append(worker.kill_at)
             elif worker.assignment is not None:
                 deadlines.append(worker.last_sign + self._stall_s(worker, worker.assignment))
-                if worker.limited_since is not None:
-                    deadlines.append(worker.limited_since + (worker.assignment.timeout_s or inf))
+                deadlines.append(worker.limited_since + (worker.assignment.timeout_s or inf))
         return min(deadlines, default=inf) - now
 
     def _stall_s(self, worker: WorkerProcess, assignment: Assignment) -> float:
         """How long it may be silent now [s]."""
-        if worker.limited_since is None:
+        if worker.limited_since == inf:
             return PREPARATION_S
         return assignment.stall_s or self._limits.stall_timeout_s
 
@@ -279,11 +278,10 @@ class ProcessExecutor(ShutDownOnExit):
             return
         if worker.assignment is None:
             return
-        stall_s = self._stall_s(worker, worker.assignment)
-        timeout_s = None if worker.limited_since is None else worker.assignment.timeout_s
+        stall_s, timeout_s = self._stall_s(worker, worker.assignment), worker.assignment.timeout_s or inf
         if now - worker.last_sign >= stall_s:
             kind, sentence = FailureKind.STALLED, f"no sign of life for {stall_s:g} s; the log shows where it hung"
-        elif timeout_s is not None and now - (worker.limited_since or now) >= timeout_s:
+        elif now - worker.limited_since >= timeout_s:
             kind, sentence = FailureKind.TIMED_OUT, f"not done after {timeout_s:g} s; the log shows where it was"
         else:
             return

@@ -11,6 +11,7 @@ import sys
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import psutil
@@ -21,7 +22,6 @@ from pipeline.executors.memory import out_of_memory_kills, process_tree, tree_me
 from pipeline.task import FailureKind
 from pipeline.worker import STACK_DUMP_SIGNAL
 
-_BOOT = "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from pipeline.worker import main; main()"
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 _LOG_TAIL_LINES = 20
 WorkerKey = tuple[str, int, int | None]
@@ -42,7 +42,7 @@ class WorkerProcess:
         resident_memory_bytes: how large it was when its last task ended.
         tasks_done: how many tasks it has ended.
         began: when its assignment was given to it, monotonic [s].
-        limited_since: since when the assignment's limit of time counts, monotonic [s]; None: not yet, it prepares.
+        limited_since: since when the assignment's limit of time counts, monotonic [s]; inf: not yet, it prepares.
         last_sign: when it last said anything, monotonic [s].
         peak_memory_bytes: most that it and all it started were seen to hold together during its assignment.
         kill_at: when its process group is killed, monotonic [s], or None.
@@ -56,8 +56,7 @@ class WorkerProcess:
         self.single_use = False
         self.resident_memory_bytes = 0
         self.tasks_done = 0
-        self.began = self.last_sign = time.monotonic()
-        self.limited_since: float | None = self.began
+        self.began = self.last_sign = self.limited_since = time.monotonic()
         self.peak_memory_bytes = 0
         self.kill_at: float | None = None
         self.verdict: tuple[FailureKind, str] | None = None
@@ -83,8 +82,8 @@ class WorkerProcess:
     def note_progress(self, progress: Progress) -> None:
         """What it prepares once for this machine takes what it takes; its limit of time counts anew from the end."""
         if progress.preparing:
-            self.limited_since = None
-        elif self.limited_since is None:
+            self.limited_since = inf
+        elif self.limited_since == inf:
             self.limited_since = time.monotonic()
 
     def end_assignment(self, *, failed: bool) -> None:
@@ -178,6 +177,12 @@ def log_tail(log: Path) -> str:
     return "\n".join(text.splitlines()[-_LOG_TAIL_LINES:])
 
 
+def python_argv(module: str, *words: str) -> list[str]:
+    """Arguments that run a module's `main` in a fresh interpreter, which finds modules where this one does."""
+    boot = f"import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from {module} import main; main()"
+    return [sys.executable, "-c", boot, *words, json.dumps([str(Path(entry).absolute()) for entry in sys.path])]
+
+
 def _describe_process(pid: int) -> str:
     try:
         process = psutil.Process(pid)
@@ -195,11 +200,10 @@ def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel]:
     """Start a fresh interpreter; what it prints before its first task goes into that task's log."""
     first.log.parent.mkdir(parents=True, exist_ok=True)
     ours, theirs = socket.socketpair()
-    search_path = json.dumps([str(Path(entry).absolute()) for entry in sys.path])
     with ExitStack() as on_failure, theirs, first.log.open("ab") as log:
         on_failure.enter_context(ours)
         process = subprocess.Popen(
-            [sys.executable, "-c", _BOOT, str(theirs.fileno()), str(os.getpid()), search_path],
+            python_argv("pipeline.worker", str(theirs.fileno()), str(os.getpid())),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from blake3 import blake3
 
-from pipeline.errors import MissingInputError
+from pipeline.errors import MissingInputError, StageUnavailableError
 from sim.cloth.parameters import ClothParameters, RectangleSheet
 from sim.scene import SceneParameters
 from sim.shapes.parameters import MeshShape, Placement
@@ -34,6 +34,23 @@ def tool_version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return ABSENT
+
+
+@cache
+def blender_version(executable: str | None) -> str:
+    """Version of the Blender that draws; wherever it lies, the same version gives the same frames.
+
+    Raises:
+        StageUnavailableError: the executable is not there, or not a Blender that can be used.
+    """
+    from render.blender import BlenderUnavailableError, require_supported_executable
+
+    if executable is None:
+        return tool_version("bpy")
+    try:
+        return ".".join(map(str, require_supported_executable(executable)))
+    except BlenderUnavailableError as error:
+        raise StageUnavailableError(f"render: {error}") from error
 
 
 def by_content(placement: P) -> P:

@@ -13,7 +13,7 @@ from pipeline.cache import FrameNumbers, read_frame, read_numbers, read_smoke_de
 from pipeline.errors import InvalidArtifactError
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
-from pipeline.stages.render import camera_path, framed_points
+from pipeline.stages.render_scene import camera_path, framed_points
 from pipeline.view.committed import CommittedFrames
 from render.camera_path import View
 from render.errors import InvalidFileError

@@ -307,7 +307,7 @@ class ViewPage:
     # --- where it is seen from ---
 
     def _first_view(self) -> View:
-        from pipeline.stages.render import camera_path
+        from pipeline.stages.render_scene import camera_path
 
         return camera_path(self._job).first()
 

@@ -14,7 +14,7 @@ from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
 from pipeline.stages import STAGES
 from pipeline.stages.bounds import read_framed
-from pipeline.stages.render import camera_path
+from pipeline.stages.render_scene import camera_path
 from render.bounds import box_of, read_bounds
 from render.meshes import write_ply
 from sim.snapshots import Snapshot

@@ -20,7 +20,7 @@ from pipeline.plan import plan_job
 from pipeline.stages import STAGES
 from pipeline.stages.cloth import ClothStage
 from pipeline.stages.inputs import estimated_cloth_nodes, estimated_nodes
-from pipeline.stages.render import render_spec
+from pipeline.stages.render_scene import render_spec
 from render.meshes import read_ply
 from sim.cloth.sheet import build_sheet
 from sim.snapshots import Snapshot

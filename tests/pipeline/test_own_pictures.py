@@ -15,7 +15,8 @@ from radiance_pictures import write_hdr
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.own_pictures import LIGHT_MAP_BYTES, bytes_of_textures, own_picture_bytes
-from pipeline.stages.render import BYTES_PER_PIXEL, WORKER_BYTES, RenderStage, render_spec
+from pipeline.stages.render import BYTES_PER_PIXEL, WORKER_BYTES, RenderStage
+from pipeline.stages.render_scene import render_spec
 from render.blend_file import Texture, read_textures
 from render.environment import environment_pixels, read_environment_size
 

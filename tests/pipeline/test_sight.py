@@ -14,7 +14,8 @@ from pipeline.layout import JobLayout
 from pipeline.plan import Assessment, Verdict
 from pipeline.progress import ProgressObserver
 from pipeline.run_events import RunStarted
-from pipeline.stages.render import RenderStage, camera_path
+from pipeline.stages.render import RenderStage
+from pipeline.stages.render_scene import camera_path
 from pipeline.stages.sight import CAMERA_INSIDE, NOTHING_SEEN, bodies_at, warn_of_sight
 from render.meshes import write_ply
 

@@ -5,7 +5,7 @@ from checked_jobs import checked
 
 from pipeline.job.loading import read_job
 from pipeline.layout import JobLayout
-from pipeline.stages.render import render_spec
+from pipeline.stages.render_scene import render_spec
 from render.spec import VolumeSequenceObject
 
 PLUME = """

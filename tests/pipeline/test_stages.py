@@ -20,7 +20,7 @@ from pipeline.scheduler_events import Start
 from pipeline.stages import STAGES
 from pipeline.stages.inputs import tool_version
 from pipeline.stages.movie import MovieStage
-from pipeline.stages.render import render_spec
+from pipeline.stages.render_scene import render_spec
 from pipeline.task import Resources
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement

@@ -20,7 +20,7 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
 from pipeline.stages import STAGES
-from pipeline.stages.render import render_spec
+from pipeline.stages.render_scene import render_spec
 from pipeline.stages.whitewater import CORES
 from render.point_clouds import read_point_cloud, validate_point_cloud
 from sim.snapshots import Snapshot

@@ -16,7 +16,7 @@ from pipeline.executors.base import Finished
 from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
-from pipeline.stages import render as render_stage
+from pipeline.stages import render_drawing
 from pipeline.task import Task
 from render.parameters import MaterialParameters
 from render.spec import MovingMeshObject
@@ -92,6 +92,6 @@ def draw_frame(task: Task, layout: JobLayout, frame: int, snapshots: Mapping[str
     cache.parent.mkdir()
     write_frame(cache, snapshots, FrameReport(frame, frame / 60, {}, {}, {}), device="cpu")
     ended = run_task(task, layout)
-    render_stage._close_renderers()
+    render_drawing.close_renderers()
     assert isinstance(ended, Finished), ended
     layout.path(layout.picture(frame)).rename(picture)

@@ -29,7 +29,7 @@ from needed_blender import needs_bpy
 from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
-from pipeline.stages import render as render_stage
+from pipeline.stages import render_drawing
 from pipeline.stages.render import RenderStage
 from pipeline.task import FailureKind
 from render.blender import (
@@ -206,14 +206,14 @@ def test_an_executable_killed_between_frames_or_while_it_draws_costs_an_attempt(
         renderer._process.wait()
 
     assert isinstance(attempt(0, 1), Finished)
-    (renderer,) = render_stage._WARM.values()
+    (renderer,) = render_drawing._WARM.values()
     kill_blender(renderer)
     lost = attempt(1, 1)
     assert isinstance(lost, Failed)
     assert lost.kind is FailureKind.WORKER_LOST
     assert isinstance(attempt(1, 2), Finished)
 
-    (renderer,) = render_stage._WARM.values()
+    (renderer,) = render_drawing._WARM.values()
     os.kill(renderer._process.pid, signal.SIGSTOP)  # it has been asked for the frame, and has not drawn it
     killer = threading.Timer(0.5, kill_blender, (renderer,))
     killer.start()
@@ -222,7 +222,7 @@ def test_an_executable_killed_between_frames_or_while_it_draws_costs_an_attempt(
     assert isinstance(lost, Failed)
     assert lost.kind is FailureKind.WORKER_LOST
     assert isinstance(attempt(2, 2), Finished)
-    render_stage._close_renderers()
+    render_drawing.close_renderers()
 
 
 def test_missing_spec_is_refused_by_the_executable(tmp_path, blender_stand_in):

@@ -17,7 +17,7 @@ from PIL import Image
 from pipeline.cache import write_frame
 from pipeline.executors.base import Failed, Finished
 from pipeline.job.loading import load_job
-from pipeline.stages import render as render_stage
+from pipeline.stages import render_drawing
 from pipeline.stages.render import RenderStage
 from render.camera_path import View, write_views
 from render.errors import InvalidFileError
@@ -99,7 +99,7 @@ def draw_with_faults(folder: Path, faults: int):
     ball = Snapshot("rigid", pose()["ball"], {})
     write_frame(cache, {"ball": ball}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu")
     ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
-    render_stage._close_renderers()
+    render_drawing.close_renderers()
     return ended, layout
 
 
@@ -187,5 +187,5 @@ def test_a_frame_that_the_ball_is_not_in_is_no_fault_without_a_background(tmp_pa
         cache, {"ball": Snapshot("rigid", pose()["ball"], {})}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu"
     )
     ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
-    render_stage._close_renderers()
+    render_drawing.close_renderers()
     assert isinstance(ended, Finished), ended

@@ -11,7 +11,7 @@ from needed_blender import needs_bpy
 from PIL import Image
 
 from pipeline.layout import JobLayout
-from pipeline.stages import render as render_stage
+from pipeline.stages import render_drawing
 from render.pictures import validate_exr, validate_picture
 
 
@@ -34,7 +34,7 @@ def test_a_still_is_drawn_beside_the_jobs_frames_and_touches_nothing_else(job):
     result = pipeline(
         "still", job.root, "--frame", 1, "--quality", "preview", "--resolution", 48, 32, "--set", "render.samples=2"
     )
-    render_stage._close_renderers()
+    render_drawing.close_renderers()
     assert result.exit_code == 0, result.output
     (drawn,) = job.stills.iterdir()
     assert result.stdout == f"{drawn}\n"
@@ -52,7 +52,7 @@ def test_a_still_goes_where_it_is_wanted_and_replaces_what_is_there(job, tmp_pat
     target.write_bytes(b"an older poster")
     arguments = ("--set", "render.samples=1", "--set", "stage.color=[0.5, 0.1, 0.1]", "-o", target)
     result = pipeline("still", job.root, "--frame", 0, "--quality", "draft", *arguments)
-    render_stage._close_renderers()
+    render_drawing.close_renderers()
     assert result.exit_code == 0, result.output
     with Image.open(target) as picture:
         assert picture.size == (64, 36)
@@ -64,7 +64,7 @@ def test_a_still_goes_where_it_is_wanted_and_replaces_what_is_there(job, tmp_pat
 def test_a_still_with_a_master_has_both_files(job, tmp_path):
     arguments = ("--set", 'render.format="exr"', "--set", "render.samples=1", "-o", tmp_path / "poster.png")
     result = pipeline("still", job.root, "--frame", 0, "--quality", "draft", *arguments)
-    render_stage._close_renderers()
+    render_drawing.close_renderers()
     assert result.exit_code == 0, result.output
     validate_exr(tmp_path / "poster.exr", (64, 36))
     validate_picture(tmp_path / "poster.png", (64, 36))
@@ -81,7 +81,7 @@ def test_vectors_of_a_rigid_body_and_of_a_camera_reach_to_the_next_frame(job, tm
         overrides = [word for key in (*keys, *more) for word in ("--set", key)]
         target = tmp_path / f"{name}.png"
         result = pipeline("still", job.root, "--frame", 1, "--quality", "draft", *overrides, "-o", target)
-        render_stage._close_renderers()
+        render_drawing.close_renderers()
         assert result.exit_code == 0, result.output
         vectors[name] = exr_channels(target.with_suffix(".exr"), tmp_path)["ViewLayer.Vector.X"]
     # 12 m/s at 60 fps are 0.2 m a frame; 64 pixels x 50 mm / 36 mm / 2.4 m = 37.0 pixels a metre on the ball's front.
