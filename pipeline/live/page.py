@@ -58,8 +58,7 @@ class LivePage:
             with gui.add_folder(label):
                 for knob in knobs:
                     self._add_knob(gui, knob)
-        self._drawing = SceneDrawing(server, session.job, session.bodies(), self._dragged)
-        self._drawing.add_pins(session.pins)
+        self._drawing = SceneDrawing(server, session.job, self._dragged)
 
         @server.on_client_disconnect
         async def _(client: Any) -> None:
@@ -69,7 +68,7 @@ class LivePage:
 
     def show(self) -> None:
         """Show where the scene is."""
-        self._drawing.show(self._session.bodies())
+        self._drawing.show(self._session.bodies(), self._session.pins)
 
     def tell(self, status: Status) -> None:
         """Show how it goes, and where knobs are after something other than the page has turned them."""

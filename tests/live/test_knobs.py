@@ -51,8 +51,8 @@ def test_a_scene_has_the_colours_of_the_viewer(tmp_path):
     read = loaded(tmp_path, BALL_OVER_SHEET + '\n[material.post]\nlook = "metal"\ncolor = [0.5, 0.1, 0.0]\n')
     session = Session(live_job(read.job))
     with page_server(port=0, label="drape") as server:
-        drawn = SceneDrawing(server, session.job, session.bodies(), lambda *_: None)
-        drawn.add_pins(session.pins)
+        drawn = SceneDrawing(server, session.job, lambda *_: None)
+        drawn.show(session.bodies(), session.pins)
         nodes = server.scene._handle_from_node_name
         expected = {
             "/body/ball/body": BODY,
