@@ -25,7 +25,6 @@ class LivePage:
     Args:
         server: viser's.
         session: the scene.
-        title: heads the page.
         save: writes the job with the present values.
         recorder: makes takes.
     """
@@ -35,7 +34,6 @@ class LivePage:
         server: viser.ViserServer,
         session: Session,
         *,
-        title: str,
         save: Callable[[], Saved],
         recorder: Recorder,
     ) -> None:
@@ -47,7 +45,6 @@ class LivePage:
         gui = server.gui
         gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
-        gui.set_panel_label(title)
         self._notice = gui.add_markdown("")
         self._state = gui.add_markdown("")
         self._add_clock(gui)
