@@ -152,7 +152,6 @@ def main() -> None:
         page = LivePage(
             server,
             session,
-            title="live",
             recorder=recorder,
             save=lambda loaded=loaded, session=session: save_job(loaded, session.values, Path()),
         )

@@ -142,8 +142,7 @@ class World:
             if not own:
                 raise ValueError(f'the checkpoint holds nothing for "{name}"')
             solver.restore(own)
-        for coupling in self._couplings:
-            coupling.resume()
+        self.tell_couplings()
         self.frame = frame
 
     def _advance_team(self, team: _Team, duration_s: float, start_s: float) -> None:

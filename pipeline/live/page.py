@@ -25,7 +25,6 @@ class LivePage:
     Args:
         server: viser's.
         session: the scene.
-        title: heads the page.
         save: writes the job with the present values.
         recorder: makes takes.
     """
@@ -35,7 +34,6 @@ class LivePage:
         server: viser.ViserServer,
         session: Session,
         *,
-        title: str,
         save: Callable[[], Saved],
         recorder: Recorder,
     ) -> None:
@@ -47,7 +45,6 @@ class LivePage:
         gui = server.gui
         gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
-        gui.set_panel_label(title)
         self._notice = gui.add_markdown("")
         self._state = gui.add_markdown("")
         self._add_clock(gui)
@@ -58,8 +55,7 @@ class LivePage:
             with gui.add_folder(label):
                 for knob in knobs:
                     self._add_knob(gui, knob)
-        self._drawing = SceneDrawing(server, session.job, session.bodies(), self._dragged)
-        self._drawing.add_pins(session.pins)
+        self._drawing = SceneDrawing(server, session.job, self._dragged)
 
         @server.on_client_disconnect
         async def _(client: Any) -> None:
@@ -69,7 +65,7 @@ class LivePage:
 
     def show(self) -> None:
         """Show where the scene is."""
-        self._drawing.show(self._session.bodies())
+        self._drawing.show(self._session.bodies(), self._session.pins)
 
     def tell(self, status: Status) -> None:
         """Show how it goes, and where knobs are after something other than the page has turned them."""

@@ -12,7 +12,7 @@ from pipeline.live.saving import save_job
 from pipeline.live.session import Session
 from pipeline.live.take import Recorder
 from pipeline.view.serving import address as address_of
-from pipeline.view.serving import close_server, open_server
+from pipeline.view.serving import page_server
 
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
@@ -59,8 +59,7 @@ def show_live(
     from sim.runtime import DeviceUnavailableError, initialize
     from sim.shapes.solid import ShapeError
 
-    server = open_server(address.host, address.port)
-    try:
+    with page_server(host=address.host, port=address.port, label=job.name) as server:
         from pipeline.live.page import LivePage
 
         try:
@@ -72,9 +71,7 @@ def show_live(
             raise PipelineError(f"{job.name}: {error}") from error
         session.is_paused = paused
         recorder = Recorder(loaded, session, output, device=device)
-        page = LivePage(
-            server, session, title=job.name, recorder=recorder, save=lambda: save_job(loaded, session.values, folder)
-        )
+        page = LivePage(server, session, recorder=recorder, save=lambda: save_job(loaded, session.values, folder))
         say(address_of(server))
         try:
             run(session, page, ends=ends)
@@ -82,5 +79,3 @@ def show_live(
             if recorder.is_recording:
                 recorder.stop()
                 tell(session.message)
-    finally:
-        close_server(server)

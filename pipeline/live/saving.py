@@ -63,7 +63,7 @@ def save_job(loaded: LoadedJob, values: Mapping[str, Value], folder: Path) -> Sa
         for number, body in enumerate(loaded.job.rigid)
         if led is not None and body.name in led
     ]
-    for path in _names(folder, f"{loaded.job.name}-live", ".toml"):
+    for path in numbered_paths(folder, f"{loaded.job.name}-live", ".toml"):
         text = text_with_values(loaded, values, [Override(("name",), path.stem, "live"), *at_rest])
         if loaded.job.recorded is not None:
             text = without_key(text, "recorded")
@@ -95,7 +95,8 @@ def bodies_led_before(loaded: LoadedJob) -> list[str] | None:
     return led if isinstance(led, list) else None
 
 
-def _names(folder: Path, stem: str, suffix: str) -> Iterator[Path]:
+def numbered_paths(folder: Path, stem: str, suffix: str = "") -> Iterator[Path]:
+    """STEM, STEM-2, STEM-3, ... without end; whoever makes one of them sees whether it is free."""
     yield folder / f"{stem}{suffix}"
     for number in count(2):
         yield folder / f"{stem}-{number}{suffix}"

@@ -13,7 +13,6 @@ import uuid
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +25,7 @@ from pipeline.job.loading import job_of_text
 from pipeline.job.overrides import Override
 from pipeline.layout import JobLayout
 from pipeline.lease import Lease
-from pipeline.live.saving import TAKE_STORY, bodies_led_before, text_with_values
+from pipeline.live.saving import TAKE_STORY, bodies_led_before, numbered_paths, text_with_values
 from pipeline.live.session import Session
 from pipeline.provenance import maker
 from pipeline.reconcile import rebuild_manifest
@@ -205,8 +204,7 @@ def _new_folder(output: Path, stem: str) -> Path:
     Raises:
         OSError: it cannot be made.
     """
-    for number in count(1):
-        folder = output / (stem if number == 1 else f"{stem}-{number}")
+    for folder in numbered_paths(output, stem):
         try:
             folder.mkdir(parents=True)
         except FileExistsError:

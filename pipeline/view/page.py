@@ -71,8 +71,6 @@ class ViewPage:
         self._panel: tuple[object, ...] = ()
         self._next_look = -np.inf
         self._shown: ShownFrame | None = None
-        server.scene.set_up_direction("+z")
-        server.scene.configure_default_lights(cast_shadow=False)  # they cost a machine without a GPU much
         self._look_from_aside()
         waits = not any(self._committed.folder.glob("*.h5.json"))
         self._controls = Controls(server.gui, self._job, rate=int(self.playback.rate), waits=waits)

@@ -157,7 +157,7 @@ class JobScene:
             self._draw_fluids(drawing, frame, shown, extents, top_speed=top_speed)
             if CLOTHS in shown.layers:
                 for name, sheet in frame.cloths.items():
-                    color = self._color(name, BODY, CLOTH)
+                    color = color_of(self._job, name, BODY, CLOTH)
                     drawing.mesh(f"/cloths/{name}", sheet.position, sheet.triangles, color, two_sided=True)
             if PINS in shown.layers:
                 self._draw_pins(drawing, frame)
@@ -176,7 +176,7 @@ class JobScene:
         if SURFACES in shown.layers:
             for name, mesh in frame.surfaces.items():
                 opacity = 0.45 if PARTICLES in shown.layers else None
-                color = self._color(name, BODY, SURFACE)
+                color = color_of(self._job, name, BODY, SURFACE)
                 drawing.mesh(f"/surfaces/{name}", mesh.vertices, mesh.faces, color, opacity=opacity)
         if SPRAY in shown.layers:
             for name, cloud in frame.whitewater.items():
@@ -198,7 +198,7 @@ class JobScene:
                         f"/bodies/{name}",
                         mesh.vertices,
                         mesh.faces,
-                        self._color(body.name, part, BODY_COLOR),
+                        color_of(self._job, body.name, part, BODY_COLOR),
                         position=pose.position,
                         orientation=pose.orientation,
                     )
@@ -268,10 +268,11 @@ class JobScene:
                 radius = 0.4 * smoke.cell_size
                 drawing.points(f"/smoke/{parameters.name}", cells.position, cells.colors, radius=radius)
 
-    def _color(self, body: str, part: str, otherwise: Rgb) -> Rgb:
-        """The colour that the job gives a body, else one that tells kinds of bodies apart."""
-        color = self._job.material_of(body, part).color
-        return otherwise if color is None else srgb(color)
+
+def color_of(job: Job, body: str, part: str, otherwise: Rgb) -> Rgb:
+    """The colour that the job gives a body, else one that tells kinds of bodies apart."""
+    color = job.material_of(body, part).color
+    return otherwise if color is None else srgb(color)
 
 
 def particle_colors(cloud: Particles, color_by: str, extents: Extents, *, top_speed: float) -> Colors | Rgb:

@@ -124,12 +124,7 @@ class ClothSolver:
             raise ValueError(f"{min(fixed)} of a cloth cannot change while it is simulated; build it anew")
         number = self.state.names.index(name)
         changed = ClothParameters.model_validate({**self.parameters[number].model_dump(exclude_unset=True), **changes})
-        before = self.parameters
-        try:
-            self._adopt((*before[:number], changed, *before[number + 1 :]))
-        except ValueError:
-            self._adopt(before)  # what explicit springs bear is known once they have their stiffness
-            raise
+        self._change_to((*self.parameters[:number], changed, *self.parameters[number + 1 :]))
 
     def take_substeps(self, count: int) -> None:
         """Take so many substeps a frame from now on, all cloths of the scene, as they share them; between frames.
@@ -137,17 +132,12 @@ class ClothSolver:
         Raises:
             ValueError: below 1, or too few for explicit springs; nothing has changed then.
         """
-        before = self.parameters
-        try:
-            self._adopt(
-                tuple(
-                    ClothParameters.model_validate({**cloth.model_dump(exclude_unset=True), "substeps": count})
-                    for cloth in before
-                )
+        self._change_to(
+            tuple(
+                ClothParameters.model_validate({**cloth.model_dump(exclude_unset=True), "substeps": count})
+                for cloth in self.parameters
             )
-        except ValueError:
-            self._adopt(before)
-            raise
+        )
 
     def hold(
         self, name: str, nodes: Sequence[int], *, shift: Vector3 = (0.0, 0.0, 0.0), within_s: float | None = None
@@ -186,6 +176,15 @@ class ClothSolver:
         if not len(numbers) or numbers[0] < 0 or numbers[-1] >= last - first:
             raise ValueError(f'nodes of cloth "{name}" are 0 to {last - first - 1}, got {list(nodes)}')
         return numbers + first
+
+    def _change_to(self, parameters: tuple[ClothParameters, ...]) -> None:
+        """Adopt parameters, or keep those that are there and raise ValueError if the solver cannot have them."""
+        before = self.parameters
+        try:
+            self._adopt(parameters)
+        except ValueError:
+            self._adopt(before)  # what explicit springs bear is known once they have their stiffness
+            raise
 
     def _adopt(self, parameters: tuple[ClothParameters, ...]) -> None:
         """Step with these parameters from now on."""

@@ -33,9 +33,7 @@ def test_a_page_has_odd_values_and_tells_what_happens_while_time_stands_still(tm
     session.is_paused = True
     with page_server(port=0, label="drape") as server:
         recorder = Recorder(read, session, tmp_path, device="cpu")
-        page = LivePage(
-            server, session, title="drape", save=lambda: save_job(read, session.values, tmp_path), recorder=recorder
-        )
+        page = LivePage(server, session, save=lambda: save_job(read, session.values, tmp_path), recorder=recorder)
         page.tell(session.status())
         session.message = "something new"
         page.tell(session.status())
@@ -51,8 +49,8 @@ def test_a_scene_has_the_colours_of_the_viewer(tmp_path):
     read = loaded(tmp_path, BALL_OVER_SHEET + '\n[material.post]\nlook = "metal"\ncolor = [0.5, 0.1, 0.0]\n')
     session = Session(live_job(read.job))
     with page_server(port=0, label="drape") as server:
-        drawn = SceneDrawing(server, session.job, session.bodies(), lambda *_: None)
-        drawn.add_pins(session.pins)
+        drawn = SceneDrawing(server, session.job, lambda *_: None)
+        drawn.show(session.bodies(), session.pins)
         nodes = server.scene._handle_from_node_name
         expected = {
             "/body/ball/body": BODY,
