@@ -14,33 +14,20 @@ import argparse
 import json
 import sys
 import tempfile
-import time
-from contextlib import closing
 from pathlib import Path
 
+from benchmarks.changed_frames import draw, specification
 from benchmarks.json_output import keep_output_for_json
-from render.blender import open_renderer
-from render.spec import RenderSpec
 
 PRESETS = ("draft", "preview", "final")
 
 
 def measure(folder: Path, *, frame: int, changes: dict[str, object], threads: int, repeats: int) -> dict[str, float]:
     """Least seconds of a frame of a job whose render settings are changed so."""
-    spec = RenderSpec.model_validate_json((folder / "scene.json").read_text(encoding="utf-8"))
+    spec = specification(folder)
     changed = spec.model_copy(update={"render": spec.render.model_copy(update=changes)})
-    least = {"wall_s": float("inf"), "cpu_s": float("inf")}
-    # Beside the job's own, as its paths start there.
-    with tempfile.NamedTemporaryFile(dir=folder, suffix=".json") as file, tempfile.TemporaryDirectory() as scratch:
-        changed.write(Path(file.name))
-        with closing(open_renderer(Path(file.name), threads=threads, blender=None)) as renderer:
-            for number in range(repeats + 1):
-                wall, processor = time.perf_counter(), time.process_time()
-                renderer.render(frame, Path(scratch) / "frame.png")
-                seconds = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - processor}
-                if number or not repeats:
-                    least = {key: min(least[key], value) for key, value in seconds.items()}
-    return {key: round(value, 2) for key, value in least.items()}
+    with tempfile.TemporaryDirectory() as scratch:
+        return draw(changed, folder, Path(scratch) / "frame.png", frame=frame, threads=threads, repeats=repeats)
 
 
 def main() -> int:

@@ -20,6 +20,9 @@ from blender_scripts.errors import RenderInputError
 REST_UV = "rest"
 """UV map of coordinates on the surface at rest [m]: what hangs on it does not swim as the surface moves."""
 
+WET = "wet"
+"""Attribute that tells where a fluid touches solids: 1 there, 0 where its surface is free (`wetting`)."""
+
 _MAX_HEADER_BYTES = 65536
 _FACE_RECORD = np.dtype([("corner_count", "u1"), ("vertex_indices", "<i4", (3,))])
 _SCALAR_TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8", "int": "<i4", "int32": "<i4"}
@@ -35,6 +38,7 @@ class TriangleMesh:
         normals: unit vectors, (n, 3), float32, or None.
         velocities: [m/s], (n, 3), float32, or None.
         uv: coordinates on the surface at rest [m], (n, 2), float32, or None.
+        wetness: of a fluid, how far it touches solids [-], (n,), float32, or None.
     """
 
     positions: np.ndarray
@@ -42,6 +46,7 @@ class TriangleMesh:
     normals: np.ndarray | None = None
     velocities: np.ndarray | None = None
     uv: np.ndarray | None = None
+    wetness: np.ndarray | None = None
 
     def edges(self) -> tuple[float, float, float] | None:
         """Edges of the box around it, along the axes [m]; None without vertices."""
@@ -89,7 +94,8 @@ def fill_mesh(mesh: Any, source: TriangleMesh) -> None:
 
     `foreach_set` copies whole arrays; a million triangles take 0.3 s where `from_pydata` needs 1.1 s. The attribute
     names are Blender's: Cycles blurs along a POINT attribute `velocity` [m/s], also when the topology changes from
-    frame to frame, and shades with a POINT attribute `custom_normal`. Coordinates at rest become the UV map `REST_UV`.
+    frame to frame, and shades with a POINT attribute `custom_normal`. Coordinates at rest become the UV map `REST_UV`,
+    the wetness becomes the attribute `WET`.
     """
     mesh.clear_geometry()
     vertex_count, triangle_count = len(source.positions), len(source.triangles)
@@ -103,6 +109,7 @@ def fill_mesh(mesh: Any, source: TriangleMesh) -> None:
         _set_vector_attribute(mesh, "velocity", source.velocities)
         _set_vector_attribute(mesh, "custom_normal", source.normals)
         _set_uv_map(mesh, source)
+        _set_wetness(mesh, source.wetness)
     mesh.update(calc_edges=True)
 
 
@@ -165,6 +172,14 @@ def _set_vector_attribute(mesh: Any, name: str, values: np.ndarray | None) -> No
     if values is not None:
         attribute = mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
         attribute.data.foreach_set("vector", values.ravel())
+
+
+def _set_wetness(mesh: Any, values: np.ndarray | None) -> None:
+    existing = mesh.attributes.get(WET)
+    if existing is not None:
+        mesh.attributes.remove(existing)
+    if values is not None:
+        mesh.attributes.new(WET, "FLOAT", "POINT").data.foreach_set("value", values)
 
 
 def _set_uv_map(mesh: Any, source: TriangleMesh) -> None:

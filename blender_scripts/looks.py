@@ -11,6 +11,7 @@ from typing import Any
 
 import bpy
 
+from blender_scripts.geometry import WET
 from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
 from blender_scripts.smoke_looks import build_fire, build_smoke
 from blender_scripts.weaves import build_cotton, build_denim, build_silk
@@ -24,10 +25,15 @@ _WATER_ABSORPTION_BY_SIZE = 7.0
 
 HONEY_IOR = 1.49
 """Of honey with 18 % water (Chataway's table has 1.4915 at 20 °C)."""
-HONEY_TINT: Color = (0.96, 0.76, 0.20)
-"""What a centimetre of honey makes of white light: an amber between clover's and heather's, chosen by eye. Absorbance
-of honey falls about exponentially from blue to red, and from one honey to another by more than a factor of ten."""
-_HONEY_SIZE = 0.1
+HONEY_TINT: Color = (0.80, 0.59, 0.045)
+"""What absorption in a centimetre of honey makes of white light: an amber between clover's and heather's, chosen by
+eye. Absorbance of honey falls about exponentially from blue to red, and from one honey to another by more than a
+factor of ten."""
+HONEY_SCATTERING_PER_M = 40.0
+HONEY_ANISOTROPY = 0.8
+"""Pollen, wax and fine crystals scatter forwards, some of the light of every centimetre [1/m], chosen by eye. Without
+them a thin stream shows what is behind it, in a dark room an olive, and no gold."""
+_HONEY_SIZE = 0.075
 """A domain this many metres across needs no thinner honey: larger ones would look like tar."""
 
 MILK_REFLECTANCE: Color = (0.91, 0.88, 0.76)
@@ -52,7 +58,7 @@ def _water(builder: NodeBuilder, context: LookContext) -> None:
     # Given explicitly, the factor is on the real absorption; by default a small tank is as blue as a deep pool.
     factor = or_default(context.density, _WATER_ABSORPTION_BY_SIZE / context.domain_size)
     coefficients = WATER_ABSORPTION_PER_M if context.color is None else _absorption_of_tint(context.color)
-    _homogeneous_absorption(builder, tuple(factor * value for value in coefficients))
+    builder.volume(_homogeneous_absorption(builder, tuple(factor * value for value in coefficients)))
 
 
 def _clear_surface(builder: NodeBuilder, context: LookContext, *, ior: float, tint: tuple[float, float, float]) -> None:
@@ -68,12 +74,21 @@ def _clear_surface(builder: NodeBuilder, context: LookContext, *, ior: float, ti
 
 
 def _honey(builder: NodeBuilder, context: LookContext) -> None:
-    """Clear amber: it absorbs blue first, and scatters nothing, as filtered honey does."""
+    """Amber that absorbs blue first, a little cloudy."""
     _clear_surface(builder, context, ior=HONEY_IOR, tint=(1.0, 0.97, 0.9))
     factor = or_default(context.density, _HONEY_SIZE / context.domain_size)
     tint = or_default(context.color, HONEY_TINT)
     per_metre = tuple(-100.0 * factor * math.log(min(max(channel, 1e-3), 0.999)) for channel in tint)
-    _homogeneous_absorption(builder, per_metre)
+    scattering = builder.node(
+        "ShaderNodeVolumeScatter",
+        Color=(1.0, 1.0, 1.0),
+        Density=HONEY_SCATTERING_PER_M * factor,
+        Anisotropy=HONEY_ANISOTROPY,
+    )
+    both = builder.node("ShaderNodeAddShader")
+    builder.link(_homogeneous_absorption(builder, per_metre).outputs[0], both.inputs[0])
+    builder.link(scattering.outputs[0], both.inputs[1])
+    builder.volume(both)
 
 
 def _milk(builder: NodeBuilder, context: LookContext) -> None:
@@ -251,6 +266,9 @@ LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
 }
 """How each look is built, by the name that a specification uses."""
 
+REFRACTING = frozenset({"water", "honey", "glass"})
+"""Looks of what bends light that enters."""
+
 
 def _scattering(builder: NodeBuilder, color: Color) -> Any:
     """White that glows through: half of the light that meets a particle leaves it on the other side."""
@@ -262,33 +280,42 @@ def _scattering(builder: NodeBuilder, color: Color) -> Any:
 
 
 def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint: Color) -> Any:
-    """What a clear body is drawn with: as `_with_clear_shadow`, unless its caustics are to be found."""
-    return shader if context.caustics else _with_clear_shadow(builder, shader, tint=tint)
-
-
-def _with_clear_shadow(builder: NodeBuilder, shader: Any, *, tint: Color) -> Any:
-    """Refract for the eye, but let light straight through to what lies behind.
+    """What a clear body is drawn with: light passes straight where it is asked for and where a fluid wets a solid.
 
     Without caustics, refractive things cast black shadows: no light sampled from behind them arrives. Rays that ask
-    for light (shadow rays, and bounces off matt surfaces and smoke) therefore meet a clear, slightly tinted surface.
+    for light therefore meet a clear, slightly tinted surface. With them, light keeps being bent on its way to what a
+    fluid wets, as Cycles follows it through refracting surfaces alone.
     """
+    if context.caustics and not context.wets:
+        return shader
+    for_light = _asks_for_light(builder)
+    if not context.caustics:
+        clear = builder.node("ShaderNodeBsdfTransparent", Color=tint)
+        shader = mix_shaders(builder, for_light, shader, clear)
+    if not context.wets:
+        return shader
+    wet = builder.node("ShaderNodeAttribute")
+    wet.attribute_name = WET
+    straight = wet.outputs[2]
+    if context.caustics:
+        straight = builder.math("MULTIPLY", straight, builder.math("SUBTRACT", 1.0, for_light))
+    return mix_shaders(builder, straight, shader, builder.node("ShaderNodeBsdfTransparent"))
+
+
+def _asks_for_light(builder: NodeBuilder) -> Any:
+    """The output socket of what is 1 for shadow rays and for bounces off matt surfaces and smoke."""
     light_path = builder.node("ShaderNodeLightPath")
     asks_for_light = light_path.outputs["Is Shadow Ray"]
     for kind in ("Is Diffuse Ray", "Is Volume Scatter Ray"):
-        maximum = builder.node("ShaderNodeMath")
-        maximum.operation = "MAXIMUM"
-        builder.link(asks_for_light, maximum.inputs[0])
-        builder.link(light_path.outputs[kind], maximum.inputs[1])
-        asks_for_light = maximum.outputs[0]
-    clear = builder.node("ShaderNodeBsdfTransparent", Color=tint)
-    return mix_shaders(builder, asks_for_light, shader, clear)
+        asks_for_light = builder.math("MAXIMUM", asks_for_light, light_path.outputs[kind])
+    return asks_for_light
 
 
-def _homogeneous_absorption(builder: NodeBuilder, coefficients: Color) -> None:
+def _homogeneous_absorption(builder: NodeBuilder, coefficients: tuple[float, ...]) -> Any:
     """Beer-Lambert absorption [1/m] inside the body. Cycles' node absorbs density (1 - colour)."""
     density = max(coefficients)
     color = tuple(1.0 - value / density for value in coefficients)
-    builder.volume(builder.node("ShaderNodeVolumeAbsorption", Color=color, Density=density))
+    return builder.node("ShaderNodeVolumeAbsorption", Color=color, Density=density)
 
 
 def _absorption_of_tint(tint: Color) -> Color:

@@ -41,6 +41,7 @@ from blender_scripts import (
     settings,
     tank,
     volumes,
+    wetting,
     workbench,
 )
 from blender_scripts.compatibility import blender_version, require_supported_version
@@ -96,12 +97,18 @@ class SceneRenderer:
         self._sequences: list[tuple[dict[str, Any], Any]] = []
         self._fires: dict[str, volumes.FireLight] = {}
         self._bodies: list[tuple[dict[str, Any], Any]] = []
+        self._fluids: list[tuple[dict[str, Any], Any]] = []
+        self._touched = wetting.TouchedSolids()
+        # Workbench sees through nothing.
+        is_plain = spec.get("engine") == "workbench"
+        self._has_wet = not is_plain and any(_wets(description) for description in spec["objects"])
+        self._floor_z = spec["domain_min"][2]
         drawn = [(description, self._add_object(description, spec)) for description in spec["objects"]]
         # Blender may have chosen another name than the job's.
         casters = {made.name for description, made in drawn if description["material"]["caustics"]}
         if casters:
             settings.cast_caustics(casters, domain_size=_domain_size(spec), domain_middle=_domain_middle(spec))
-        if spec.get("engine") == "workbench":
+        if is_plain:
             workbench.apply_workbench_settings(drawn, panes=panes)
             self.device = "Workbench"
 
@@ -118,8 +125,9 @@ class SceneRenderer:
             RenderFailedError: Blender did not finish.
         """
         self._require_current()
+        sheets = []
         for description, blender_object in self._sequences:
-            path = self._folder / description["file"].replace("{frame}", f"{frame:06d}")
+            path = self._file(description["file"], frame)
             if description["type"] == "volume_sequence":
                 volumes.load_volume(blender_object.data, path)
                 if fire := self._fires.get(description["name"]):
@@ -127,8 +135,13 @@ class SceneRenderer:
             elif description["type"] == "point_sequence":
                 points.fill_points(blender_object.data, points.read_points(path, description["kind"]))
             else:
-                geometry.fill_mesh(blender_object.data, geometry.read_ply(path))
-        self._place_bodies(frame)
+                mesh = geometry.read_ply(path)
+                geometry.fill_mesh(blender_object.data, mesh)
+                if self._is_touched(description):
+                    sheets.append(mesh)
+        places = self._place_bodies(frame)
+        if self._has_wet:
+            self._fill_fluids(frame, places, sheets)
         self._place_camera(frame)
         self._draw(frame, output_path, master_path)
 
@@ -180,20 +193,46 @@ class SceneRenderer:
             result.save_render(str(master_path.resolve()), scene=bpy.context.scene)
             exr.strip_metadata(master_path)
 
-    def _place_bodies(self, frame: int) -> None:
+    def _is_touched(self, description: dict[str, Any]) -> bool:
+        """Whether fluids wet an object. Glass bends light as if from air, so they keep their surface against it.
+
+        Through the sliver between them light is bent as between the two, at all but flat angles.
+        """
+        return self._has_wet and description["material"]["look"] not in looks.REFRACTING
+
+    def _file(self, path: str, frame: int) -> Path:
+        return self._folder / path.replace("{frame}", f"{frame:06d}")
+
+    def _place_bodies(self, frame: int) -> dict[str, poses.Pose]:
+        """Put the bodies that move where they are; returns where, by the name of the object."""
         of_file: dict[Path, dict[str, poses.Pose]] = {}
+        places = {}
         for description, blender_object in self._bodies:
-            path = self._folder / description["poses"].replace("{frame}", f"{frame:06d}")
+            path = self._file(description["poses"], frame)
             if path not in of_file:
                 of_file[path] = poses.read_poses(path)
             if description["body"] not in of_file[path]:
                 raise RenderInputError(f'the poses {path} have none of "{description["body"]}"')
-            poses.place(blender_object, of_file[path][description["body"]], frame=frame)
+            places[description["name"]] = of_file[path][description["body"]]
+            poses.place(blender_object, places[description["name"]], frame=frame)
+        return places
+
+    def _fill_fluids(self, frame: int, places: dict[str, poses.Pose], sheets: list[geometry.TriangleMesh]) -> None:
+        solids = self._touched.at({name: pose.after(0.0) for name, pose in places.items()}, sheets)
+        for description, blender_object in self._fluids:
+            path = self._file(description["file"], frame)
+            mesh = geometry.read_ply(path)
+            if mesh.normals is None:
+                raise RenderInputError(f"the surface {path} has no normals (nx, ny, nz)")
+            # Cycles follows light through one surface on its way to the floor, and not through two that are parallel.
+            dips, reach = description["material"]["caustics"], description["wets_within"]
+            touching = wetting.wetted(mesh, reach=reach, floor_z=self._floor_z, solids=solids, dips=dips)
+            geometry.fill_mesh(blender_object.data, touching)
 
     def _place_camera(self, frame: int) -> None:
         if self._views is None:
             return
-        camera.place_camera(self._camera, self._folder / self._views.replace("{frame}", f"{frame:06d}"), frame=frame)
+        camera.place_camera(self._camera, self._file(self._views, frame), frame=frame)
         # A pattern that stood still in a moving picture would look like dirt on the lens.
         bpy.context.scene.cycles.seed = (self._seed + frame) % 2**31
 
@@ -208,6 +247,7 @@ class SceneRenderer:
             smoke_box=_smoke_box(description) if kind == "volume_sequence" else None,
             surface="sheet" if kind == "mesh_sequence" else "body",
             edges=None if at_rest is None else at_rest.edges(),
+            wets=_wets(description),
         )
         if description["material"]["blend"] is None:
             material = looks.new_material(name, look, context)
@@ -223,9 +263,13 @@ class SceneRenderer:
             else:
                 self._bodies.append((description, blender_object))
             geometry.keep_sharp_edges(blender_object.data, description["shade_smooth_angle_deg"])
+            if self._is_touched(description):
+                self._touched.add_body(description, at_rest)
         elif kind == "mesh_sequence":
             blender_object = geometry.new_mesh_object(name, geometry.EMPTY_MESH)
-            self._sequences.append((description, blender_object))
+            (self._fluids if self._has_wet and _wets(description) else self._sequences).append(
+                (description, blender_object)
+            )
         elif kind == "point_sequence":
             blender_object = points.new_points_object(name, material)
             self._sequences.append((description, blender_object))
@@ -236,6 +280,11 @@ class SceneRenderer:
                 self._fires[name] = volumes.FireLight(name, glow_of(context))
         blender_object.data.materials.append(material)
         return blender_object
+
+
+def _wets(description: dict[str, Any]) -> bool:
+    """Whether an object is a fluid, which tells where it touches solids."""
+    return description.get("wets_within") is not None
 
 
 def _domain_middle(spec: dict[str, Any]) -> tuple[float, ...]:

@@ -41,6 +41,7 @@ class LookContext:
         smoke_box: of a volume; None for everything else.
         surface: what a texture hangs on; see `SurfaceKind`.
         edges: of the box around a body at rest, in its own axes [m]; None for what is no body.
+        wets: whether the mesh tells where it touches solids, as a fluid's does (`wetting`).
         color: base colour or tint from the job, linear RGB.
         roughness: from the job [-].
         caustics: whether light of lamps is bent, from the job.
@@ -57,6 +58,7 @@ class LookContext:
     smoke_box: SmokeBox | None
     surface: SurfaceKind
     edges: tuple[float, float, float] | None
+    wets: bool
     color: Color | None
     roughness: float | None
     caustics: bool | None
@@ -77,6 +79,7 @@ class LookContext:
         smoke_box: SmokeBox | None = None,
         surface: SurfaceKind = "body",
         edges: tuple[float, float, float] | None = None,
+        wets: bool = False,
     ) -> LookContext:
         """The context for a material of the specification; keys that it does not have are left to the look."""
         own = {name: parameters.get(name) for name in _FROM_THE_JOB}
@@ -88,6 +91,7 @@ class LookContext:
             smoke_box=smoke_box,
             surface=surface,
             edges=edges,
+            wets=wets,
             **own,
         )
 

@@ -194,8 +194,8 @@ class MaterialParameters(Parameters):
     roughness: Fraction | None = Field(default=None, description="Roughness [-]; the look's own if omitted.")
     density: Positive | None = Field(
         default=None,
-        description="Smoke and fire: extinction per metre at density 1 [1/m]. Water and honey: factor on their "
-        "absorption, milk: on its scattering [-].",
+        description="Smoke and fire: extinction per metre at density 1 [1/m]. Factor on the absorption of "
+        "water, on the absorption and scattering of honey, on the scattering of milk [-].",
     )
     caustics: bool = Field(
         default=False,

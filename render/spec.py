@@ -62,6 +62,11 @@ class MeshSequenceObject(Parameters):
     name: str
     file: str = Field(description="Path with {frame}.")
     material: MaterialParameters
+    wets_within: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="A fluid: how near its surface comes to the floor, bodies and cloths where it touches them [m].",
+    )
 
 
 class PointSequenceObject(Parameters):

@@ -47,6 +47,8 @@ _LATER_KEYS: dict[str, Any] = {"format": "png", "passes": []}
 _LATER_STAGE_KEYS: dict[str, Any] = {"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0}
 _LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None, "caustics": False}
 """Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
+_LOOK_REVISIONS = {"honey": 2}
+"""Looks that are drawn otherwise than in earlier versions: nothing else of a job says so."""
 
 _FORMER_COLOR = [0.22, 0.25, 0.29]
 """What stood for a stage's colour where the job gives none, in those versions."""
@@ -223,14 +225,23 @@ def _decisive(spec: RenderSpec) -> dict[str, Any]:
     if stage["color"] is None and "ground" not in stage and stage["name"] != "window":
         stage["color"] = _FORMER_COLOR
     for drawn in document["objects"]:
-        material = drawn["material"]
-        for key, unused in _LATER_MATERIAL_KEYS.items():
-            if material[key] == unused:
-                del material[key]
-        if "blend" in material:
-            file, name = split_blend(material["blend"])
-            drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
+        _keep_decisive(drawn)
     return document
+
+
+def _keep_decisive(drawn: dict[str, Any]) -> None:
+    """Take out of an object what decides no pixel, as `_decisive` does."""
+    if drawn.get("wets_within", ...) is None:
+        del drawn["wets_within"]
+    material = drawn["material"]
+    for key, unused in _LATER_MATERIAL_KEYS.items():
+        if material[key] == unused:
+            del material[key]
+    if material["look"] in _LOOK_REVISIONS:
+        material["look_revision"] = _LOOK_REVISIONS[material["look"]]
+    if "blend" in material:
+        file, name = split_blend(material["blend"])
+        drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
 
 
 def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:

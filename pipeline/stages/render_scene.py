@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.cache import read_frame
-from pipeline.job.looks import BODY, parts_of
+from pipeline.job.looks import BODY, REFRACTING_LOOKS, parts_of
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.stages.bounds import read_framed
@@ -29,9 +29,14 @@ from render.spec import (
     SceneObject,
     VolumeSequenceObject,
 )
+from sim.fluid.parameters import FluidParameters
 from sim.rigid.parameters import RigidBodyParameters
 
 Poses = Mapping[str, Mapping[str, NDArray[Any]]]
+
+WETS_WITHIN_RADII = 1.5
+"""How near a fluid's surface is to what it touches, in radii of its particles. It ends 0.05 radii above a floor and a
+radius inside of a body where particles rest, and 0.8 above where they move; a layer of one particle is two thick."""
 
 
 def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None = None) -> RenderSpec:
@@ -41,7 +46,10 @@ def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None 
     ]
     objects += [
         MeshSequenceObject(
-            name=fluid.name, file=f"surfaces/{fluid.name}/{{frame}}.ply", material=job.material_of(fluid.name)
+            name=fluid.name,
+            file=f"surfaces/{fluid.name}/{{frame}}.ply",
+            material=job.material_of(fluid.name),
+            wets_within=_wets_within(job, fluid),
         )
         for fluid in job.fluid
     ]
@@ -84,6 +92,15 @@ def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None 
         objects=tuple(objects),
         render=job.render,
     )
+
+
+def _wets_within(job: Job, fluid: FluidParameters) -> float | None:
+    """Within which distance a fluid's surface touches solids [m]; None where nobody sees from inside whether it does.
+
+    A material of one's own may look at it, too.
+    """
+    look = job.material_of(fluid.name).look
+    return None if look is not None and look not in REFRACTING_LOOKS else WETS_WITHIN_RADII * fluid.particle_radius
 
 
 def _body_object(job: Job, layout: JobLayout, body: RigidBodyParameters, part: str) -> SceneObject:

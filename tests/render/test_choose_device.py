@@ -29,7 +29,8 @@ CHOOSE = """
         except RuntimeError as error:
             told = f"refused: {error}"
         used = [device.name for device in preferences.devices if device.use]
-        return [told, bpy.context.scene.cycles.device, len(used)]
+        cycles = bpy.context.scene.cycles
+        return [told, cycles.device, cycles.denoising_use_gpu, len(used)]
 
     (card,) = (device for device in preferences.devices if device.type == "CPU")
     answers = {"name": card.name, "without": {}, "with": {}}
@@ -41,20 +42,20 @@ CHOOSE = """
         answers["with"][f"{wanted} {gpu}"] = choose(wanted, gpu)
     print("ANSWERS", json.dumps(answers))
 """
-CPU = ["CPU", "CPU"]
+CPU = ["CPU", "CPU", False]
 
 
 def test_a_renderer_enables_the_gpu_it_was_given_and_takes_the_processor_only_where_the_job_says_so():
     (line,) = (line for line in run_python(CHOOSE).splitlines() if line.startswith("ANSWERS "))
     answers = json.loads(line.partition(" ")[2])
     without, with_card = answers["without"], answers["with"]
-    on_card = [f"CUDA: {answers['name']}", "GPU", 1]
+    on_card = [f"CUDA: {answers['name']}", "GPU", True, 1]
     for case in ("auto 0", "auto None", "cpu 0"):
-        assert without[case][:2] == CPU
+        assert without[case][:3] == CPU
     assert without["gpu 0"][0] == 'refused: render.device is "gpu", but Cycles finds none; use "auto" or "cpu"'
     assert with_card["auto 0"] == with_card["gpu 0"] == with_card["cuda 0"] == on_card
     for case in ("auto None", "cpu 0", "auto 1"):
-        assert with_card[case][:2] == CPU
+        assert with_card[case][:3] == CPU
     assert with_card["hip 0"][0].startswith('refused: render.device is "hip", but Cycles finds none')
     refused = f'refused: render.device is "cuda", and GPU 1, counted from 0, is not among {answers["name"]}'
     assert with_card["cuda 1"][0] == refused

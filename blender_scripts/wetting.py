@@ -1,0 +1,187 @@
+"""Where the surface of a fluid touches what it wets, computed for every vertex of every frame.
+
+A surface made of particles ends a little short of the solid or a little inside of it, and the sliver of air between
+them would reflect like a mirror whatever meets it at more than the critical angle (48.6° in water). A liquid that wets
+has no air there, so looks let rays straight through where it touches (`looks`, docs/decisions/0035-wet-surfaces.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from mathutils import Quaternion
+from mathutils.bvhtree import BVHTree
+
+from blender_scripts.geometry import TriangleMesh
+
+_TOUCHES_WITHIN, _FREE_BEYOND = 2.0 / 3.0, 4.0 / 3.0
+"""Distances between which a surface goes from touching to free, in `reach`."""
+_ALONG, _TOWARDS = 0.1, 0.5
+"""Cosines between the outward normal and the way to the solid: free below the first, touching above the second. A free
+surface that ends at a wall, and the outside of a film, do not face the solid although they are near it."""
+
+_DIP = 0.2
+"""How deep a surface that may be moved dips into what it touches, in `reach`."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """What a fluid may touch, with its place.
+
+    Attributes:
+        tree: its triangles, in its own axes; None without any.
+        low: lower corner of the box around it, in its own axes [m], (3,).
+        high: upper corner [m], (3,).
+        is_closed: whether it has an inside; a sheet has not.
+        position: of its origin [m], (3,).
+        rotation: from its own axes to the world's, (3, 3).
+    """
+
+    tree: Any
+    low: np.ndarray
+    high: np.ndarray
+    is_closed: bool
+    position: np.ndarray
+    rotation: np.ndarray
+
+    @classmethod
+    def of(cls, mesh: TriangleMesh, *, is_closed: bool) -> Solid:
+        """A mesh at the origin. Building its tree is most of the work: a rigid body needs one for all frames."""
+        low, high = np.zeros(3), np.zeros(3)
+        tree = None
+        if len(mesh.triangles):
+            low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
+            tree = BVHTree.FromPolygons(mesh.positions.tolist(), mesh.triangles.tolist(), all_triangles=True)
+        return cls(tree, low, high, is_closed, np.zeros(3), np.eye(3))
+
+    def placed(self, position: Sequence[float], orientation: Sequence[float]) -> Solid:
+        """The same solid somewhere else.
+
+        Args:
+            position: of its origin [m], (3,).
+            orientation: unit quaternion (w, x, y, z).
+        """
+        rotation = np.array(Quaternion(orientation).to_matrix())
+        return Solid(self.tree, self.low, self.high, self.is_closed, np.array(position), rotation)
+
+
+class TouchedSolids:
+    """The bodies of a scene that fluids touch."""
+
+    def __init__(self) -> None:
+        self._bodies: list[tuple[dict[str, Any], Solid]] = []
+
+    def add_body(self, description: dict[str, Any], mesh: TriangleMesh) -> None:
+        """Take in a `mesh` or `moving_mesh` of the specification."""
+        self._bodies.append((description, Solid.of(mesh, is_closed=True)))
+
+    def at(self, places: Mapping[str, tuple[Any, Any]], sheets: Sequence[TriangleMesh]) -> list[Solid]:
+        """The solids of a frame.
+
+        Args:
+            places: position and orientation of the bodies that move, by name.
+            sheets: cloths as they are in this frame.
+        """
+        bodies = []
+        for description, solid in self._bodies:
+            if description["name"] in places:
+                bodies.append(solid.placed(*places[description["name"]]))
+            else:
+                bodies.append(solid.placed(description["position"], description["orientation"]))
+        return bodies + [Solid.of(sheet, is_closed=False) for sheet in sheets]
+
+
+def wetted(
+    mesh: TriangleMesh, *, reach: float, floor_z: float, solids: Sequence[Solid], dips: bool = False
+) -> TriangleMesh:
+    """A fluid's surface with how far each vertex touches the floor or a solid: 1 where it does, 0 where it is free.
+
+    Args:
+        mesh: the surface, with outward normals.
+        reach: distance at which it is half wet, if it faces the solid [m]. What lies inside of a closed solid, or below
+            the floor, touches; sheets touch on both sides.
+        floor_z: height of the floor [m].
+        solids: bodies and cloths.
+        dips: move what touches a closed solid or the floor into it.
+    """
+    assert mesh.normals is not None
+    height = mesh.positions[:, 2] - floor_z
+    down = np.broadcast_to((0.0, 0.0, -1.0), mesh.positions.shape)
+    touch = _Touch(np.zeros(len(mesh.positions)), np.zeros(mesh.positions.shape), reach)
+    touch.add(np.arange(len(height)), np.maximum(height, 0.0), down, -mesh.normals[:, 2], moves=True)
+    for solid in solids:
+        if solid.tree is not None:
+            _add_solid(touch, solid, mesh)
+    positions = (mesh.positions + touch.moves).astype(np.float32) if dips else mesh.positions
+    return replace(mesh, positions=positions, wetness=touch.wet.astype(np.float32))
+
+
+@dataclass
+class _Touch:
+    """What is known of the vertices so far.
+
+    Attributes:
+        wet: how far each touches something [-], (n,).
+        moves: the ways into what they touch [m], (n, 3).
+        reach: as for `wetted` [m].
+    """
+
+    wet: np.ndarray
+    moves: np.ndarray
+    reach: float
+
+    def add(
+        self, numbers: np.ndarray, distance: np.ndarray, inwards: np.ndarray, facing: np.ndarray, *, moves: bool
+    ) -> None:
+        """Take a solid into account.
+
+        Args:
+            numbers: of the vertices near it, (m,).
+            distance: from it [m], 0 inside, (m,).
+            inwards: unit vectors into it, (m, 3).
+            facing: cosines of the angles between these and the normals, (m,).
+            moves: whether what touches it may be moved into it.
+        """
+        far = _smoothstep(distance, _TOUCHES_WITHIN * self.reach, _FREE_BEYOND * self.reach)
+        wet = (1.0 - far) * _smoothstep(facing, _ALONG, _TOWARDS)
+        more = wet > self.wet[numbers]
+        self.wet[numbers[more]] = wet[more]
+        depth = wet * (distance + _DIP * self.reach) if moves else np.zeros(len(wet))
+        self.moves[numbers[more]] = depth[more, None] * inwards[more]
+
+
+def _add_solid(touch: _Touch, solid: Solid, mesh: TriangleMesh) -> None:
+    """Take a solid into account, for the vertices that are near it."""
+    farthest = _FREE_BEYOND * touch.reach
+    own = (mesh.positions - solid.position) @ solid.rotation
+    candidates = np.flatnonzero(((own > solid.low - farthest) & (own < solid.high + farthest)).all(axis=1))
+    near, places, normals = [], [], []
+    find = solid.tree.find_nearest
+    for number, point in zip(candidates.tolist(), own[candidates].tolist(), strict=True):
+        place, normal, _, _ = find(point, farthest)
+        if place is not None:
+            near.append(number)
+            places.append(place[:])
+            normals.append(normal[:])
+    if not near:
+        return
+    numbers = np.array(near)
+    way = np.array(places) - own[numbers]
+    distance = np.linalg.norm(way, axis=1)
+    if solid.is_closed:
+        # The way to the nearest point turns around where the surface dips into the solid, which is as good as touching.
+        inwards = -np.array(normals)
+        distance = np.where((way * inwards).sum(axis=1) > 0.0, distance, 0.0)
+    else:
+        inwards = way / np.maximum(distance, 1e-12)[:, None]
+    inwards = inwards @ solid.rotation.T
+    facing = (mesh.normals[numbers] * inwards).sum(axis=1)
+    touch.add(numbers, distance, inwards, facing, moves=solid.is_closed)
+
+
+def _smoothstep(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    share = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return share * share * (3.0 - 2.0 * share)

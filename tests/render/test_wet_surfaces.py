@@ -1,0 +1,132 @@
+"""No mirror of air between water and what it wets: tiny pictures without denoising."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blender_scenes import RENDER_FRAMES, read, redness, spec_of, sphere, still_camera, write_mesh
+from fresh_python import run_python
+from needed_blender import needs_bpy
+
+from render.meshes import write_ply
+from render.parameters import CameraParameters, MaterialParameters
+from render.spec import MeshObject, MeshSequenceObject, SceneObject
+
+pytestmark = needs_bpy
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+REACH = 0.012
+"""Of particles with a radius of 8 mm [m]."""
+GAP = 0.002
+"""Between the water and what it lies on, a quarter of a radius [m]."""
+NO_REACH = 0.1 * GAP
+"""Too short to reach across the gap [m]."""
+WATER_TOP = 0.5
+RED = MaterialParameters(look="plastic", color=(0.7, 0.02, 0.02), roughness=0.5)
+CAMERA = still_camera(CameraParameters(position=(0.0, -3.0, 0.62), look_at=(0.0, 0.0, 0.3), focal_length_mm=70.0))
+
+
+def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A closed box whose vertices belong to one side each: positions, triangles and outward normals."""
+    corners = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]) * np.subtract(high, low) + low
+    quads = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
+    sides = np.array([(0, 0, -1), (0, 0, 1), (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)])
+    first = 4 * np.arange(6)[:, None]
+    triangles = np.concatenate([first + np.array(three) for three in ((0, 1, 2), (0, 2, 3))])
+    return corners[quads.ravel()], triangles, np.repeat(sides, 4, axis=0)
+
+
+def write_water(folder: Path, *, hole: tuple[tuple[float, float, float], float] | None = None) -> None:
+    """A block of water a hair above the floor, maybe with a round hole in it: its centre and radius."""
+    positions, triangles, normals = box((-0.45, -0.4, GAP), (0.45, 0.4, WATER_TOP))
+    if hole is not None:
+        around, inside = sphere(*hole)
+        triangles = np.concatenate([triangles, inside[:, ::-1] + len(positions)])
+        normals = np.concatenate([normals, (np.array(hole[0]) - around) / hole[1]])
+        positions = np.concatenate([positions, around])
+    write_ply(folder / "water000000.ply", positions, triangles, normals=normals, velocities=0 * positions)
+
+
+def water(wets_within: float, *, caustics: bool = False) -> MeshSequenceObject:
+    # Hardly coloured: the surface alone decides what is seen.
+    material = MaterialParameters(look="water", density=0.02, caustics=caustics)
+    return MeshSequenceObject(name="water", file="water{frame}.ply", material=material, wets_within=wets_within)
+
+
+def draw(folder: Path, *objects: SceneObject) -> np.ndarray:
+    """Display values of frame 0 from 0 to 255, (72, 128, 3)."""
+    spec = spec_of(*objects, samples=16, motion_blur=False, resolution=(128, 72), quality="preview")
+    spec.model_copy(update={"camera": CAMERA}).write(folder / "spec.json")
+    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
+    return read(folder / "0.png")
+
+
+FLOOR = np.s_[58:62, 44:84]
+"""Pixels of the floor through the water's front, which meet its lower side at some 80 degrees."""
+
+
+def brightness_of_the_floor(folder: Path, *objects: SceneObject) -> float:
+    return float((draw(folder, *objects)[FLOOR] @ LUMINANCE).mean())
+
+
+def test_the_floor_under_water_is_seen_and_mirrors_nothing(tmp_path):
+    write_water(tmp_path)
+    bare, wet = brightness_of_the_floor(tmp_path), brightness_of_the_floor(tmp_path, water(REACH))
+    # What the water's surfaces keep back comes to 0.1 % in display values, noise of 16 samples to less.
+    assert wet == pytest.approx(bare, rel=0.05)
+    # What does not wet is a mirror, of the dark upper half of the room.
+    assert brightness_of_the_floor(tmp_path, water(NO_REACH)) < 0.5 * wet
+
+
+def test_light_that_caustics_bend_reaches_a_floor_under_water(tmp_path):
+    """Cycles finds no way through two parallel surfaces, and a floor under a block of water was a quarter as bright."""
+    write_water(tmp_path)
+    straight, bent = (brightness_of_the_floor(tmp_path, water(REACH, caustics=on)) for on in (False, True))
+    # The light of the room's dome is not followed.
+    assert bent > 0.7 * straight
+
+
+BALL = ((0.0, -0.1, 0.2), 0.12)
+IN_FRONT = np.s_[36:66, 40:88]
+"""Pixels of the ball as it is seen through the water's front."""
+
+
+def draw_ball(folder: Path, material: MaterialParameters, *, gap: float, reach: float) -> np.ndarray:
+    """A ball in a hole in the water that is so much wider than it."""
+    center, radius = BALL
+    write_mesh(folder / "ball.ply", *sphere((0.0, 0.0, 0.0), radius))
+    write_water(folder, hole=(center, radius + gap))
+    return draw(folder, water(reach), MeshObject(name="ball", file="ball.ply", position=center, material=material))
+
+
+def red_pixels(picture: np.ndarray) -> int:
+    # Grey has 0.33; the bright upper side of the ball is paler than the rest.
+    return int((redness(picture) > 0.42)[IN_FRONT].sum())
+
+
+def test_a_ball_under_water_is_red_up_to_its_rim(tmp_path):
+    wet, dry, apart = (
+        red_pixels(draw_ball(tmp_path, RED, gap=gap, reach=reach))
+        for gap, reach in ((GAP, REACH), (GAP, NO_REACH), (2.0 * REACH, REACH))
+    )
+    # Total reflection begins at three quarters of the radius, which leaves 0.56 of the disc.
+    assert dry < 0.7 * wet
+    # Water that is far from the ball has air around it, and its mirror.
+    assert apart < 0.7 * wet
+
+
+def test_water_keeps_its_surface_around_a_body_of_glass(tmp_path):
+    """Glass bends light as if it came from air, and through a sliver of air it comes as if from water."""
+    ball = draw_ball(tmp_path, MaterialParameters(look="glass"), gap=GAP, reach=REACH) @ LUMINANCE
+    # A lens of 1.5 shows the room upside down, its dark half from the ball's middle down (129 there); relative to
+    # water glass bends little (182, and 200 for the ground beside the ball).
+    assert ball[46:49, 58:70].mean() > 155
+
+
+def test_a_surface_without_normals_is_refused(tmp_path):
+    write_mesh(tmp_path / "water000000.ply", *sphere((0.0, 0.0, 0.5), 0.2))
+    spec_of(water(REACH)).write(tmp_path / "spec.json")
+    told = run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0")
+    assert "REFUSED" in told and "has no normals (nx, ny, nz)" in told
