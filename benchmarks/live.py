@@ -87,6 +87,7 @@ def measure(session: Session, page: Counted, seconds: float, *, drags: bool) -> 
     """Run for so many seconds of wall time, with the ball in hand or not."""
     times: list[float] = []
     substeps: list[int] = []
+    strains: list[float] = []
     processor = time.process_time()
     began, first, page.shown, page.show_s = time.perf_counter(), session.world.frame, 0, 0.0
     seen = first
@@ -98,6 +99,7 @@ def measure(session: Session, page: Counted, seconds: float, *, drags: bool) -> 
             status = session.status()
             times.append(status.frame_ms)
             substeps.append(status.substeps["cloth"])
+            strains.append(session.world.diagnostics()["cloth"]["max_strain"])
         passed = time.perf_counter() - began
         if drags:
             angle = 2.0 * math.pi * passed / 2.0
@@ -117,6 +119,7 @@ def measure(session: Session, page: Counted, seconds: float, *, drags: bool) -> 
         "frame_ms": statistics.median(times),
         "processor_ms": 1e3 * (time.process_time() - processor) / max(frames, 1),
         "substeps_taken": statistics.mean(substeps),
+        "max_strain": max(strains),
         "show_ms": 1e3 * page.show_s / max(page.shown, 1),
         "message": session.message,
     }
@@ -154,6 +157,7 @@ def main() -> None:
             session,
             recorder=recorder,
             save=lambda loaded=loaded, session=session: save_job(loaded, session.values, Path()),
+            written=loaded.job,
         )
         address = f"ws://127.0.0.1:{server.get_port()}"
         viewer = None

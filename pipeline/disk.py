@@ -90,8 +90,8 @@ def _picture_bytes_per_pixel(job: Job) -> float:
 _PRORES_FACTOR = 30.0
 
 _BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
-    # Positions and velocities of particles; smoke is stored where there is some.
-    "simulate": lambda size: 22_000 + 22.0 * size.particles + 2.0 * size.cells + 32.0 * size.nodes,
+    # Positions, velocities, densities and pressures of particles; smoke is stored where there is some.
+    "simulate": lambda size: 22_000 + 26.0 * size.particles + 2.0 * size.cells + 32.0 * size.nodes,
     # A surface grows with the two thirds of the volume.
     "surface": lambda size: 2_500.0 * size.particles ** (2 / 3),
     "volume": lambda size: 20_000 + 3.0 * size.cells,

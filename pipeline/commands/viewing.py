@@ -13,7 +13,9 @@ from pipeline.commands.stopping import told_to_stop
 @click.command()
 @submitted_job_argument
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0 takes a free one.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at; the page has no password.")
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, help="Address of this machine alone; from others, ssh -L."
+)
 @click.option(
     "--particles", type=click.IntRange(min=1), default=200_000, show_default=True, help="Most drawn of each fluid."
 )

@@ -113,7 +113,8 @@ class Follower:
                 elif entry.wish is not Wish.RUN:
                     if not runs:
                         return self._say_why_it_stands(display, entry)
-                elif live_holder(self._spool.lease) is None:
+                elif live_holder(self._spool.lease) is None and self._spool.find(self._name) == entry:
+                    # Looked up again: the job, and with it the runner, may have ended since the entry was read.
                     return None
                 elif not runs:
                     self._say_place(display)

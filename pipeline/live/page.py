@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.live.drawing import SceneDrawing
 from pipeline.live.knobs import Knob, Value
+from pipeline.live.pace import told_pace
 from pipeline.live.saving import Saved
 from pipeline.live.session import Session, Status
 from pipeline.live.take import Recorder
 
 if TYPE_CHECKING:
     import viser
+
+    from pipeline.job.models import Job
 
 DECADE_STEP = 0.02
 """Of sliders over the powers of ten: 5 %."""
@@ -27,6 +30,7 @@ class LivePage:
         session: the scene.
         save: writes the job with the present values.
         recorder: makes takes.
+        written: the job as it was read: what differs from it for the sake of speed is told.
     """
 
     def __init__(
@@ -36,7 +40,9 @@ class LivePage:
         *,
         save: Callable[[], Saved],
         recorder: Recorder,
+        written: Job,
     ) -> None:
+        self._written = written
         self._server, self._session = server, session
         self._save, self._recorder = save, recorder
         self._sliders: dict[str, tuple[Knob, Any]] = {}
@@ -47,6 +53,7 @@ class LivePage:
         gui.main_panel.dock_right()
         self._notice = gui.add_markdown("")
         self._state = gui.add_markdown("")
+        self._pace = gui.add_markdown("")
         self._add_clock(gui)
         folders: dict[str, list[Knob]] = {}
         for knob in session.knobs.values():
@@ -69,6 +76,7 @@ class LivePage:
 
     def tell(self, status: Status) -> None:
         """Show how it goes, and where knobs are after something other than the page has turned them."""
+        self._pace.content = _plain(told_pace(self._written, self._session.values))
         self._pause.label = "Go on" if status.is_paused else "Pause"
         self._record.label = "Stop recording" if self._recorder.is_recording else "Record"
         written = _written(status, self._session.speed)
@@ -108,7 +116,8 @@ class LivePage:
     def _add_knob(self, gui: Any, knob: Knob) -> None:
         start = self._session.values[knob.name]
         if knob.kind == "switch":
-            handle = gui.add_checkbox(knob.label, bool(start))
+            hint = "Layers that cross while it is off hang together once it is on: reset then"
+            handle = gui.add_checkbox(knob.label, bool(start), hint=hint)
         elif knob.kind == "vector":
             handle = gui.add_vector3(
                 knob.label, start, min=(knob.low,) * 3, max=(knob.high,) * 3, step=0.1 if knob.high <= 100.0 else 1.0

@@ -71,7 +71,13 @@ def show_live(
             raise PipelineError(f"{job.name}: {error}") from error
         session.is_paused = paused
         recorder = Recorder(loaded, session, output, device=device)
-        page = LivePage(server, session, recorder=recorder, save=lambda: save_job(loaded, session.values, folder))
+        page = LivePage(
+            server,
+            session,
+            save=lambda: save_job(loaded, session.values, folder),
+            recorder=recorder,
+            written=loaded.job,
+        )
         say(address_of(server))
         try:
             run(session, page, ends=ends)

@@ -6,14 +6,12 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import PipelineError
 from pipeline.live.knobs import with_substeps
+from pipeline.live.pace import cloth_frame_s
 from pipeline.stages.inputs import estimated_cloth_nodes, most_particles
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
-
-NODE_SUBSTEP_S = 1.4e-6
-"""Core time of a node in a substep of cloth in contact [s]: 10 000 nodes, 20 substeps, 0.28 s (docs/live.md)."""
 
 PARTICLE_STEP_S = {"wcsph": 0.45e-6, "dfsph": 1.7e-6, "pcisph": 1.7e-6}
 """Core time of a particle in a step [s] (docs/performance.md)."""
@@ -50,6 +48,11 @@ def live_job(job: Job, *, substeps: int | None = None) -> Job:
     return job.model_copy(update=changes)
 
 
+def computing_power(*, cores: int, on_gpu: bool) -> int:
+    """By how many cores a scene is computed."""
+    return GPU_CORES if on_gpu else cores
+
+
 def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
     """Refuse a scene whose frames would take too long.
 
@@ -57,9 +60,9 @@ def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
         PipelineError: says about how long a frame takes, and what would fit.
     """
     nodes, particles = estimated_cloth_nodes(job), most_particles(job)
-    power = GPU_CORES if on_gpu else cores
+    power = computing_power(cores=cores, on_gpu=on_gpu)
     substeps = (job.cloth[0].substeps or DEFAULT_SUBSTEPS) if job.cloth else 0
-    cloth_s = nodes * substeps * NODE_SUBSTEP_S / power
+    cloth_s = cloth_frame_s(job, power=power)
     fluid_s = 0.0
     if job.fluid:
         kind = job.fluid[0].solver
@@ -70,7 +73,9 @@ def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
     sizes, remedies = [], []
     if nodes:
         sizes.append(f"{nodes:,} cloth nodes at {substeps} substeps a frame")
-        remedies.append(f"about {int(nodes * share):,} nodes fit, or --substeps {max(1, int(substeps * share))}")
+        remedies.append(f"about {int(nodes * share):,} nodes fit")
+        if any(cloth.self_collision for cloth in job.cloth):  # else substeps were given up already
+            remedies[-1] += f", or --substeps {max(1, int(substeps * share))}"
     if particles:
         sizes.append(f"up to {particles:,.0f} particles")
         remedies.append(f"about {particles * share:,.0f} particles fit")

@@ -6,7 +6,7 @@ import errno
 import os
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from math import inf, prod
+from math import inf, pi, prod
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,13 +14,17 @@ from blake3 import blake3
 
 from pipeline.errors import MissingInputError, StageUnavailableError
 from sim.cloth.parameters import ClothParameters, RectangleSheet
+from sim.fluid.parameters import EmitterParameters, FluidParameters, RectangleOpening
 from sim.scene import SceneParameters
-from sim.shapes.parameters import MeshShape, Placement
+from sim.shapes.parameters import BoxShape, MeshShape, Placement
 
 ABSENT = "absent"
 """Version of a package that is not installed."""
 
 P = TypeVar("P", Placement, ClothParameters)
+
+MOST_IN_A_VOLUME = 1.5
+"""Of a thin block or a narrow opening, whose last particles reach beyond it, as against what the volume tells."""
 
 BYTES_PER_VERTEX = 8
 """What a vertex takes in a mesh file, with its share of the triangles, at the low end, which is OBJ of short numbers
@@ -85,9 +89,32 @@ def domain_volume(scene: SceneParameters) -> float:
 
 
 def most_particles(scene: SceneParameters) -> float:
-    """Upper bound of the number of fluid particles: no fluid holds more than fills the domain."""
-    volume = domain_volume(scene)
-    return sum(min(volume / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf) for fluid in scene.fluid)
+    """About the most particles of all fluids."""
+    return sum(most_particles_of(fluid, scene) for fluid in scene.fluid)
+
+
+def most_particles_of(fluid: FluidParameters, scene: SceneParameters, *, until_s: float = inf) -> float:
+    """About the most particles of a fluid: what its blocks and emitters give, at most a domain full.
+
+    Args:
+        fluid: one of the scene's.
+        scene: which has the domain.
+        until_s: what flows in later does not count [s].
+    """
+    filled = sum(
+        prod(block.shape.size) * block.scale**3 if isinstance(block.shape, BoxShape) else inf for block in fluid.block
+    )
+    emitted = sum(_emitted_volume(emitter, until_s) for emitter in fluid.emitter)
+    volume = min(MOST_IN_A_VOLUME * (filled + emitted), domain_volume(scene))
+    return min(volume / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf)
+
+
+def _emitted_volume(emitter: EmitterParameters, until_s: float) -> float:
+    """What flows in until then [m³]."""
+    opening = emitter.shape
+    area = prod(opening.size) if isinstance(opening, RectangleOpening) else pi * opening.radius**2
+    end_s = until_s if emitter.end_s is None else min(emitter.end_s, until_s)
+    return area * emitter.speed * max(0.0, end_s - emitter.start_s)
 
 
 def estimated_cloth_nodes(scene: SceneParameters) -> int:

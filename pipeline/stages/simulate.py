@@ -47,8 +47,8 @@ SNAPSHOTS_AT_ONCE = 5 + WAITING
 that, the newest before it finds a place in the queue, and what goes into its making."""
 WORKER_BYTES = 800_000_000
 """Interpreter, compiler and the driver's share of the host's memory; an estimate, on the safe side."""
-BYTES_PER_PARTICLE = 80
-"""A checkpoint's position, velocity, number and reference position, and sorting; a frame takes 32."""
+BYTES_PER_PARTICLE = 84
+"""A checkpoint's position, velocity, number and reference position, and sorting; a frame takes 36."""
 BYTES_PER_CELL = 24
 """Five float32 in a frame, five with ghosts in a checkpoint."""
 BYTES_PER_CLOTH_NODE = 60
@@ -59,7 +59,7 @@ class SimulateStage:
     """One task for the whole job: it commits a frame at a time and continues where it stopped."""
 
     name = "simulate"
-    version = 6
+    version = 7
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one.

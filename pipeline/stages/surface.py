@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from math import ceil
+from typing import TYPE_CHECKING
+
 from pipeline.cache import read_frame
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
 from pipeline.stages.body_frames import tasks_of_bodies
-from pipeline.stages.inputs import tool_version
+from pipeline.stages.inputs import most_particles_of, tool_version
 from pipeline.task import Resources, Task
 
-MEMORY_BYTES = 500_000_000
-"""What meshing half a million particles was measured to take (425 MB at 512,000, 76 MB at 16,000). How many there are
-is not known before the simulation has filled its blocks."""
+if TYPE_CHECKING:
+    from sim.fluid.parameters import FluidParameters
+
+WORKER_BYTES = 100_000_000
+BYTES_PER_SURFACE_PARTICLE = 140_000
+"""What meshing takes goes with the surface, so with the particles to the power 2/3, at `CUBE_SIZE`. Measured: 76 MB for
+16,000 particles at rest, 425 for 512,000; splashes have more surface: 119 MB for 25,000, 798 for 504,000."""
+CUBE_SIZE = 0.75
+"""In radii. Cubes of half the width need four times the memory (0.5: 262 MB for those 25,000)."""
 
 
 class SurfaceStage:
@@ -35,8 +44,7 @@ class SurfaceStage:
             tools={name: tool_version(name) for name in tools},
             surface=surface,
         )
-        resources = Resources(memory_bytes=MEMORY_BYTES)
-        fluids = [(fluid.name, resources) for fluid in job.fluid]
+        fluids = [(fluid.name, _resources(fluid, job)) for fluid in job.fluid]
         return tasks_of_bodies(self.name, job, layout, bodies=fluids, output=layout.surface, parameters=parameters)
 
     def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
@@ -60,3 +68,10 @@ class SurfaceStage:
         with context.committing(task.outputs[0], validate_ply) as path:
             write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities)
         context.progress(1, 1)
+
+
+def _resources(fluid: FluidParameters, job: Job) -> Resources:
+    """An upper bound: how many particles there are is not known before the simulation has filled its blocks."""
+    on_surface = most_particles_of(fluid, job, until_s=job.frame_count / job.fps) ** (2.0 / 3.0)
+    finer = CUBE_SIZE / job.surface.cube_size_in_radii
+    return Resources(memory_bytes=WORKER_BYTES + ceil(BYTES_PER_SURFACE_PARTICLE * on_surface * finer**2))

@@ -24,6 +24,7 @@ from sim.snapshots import BodyKind, Snapshot
 Floats = NDArray[np.float32]
 DENSE_KINDS: tuple[BodyKind, ...] = ("fluid", "rigid", "cloth")
 """Kinds of bodies whose arrays are read whole; of a smoke only the cells that are not empty."""
+PRESSURE = "pressure"
 SPEED = "speed"
 """Computed from the velocities; every other value that particles are coloured by is an array of the cache."""
 

@@ -27,7 +27,7 @@ from pipeline.view.loaded import LoadedFrames
 from pipeline.view.numbers import SolverSeries, plot, table
 from pipeline.view.playback import Playback
 from pipeline.view.scene import CAMERA, SURFACES, Extents, JobScene, Shown
-from pipeline.view.texts import legend, notice, thinned, title
+from pipeline.view.texts import lacking, legend, notice, thinned, title
 
 if TYPE_CHECKING:
     from render.camera_path import View
@@ -230,7 +230,7 @@ class ViewPage:
         """Text and plot; viser sends only what differs."""
         controls, shown, count = self._controls, self._shown, self._job.frame_count
         controls.title.content = title(self._job.name, shown, frame, done=len(self.frames), count=count)
-        remarks = thinned(shown) if shown is not None else []
+        remarks = [*thinned(shown), *lacking(shown)] if shown is not None else []
         controls.notice.content = notice(self._troubles(frame, settings), remarks)
         controls.legend.content = self._legend(settings.color_by, top_speed)
         controls.play.label = "Pause" if self.playback.plays else "Play"

@@ -17,7 +17,7 @@ from pipeline.view.colors import BODY as BODY_COLOR
 from pipeline.view.colors import CLOTH, PIN, SURFACE, WHITEWATER, Colors, ramp, srgb
 from pipeline.view.committed import CommittedFrames, Stamp
 from pipeline.view.drawing import Drawing, Rgb, box_edges
-from pipeline.view.frames import SPEED, Particles, Pose, ShownFrame
+from pipeline.view.frames import PRESSURE, SPEED, Particles, Pose, ShownFrame
 from pipeline.view.smoke_pictures import cut, points
 from render.errors import InvalidFileError
 from render.meshes import SurfaceMesh, read_ply
@@ -26,6 +26,8 @@ from sim.rigid.rotation import from_degrees
 PLAIN = "plain"
 DENSITY_AROUND = 0.03
 """Densities are coloured within so much of the one at rest, on both sides."""
+PRESSURE_PERCENTILE = 99.0
+"""The last colour of pressures is what all but one of a hundred have at most: where water hits, single ones peak."""
 DOMAIN_COLOR, CAMERA_COLOR = (120, 130, 146), (240, 190, 90)
 PARTICLES, SURFACES, SPRAY, CLOTHS, BODIES, SMOKE, DOMAIN, PINS, CAMERA = (
     "Particles", "Surfaces", "Whitewater", "Cloth", "Rigid bodies", "Smoke", "Domain", "Pins", "Camera",
@@ -81,7 +83,8 @@ class Extents:
                 finite = values[np.isfinite(values)]
                 if len(finite):
                     low, high = self.values.get(name, (math.inf, -math.inf))
-                    self.values[name] = (min(low, float(finite.min())), max(high, float(finite.max())))
+                    top = np.percentile(finite, PRESSURE_PERCENTILE) if name == PRESSURE else finite.max()
+                    self.values[name] = (min(low, float(finite.min())), max(high, float(top)))
         for name, smoke in shown.smokes.items():
             if smoke.density.size:
                 self.smoke[name] = max(self.smoke.get(name, 0.0), float(smoke.density.max()))
@@ -98,6 +101,8 @@ class Extents:
             reach = DENSITY_AROUND * cloud.rest_density
             return Range(cloud.rest_density - reach, cloud.rest_density + reach, around=True)
         low, high = self.values.get(name, (0.0, 1.0))
+        if name == PRESSURE:
+            return Range(0.0, high)
         return Range(0.0, top_speed or high) if name == SPEED else Range(low, high)
 
 

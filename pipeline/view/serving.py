@@ -2,10 +2,10 @@
 
 viser asks nobody where he comes from, so a page of somebody else, open in the same browser, could use the controls of
 ours and see its scene: websockets are not bound to the site that they are opened from. And whoever is connected may ask
-viser for a tunnel through which all the world reaches the page. So requests whose Origin is another site than the Host
-that they name are refused, and for a page that only this machine reaches, also those that name another Host ("DNS
-rebinding": a name of somebody else that was bent to this machine's address); tunnels are not opened. Programs that are
-no browsers send no Origin and are let in: they could do on this machine, or in its network, what they like anyway.
+viser for a tunnel through which all the world reaches the page. So pages listen at addresses that only this machine
+reaches; requests whose Origin is another site than the Host that they name are refused, and those that name another
+Host than this machine ("DNS rebinding": a name of somebody else that was bent to its address); tunnels are not opened.
+Programs that are no browsers send no Origin and are let in: they could do on this machine what they like anyway.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ import errno
 import http
 import importlib.util
 import io
-import ipaddress
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from pipeline.dashboard.access import host_of, is_address, is_loopback
+from pipeline.dashboard.access import host_of, is_loopback
 from pipeline.errors import PipelineError, StageUnavailableError
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from websockets.datastructures import Headers
 
 LOCAL = "127.0.0.1"
-"""A page lets anybody who reaches it use its controls, so by default only this machine reaches it."""
+"""A page lets anybody who reaches it use its controls, so only this machine reaches it."""
 
 _OPENING = threading.Lock()
 
@@ -47,7 +46,7 @@ def require_viser() -> None:
 
 
 def open_server(host: str, port: int, *, label: str | None = None) -> viser.ViserServer:
-    """A server that answers its own pages only; the caller stops it.
+    """A server that answers its own pages only, and only on this machine; the caller stops it.
 
     Args:
         host: address that it listens at.
@@ -55,9 +54,10 @@ def open_server(host: str, port: int, *, label: str | None = None) -> viser.Vise
         label: of its panel.
 
     Raises:
-        PipelineError: viser is missing or cannot be guarded, or the address cannot be had.
+        PipelineError: viser is missing or cannot be guarded, or the address cannot be had, or others reach it.
     """
     require_viser()
+    _require_loopback(host, port)
     import viser
     from viser import _messages
 
@@ -94,11 +94,9 @@ def page_server(*, host: str = LOCAL, port: int, label: str) -> Iterator[viser.V
 
 
 def address(server: viser.ViserServer) -> str:
-    """Where a browser finds it; one that listens at all addresses is found by this machine's name."""
+    """Where a browser finds it."""
     host = server.get_host()
-    if is_address(host) and ipaddress.ip_address(host).is_unspecified:
-        host = socket.gethostname()
-    elif host == LOCAL:
+    if host == LOCAL:
         host = "localhost"
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
@@ -114,7 +112,7 @@ def refusal(headers: Headers, *, host: str) -> str | None:
     if len(named) != 1:
         return "a request names one Host"
     name = host_of(named[0])
-    if is_loopback(host) and not is_loopback(name):
+    if not is_loopback(name):
         return f"this page is at {host}, not at {name}"
     if any(origin.lower().partition("://")[2] != named[0].lower() for origin in headers.get_all("Origin")):
         return "another site may not use this page"
@@ -158,14 +156,24 @@ def _silence() -> contextlib.redirect_stdout[io.StringIO]:
     return contextlib.redirect_stdout(io.StringIO())
 
 
+def _require_loopback(host: str, port: int) -> None:
+    """viser knows no passwords: whoever reaches its page may steer it, and a token in its address would be ours to keep
+    out of every message that it sends. ssh asks who comes, and keeps what is said from others."""
+    if is_loopback(host):
+        return
+    here = f"ssh -L {port or 'PORT'}:{LOCAL}:{port or 'PORT'} {socket.gethostname()}"
+    raise PipelineError(
+        f"--host {host}: others would reach the page, and it has no password. From another machine, go through ssh: "
+        f"leave --host out, run `{here}` there, and open http://{LOCAL}:{port or 'PORT'} in its browser"
+    )
+
+
 def _require_free(host: str, port: int) -> None:
     """viser takes the next port where one is taken, which would show another job than the address that is known."""
     try:
         family, kind, protocol, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except socket.gaierror as error:
         raise PipelineError(f"--host {host}: no address of this machine ({error.strerror})") from error
-    except UnicodeError as error:  # as of "a..b", which cannot be a name
-        raise PipelineError(f"--host {host}: no such address") from error
     with socket.socket(family, kind, protocol) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

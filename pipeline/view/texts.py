@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from html import escape
 
 from pipeline.view.colors import css_ramp
-from pipeline.view.frames import SPEED, ShownFrame
+from pipeline.view.frames import PRESSURE, SPEED, ShownFrame
 from pipeline.view.scene import Range
 
 NO_FRAME = "no frame yet"
-_UNITS = {SPEED: " m/s", "density": " kg/m³"}
+_UNITS = {SPEED: " m/s", "density": " kg/m³", PRESSURE: " Pa"}
 
 
 def title(name: str, shown: ShownFrame | None, frame: int | None, *, done: int, count: int) -> str:
@@ -40,6 +40,15 @@ def thinned(shown: ShownFrame) -> list[str]:
         f"{name}: {len(cloud.position):,} of {cloud.count:,} particles are drawn"
         for name, cloud in clouds.items()
         if len(cloud.position) < cloud.count
+    ]
+
+
+def lacking(shown: ShownFrame) -> list[str]:
+    """What caches of earlier versions do not have."""
+    return [
+        f"{name}: the cache holds no pressures, as an earlier version simulated this frame"
+        for name, cloud in shown.fluids.items()
+        if PRESSURE not in cloud.values
     ]
 
 

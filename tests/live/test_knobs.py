@@ -33,7 +33,9 @@ def test_a_page_has_odd_values_and_tells_what_happens_while_time_stands_still(tm
     session.is_paused = True
     with page_server(port=0, label="drape") as server:
         recorder = Recorder(read, session, tmp_path, device="cpu")
-        page = LivePage(server, session, save=lambda: save_job(read, session.values, tmp_path), recorder=recorder)
+        page = LivePage(
+            server, session, save=lambda: save_job(read, session.values, tmp_path), recorder=recorder, written=read.job
+        )
         page.tell(session.status())
         session.message = "something new"
         page.tell(session.status())

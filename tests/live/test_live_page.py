@@ -111,7 +111,9 @@ def test_a_page_draws_and_takes_drags_buttons_and_sliders_to_the_scene(tmp_path)
     recorder = Recorder(read, session, tmp_path / "renders", device="cpu")
     server = open_server("127.0.0.1", 0)
     try:
-        page = LivePage(server, session, save=lambda: save_job(read, session.values, tmp_path), recorder=recorder)
+        page = LivePage(
+            server, session, save=lambda: save_job(read, session.values, tmp_path), recorder=recorder, written=read.job
+        )
         with ThreadPoolExecutor(1) as browser:
             playing = browser.submit(play, f"http://127.0.0.1:{server.get_port()}", session, tmp_path)
             run(session, page, ends=playing.done)

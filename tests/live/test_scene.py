@@ -8,6 +8,10 @@ from live_jobs import BALL_OVER_SHEET, loaded
 
 from pipeline.cli import main
 from pipeline.errors import PipelineError
+from pipeline.job.loading import load_job
+from pipeline.live.knobs import knobs_of
+from pipeline.live.pace import FEWEST_SUBSTEPS, FLUENT_FRAME_S, cloth_frame_s, fluent, told_pace
+from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job, require_small
 
 
@@ -16,6 +20,39 @@ def test_a_scene_that_is_too_large_is_told_what_fits(tmp_path):
     with pytest.raises(PipelineError, match=r"160,801 cloth nodes at 20 substeps .* about [\d,]+ nodes fit.*--anyway"):
         require_small(large, cores=2, on_gpu=False)
     require_small(live_job(loaded(tmp_path).job), cores=1, on_gpu=False)
+
+
+@pytest.mark.parametrize(
+    ("counts", "substeps", "collides"),
+    [("[17, 17]", 20, True), ("[65, 65]", 11, True), ("[80, 80]", 9, False), ("[100, 100]", FEWEST_SUBSTEPS, False)],
+)
+def test_cloth_that_is_too_slow_gives_up_substeps_then_its_collisions_and_that_is_told(
+    tmp_path, counts: str, substeps: int, collides: bool
+):
+    text = BALL_OVER_SHEET.replace("[17, 17]", counts).replace("substeps = 8\n", "")
+    written = loaded(tmp_path, text).job
+    job = fluent(live_job(written), power=2)
+    (cloth,) = job.cloth
+    assert (cloth.substeps or 20, cloth.self_collision) == (substeps, collides)
+    assert cloth_frame_s(job, power=2) <= FLUENT_FRAME_S
+    told = told_pace(written, {knob.name: knob.start for knob in knobs_of(job)})
+    assert (f"{substeps} substeps a frame instead of 20" in told) == (substeps != 20)
+    assert ('"sheet" does not collide with itself' in told) == (not collides)
+    written_values = {knob.name: knob.start for knob in knobs_of(written)}
+    assert told_pace(written, written_values) == ""
+
+
+def test_a_job_that_is_saved_has_the_pace_that_it_was_played_with(tmp_path):
+    read = loaded(tmp_path, BALL_OVER_SHEET.replace("[17, 17]", "[100, 100]").replace("substeps = 8\n", ""))
+    values = {knob.name: knob.start for knob in knobs_of(fluent(live_job(read.job), power=2))}
+    (cloth,) = load_job(save_job(read, values, tmp_path).path).cloth
+    assert (cloth.substeps, cloth.self_collision) == (FEWEST_SUBSTEPS, False)
+
+
+def test_explicit_springs_keep_the_steps_that_they_need(tmp_path):
+    text = BALL_OVER_SHEET.replace("[17, 17]", "[100, 100]").replace("substeps = 8\n", 'integrator = "explicit"\n')
+    job = live_job(loaded(tmp_path, text).job)
+    assert fluent(job, power=2) is job
 
 
 def test_bodies_at_rest_can_be_led_but_not_in_a_fluid(tmp_path):
@@ -55,3 +92,17 @@ def test_without_viser_the_command_says_how_to_get_it(tmp_path, monkeypatch):
     outcome = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml")])
     assert outcome.exit_code == 3
     assert "pages in a browser need viser, which is not installed" in outcome.output
+
+
+def test_substeps_of_ones_own_and_those_of_the_job_are_not_had_at_once(tmp_path):
+    (tmp_path / "drape.toml").write_text(BALL_OVER_SHEET, encoding="utf-8")
+    outcome = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml"), "--as-written", "--substeps", "6"])
+    assert outcome.exit_code == 2
+    assert "give one of them" in outcome.output
+
+
+def test_several_sheets_keep_their_collisions_as_they_meet_each_other_anyway(tmp_path):
+    text = BALL_OVER_SHEET.replace("[17, 17]", "[100, 100]").replace("substeps = 8\n", "")
+    job = live_job(loaded(tmp_path, text).job)
+    two = job.model_copy(update={"cloth": (*job.cloth, job.cloth[0].model_copy(update={"name": "other"}))})
+    assert all(cloth.self_collision for cloth in fluent(two, power=2).cloth)

@@ -27,8 +27,8 @@ def estimated(frames: int, costs: dict[str, StageCost]) -> float:
 
 def test_an_estimate_grows_with_the_frames_that_are_to_be_made() -> None:
     ten, twenty = estimated(10, {}), estimated(20, {})
-    # 22 bytes a particle and 1.2 a pixel; checkpoints and the film are there once.
-    assert twenty - ten == pytest.approx(10 * (22_000 + 22e6 + 1_000 + 1.2 * 1920 * 1080))
+    # 26 bytes a particle and 1.2 a pixel; checkpoints and the film are there once.
+    assert twenty - ten == pytest.approx(10 * (22_000 + 26e6 + 1_000 + 1.2 * 1920 * 1080))
 
 
 @pytest.mark.parametrize(

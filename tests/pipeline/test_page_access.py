@@ -11,12 +11,24 @@ import msgspec
 import pytest
 import viser
 import websockets.asyncio.server
+from click.testing import CliRunner
 from viser import _messages
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from pipeline.cli import main
 from pipeline.errors import PipelineError
 from pipeline.view.serving import address, close_server, open_server, page_server
+
+DROP = """
+name = "drop"
+[[rigid]]
+name = "ball"
+kind = "dynamic"
+density = 500.0
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 1.0]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -63,13 +75,17 @@ def test_a_name_that_was_bent_to_this_machine_gets_nothing(server):
         page.close()
 
 
-def test_where_others_may_come_in_the_page_has_any_name_but_one_site():
-    with page_server(host="0.0.0.0", port=0, label="page") as server:
-        assert address(server) == f"http://{socket.gethostname()}:{server.get_port()}"
-        with joined(server, origin="http://studio-3:{port}", name="studio-3") as page:
-            assert page.recv(timeout=20)
-        with pytest.raises(InvalidStatus):
-            joined(server, origin="http://evil.example", name="studio-3")
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "studio-3", "a..b", "no such host", ""])
+def test_an_address_that_others_reach_is_refused_and_ssh_is_named(host):
+    with pytest.raises(PipelineError, match=f"--host {host}: others would reach the page.*ssh -L 8123:127.0.0.1:8123 "):
+        open_server(host, 8123)
+
+
+def test_live_says_so_before_it_builds_anything(tmp_path):
+    (tmp_path / "drop.toml").write_text(DROP)
+    outcome = CliRunner().invoke(main, ["live", str(tmp_path / "drop.toml"), "--host", "0.0.0.0", "--port", "0"])
+    assert outcome.exit_code == 1
+    assert "others would reach the page" in outcome.output
 
 
 def test_nobody_opens_a_tunnel(server):
@@ -87,12 +103,6 @@ def test_opening_a_page_leaves_the_library_of_websockets_as_it_was():
     server = open_server("127.0.0.1", 0)
     assert websockets.asyncio.server.serve is plain
     close_server(server)
-
-
-@pytest.mark.parametrize("host", ["a..b", "no such host"])
-def test_a_name_that_is_no_address_is_told_in_a_line(host):
-    with pytest.raises(PipelineError, match=f"--host {host}: no"):
-        open_server(host, 0)
 
 
 def test_an_address_of_ipv6_is_printed_in_brackets():

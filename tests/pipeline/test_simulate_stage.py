@@ -101,7 +101,9 @@ def test_frames_of_two_devices_are_not_mixed(layout: JobLayout, monkeypatch: pyt
         # Only the name is another machine's: what it would compute is not what this is about.
         other_machine.setattr("sim.runtime.initialize", lambda device, **options: start(device, **options) and "cuda")
         assert isinstance(simulate(layout, frames=2), Finished)
-    assert read_frame(layout.path(layout.frame_cache(1))).device == "cuda"
+    former = read_frame(layout.path(layout.frame_cache(1)))
+    assert former.device == "cuda"
+    assert set(former.bodies["water"].arrays) == {"position", "velocity", "density", "pressure", "particle_id"}
     shutil.rmtree(layout.checkpoints)
     ended = simulate(layout, frames=3)
     assert isinstance(ended, Failed)

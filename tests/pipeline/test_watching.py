@@ -60,6 +60,22 @@ def test_a_film_that_was_done_when_its_entry_went_was_not_cancelled(layout: JobL
     assert follower.follow() == 0
 
 
+def test_a_runner_that_ends_between_two_looks_leaves_a_film_and_not_a_job_that_waits(
+    layout: JobLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = Spool.of(layout)
+    entry = spool.enqueue(submission(layout.root.name))
+    with Lease.acquire(layout.lease):
+        follower = Follower(spool, layout, ticket=entry.ticket)
+
+    def look(lease: Path) -> None:
+        if lease == spool.lease:
+            spool.drop(entry.name)  # by a runner that ends right before its lease is looked at
+
+    monkeypatch.setattr("pipeline.commands.watching.live_holder", look)
+    assert follower.follow() == 0
+
+
 def test_a_run_that_says_it_did_everything_is_a_success(layout: JobLayout, capsys: pytest.CaptureFixture[str]) -> None:
     def succeed(lease: Lease) -> None:
         with Manifest(layout.manifest) as manifest:

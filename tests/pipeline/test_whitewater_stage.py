@@ -86,10 +86,12 @@ def test_a_change_concerns_only_the_stages_that_read_it(change, concerned):
 
 
 def test_the_memory_claim_counts_the_fluids_and_the_cloud():
+    ball = {"shape": {"type": "sphere", "radius": 0.1}}
+
     def claim(fluid_particles: int, cloud: int) -> int:
         of = job(
             domain={"min": [-10, -10, 0], "max": [10, 10, 20]},
-            fluid=[{**TANK["fluid"][0], "max_particles": fluid_particles}],
+            fluid=[{**TANK["fluid"][0], "block": [ball], "max_particles": fluid_particles}],
             whitewater={"water": {"max_particles": cloud}},
         )
         return next(task for task in plan_job(of, LAYOUT, STAGES) if task.stage == "whitewater").resources.memory_bytes

@@ -1,0 +1,90 @@
+"""How a scene is made fast enough to be played with, and how that is told: nothing of it is silent, all can be undone.
+
+A film's cloth takes as many substeps as look right and collides with itself; ten thousand nodes of it take several
+times longer than a hand can wait for. Only what does not fit is given up: substeps first, which make cloth softer,
+then its collisions with itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from pipeline.live.knobs import Value, knobs_of, with_substeps
+from pipeline.stages.inputs import estimated_cloth_nodes
+from sim.cloth.parameters import DEFAULT_SUBSTEPS
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+
+NODE_SUBSTEP_S = 1.4e-6
+"""Core time of a node in a substep of cloth in contact [s]. Twice what the scene alone was measured to take (10 000
+nodes, 20 substeps: 117 to 138 ms of processor time, docs/live.md): threads wait for each other, and page and browser
+want their share of the cores."""
+
+APART_SHARE = 0.75
+"""Of it, where cloth does not collide with itself: measured are 0.5 to 0.6, of which threads wait for more."""
+
+FLUENT_FRAME_S = 1.0 / 30.0
+"""What a frame of the scene may take for hands and eyes to go along [s]."""
+
+FEWEST_SUBSTEPS = 6
+"""Nothing blows up in fewer, but cloth that hangs by its corners is drawn to a multiple of its length there: a dragged
+ball draws springs beside the pins to 5 times their length in 6, to 12 in 4, to one and a half in 20 (docs/live.md)."""
+
+FEWEST_COLLIDING = 10
+"""Where cloth collides with itself, fewer substeps gain nothing: contacts have the more to do."""
+
+_PACE_KEYS = ("substeps", "self_collision")
+
+
+def cloth_frame_s(job: Job, *, power: float) -> float:
+    """About how long a frame of the cloths takes [s], on so many cores."""
+    if not job.cloth:
+        return 0.0
+    substeps = job.cloth[0].substeps or DEFAULT_SUBSTEPS
+    meets = any(cloth.self_collision for cloth in job.cloth) or len(job.cloth) > 1
+    return estimated_cloth_nodes(job) * substeps * NODE_SUBSTEP_S * (1.0 if meets else APART_SHARE) / power
+
+
+def fluent(job: Job, *, power: float) -> Job:
+    """The job with what it takes to run fluently given up, if it has any cloth that is too slow.
+
+    Args:
+        job: as it is simulated live.
+        power: cores that compute it.
+    """
+    if not job.cloth or job.cloth[0].integrator != "xpbd" or cloth_frame_s(job, power=power) <= FLUENT_FRAME_S:
+        return job
+    fewer = _in_fewer_substeps(job, FEWEST_COLLIDING, power=power)
+    if cloth_frame_s(fewer, power=power) <= FLUENT_FRAME_S or len(job.cloth) > 1:
+        return fewer  # several cloths collide with each other anyway
+    apart = tuple(cloth.model_copy(update={"self_collision": False}) for cloth in job.cloth)
+    return _in_fewer_substeps(job.model_copy(update={"cloth": apart}), FEWEST_SUBSTEPS, power=power)
+
+
+def _in_fewer_substeps(job: Job, fewest: int, *, power: float) -> Job:
+    """The job in as many substeps as are fluent, but no more than it has, and no fewer than that many."""
+    substeps = job.cloth[0].substeps or DEFAULT_SUBSTEPS
+    fitting = int(substeps * FLUENT_FRAME_S / cloth_frame_s(job, power=power))
+    return job.model_copy(update={"cloth": with_substeps(job.cloth, min(substeps, max(fitting, fewest)))})
+
+
+def told_pace(written: Job, values: Mapping[str, Value]) -> str:
+    """What is otherwise than in the job for the sake of speed, in a line; "" if nothing is.
+
+    Args:
+        written: the job.
+        values: of the scene's knobs, by name.
+    """
+    told = []
+    for knob in knobs_of(written):
+        value = values[knob.name]
+        if knob.paths[0][0] != "cloth" or knob.paths[0][-1] not in _PACE_KEYS or value == knob.start:
+            continue
+        if knob.kind == "whole":
+            told.append(f"{value} substeps a frame instead of {knob.start}")
+        else:
+            cloth = written.cloth[int(knob.paths[0][1])].name
+            told.append(f'"{cloth}" {"collides" if value else "does not collide"} with itself')
+    return f"Other than in the job: {'; '.join(told)}." if told else ""
