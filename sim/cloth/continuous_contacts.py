@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from sim.cloth.continuous_response import (
     STEPS,
-    finish_push,
-    push_apart,
+    begin_push,
+    push_on,
     repair_crossings,
-    weigh_contacts,
 )
 from sim.cloth.continuous_zones import ImpactZones
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
@@ -28,9 +27,9 @@ from sim.short_loops import is_short
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
 
-ITERATIONS = (8, 16)
-"""Steps of the contact iteration, multiples of `STEPS`, and of those that follow where it is not there yet: two layers
-under their weight need one, stacks and impacts more."""
+MORE_ITERATIONS = 16
+"""Steps of the contact iteration, a multiple of `STEPS`, that follow the first `STEPS` where those are not enough, as
+in stacks and impacts; two layers under their weight need one step."""
 
 TOLERANCE = 0.02
 """Part of their thickness by which contacts may miss what they should keep."""
@@ -92,7 +91,8 @@ class ContinuousContacts:
     def stable_dt(self, state: ClothState) -> float:
         """Largest step [s] in which cloth moves little against itself and against bodies."""
         deviation, speed = half_range(state.velocity, state.vertex_count, self._ends)
-        own = LARGEST_MOTION * self._pairs.mean_edge / deviation if deviation > 0.0 else math.inf
+        meets_cloth = deviation > 0.0 and (len(state.names) > 1 or any(state.self_collision))
+        own = LARGEST_MOTION * self._pairs.mean_edge / deviation if meets_cloth else math.inf
         return min(own, self.rigid.stable_dt(speed))
 
     def begin_frame(self) -> None:
@@ -154,53 +154,42 @@ class ContinuousContacts:
     def _find(self, state: ClothState, dt: float) -> int:
         recovery = min(1.0, dt / RECOVERY_TIME_S)
         while True:
-            self._contacts.counter.fill(0)
             self._pairs.find(state, self._contacts, recovery)
             self.rigid.find(state, self._pairs.patches, self._contacts, recovery)
-            found = self._contacts.found
+            found = self._contacts.take_found()
             if not self._contacts.make_room_for(found):
                 return found
 
     def _push(self, state: ClothState, count: int, *, is_first: bool) -> None:
         contacts, bodies, n = self._contacts, self.rigid.bodies, state.vertex_count
-        pushing, touched = weigh_contacts(
-            count, contacts.vertices, contacts.weights, contacts.floor, contacts.kind, contacts.arm, contacts.mobility,
-            contacts.impulse, contacts.pushing, self._counter, n, state.displacement,
-            self._predicted, state.inverse_mass, self._shares, self._touched,
-            *self._uses_of(contacts), bodies.count, bodies.inverse_mass, bodies.inverse_inertia, bodies.load,
-            bodies.load_unit, is_first, self._is_short(count),
-        )[:2]  # fmt: skip
+        short = self._is_short(count)
+        pushing, touched, missing = begin_push(
+            _momenta_from(0), count, contacts.vertices, contacts.weights, contacts.normal, contacts.floor,
+            contacts.kind, contacts.arm, contacts.friction, contacts.mobility, contacts.impulse,
+            contacts.impulse_before, contacts.impulse_given, contacts.pushing, contacts.push, self._counter, n,
+            state.displacement, self._predicted, self._start, self._reached, state.inverse_mass, state.thickness,
+            self._shares, self._touched, *self._uses_of(contacts), bodies.count, bodies.motion, bodies.motion_start,
+            bodies.motion_reached, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, bodies.impulse,
+            bodies.load, bodies.load_unit, self._impulse_unit, *self._missing.tree, is_first, short,
+        )  # fmt: skip
         if not pushing:
             return
-        for iterations in ITERATIONS:
-            if self._iterate(state, int(pushing), int(touched), iterations) <= TOLERANCE:
-                break
+        self._iterations += STEPS
+        if not np.int32(missing).view(np.float32) <= TOLERANCE:
+            for first in range(0, MORE_ITERATIONS, STEPS):
+                self._push_on(state, int(pushing), int(touched), first, short=short)
+            self._iterations += MORE_ITERATIONS
 
-    def _iterate(self, state: ClothState, count: int, touched: int, iterations: int) -> float:
-        """Some steps of the contact iteration; the most that a contact misses then, in its thickness."""
+    def _push_on(self, state: ClothState, count: int, touched: int, first: int, *, short: bool) -> None:
+        """More steps of the contact iteration, from step `first` of `MORE_ITERATIONS` on."""
         contacts, bodies = self._contacts, self.rigid.bodies
-        vertices, lanes, short = (touched, self._touched), self._missing.lanes, self._is_short(count)
-        uses = self._uses_of(contacts)
-        for first in range(0, iterations, STEPS):
-            push_apart(
-                tuple(k / (k + 3.0) for k in range(first, first + STEPS + 1)), int(first == 0), count,
-                contacts.pushing, contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind,
-                contacts.arm, contacts.friction, contacts.mobility, contacts.impulse, contacts.impulse_before,
-                contacts.impulse_given, contacts.push, *vertices, state.displacement, self._start, self._reached,
-                state.inverse_mass, *uses, bodies.count, bodies.motion, bodies.motion_start,
-                bodies.motion_reached, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered,
-                self._impulse_unit, short,
-            )  # fmt: skip
-        self._iterations += iterations
-        return float(
-            finish_push(
-                count, contacts.pushing, contacts.vertices, contacts.weights, contacts.normal, contacts.floor,
-                contacts.kind, contacts.arm, contacts.impulse, contacts.impulse_given, contacts.push, *vertices,
-                state.displacement, self._start, state.inverse_mass, state.thickness, *uses, bodies.count,
-                bodies.motion, bodies.motion_start, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered,
-                bodies.impulse, self._impulse_unit, lanes.items(count), lanes.lane_step(count), lanes.item_step(),
-                *self._missing.tree, short,
-            )
+        push_on(
+            _momenta_from(first), int(first == 0), first + STEPS >= MORE_ITERATIONS, count, contacts.pushing,
+            contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind, contacts.arm,
+            contacts.friction, contacts.mobility, contacts.impulse, contacts.impulse_before, contacts.impulse_given,
+            contacts.push, touched, self._touched, state.displacement, self._start, self._reached, state.inverse_mass,
+            *self._uses_of(contacts), bodies.count, bodies.motion, bodies.motion_start, bodies.motion_reached,
+            bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, bodies.impulse, self._impulse_unit, short,
         )  # fmt: skip
 
     def _uses_of(self, contacts: ContactList) -> tuple[ti.Ndarray, ...]:
@@ -242,3 +231,8 @@ class ContinuousContacts:
 
     def _crossing_rows(self, count: int) -> NDArray[np.bool_]:
         return self._crossing.to_numpy()[:count] == 1
+
+
+def _momenta_from(first: int) -> tuple[float, ...]:
+    """Momenta of the steps of one launch, from that of step `first` of an iteration on, and of the step after them."""
+    return tuple(k / (k + 3.0) for k in range(first, first + STEPS + 1))

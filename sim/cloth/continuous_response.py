@@ -43,8 +43,7 @@ ROUNDING = 1.0e-6
 """Relative rounding of a separation in float32, in lengths of the elements."""
 
 
-@fast_launch
-@ti.kernel
+@ti.func
 def weigh_contacts(
     count: ti.i32, vertices: Quadruples, weights: Weights, floor: Floats, kind: Integers, arm: Vectors,
     mobility: Floats, impulse: Vectors, pushing: Integers, counter: Integers,
@@ -52,12 +51,12 @@ def weigh_contacts(
     touched: Integers, uses: Integers, used_by: Integers, use_weight: Floats,
     body_count: ti.i32, body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_load: LongIntegers,
     load_unit: ti.f32, is_first: ti.template(), is_short: ti.template(),
-) -> ti.math.ivec2:  # fmt: skip
+):  # fmt: skip
     """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses, and
     keep what displacements were `predicted` without contacts.
 
-    Returns how many there are, and how many vertices they push, which are listed too. Contacts whose free vertices
-    weigh less than `LEAST_FREE_WEIGHT` do not push.
+    `counter` gets how many there are, and how many vertices they push, which are listed too. Contacts whose free
+    vertices weigh less than `LEAST_FREE_WEIGHT` do not push.
 
     Which of them push a vertex, by their places in `pushing`, and with what weights, is listed in `used_by` and
     `use_weight`, between `uses[2 i]` and `uses[2 i + 1]` of vertex i: then a step sums over the contacts of a vertex,
@@ -122,7 +121,6 @@ def weigh_contacts(
             most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
             total += ti.sqrt(most) * ti.cast(body_load[b], ti.f32) * load_unit
         mobility[c] = total
-    return ti.math.ivec2(counter[0], counter[1])
 
 
 @ti.func
@@ -182,8 +180,7 @@ def take(gathered: LongIntegers, first: ti.i32) -> ti.math.vec3:
     return push
 
 
-@fast_launch
-@ti.kernel
+@ti.func
 def push_apart(
     momenta: Momenta, starts: ti.i32, count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights,
     normal: Vectors, floor: Floats, kind: Integers, arm: Vectors, friction: Floats, mobility: Floats,
@@ -262,24 +259,18 @@ def push_apart(
             body_reached[2 * b + 1] = turn
 
 
-@fast_launch
-@ti.kernel
+@ti.func
 def finish_push(
-    count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats,
-    kind: Integers, arm: Vectors, impulse: Vectors, impulse_given: Vectors, push: Vectors,
-    touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, inverse_mass: Floats,
-    thickness: Floats, uses: Integers, used_by: Integers, use_weight: Floats,
-    body_count: ti.i32, body_motion: Vectors, body_start: Vectors,
-    body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_gathered: LongIntegers,
-    body_impulse: LongIntegers, unit: ti.f32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
-    lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats, is_short: ti.template(),
-) -> ti.f32:  # fmt: skip
-    """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
-
-    Returns the most that a contact's displacement is below its floor, in thicknesses of what touches.
-    """
+    count: ti.i32, pushing: Integers, kind: Integers, arm: Vectors, impulse: Vectors, impulse_given: Vectors,
+    push: Vectors, touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors,
+    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats,
+    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_inverse_mass: Floats,
+    body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, unit: ti.f32,
+    is_short: ti.template(),
+):  # fmt: skip
+    """The displacements that the impulses alone make, from where the iteration started; so both sides get the same."""
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, touched_end, bodies_end, lanes_end = count, touched_count, body_count, lanes
+    contacts_end, touched_end, bodies_end = count, touched_count, body_count
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for place in range(contacts_end):
@@ -300,6 +291,21 @@ def finish_push(
         body_motion[2 * b] = body_start[2 * b] + (body_inverse_mass[b] * unit) * take(body_gathered, 6 * b)
         twist = unit * take(body_gathered, 6 * b + 3)
         body_motion[2 * b + 1] = body_start[2 * b + 1] + body_inverse_inertia[b] @ twist
+
+
+@ti.func
+def most_missing(
+    count: ti.i32, pushing: Integers, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats,
+    kind: Integers, arm: Vectors, displacement: Vectors, thickness: Floats, body_motion: Vectors,
+    partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats, is_short: ti.template(),
+) -> ti.f32:  # fmt: skip
+    """The most that a contact's displacement is below its floor, in thicknesses of what touches."""
+    lanes_end = lanes
+    # Lanes as those of `sim.reductions.Lanes`, for a number of contacts that the host does not know yet.
+    items = (count + lanes - 1) // lanes
+    lane_step, item_step = items, 1
+    if ti.static(runs_on_gpu()):
+        lane_step, item_step = 1, lanes
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for lane in range(lanes_end):
@@ -313,6 +319,74 @@ def finish_push(
                 missing = ti.max(missing, least / thickness_between(vertices[c], thickness))
         partial[lane] = missing
     return reduced(partial, lanes, quantities, maxima, nodes)[0]
+
+
+@fast_launch
+@ti.kernel
+def begin_push(
+    momenta: Momenta, count: ti.i32, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats,
+    kind: Integers, arm: Vectors, friction: Floats, mobility: Floats, impulse: Vectors, impulse_before: Vectors,
+    impulse_given: Vectors, pushing: Integers, push: Vectors, counter: Integers, vertex_count: ti.i32,
+    displacement: Vectors, predicted: Vectors, start: Vectors, reached: Vectors, inverse_mass: Floats,
+    thickness: Floats, shares: Integers, touched: Integers, uses: Integers, used_by: Integers, use_weight: Floats,
+    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
+    body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, body_load: LongIntegers,
+    load_unit: ti.f32, unit: ti.f32, partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32,
+    nodes: Floats, is_first: ti.template(), is_short: ti.template(),
+) -> ti.math.ivec3:  # fmt: skip
+    """A round of contacts in one launch: which of them push, some steps of the iteration, and where these lead.
+
+    Returns how many contacts push, how many vertices they push, and the bits of what `most_missing` is.
+    """
+    weigh_contacts(
+        count, vertices, weights, floor, kind, arm, mobility, impulse, pushing, counter, vertex_count, displacement,
+        predicted, inverse_mass, shares, touched, uses, used_by, use_weight, body_count, body_inverse_mass,
+        body_inverse_inertia, body_load, load_unit, is_first, is_short,
+    )  # fmt: skip
+    pushing_count, touched_count = counter[0], counter[1]
+    push_apart(
+        momenta, 1, pushing_count, pushing, vertices, weights, normal, floor, kind, arm, friction, mobility, impulse,
+        impulse_before, impulse_given, push, touched_count, touched, displacement, start, reached, inverse_mass, uses,
+        used_by, use_weight, body_count, body_motion, body_start, body_reached, body_inverse_mass,
+        body_inverse_inertia, body_gathered, unit, is_short,
+    )  # fmt: skip
+    finish_push(
+        pushing_count, pushing, kind, arm, impulse, impulse_given, push, touched_count, touched, displacement, start,
+        inverse_mass, uses, used_by, use_weight, body_count, body_motion, body_start, body_inverse_mass,
+        body_inverse_inertia, body_gathered, body_impulse, unit, is_short,
+    )  # fmt: skip
+    missing = most_missing(
+        pushing_count, pushing, vertices, weights, normal, floor, kind, arm, displacement, thickness, body_motion,
+        partial, lanes, quantities, maxima, nodes, is_short,
+    )  # fmt: skip
+    return ti.math.ivec3(pushing_count, touched_count, ti.bit_cast(missing, ti.i32))
+
+
+@fast_launch
+@ti.kernel
+def push_on(
+    momenta: Momenta, starts: ti.i32, finishes: ti.template(), count: ti.i32, pushing: Integers, vertices: Quadruples,
+    weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors, friction: Floats,
+    mobility: Floats, impulse: Vectors, impulse_before: Vectors, impulse_given: Vectors, push: Vectors,
+    touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, reached: Vectors,
+    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats,
+    body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
+    body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, unit: ti.f32,
+    is_short: ti.template(),
+):  # fmt: skip
+    """More steps of the iteration, and where they lead if it `finishes`."""
+    push_apart(
+        momenta, starts, count, pushing, vertices, weights, normal, floor, kind, arm, friction, mobility, impulse,
+        impulse_before, impulse_given, push, touched_count, touched, displacement, start, reached, inverse_mass, uses,
+        used_by, use_weight, body_count, body_motion, body_start, body_reached, body_inverse_mass,
+        body_inverse_inertia, body_gathered, unit, is_short,
+    )  # fmt: skip
+    if ti.static(finishes):
+        finish_push(
+            count, pushing, kind, arm, impulse, impulse_given, push, touched_count, touched, displacement, start,
+            inverse_mass, uses, used_by, use_weight, body_count, body_motion, body_start, body_inverse_mass,
+            body_inverse_inertia, body_gathered, body_impulse, unit, is_short,
+        )  # fmt: skip
 
 
 @fast_launch

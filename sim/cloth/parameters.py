@@ -40,7 +40,8 @@ class RectangleSheet(Parameters):
         if self.counts is not None:
             return self.counts
         assert self.resolution is not None
-        along_x, along_y = (max(2, round(side / self.resolution) + 1) for side in self.size)
+        # Far beyond what is allowed, as a side over the smallest numbers is no number any more.
+        along_x, along_y = (max(2, round(min(side / self.resolution, 1.0e9)) + 1) for side in self.size)
         return along_x, along_y
 
     @model_validator(mode="after")

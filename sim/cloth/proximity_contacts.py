@@ -42,12 +42,12 @@ class ContactList:
 
     def __init__(self, capacity: int) -> None:
         self.counter = ti.ndarray(ti.i32, 1)
+        self.counter.fill(0)
         self._allocate(capacity)
 
-    @property
-    def found(self) -> int:
-        """Number of contacts found, also those beyond the capacity; waits for the device."""
-        return int(read_count(self.counter))
+    def take_found(self) -> int:
+        """Number of contacts found, also those beyond the capacity; none are from now on. Waits for the device."""
+        return int(take_count(self.counter))
 
     def make_room_for(self, found: int) -> bool:
         """Whether so many contacts did not fit, so that they have to be found again; now there is room."""
@@ -84,9 +84,11 @@ class ContactList:
 
 @fast_launch
 @ti.kernel
-def read_count(counter: Integers) -> ti.i32:
-    """The first of some integers."""
-    return counter[0]
+def take_count(counter: Integers) -> ti.i32:
+    """The first of some integers, which is zero then."""
+    count = counter[0]
+    counter[0] = 0
+    return count
 
 
 @ti.func

@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.host_access import put, take
 from sim.rigid.contacts import Poses
 from sim.rigid.device_shapes import DeviceShapes
 from sim.rigid.geometry import BodyGeometry
@@ -72,10 +73,10 @@ class CollisionBodies(DeviceShapes):
         b = self.count
         if not b:
             return
-        self.position.from_numpy(poses.position[:b].astype(np.float32))
-        self.rotation.from_numpy(poses.rotation[:b].astype(np.float32))
-        self.inverse_mass.from_numpy(inverse_mass.astype(np.float32))
-        self.inverse_inertia.from_numpy(inverse_inertia.astype(np.float32))
+        put(self.position, poses.position[:b])
+        put(self.rotation, poses.rotation[:b])
+        put(self.inverse_mass, inverse_mass)
+        put(self.inverse_inertia, inverse_inertia)
         reach = np.array([geometry.radius for geometry in self.geometries])
         mobility = inverse_mass + reach**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))
         self.load_unit = LOAD_UNIT * float(np.sqrt(mobility.max())) or 1.0
@@ -94,7 +95,7 @@ class CollisionBodies(DeviceShapes):
             turn: rotation vectors [rad], (b, 3).
         """
         if self.count:
-            self.motion.from_numpy(np.stack([shift, turn], axis=1).reshape(-1, 3).astype(np.float32))
+            put(self.motion, np.stack([shift, turn], axis=1).reshape(-1, 3))
 
     def take_impulses(self, unit: float) -> tuple[Array, Array]:
         """Linear and angular impulse times the step that cloth gave since the last call [kg m], [kg m²], (b, 3) each.
@@ -102,6 +103,5 @@ class CollisionBodies(DeviceShapes):
         Args:
             unit: of the integers [kg m].
         """
-        sums = unit * self.impulse.to_numpy().astype(np.float64).reshape(-1, 6)[: self.count]
-        self.impulse.fill(0)
+        sums = unit * take(self.impulse).astype(np.float64).reshape(-1, 6)[: self.count]
         return sums[:, :3], sums[:, 3:]

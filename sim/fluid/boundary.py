@@ -37,6 +37,7 @@ class Boundary:
         position: (fixed + moving,) of 3-vectors [m].
         velocity: (fixed + moving,) of 3-vectors [m/s], 0 for the fixed ones.
         volume: V_b of each sample [m³], (fixed + moving,).
+        friction_volume: V_b as friction counts it [m³], 0 for samples without friction, (fixed + moving,).
         index: row in the fixed samples given of each fixed sample here, (fixed,), on the host.
         offset: moving samples relative to the centre of mass of their body, in its axes [m], (moving,) of 3-vectors.
         body: number of the body of each moving sample, `NO_BODY` for those of sheets, (moving,), int32.
@@ -51,12 +52,14 @@ class Boundary:
         fixed: BoundarySamples,
         moving: BoundarySamples,
         *,
+        is_smooth: NDArray[np.bool_],
         sheets: BoundarySamples,
         body_count: int,
         grid: CellGrid,
         spacing: float,
         support_in_spacings: float,
     ) -> None:
+        """Sort and weigh samples; those of the fixed ones that are smooth, (m,), exert no friction."""
         if (np.diff(moving.body) < 0).any() or moving.body.max(initial=-1) >= body_count:
             raise ValueError(f"moving samples must be given body by body, numbered from 0 to {body_count - 1}")
         low = np.array(grid.origin)
@@ -83,6 +86,8 @@ class Boundary:
         self.position = _device_array(np.concatenate([fixed_positions, moving_positions]))
         self.velocity = _device_array(np.zeros((self.fixed_count + self.moving_count, 3), dtype=np.float32))
         self.volume = _device_array(volumes.astype(np.float32))
+        volumes[: self.fixed_count][is_smooth[self.index]] = 0.0
+        self.friction_volume = _device_array(volumes.astype(np.float32))
 
         no_body = np.full(self.sheet_count, NO_BODY, dtype=np.int32)
         self.offset, self.body = _device_array(moving.positions), _device_array(np.concatenate([moving.body, no_body]))

@@ -83,8 +83,11 @@ class SPHFluid(MaterialFluid):
     def pressures(self) -> NDArray[np.float32]:
         """Pressure of each particle [Pa], (n,), by particle id."""
         self._compute_density()
+        return self._pressures()[self._by_id()]
+
+    def _pressures(self) -> NDArray[np.float32]:
         density, term = self._host(self._density), self._host(self._pressure_term)
-        return (term * density**2)[self._by_id()]
+        return (term * density**2).astype(np.float32)
 
     @property
     @abstractmethod
@@ -109,7 +112,8 @@ class SPHFluid(MaterialFluid):
             particles.position, particles.velocity, particles.phase, self._density,
             self._density if pressure_term is None else pressure_term,
             particles.count, *self._list,
-            self.boundary.position, self.boundary.velocity, self.boundary.volume, self.boundary.moving_count > 0,
+            self.boundary.position, self.boundary.velocity, self.boundary.volume, self.boundary.friction_volume,
+            self.boundary.moving_count > 0,
             phases.rest_density, self._explicit_viscosity, phases.surface_tension, len(phases) > 1,
             self.gravity, self.particle_volume, self._sigma, 1.0 / self.support_radius,
             pressure_term is not None, self._pressure_slope,
@@ -199,7 +203,8 @@ class SPHFluid(MaterialFluid):
 def compute_acceleration(
     position: Vectors, velocity: Vectors, phase: Integers, density: Floats, pressure_term: Floats, count: ti.i32,
     start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
-    boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, with_moving: ti.template(),
+    boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, friction_volume: Floats,
+    with_moving: ti.template(),
     rest_density: Floats, dynamic_viscosity: Floats, surface_tension: Floats, several: ti.template(),
     gravity: ti.math.vec3, volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, with_pressure: ti.template(),
     pressure_slope: ti.f32, softening: ti.f32, artificial: ti.f32, wall_friction: ti.f32, spacing: ti.f32,
@@ -264,15 +269,15 @@ def compute_acceleration(
             r_squared = x_ib.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             r = r_squared * inverse_r
-            scale = -pressure_i
+            slope = spline_slope(r * inverse_support)
             if ti.static(with_wall_friction):
                 v_ib = v_i
                 if ti.static(with_moving):
                     v_ib -= boundary_velocity[b]
                 viscous = viscous_factor(v_ib.dot(x_ib), r_squared, softening, mu, artificial * rho0)
-                scale += wall_friction * viscous / rho_i
-            gradient = boundary_volume[b] * spline_slope(r * inverse_support) * inverse_r * x_ib
-            boundary_sum += scale * gradient
+                boundary_sum += wall_friction * viscous / rho_i * friction_volume[b] * slope * inverse_r * x_ib
+            gradient = boundary_volume[b] * slope * inverse_r * x_ib
+            boundary_sum -= pressure_i * gradient
             boundary_gradient += gradient
         if ti.static(with_pressure):
             diagonal = (volume * gradient_sum + boundary_gradient).norm_sqr() + volume * volume * square_sum

@@ -198,7 +198,7 @@ class MaterialFluid(ParticleFluid):
             density=self._density,
             count=particles.count,
             neighbor_list=self._list,
-            boundary=(boundary.position, boundary.velocity, boundary.volume),
+            boundary=(boundary.position, boundary.velocity, boundary.friction_volume),
             materials=(phases.rest_density, phases.dynamic_viscosity),
             friction=lambda fluid, samples: self.body_forces.measure(samples, *friction_terms(fluid)),
             gradient_factor=self._sigma / self.support_radius,

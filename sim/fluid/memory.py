@@ -35,7 +35,7 @@ def estimate_bytes(
     results = vector + 2 * number  # acceleration, density, pressure
     entries = EXPECTED_NEIGHBORS * (support_in_spacings / SUPPORT_IN_SPACINGS) ** 3
     search = 5 * number + entries * GROWTH * number  # cell, order, start, two counts; the list itself
-    boundary = 3 * vector + 3 * number  # position, coordinates and velocity; volume, cell, order
+    boundary = 3 * vector + 4 * number  # position, coordinates and velocity; volume, that of friction, cell, order
     cell = 3 * number  # where its particles and its samples start; the cursor of the sort
     return int(
         particle_count * (state + results + search + extra_bytes) + boundary_count * boundary + cell_count * cell

@@ -1,4 +1,4 @@
-"""The nozzles of a tank together: which of them are in each other's way, and the pipes around them."""
+"""The nozzles of a tank together: which are in each other's way, the pipes around them, and what would brake them."""
 
 from __future__ import annotations
 
@@ -82,6 +82,26 @@ def pipes(openings: Sequence[Opening], spacing: float) -> list[NDArray[np.float6
         for number, opening in enumerate(openings)
         if not any(is_same_nozzle(opening, earlier, spacing) for earlier in openings[:number])
     ]
+
+
+def is_felt_in_nozzles(
+    positions: NDArray[np.floating], openings: Sequence[Opening], support_radius: float
+) -> NDArray[np.bool_]:
+    """Whether particles in any of the nozzles may feel a sample that stands here, (m,).
+
+    Such samples, of pipes and of walls and bodies at rest that an opening lies in, exert no friction. A nozzle gives
+    its particles their velocity once a step, but within it they are unknowns of the viscosity as all others are: held
+    by samples at rest, they would brake the jet that they push. A fluid that sticks to walls would hardly come out.
+
+    Args:
+        positions: of the samples [m], (m, 3).
+        openings: of the tank.
+        support_radius: of the kernel [m].
+    """
+    felt = np.zeros(len(positions), dtype=np.bool_)
+    for opening in openings:
+        felt |= opening.distance_to_nozzle(positions) < support_radius
+    return felt
 
 
 def _least_distance(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:

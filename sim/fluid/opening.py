@@ -137,11 +137,23 @@ class Opening:
         moved = np.arange(self.nozzle_layers) * self.layer_distance
         return (self.points[None] + moved[:, None, None] * self.direction).reshape(-1, 3)
 
+    def distance_to_nozzle(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Distance of points (m, 3) from the space that the full nozzle fills [m], (m,); 0 in it."""
+        from_centre = points - self.centre
+        along = from_centre @ self.direction
+        across = np.abs(np.stack([from_centre @ axis for axis in self.axes]))
+        if self.is_round:
+            outside = np.maximum(np.hypot(*across) - self.half_size[0], 0.0)
+        else:
+            outside = np.hypot(*np.maximum(across - np.array(self.half_size)[:, None], 0.0))
+        return np.hypot(outside, np.maximum(np.maximum(-along, along - self.nozzle_depth), 0.0))
+
     def pipe(self, spacing: float) -> NDArray[np.float64]:
         """Boundary samples of a short pipe around the nozzle [m], (m, 3).
 
         It keeps surrounding fluid from flowing into the gap that opens behind a layer before the next one fills it.
-        The samples are as far outside of the nozzle as those of a wall that touches the fluid.
+        The samples are as far outside of the nozzle as those of a wall that touches the fluid. They push, and exert no
+        friction (`sim.fluid.nozzles.is_felt_in_nozzles`).
 
         Args:
             spacing: of the particles [m].

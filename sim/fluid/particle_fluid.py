@@ -18,6 +18,7 @@ from sim.fluid.box import Box, check_particles
 from sim.fluid.checkpoints import check_checkpoint
 from sim.fluid.emitter import Emission
 from sim.fluid.kernels import normalization, particle_volume
+from sim.fluid.nozzles import is_felt_in_nozzles
 from sim.fluid.particles import ParticleSet
 from sim.fluid.phases import Phases
 from sim.fluid.stepping import MotionSummary, ParticleStepper
@@ -104,9 +105,13 @@ class ParticleFluid(ABC):
             np.array(domain.min), np.array(domain.max), self._search_radius,
             reach=cells_per_radius(self.parameters.support_in_spacings),
         )  # fmt: skip
+        self._emission = Emission(
+            self.phases.parameters, spacing=self.spacing, particle_volume=self.particle_volume, grid=self._grid
+        )
         self.boundary = Boundary(
             boundary,
             BoundarySamples.of_bodies() if moving is None else moving,
+            is_smooth=is_felt_in_nozzles(boundary.positions, self._emission.openings, self.support_radius),
             sheets=BoundarySamples.of_bodies() if sheets is None else sheets,
             body_count=body_count,
             grid=self._grid,
@@ -117,9 +122,6 @@ class ParticleFluid(ABC):
         count = len(positions)
         self._particles = ParticleSet(self._grid, max(count, capacity or 0), carried=self.carried)
         self._density = ti.ndarray(ti.f32, self._particles.capacity)
-        self._emission = Emission(
-            self.phases.parameters, spacing=self.spacing, particle_volume=self.particle_volume, grid=self._grid
-        )
         self._without_neighbors = False
         self._next_particle_id = count
         self._particles.load(
@@ -193,7 +195,7 @@ class ParticleFluid(ABC):
         self._without_neighbors |= elapsed_s == 0.0
 
     def snapshots(self) -> dict[str, Snapshot]:
-        """Positions, velocities and densities of the particles of each fluid, sorted by particle id."""
+        """Positions, velocities, densities and pressures of the particles of each fluid, sorted by particle id."""
         self._compute_density()
         order = self._by_id()
         phase = self._host(self._particles.phase)[order]
@@ -201,6 +203,7 @@ class ParticleFluid(ABC):
             "position": self._host(self._particles.position)[order],
             "velocity": self._host(self._particles.velocity)[order],
             "density": self._host(self._density)[order],
+            "pressure": self._pressures()[order],
             "particle_id": self._host(self._particles.particle_id)[order],
         }
         snapshots = {}
@@ -319,6 +322,10 @@ class ParticleFluid(ABC):
     @abstractmethod
     def _compute_density(self) -> None:
         """Fill `_density`, relative to the rest density, for the current positions and their neighbours."""
+
+    @abstractmethod
+    def _pressures(self) -> NDArray[np.float32]:
+        """Pressure of each particle [Pa], (n,), not sorted, after `_compute_density`."""
 
     @property
     def _list(self) -> tuple[Any, ...]:

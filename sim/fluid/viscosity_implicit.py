@@ -128,7 +128,7 @@ class ImplicitViscosity:
             density: relative to the rest density [-].
             count: number of particles.
             neighbor_list: start, fluid_count, boundary_count, indices, stride.
-            boundary: position [m], velocity [m/s] and volume [m³] of the boundary samples.
+            boundary: position [m], velocity [m/s] and volume for friction [m³] of the boundary samples.
             materials: rest density [kg/m³] and dynamic viscosity [Pa s] of each fluid.
             friction: of the particles on the bodies.
             gradient_factor: sigma/h of the kernel [1/m⁴].

@@ -27,7 +27,9 @@ from sim.solver import Arrays, Diagnostics
 Array = NDArray[np.float64]
 
 LARGEST_DT = 2.0e-3
-"""Largest step [s]: a stack of boxes is held to a micrometre, and a frame at 60 fps costs nine steps."""
+"""Largest step [s] of dynamic bodies: a stack of boxes is held to a micrometre, and a frame at 60 fps costs nine steps.
+And of bodies with keyframes, as nothing else looks ahead to where a path sets in. Bodies that are led steadily, or by
+hand, need none."""
 
 LARGEST_ADVANCE = 0.25
 """How far surfaces may get in a step, in half shortest edges of the smallest dynamic body."""
@@ -112,6 +114,8 @@ class RigidSolver:
         dynamic = np.flatnonzero(self.bodies.is_dynamic)
         smallest = min((self._geometries[number].shortest_edge for number in dynamic), default=math.inf)
         self._largest_advance = LARGEST_ADVANCE * 0.5 * smallest
+        has_keyframes = any(body.keyframe for body in parameters)
+        self._largest_dt = LARGEST_DT if len(dynamic) or has_keyframes else math.inf
         self.time_s = 0.0
         self.begin_frame(0.0)
 
@@ -151,7 +155,7 @@ class RigidSolver:
     def stable_dt(self) -> float:
         """Largest step [s] in which surfaces move and bodies turn little enough; gravity's part counts."""
         spin = float(np.max(np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1)), initial=0.0))
-        dt = LARGEST_DT if spin == 0.0 else min(LARGEST_DT, LARGEST_TURN / spin)
+        dt = self._largest_dt if spin == 0.0 else min(self._largest_dt, LARGEST_TURN / spin)
         if not math.isfinite(self._largest_advance):
             return dt
         # v dt + g dt² is the largest advance.
@@ -162,6 +166,10 @@ class RigidSolver:
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         bodies = self.bodies
+        if not bodies.is_dynamic.any():  # nothing that impulses, contacts or weight could move
+            self.time_s += dt
+            self._place_kinematic_bodies(self.time_s)
+            return
         before = (bodies.position.copy(), bodies.orientation.copy())
         free = bodies.is_free[:, None]
         bodies.velocity = bodies.velocity + np.where(free, dt * self.gravity, 0.0)

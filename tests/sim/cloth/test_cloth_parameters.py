@@ -32,6 +32,7 @@ def test_rubber_is_the_isotropic_sheet_that_its_docstring_says():
     [
         ({"shape": {"type": "rectangle", "size": (1, 1)}}, "give counts or resolution"),
         ({"shape": {"type": "rectangle", "size": (1, 1), "resolution": 1e-5}}, "4096 at most"),
+        ({"shape": {"type": "rectangle", "size": (1e3, 1), "resolution": 1e-307}}, "4096 at most"),
         ({"mass_per_area": 0.0}, "greater than 0"),
         ({"pin": [{}]}, "give one of corner, edge, index and region, got none"),
         ({"pin": [{"corner": "x-y-", "edge": "x-"}]}, "got corner and edge"),

@@ -278,9 +278,8 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
 def near_pairs(state, pairs: SelfCollision) -> list[tuple[int, ...]]:
     """What is found in the lists, in an order of its own."""
     contacts = ContactList(10**5)
-    contacts.counter.fill(0)
     pairs.find(state, contacts, 0.1)
-    return sorted(map(tuple, contacts.vertices.to_numpy()[: contacts.found].tolist()))
+    return sorted(map(tuple, contacts.vertices.to_numpy()[: contacts.take_found()].tolist()))
 
 
 def test_patches_are_searched_anew_only_where_cloth_moves():

@@ -211,6 +211,21 @@ def test_stable_step_shrinks_with_speed_and_spin():
     assert step() == pytest.approx(2e-3)
 
 
+def test_bodies_that_are_led_are_where_their_paths_say_whatever_the_step():
+    moved = body("a", cube(0.2), (0, 0, 1), kind="kinematic", velocity=(1, 0, 0), angular_velocity=(0, 0, 1))
+    solver = in_room(moved)
+    assert solver.stable_dt() == pytest.approx(0.1)  # a tenth of a radian; no stack of boxes hangs on it
+    solver.substep(0.1)
+    np.testing.assert_allclose(solver.bodies.position, [[0.1, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(rotation.matrices(solver.bodies.orientation[0])[:2, 0], [np.cos(0.1), np.sin(0.1)])
+    np.testing.assert_allclose(solver.bodies.velocity, [[1, 0, 0]], atol=1e-12)
+    with_another = in_room(moved, body("b", ball(0.1), (0, 0, 3)))
+    assert with_another.stable_dt() == pytest.approx(2e-3)
+    path = [{"time_s": 1.0, "position": (0, 0, 1)}, {"time_s": 2.0, "position": (1, 0, 1)}]
+    sets_in = body("c", cube(0.2), kind="kinematic", keyframe=path)
+    assert in_room(sets_in).stable_dt() == pytest.approx(2e-3)
+
+
 def test_loaded_ball_rocks_with_the_period_of_theory():
     """omega² = m g e / (I + m (R - e)²) for a ball that rolls, its centre of mass e below the middle."""
     radius, share = 0.1, 0.5
