@@ -85,7 +85,7 @@ class Connection:
         timeout_s: how long to try to connect [s].
 
     Raises:
-        OSError: there is no scheduler.
+        OSError: there is no scheduler, or this machine is too busy to ask for one.
     """
 
     def __init__(
@@ -103,7 +103,10 @@ class Connection:
         self._closing = False
         for name in ("distributed", "distributed.client"):  # what matters of it is said here, in our own words
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        self._client = Client(address, timeout=timeout_s, set_as_default=False, name="pipeline")
+        try:
+            self._client = Client(address, timeout=timeout_s, set_as_default=False, name="pipeline")
+        except AssertionError as error:  # Dask's way to say that its thread did not start within ten seconds
+            raise OSError("Dask did not start in time: this machine is very busy, or was asleep") from error
         try:
             self._client.subscribe_topic(self._topic, self._hear)
         except BaseException:

@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 from dask_processes import HOST, free_port, running, start_scheduler, start_worker
+from distributed import Client
 from executor_contract import (
     PATIENCE_S,
     ProcessesContract,
@@ -218,6 +220,23 @@ def test_without_a_scheduler_there_is_a_clear_line(tmp_path: Path) -> None:
     port = free_port()
     with pytest.raises(ClusterError, match=f"no Dask scheduler at tcp://{HOST}:{port} for 1 s"):
         DaskExecutor(f"tcp://{HOST}:{port}", tmp_path, patience_s=1.0)
+
+
+def test_a_machine_that_was_too_busy_to_connect_tries_again(
+    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask asserts that its thread starts within ten seconds; a machine that sleeps for a while fails that."""
+    sleeps = iter([True])
+
+    def connect(*arguments: Any, **options: Any) -> Client:
+        assert not next(sleeps, False)
+        return Client(*arguments, **options)
+
+    monkeypatch.setattr("pipeline.executors.dask_connection.Client", connect)
+    said: list[str] = []
+    with DaskExecutor(cluster, tmp_path, of_runner=True, say=said.append) as executor:
+        assert executor.capacity.cores == 2
+    assert ["very busy, or was asleep" in sentence for sentence in said] == [True]
 
 
 def test_a_worker_that_does_not_see_the_folder_gets_no_task(cluster: str, tmp_path: Path) -> None:
