@@ -29,7 +29,11 @@ RED = MaterialParameters(look="plastic", color=(0.7, 0.02, 0.02), roughness=0.5)
 CAMERA = still_camera(CameraParameters(position=(0.0, -3.0, 0.62), look_at=(0.0, 0.0, 0.3), focal_length_mm=70.0))
 
 
-def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Positions, triangles and normals."""
+
+
+def box(low: tuple[float, ...], high: tuple[float, ...]) -> Mesh:
     """A closed box whose vertices belong to one side each: positions, triangles and outward normals."""
     corners = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]) * np.subtract(high, low) + low
     quads = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
@@ -50,10 +54,15 @@ def write_water(folder: Path, *, hole: tuple[tuple[float, float, float], float] 
     write_ply(folder / f"water{frame:06d}.ply", positions, triangles, normals=normals, velocities=0 * positions)
 
 
-def write_layers(path: Path, height: float) -> None:
-    """Two blocks of water, one a hair below and one a hair above a sheet at a height [m]."""
+def layers(height: float) -> tuple[Mesh, Mesh]:
+    """Two blocks of water, one a hair below and one a hair above a height [m]."""
     below = box((-0.45, -0.4, GAP), (0.45, 0.4, height - GAP))
-    above = box((-0.45, -0.4, height + GAP), (0.45, 0.4, WATER_TOP))
+    return below, box((-0.45, -0.4, height + GAP), (0.45, 0.4, WATER_TOP))
+
+
+def write_layers(path: Path, height: float) -> None:
+    """Both of them as one fluid."""
+    below, above = layers(height)
     positions, normals = (np.concatenate([below[part], above[part]]) for part in (0, 2))
     triangles = np.concatenate([below[1], above[1] + len(below[0])])
     write_ply(path, positions, triangles, normals=normals, velocities=0 * positions)
@@ -180,6 +189,26 @@ def test_cloth_that_lies_in_water_is_seen_wherever_it_is(tmp_path):
     )
     # 1264 and 858 against 146 and 81, which are its edge and its image in the water's top.
     assert dry[0] < 0.3 * wet[0] and dry[1] < 0.3 * wet[1]
+
+
+BETWEEN = np.s_[39:42, 40:88]
+"""Pixels of where two blocks of water meet at a height of 0.26 m, through the front of the upper one."""
+
+
+def test_two_clear_fluids_that_meet_mirror_nothing(tmp_path):
+    write_water(tmp_path)
+    one = draw(tmp_path, water(REACH))
+    below, above = layers(0.26)
+    for name, (positions, triangles, normals) in (("water", below), ("upper", above)):
+        write_ply(tmp_path / f"{name}000000.ply", positions, triangles, normals=normals, velocities=0 * positions)
+
+    def brightness(reach: float) -> float:
+        upper = water(reach).model_copy(update={"name": "upper", "file": "upper{frame}.ply"})
+        return float((draw(tmp_path, water(reach), upper)[BETWEEN] @ LUMINANCE).mean())
+
+    # 156 where one block has 155; the sliver between them mirrors the dark upper half of the room, 69.
+    assert brightness(REACH) == pytest.approx(float((one[BETWEEN] @ LUMINANCE).mean()), rel=0.05)
+    assert brightness(NO_REACH) < 0.6 * brightness(REACH)
 
 
 def test_water_keeps_its_surface_around_a_body_of_glass(tmp_path):
