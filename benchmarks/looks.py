@@ -2,9 +2,9 @@
 
     python -m benchmarks.looks docs/images [--only wood milk window] [--quality preview] [--suffix .webp]
 
-Solid looks are shown on a bunny and a ball, liquids as a drop that lies on the ground and one that falls, in the stage
-`studio`; stages with a bunny of ceramic and a ball of metal. Writes `look-NAME` and `stage-NAME`, and tells how many
-seconds and processor seconds each took.
+Solid looks are shown on a bunny and a ball, liquids as a drop that lies on the ground and one that falls, cloths as
+sheets that lie and hang, each in its own colour, dark and light, in the stage `studio`; stages with a bunny of ceramic
+and a ball of metal. Writes `look-NAME` and `stage-NAME`, and tells how many seconds and processor seconds each took.
 """
 
 from __future__ import annotations
@@ -22,14 +22,19 @@ from render.blender import open_renderer
 from render.camera_path import CameraPath
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters, RenderParameters, StageParameters
-from render.spec import Camera, MeshObject, RenderSpec
+from render.spec import Camera, MeshObject, MeshSequenceObject, RenderSpec
 from sim.shapes import build_solid
 from sim.shapes.parameters import BunnyShape, Placement, SphereShape
 
 WIDTH, HEIGHT = 240, 180
+BESIDE = (-1.1, 0.05, 1.2)
+"""Where three things stand in a wide picture, along x [m]."""
 LOW, HIGH = (-0.5, -0.5, 0.0), (0.5, 0.5, 1.0)
 SOLID_LOOKS = ("ceramic", "rubber", "plastic", "metal", "stone", "wood", "glass")
 LIQUID_LOOKS = ("water", "honey", "milk")
+CLOTH_LOOKS = ("cotton", "silk", "denim")
+CLOTH_COLORS = (None, (0.02, 0.02, 0.022), (0.72, 0.70, 0.66))
+"""Of a cloth's three sheets: its own, a dark and a light one."""
 STAGES = {
     "studio": StageParameters(),
     "outdoor": StageParameters(name="outdoor"),
@@ -45,7 +50,7 @@ STAGES = {
 class Scene:
     """What a picture shows, and its width [pixels]."""
 
-    objects: tuple[MeshObject, ...]
+    objects: tuple[MeshObject | MeshSequenceObject, ...]
     stage: StageParameters = STAGES["studio"]
     width: int = WIDTH
 
@@ -61,6 +66,30 @@ def write_shapes(folder: Path) -> None:
     lying = ball.vertices * (1.0, 1.0, 0.56)
     lying[:, 2] = np.maximum(lying[:, 2], -0.18) + 0.16
     write_ply(folder / "lying.ply", lying, ball.faces)
+    for place, x in enumerate(BESIDE):
+        write_table_cloth(folder / f"sheet{place}.ply", x)
+
+
+def write_table_cloth(path: Path, x: float, *, width: float = 0.85, counts: int = 181) -> None:
+    """A sheet around x that lies flat half a metre above the ground and hangs down in front, in folds."""
+    s, t = (each.ravel() for each in np.meshgrid(*[np.linspace(0.0, 1.0, counts)] * 2, indexing="ij"))
+    edge = 0.06
+    turned = np.clip((t - 0.5) / edge, 0.0, 0.5 * np.pi)
+    hanging = np.maximum(t - 0.5 - 0.5 * np.pi * edge, 0.0)
+    fold = 0.12 * np.minimum(3.0 * hanging, 1.0) * np.cos(6.0 * np.pi * s)
+    y = 0.25 - np.minimum(t, 0.5) - edge * np.sin(turned) + fold
+    z = 0.5 - edge * (1.0 - np.cos(turned)) - hanging
+    vertices = np.stack([x + width * (s - 0.5), y, z], axis=1)
+    first = (counts * np.arange(counts - 1)[:, None] + np.arange(counts - 1)).ravel()
+    corners = np.stack([first, first + counts, first + counts + 1, first + 1], axis=1)
+    faces = np.concatenate([corners[:, (0, 2, 1)], corners[:, (0, 3, 2)]])
+    normals = np.zeros(vertices.shape)
+    of_faces = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], of_faces)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    uv = np.stack([width * s, t], axis=1)
+    write_ply(path, vertices, faces, normals=normals, velocities=np.zeros(vertices.shape), uv=uv)
 
 
 def solids(first: MaterialParameters, second: MaterialParameters) -> tuple[MeshObject, ...]:
@@ -76,6 +105,16 @@ def liquid(material: MaterialParameters, x: float = 0.05) -> tuple[MeshObject, .
     return (
         MeshObject(name=f"lying {x}", file="lying.ply", position=(x, 0.0, 0.0), material=material),
         MeshObject(name=f"falling {x}", file="drop.ply", position=(x + 0.1, 0.0, 0.66), material=material),
+    )
+
+
+def sheets(look: str) -> tuple[MeshSequenceObject, ...]:
+    """Three sheets of one look: in its own colour, dark and light."""
+    return tuple(
+        MeshSequenceObject(
+            name=f"sheet {place}", file=f"sheet{place}.ply", material=MaterialParameters(look=look, color=color)
+        )
+        for place, color in enumerate(CLOTH_COLORS)
     )
 
 
@@ -110,8 +149,10 @@ def all_scenes() -> dict[str, Scene]:
         scenes[f"look-{look}"] = Scene(solids(material, material))
     for look in LIQUID_LOOKS:
         scenes[f"look-{look}"] = Scene(liquid(MaterialParameters(look=look)))
-    beside = [liquid(MaterialParameters(look=look), x) for look, x in zip(LIQUID_LOOKS, (-1.1, 0.05, 1.2), strict=True)]
+    beside = [liquid(MaterialParameters(look=look), x) for look, x in zip(LIQUID_LOOKS, BESIDE, strict=True)]
     scenes["look-liquids"] = Scene(sum(beside, ()), width=2 * WIDTH)
+    for cloth in CLOTH_LOOKS:
+        scenes[f"look-{cloth}"] = Scene(sheets(cloth), width=2 * WIDTH)
     for name, stage in STAGES.items():
         scenes[f"stage-{name}"] = Scene(solids(ceramic, metal), stage)
     return scenes

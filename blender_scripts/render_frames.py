@@ -219,15 +219,22 @@ class SceneRenderer:
 
     def _fill_fluids(self, frame: int, places: dict[str, poses.Pose], sheets: list[geometry.TriangleMesh]) -> None:
         solids = self._touched.at({name: pose.after(0.0) for name, pose in places.items()}, sheets)
-        for description, blender_object in self._fluids:
-            path = self._file(description["file"], frame)
-            mesh = geometry.read_ply(path)
-            if mesh.normals is None:
-                raise RenderInputError(f"the surface {path} has no normals (nx, ny, nz)")
+        surfaces = [self._read_surface(self._file(description["file"], frame)) for description, _ in self._fluids]
+        for (description, blender_object), surface in zip(self._fluids, surfaces, strict=True):
             # Cycles follows light through one surface on its way to the floor, and not through two that are parallel.
             dips, reach = description["material"]["caustics"], description["wets_within"]
-            touching = wetting.wetted(mesh, reach=reach, floor_z=self._floor_z, solids=solids, dips=dips)
+            others = [
+                wetting.Solid.of_fluid(other, near=surface, reach=reach) for other in surfaces if other is not surface
+            ]
+            touching = wetting.wetted(surface, reach=reach, floor_z=self._floor_z, solids=[*solids, *others], dips=dips)
             geometry.fill_mesh(blender_object.data, touching)
+
+    def _read_surface(self, path: Path) -> geometry.TriangleMesh:
+        """A fluid's surface."""
+        surface = geometry.read_ply(path)
+        if surface.normals is None:
+            raise RenderInputError(f"the surface {path} has no normals (nx, ny, nz)")
+        return surface
 
     def _place_camera(self, frame: int) -> None:
         if self._views is None:

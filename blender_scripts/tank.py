@@ -45,8 +45,9 @@ def add_tank(spec: dict[str, Any]) -> Any:
         for y_low, y_high in ((outer_low[1], inner_low[1]), (inner_high[1], outer_high[1])):
             edges.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2])))
     made = []
-    for name, boxes in (("tank_glass", panes), ("tank_edge", edges)):
-        tank = new_mesh_object(name, _boxes(boxes))
+    # What panes stand on shows through them. A lower side would be seen from inside of the glass: a mirror.
+    for name, boxes in (("tank_glass", _boxes(panes, open_below=True)), ("tank_edge", _boxes(edges))):
+        tank = new_mesh_object(name, boxes)
         context = LookContext.of({}, domain_size=size, pixel_angle=pixel_angle(spec))
         tank.data.materials.append(new_material(name, name, context))
         tank.data.shade_flat()
@@ -54,10 +55,11 @@ def add_tank(spec: dict[str, Any]) -> Any:
     return made[0]
 
 
-def _boxes(extents: list[tuple[tuple[float, ...], tuple[float, ...]]]) -> TriangleMesh:
-    """Axis-aligned boxes as one mesh, faces outwards."""
+def _boxes(extents: list[tuple[tuple[float, ...], tuple[float, ...]]], *, open_below: bool = False) -> TriangleMesh:
+    """Axis-aligned boxes as one mesh, faces outwards; without their lower sides if they are open below."""
     unit = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
     quads = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
+    quads = quads[1:] if open_below else quads
     triangles = np.concatenate([quads[:, (0, 1, 2)], quads[:, (0, 2, 3)]])
     positions = [np.array(low) + unit * (np.array(high) - np.array(low)) for low, high in extents]
     indices = [triangles + 8 * number for number in range(len(extents))]

@@ -35,9 +35,10 @@ class Weave:
         warp: colour of the warp threads, if the job gives none; the job's colours these.
         weft: colour of the weft threads; that of the warp if None.
         roughness: of the surface [-].
-        specular: of the surface, 0.5 as glass [-].
+        specular: of the surface, 0.5 as glass [-]. Threads show all their sides at any angle, so less of a mirror than
+            glass; at grazing angles a higher one would lay the lamps' white over a matt, dark cloth.
         anisotropy: how much highlights are drawn out across the warp [-].
-        sheen: light that fibres on the surface scatter at grazing angles [-].
+        sheen: light that fibres on the surface scatter at grazing angles, in the threads' colour [-].
         translucency: share of the scattered light that goes through [-].
         unevenness: how much threads differ in brightness [-].
         gaps: how dark it is between threads [-], 0 black.
@@ -58,11 +59,11 @@ class Weave:
     gaps: float
 
 
-COTTON = Weave(2, 1, 1, 0.5e-3, (0.72, 0.66, 0.56), None, 0.85, 0.2, 0.0, 0.5, 0.25, 0.10, 0.45)
+COTTON = Weave(2, 1, 1, 0.5e-3, (0.72, 0.66, 0.56), None, 0.85, 0.1, 0.0, 0.5, 0.25, 0.10, 0.45)
 """Plain weave of a shirting, some 20 threads a centimetre."""
 SILK = Weave(5, 2, -2, 0.15e-3, (0.42, 0.02, 0.035), None, 0.38, 0.5, 0.6, 0.25, 0.2, 0.04, 0.8)
 """Five-end satin: long floats of fine threads, which shine across."""
-DENIM = Weave(4, 1, 1, 0.8e-3, (0.012, 0.030, 0.100), (0.15, 0.16, 0.18), 0.9, 0.15, 0.0, 0.15, 0.0, 0.3, 0.4)
+DENIM = Weave(4, 1, 1, 0.8e-3, (0.012, 0.030, 0.100), (0.15, 0.16, 0.18), 0.9, 0.05, 0.0, 0.15, 0.0, 0.3, 0.4)
 """Twill of indigo warp over three, under one undyed weft; its back is mostly weft."""
 
 RESOLVED, UNRESOLVED = 0.5, 1.0
@@ -112,6 +113,8 @@ def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
         Sheen_Roughness=0.5,
     )
     builder.link(color, shader.inputs["Base Color"])
+    # Fibres are dyed as their threads are; white ones would make every dark cloth pale where light grazes it.
+    builder.link(color, shader.inputs["Sheen Tint"])
     builder.link(bump.outputs["Normal"], shader.inputs["Normal"])
     if weave.anisotropy:
         tangent = builder.node("ShaderNodeTangent")

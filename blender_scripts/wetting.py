@@ -3,6 +3,7 @@
 A surface made of particles ends a little short of the solid or a little inside of it, and the sliver of air between
 them would reflect like a mirror whatever meets it at more than the critical angle (48.6° in water). A liquid that wets
 has no air there, so looks let rays straight through where it touches (`looks`, docs/decisions/0035-wet-surfaces.md).
+Where two clear fluids meet, the surfaces of both do.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from mathutils import Quaternion
 from mathutils.bvhtree import BVHTree
 
-from blender_scripts.geometry import TriangleMesh
+from blender_scripts.geometry import EMPTY_MESH, TriangleMesh
 
 _TOUCHES_WITHIN, _FREE_BEYOND = 2.0 / 3.0, 4.0 / 3.0
 """Distances between which a surface goes from touching to free, in `reach`."""
@@ -23,19 +24,26 @@ _ALONG, _TOWARDS = 0.1, 0.5
 """Cosines between the outward normal and the way to the solid: free below the first, touching above the second. A free
 surface that ends at a wall, and the outside of a film, do not face the solid although they are near it."""
 
+_RIGHT_ANGLE = 1.0e-3
+"""Cosine of what counts as a right angle; single precision leaves less."""
+_NO_WAY = 1.0e-3
+"""A distance too short to have a direction, in `reach`."""
+
 _DIP = 0.2
 """How deep a surface that may be moved dips into what it touches, in `reach`."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """What a fluid may touch, with its place.
+    """What a fluid may touch, with its place: a body, a cloth or another fluid.
 
     Attributes:
         tree: its triangles, in its own axes; None without any.
         low: lower corner of the box around it, in its own axes [m], (3,).
         high: upper corner [m], (3,).
         is_closed: whether it has an inside; a sheet has not.
+        takes_dips: whether what touches it may be moved into it. It would come out of a sheet again, and two fluids
+            would be moved into each other.
         position: of its origin [m], (3,).
         rotation: from its own axes to the world's, (3, 3).
     """
@@ -44,6 +52,7 @@ class Solid:
     low: np.ndarray
     high: np.ndarray
     is_closed: bool
+    takes_dips: bool
     position: np.ndarray
     rotation: np.ndarray
 
@@ -55,7 +64,20 @@ class Solid:
         if len(mesh.triangles):
             low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
             tree = BVHTree.FromPolygons(mesh.positions.tolist(), mesh.triangles.tolist(), all_triangles=True)
-        return cls(tree, low, high, is_closed, np.zeros(3), np.eye(3))
+        return cls(tree, low, high, is_closed, is_closed, np.zeros(3), np.eye(3))
+
+    @classmethod
+    def of_fluid(cls, surface: TriangleMesh, *, near: TriangleMesh, reach: float) -> Solid:
+        """The surface of another fluid, as far as one that wets it within this distance [m] may be near it."""
+        if not len(near.positions):
+            return cls.of(EMPTY_MESH, is_closed=True)
+        farthest = _FREE_BEYOND * reach
+        low, high = near.positions.min(axis=0) - farthest, near.positions.max(axis=0) + farthest
+        corners = surface.positions[surface.triangles]
+        touching = (corners.max(axis=1) >= low).all(axis=1) & (corners.min(axis=1) <= high).all(axis=1)
+        used, triangles = np.unique(surface.triangles[touching], return_inverse=True)
+        part = TriangleMesh(surface.positions[used], triangles.reshape(-1, 3))
+        return replace(cls.of(part, is_closed=True), takes_dips=False)
 
     def placed(self, position: Sequence[float], orientation: Sequence[float]) -> Solid:
         """The same solid somewhere else.
@@ -65,7 +87,7 @@ class Solid:
             orientation: unit quaternion (w, x, y, z).
         """
         rotation = np.array(Quaternion(orientation).to_matrix())
-        return Solid(self.tree, self.low, self.high, self.is_closed, np.array(position), rotation)
+        return replace(self, position=np.array(position), rotation=rotation)
 
 
 class TouchedSolids:
@@ -104,8 +126,8 @@ def wetted(
         reach: distance at which it is half wet, if it faces the solid [m]. What lies inside of a closed solid, or below
             the floor, touches; sheets touch on both sides.
         floor_z: height of the floor [m].
-        solids: bodies and cloths.
-        dips: move what touches a closed solid or the floor into it.
+        solids: bodies, cloths and other fluids.
+        dips: move what touches a body or the floor into it.
     """
     assert mesh.normals is not None
     height = mesh.positions[:, 2] - floor_z
@@ -171,15 +193,20 @@ def _add_solid(touch: _Touch, solid: Solid, mesh: TriangleMesh) -> None:
     numbers = np.array(near)
     way = np.array(places) - own[numbers]
     distance = np.linalg.norm(way, axis=1)
+    towards = way / np.maximum(distance, 1e-12)[:, None]
     if solid.is_closed:
         # The way to the nearest point turns around where the surface dips into the solid, which is as good as touching.
+        # Beyond an edge it may be at right angles with the normal of either side.
         inwards = -np.array(normals)
-        distance = np.where((way * inwards).sum(axis=1) > 0.0, distance, 0.0)
+        is_outside = (towards * inwards).sum(axis=1) > -_RIGHT_ANGLE
+        is_outside &= distance > _NO_WAY * touch.reach
+        distance = np.where(is_outside, distance, 0.0)
+        inwards = np.where(is_outside[:, None], towards, inwards)
     else:
-        inwards = way / np.maximum(distance, 1e-12)[:, None]
+        inwards = towards
     inwards = inwards @ solid.rotation.T
     facing = (mesh.normals[numbers] * inwards).sum(axis=1)
-    touch.add(numbers, distance, inwards, facing, moves=solid.is_closed)
+    touch.add(numbers, distance, inwards, facing, moves=solid.takes_dips)
 
 
 def _smoothstep(values: np.ndarray, low: float, high: float) -> np.ndarray:

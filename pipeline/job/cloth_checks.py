@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.job.amounts import count, gigabytes
 from pipeline.job.boxes import Box, domain_box, span, touch
-from pipeline.job.cloth_bodies import check_bodies_for_cloth
+from pipeline.job.cloth_bodies import ClothAtStart, check_bodies_for_cloth
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.mesh_checks import mesh_exists
 from pipeline.job.pin_checks import check_pin_load, check_pin_speed, check_pin_times
@@ -153,7 +153,11 @@ def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
             if path[0] == "rigid":
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
         _check_crossings(start, starts[:number], findings)
-    check_bodies_for_cloth(job, solids, {int(start.path[1]): start.longest_edge for start in starts}, findings)
+    at_start = {
+        int(start.path[1]): ClothAtStart(start.longest_edge, [start.position[nodes] for nodes in start.pinned.values()])
+        for start in starts
+    }
+    check_bodies_for_cloth(job, solids, at_start, findings)
     return sum(len(start.position) for start in starts)
 
 

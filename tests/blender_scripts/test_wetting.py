@@ -103,3 +103,32 @@ def test_what_touches_a_body_or_the_floor_can_be_moved_into_it_and_through_no_cl
     np.testing.assert_array_equal(kept.positions, places)
     """
     )
+
+
+def test_fluids_are_wet_where_they_face_each_other_and_are_not_moved():
+    run_python(
+        SETUP
+        + """
+    other = Solid.of_fluid(box, near=TriangleMesh(np.full((1, 3), 0.1, np.float32), box.triangles), reach=REACH)
+    # Right above the edges of the box, above its middle, beside it, and inside; and a film's outside.
+    places = np.array([(0.1, 0.1, 0.11), (0, 0.1, 0.11), (0, 0, 0.11), (0.11, 0, 0.0), (0, 0, 0.09), (0, 0, 0.11)])
+    normals = np.array([(0, 0, -1)] * 3 + [(-1, 0, 0)] + [(0, 0, -1)] + [(0, 0, 1)], np.float32)
+    np.testing.assert_allclose(wet(places, normals, other), [1, 1, 1, 1, 1, 0], atol=1e-5)
+    surface = TriangleMesh(places.astype(np.float32), np.zeros((0, 3), np.int32), normals)
+    moved = wetted(surface, reach=REACH, floor_z=-10.0, solids=[other], dips=True)
+    np.testing.assert_array_equal(moved.positions, surface.positions)
+    """
+    )
+
+
+def test_of_another_fluid_only_what_is_near_counts():
+    run_python(
+        SETUP
+        + """
+    far = TriangleMesh(box.positions + np.float32(5.0), box.triangles)
+    assert Solid.of_fluid(box, near=far, reach=REACH).tree is None
+    nothing = TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    assert Solid.of_fluid(box, near=nothing, reach=REACH).tree is None
+    assert Solid.of_fluid(nothing, near=box, reach=REACH).tree is None
+    """
+    )

@@ -247,6 +247,30 @@ def test_bodies_that_fit_between_the_nodes_are_told(tmp_path):
     )
 
 
+ROD = """
+[[rigid]]
+name = "rod"
+shape = { type = "cylinder", radius = 0.02, height = 0.5 }
+position = [-0.2, 0.0, 0.475]
+rotation_deg = [90.0, 0.0, 0.0]
+"""
+
+
+def test_a_rod_that_cloth_is_pinned_along_may_be_thinner_than_two_of_its_edges(tmp_path):
+    def told(*tables: str) -> list[str]:
+        return [line for line in warnings("".join((SHEET, *tables)), tmp_path) if '"rod" is 0.04 m across' in line]
+
+    pin = '[[cloth.pin]]\nedge = "x-"\n'
+    assert told(pin, ROD) == []
+    assert told(pin + "release_s = 1.0\n", ROD) == []
+    # Without pins it falls onto the rod, held by a corner it may come to it, and so may a sheet held elsewhere.
+    assert len(told(ROD)) == len(told(pin.replace('edge = "x-"', 'corner = "x-y-"'), ROD)) == 1
+    assert len(told(pin.replace("x-", "x+"), ROD)) == 1
+    # Another sheet may come to it too.
+    (of_the_other,) = told(pin, SECOND, ROD)
+    assert "cloth[1].shape" in of_the_other
+
+
 @pytest.mark.parametrize(("wall", "is_told"), [(0.001, True), (0.004, False)])
 def test_shells_with_thinner_walls_than_cloth_can_feel_are_told(wall, is_told, tmp_path):
     shell = trimesh.creation.icosphere(3, 0.2)

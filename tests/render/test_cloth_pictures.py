@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, read, redness, spec_of
+from blender_scenes import RENDER_FRAMES, read, redness, spec_of, still_camera
 from fresh_python import run_python
 from needed_blender import needs_bpy
 
 from render.meshes import write_ply
-from render.parameters import MaterialParameters
+from render.parameters import CameraParameters, MaterialParameters
 from render.spec import MeshSequenceObject
 
 pytestmark = [needs_bpy, pytest.mark.slow]
@@ -85,3 +85,36 @@ def test_from_afar_denim_has_the_mean_colour_of_its_threads_on_either_side(seen_
     # the front.
     for near, afar in zip(seen_from_near, seen_from_afar, strict=True):
         assert redness(afar).mean() == pytest.approx(redness(near).mean(), abs=0.08)
+
+
+def brightness_lying(folder: Path, look: str, color: tuple[float, float, float]) -> float:
+    """Luminance [0, 255] of a sheet that lies in the studio, seen at 16 degrees against the lamps behind it."""
+    vertices = np.array([[-0.45, -0.45, 0.3], [0.45, -0.45, 0.3], [0.45, 0.45, 0.3], [-0.45, 0.45, 0.3]])
+    write_ply(
+        folder / "sheet.ply",
+        vertices,
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        normals=np.tile([0, 0, 1], (4, 1)),
+        velocities=np.zeros((4, 3)),
+        uv=vertices[:, :2],
+    )
+    sheet = MeshSequenceObject(name="sheet", file="sheet.ply", material=MaterialParameters(look=look, color=color))
+    camera = still_camera(CameraParameters(position=(0.0, -3.0, 1.16), look_at=(0.0, 0.0, 0.3)))
+    spec = spec_of(sheet, samples=16, motion_blur=False).model_copy(update={"camera": camera})
+    spec.write(folder / "spec.json")
+    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
+    # A band across the sheet, which begins 8 pixels beside the middle of the picture and is 6 high.
+    return float((read(folder / "0.png")[16:20, 27:37] @ [0.2126, 0.7152, 0.0722]).mean())
+
+
+@pytest.mark.parametrize(("look", "darkest", "brightest"), [("cotton", 50, 125), ("denim", 50, 155)])
+def test_matt_cloth_stays_dark_where_light_grazes_it(tmp_path, look, darkest, brightest):
+    """With white sheen and more gloss both were pale, 183 and 172 of 255; they are 100 and 136.
+
+    With neither, black cotton has 51 and denim, whose weft is undyed, more; cloth as light as paper has 227.
+    """
+    assert darkest < brightness_lying(tmp_path, look, (0.02, 0.02, 0.022)) < brightest
+
+
+def test_light_cloth_is_as_light_as_its_threads_where_light_grazes_it(tmp_path):
+    assert brightness_lying(tmp_path, "cotton", (0.72, 0.70, 0.66)) > 210

@@ -141,3 +141,11 @@ def test_an_hdri_that_is_gone_or_damaged_draws_nothing(tmp_path):
     for name in ("gone.hdr", "text.hdr"):
         with pytest.raises(AssertionError, match=rf"cannot read the picture .*{name}"):
             draw(tmp_path, hdri=str(tmp_path / name))
+
+
+def test_the_panes_of_a_tank_mirror_nothing_where_they_stand_on_the_ground(tmp_path):
+    """The lower side of a pane, seen from inside of the glass, would be a mirror of lamps and of the dark room."""
+    camera = CameraParameters(position=(0.0, -2.5, 0.9), look_at=(0.0, -0.51, 0.0), focal_length_mm=800.0)
+    front = draw(tmp_path, ball=None, camera=camera, tank=True)[..., :3] @ LUMINANCE
+    # 193 everywhere, less what the pane's surfaces keep back. The mirror of the dark room had 42.
+    assert front.mean(axis=1) == pytest.approx(np.median(front), rel=0.05)

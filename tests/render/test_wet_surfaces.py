@@ -12,7 +12,8 @@ from needed_blender import needs_bpy
 
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters
-from render.spec import MeshObject, MeshSequenceObject, SceneObject
+from render.poses import write_poses
+from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, SceneObject
 
 pytestmark = needs_bpy
 
@@ -28,7 +29,11 @@ RED = MaterialParameters(look="plastic", color=(0.7, 0.02, 0.02), roughness=0.5)
 CAMERA = still_camera(CameraParameters(position=(0.0, -3.0, 0.62), look_at=(0.0, 0.0, 0.3), focal_length_mm=70.0))
 
 
-def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Positions, triangles and normals."""
+
+
+def box(low: tuple[float, ...], high: tuple[float, ...]) -> Mesh:
     """A closed box whose vertices belong to one side each: positions, triangles and outward normals."""
     corners = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]) * np.subtract(high, low) + low
     quads = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
@@ -38,7 +43,7 @@ def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np
     return corners[quads.ravel()], triangles, np.repeat(sides, 4, axis=0)
 
 
-def write_water(folder: Path, *, hole: tuple[tuple[float, float, float], float] | None = None) -> None:
+def write_water(folder: Path, *, hole: tuple[tuple[float, float, float], float] | None = None, frame: int = 0) -> None:
     """A block of water a hair above the floor, maybe with a round hole in it: its centre and radius."""
     positions, triangles, normals = box((-0.45, -0.4, GAP), (0.45, 0.4, WATER_TOP))
     if hole is not None:
@@ -46,7 +51,29 @@ def write_water(folder: Path, *, hole: tuple[tuple[float, float, float], float] 
         triangles = np.concatenate([triangles, inside[:, ::-1] + len(positions)])
         normals = np.concatenate([normals, (np.array(hole[0]) - around) / hole[1]])
         positions = np.concatenate([positions, around])
-    write_ply(folder / "water000000.ply", positions, triangles, normals=normals, velocities=0 * positions)
+    write_ply(folder / f"water{frame:06d}.ply", positions, triangles, normals=normals, velocities=0 * positions)
+
+
+def layers(height: float) -> tuple[Mesh, Mesh]:
+    """Two blocks of water, one a hair below and one a hair above a height [m]."""
+    below = box((-0.45, -0.4, GAP), (0.45, 0.4, height - GAP))
+    return below, box((-0.45, -0.4, height + GAP), (0.45, 0.4, WATER_TOP))
+
+
+def write_layers(path: Path, height: float) -> None:
+    """Both of them as one fluid."""
+    below, above = layers(height)
+    positions, normals = (np.concatenate([below[part], above[part]]) for part in (0, 2))
+    triangles = np.concatenate([below[1], above[1] + len(below[0])])
+    write_ply(path, positions, triangles, normals=normals, velocities=0 * positions)
+
+
+def write_sheet(path: Path, height: float) -> None:
+    """A level sheet, a little wider than the water."""
+    vertices = np.array([(-0.46, -0.41, height), (0.46, -0.41, height), (0.46, 0.41, height), (-0.46, 0.41, height)])
+    triangles = np.array([(0, 1, 2), (0, 2, 3)])
+    up = np.tile((0, 0, 1), (4, 1))
+    write_ply(path, vertices, triangles, normals=up, velocities=0 * vertices, uv=vertices[:, :2])
 
 
 def water(wets_within: float, *, caustics: bool = False) -> MeshSequenceObject:
@@ -57,10 +84,15 @@ def water(wets_within: float, *, caustics: bool = False) -> MeshSequenceObject:
 
 def draw(folder: Path, *objects: SceneObject) -> np.ndarray:
     """Display values of frame 0 from 0 to 255, (72, 128, 3)."""
+    return draw_frames(folder, 1, *objects)[0]
+
+
+def draw_frames(folder: Path, count: int, *objects: SceneObject) -> list[np.ndarray]:
+    """Display values of the first frames, all drawn in one process."""
     spec = spec_of(*objects, samples=16, motion_blur=False, resolution=(128, 72), quality="preview")
     spec.model_copy(update={"camera": CAMERA}).write(folder / "spec.json")
-    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
-    return read(folder / "0.png")
+    run_python(RENDER_FRAMES, str(folder), "{frame}.png", ",".join(map(str, range(count))), "2")
+    return [read(folder / f"{frame}.png") for frame in range(count)]
 
 
 FLOOR = np.s_[58:62, 44:84]
@@ -91,6 +123,9 @@ def test_light_that_caustics_bend_reaches_a_floor_under_water(tmp_path):
 BALL = ((0.0, -0.1, 0.2), 0.12)
 IN_FRONT = np.s_[36:66, 40:88]
 """Pixels of the ball as it is seen through the water's front."""
+IN_FRONT_OF_ALL = np.s_[36:66, :]
+"""The same rows, wherever the ball is."""
+EVERYWHERE = np.s_[:, :]
 
 
 def draw_ball(folder: Path, material: MaterialParameters, *, gap: float, reach: float) -> np.ndarray:
@@ -101,9 +136,9 @@ def draw_ball(folder: Path, material: MaterialParameters, *, gap: float, reach: 
     return draw(folder, water(reach), MeshObject(name="ball", file="ball.ply", position=center, material=material))
 
 
-def red_pixels(picture: np.ndarray) -> int:
+def red_pixels(picture: np.ndarray, where: tuple[slice, slice] = IN_FRONT) -> int:
     # Grey has 0.33; the bright upper side of the ball is paler than the rest.
-    return int((redness(picture) > 0.42)[IN_FRONT].sum())
+    return int((redness(picture) > 0.42)[where].sum())
 
 
 def test_a_ball_under_water_is_red_up_to_its_rim(tmp_path):
@@ -115,6 +150,65 @@ def test_a_ball_under_water_is_red_up_to_its_rim(tmp_path):
     assert dry < 0.7 * wet
     # Water that is far from the ball has air around it, and its mirror.
     assert apart < 0.7 * wet
+
+
+def test_the_wet_surface_follows_a_body_that_moves_and_turns(tmp_path):
+    """A ball beside its mesh's origin, in a hole of the water that is where the ball is in that frame."""
+    (_, y, z), radius = BALL
+    beside = np.array([0.2, 0.0, 0.0])
+    write_mesh(tmp_path / "ball.ply", *sphere(tuple(beside), radius))
+    places = [(-0.25, y, z), (0.25, y, z)]
+    for frame, (place, angle, offset) in enumerate(zip(places, (0.0, np.pi), (-beside, beside), strict=True)):
+        write_water(tmp_path, hole=(place, radius + GAP), frame=frame)
+        pose = {
+            "position": np.add(place, offset),
+            "orientation": np.array((np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2))),
+            "velocity": np.zeros(3),
+            "angular_velocity": np.zeros(3),
+        }
+        write_poses(tmp_path / f"poses{frame:06d}.json", frame, {"ball": pose})
+    ball = MovingMeshObject(name="ball", file="ball.ply", body="ball", poses="poses{frame}.json", material=RED)
+    wet, dry = (
+        [red_pixels(picture, IN_FRONT_OF_ALL) for picture in draw_frames(tmp_path, 2, water(reach), ball)]
+        for reach in (REACH, NO_REACH)
+    )
+    # 288 and 300 against 170 and 172, as for the ball that stays.
+    assert dry[0] < 0.7 * wet[0] and dry[1] < 0.7 * wet[1]
+
+
+def test_cloth_that_lies_in_water_is_seen_wherever_it_is(tmp_path):
+    """A red sheet between two blocks of water, each a hair from it: seen from above through the front of both."""
+    for frame, height in enumerate((0.12, 0.26)):
+        write_sheet(tmp_path / f"cloth{frame:06d}.ply", height)
+        write_layers(tmp_path / f"water{frame:06d}.ply", height)
+    material = MaterialParameters(look="cotton", color=RED.color)
+    cloth = MeshSequenceObject(name="cloth", file="cloth{frame}.ply", material=material)
+    wet, dry = (
+        [red_pixels(picture, EVERYWHERE) for picture in draw_frames(tmp_path, 2, water(reach), cloth)]
+        for reach in (REACH, NO_REACH)
+    )
+    # 1264 and 858 against 146 and 81, which are its edge and its image in the water's top.
+    assert dry[0] < 0.3 * wet[0] and dry[1] < 0.3 * wet[1]
+
+
+BETWEEN = np.s_[39:42, 40:88]
+"""Pixels of where two blocks of water meet at a height of 0.26 m, through the front of the upper one."""
+
+
+def test_two_clear_fluids_that_meet_mirror_nothing(tmp_path):
+    write_water(tmp_path)
+    one = draw(tmp_path, water(REACH))
+    below, above = layers(0.26)
+    for name, (positions, triangles, normals) in (("water", below), ("upper", above)):
+        write_ply(tmp_path / f"{name}000000.ply", positions, triangles, normals=normals, velocities=0 * positions)
+
+    def brightness(reach: float) -> float:
+        upper = water(reach).model_copy(update={"name": "upper", "file": "upper{frame}.ply"})
+        return float((draw(tmp_path, water(reach), upper)[BETWEEN] @ LUMINANCE).mean())
+
+    # 156 where one block has 155; the sliver between them mirrors the dark upper half of the room, 69.
+    assert brightness(REACH) == pytest.approx(float((one[BETWEEN] @ LUMINANCE).mean()), rel=0.05)
+    assert brightness(NO_REACH) < 0.6 * brightness(REACH)
 
 
 def test_water_keeps_its_surface_around_a_body_of_glass(tmp_path):
