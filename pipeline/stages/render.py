@@ -47,8 +47,10 @@ _LATER_KEYS: dict[str, Any] = {"format": "png", "passes": []}
 _LATER_STAGE_KEYS: dict[str, Any] = {"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0}
 _LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None, "caustics": False}
 """Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
-_LOOK_REVISIONS = {"honey": 2}
+_LOOK_REVISIONS = {"honey": 2, "cotton": 2, "silk": 2, "denim": 2}
 """Looks that are drawn otherwise than in earlier versions: nothing else of a job says so."""
+_TANK_REVISION = 2
+"""The same of the glass tank."""
 
 _FORMER_COLOR = [0.22, 0.25, 0.29]
 """What stood for a stage's colour where the job gives none, in those versions."""
@@ -224,6 +226,8 @@ def _decisive(spec: RenderSpec) -> dict[str, Any]:
         stage.pop("rotation_deg", None)  # there is nothing to turn
     if stage["color"] is None and "ground" not in stage and stage["name"] != "window":
         stage["color"] = _FORMER_COLOR
+    if stage["tank"]:
+        stage["tank_revision"] = _TANK_REVISION
     for drawn in document["objects"]:
         _keep_decisive(drawn)
     return document

@@ -218,11 +218,18 @@ def test_a_clear_fluid_tells_where_it_touches_solids_and_nothing_else_does():
         assert {name for name, each in objects.items() if "wets_within" in each} == ({"water"} if reach else set())
 
 
-def test_frames_with_a_look_that_has_changed_are_drawn_again_and_others_are_not():
-    tank = job(material={"ball": {"look": "honey"}})
+@pytest.mark.parametrize("look", ["honey", "cotton", "silk", "denim"])
+def test_frames_with_a_look_that_has_changed_are_drawn_again_and_others_are_not(look):
+    tank = job(material={"ball": {"look": look}})
     task = next(task for task in plan_job(tank, LAYOUT, STAGES) if task.stage == "render")
     objects = {each["name"]: each for each in json.loads(task.parameters.canonical)["objects"]}
     assert {name for name, each in objects.items() if "look_revision" in each["material"]} == {"ball"}
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_frames_with_a_tank_are_drawn_again_and_others_are_not(is_seen):
+    task = next(task for task in plan_job(job(stage={"tank": is_seen}), LAYOUT, STAGES) if task.stage == "render")
+    assert ("tank_revision" in json.loads(task.parameters.canonical)["stage"]) == is_seen
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (90, 0, 0), (10, 20, 30), (-35, 120, 200)])
