@@ -260,7 +260,7 @@ class RigidSolver:
             arm = rotation.rotated(motion.orientation, self._geometries[number].centre_of_mass)
             self.bodies.position[number] = motion.position + arm
             self.bodies.orientation[number] = motion.orientation
-            self.bodies.velocity[number] = motion.velocity + np.cross(motion.angular_velocity, arm)
+            self.bodies.velocity[number] = motion.velocity + rotation.cross(motion.angular_velocity, arm)
             self.bodies.angular_velocity[number] = motion.angular_velocity
 
     def _set_mean_velocities_of_kinematic_bodies(self, dt: float) -> None:
