@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 
 NODE_SUBSTEP_S = 1.4e-6
 """Core time of a node in a substep of cloth in contact [s]. Twice what the scene alone was measured to take (10 000
-nodes, 20 substeps: 117 to 138 ms of processor time, docs/live.md): threads wait for each other, and page and browser
+nodes, 20 substeps: 101 to 144 ms of processor time, docs/live.md): threads wait for each other, and page and browser
 want their share of the cores."""
 
-APART_SHARE = 0.5
-"""Of it, where cloth does not collide with itself: measured are 0.35 to 0.4 on two cores."""
+APART_SHARE = 0.4
+"""Of it, where cloth does not collide with itself: measured are 0.25 to 0.35 on two cores."""
 
 FLUENT_FRAME_S = 1.0 / 30.0
 """What a frame of the scene may take for hands and eyes to go along [s]."""
 
 FEWEST_SUBSTEPS = 6
 """Nothing blows up in fewer, but cloth that hangs by its corners is drawn to a multiple of its length there: a dragged
-ball draws springs beside the pins to 5 times their length in 6, to 12 in 4, to one and a half in 20 (docs/live.md)."""
+ball draws springs beside the pins to 6 times their length in 6, to 14 in 4, to 1.6 in 20 (docs/live.md)."""
 
 FEWEST_COLLIDING = 10
 """Where cloth collides with itself, fewer substeps gain nothing: contacts have the more to do."""
