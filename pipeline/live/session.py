@@ -161,7 +161,10 @@ class Session:
                 self.world.tell_couplings()
             report = self.world.advance_frame()
             _require_sound(report)
-        except (SimulationDivergedError, FloatingPointError, np.linalg.LinAlgError) as error:
+        except SimulationDivergedError as error:
+            self._go_back(error.finding)  # its hint is about keys of a job that no knob turns
+            return
+        except (FloatingPointError, np.linalg.LinAlgError) as error:
             self._go_back(str(error))
             return
         self.report = report

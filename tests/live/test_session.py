@@ -135,7 +135,7 @@ def test_after_a_blow_up_live_names_what_it_had_given_up_itself_and_how_to_have_
         session._changes.clear()  # as if it had been long ago
         session.world.solvers["rigid"].bodies.velocity[0] = (np.nan, 0.0, 0.0)
         run(session, 1)
-        assert "Nothing had been turned." in session.message
+        assert '"ball" is not finite. Nothing had been turned.' in session.message
         assert ("5 substeps a frame instead of 8" in session.message) == (substeps == 5)
         assert ("Knobs bring that back, and so does --as-written." in session.message) == (substeps == 5)
         assert ("The job may need more substeps." in session.message) == (substeps == 8)
