@@ -31,7 +31,7 @@ from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job
 from pipeline.live.session import Session, Status
 from pipeline.live.take import Recorder
-from pipeline.view.serving import open_server
+from pipeline.view.serving import close_server, open_server
 from sim.runtime import initialize
 
 JOB = """
@@ -99,7 +99,8 @@ def measure(session: Session, page: Counted, seconds: float, *, drags: bool) -> 
             status = session.status()
             times.append(status.frame_ms)
             substeps.append(status.substeps["cloth"])
-            strains.append(session.world.diagnostics()["cloth"]["max_strain"])
+            if session.report is not None:
+                strains.append(session.report.diagnostics["cloth"]["max_strain"])
         passed = time.perf_counter() - began
         if drags:
             angle = 2.0 * math.pi * passed / 2.0
@@ -174,7 +175,7 @@ def main() -> None:
             if viewer is not None:
                 viewer.terminate()
                 sent = [int(line) for line in viewer.communicate()[0].split()]
-            server.stop()
+            close_server(server)
         result = {"substeps": substeps, "falls": falls, "dragged": dragged}
         results.append({**result, "messages_to_viewer": len(sent), "bytes_to_viewer": sum(sent)})
     told = {

@@ -6,6 +6,7 @@ Taichi's internals, as `sim.launch` does.
 """
 
 import ctypes
+import math
 
 import numpy as np
 import taichi as ti
@@ -43,10 +44,15 @@ def take(array: ti.Ndarray) -> NDArray[np.generic]:
     return values
 
 
+def copied(array: ti.Ndarray) -> NDArray[np.generic]:
+    """The numbers of an array, vectors and matrices along the last axes."""
+    return array.to_numpy() if runs_on_gpu() else _memory(array).copy()
+
+
 def _memory(array: ti.Ndarray) -> NDArray[np.generic]:
     """The memory of an array on a CPU, not to be kept: it goes with the array."""
     kind = np.dtype(to_numpy_type(array.dtype))
     shape = (*array.shape, *array.element_shape)
     address = impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr)
-    memory = (ctypes.c_char * (int(np.prod(shape)) * kind.itemsize)).from_address(address)
+    memory = (ctypes.c_char * (math.prod(shape) * kind.itemsize)).from_address(address)
     return np.frombuffer(memory, dtype=kind).reshape(shape)

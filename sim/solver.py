@@ -33,9 +33,13 @@ class SimulationDivergedError(RuntimeError):
         super().__init__(body, frame, time_s, quantity, hint)
         self.body, self.frame, self.time_s, self.quantity, self.hint = body, frame, time_s, quantity, hint
 
+    @property
+    def finding(self) -> str:
+        """What happened, without what a job may do about it."""
+        return f'"{self.body}" diverged at frame {self.frame}, t = {self.time_s:.4f} s: {self.quantity}'
+
     def __str__(self) -> str:
-        sentence = f'"{self.body}" diverged at frame {self.frame}, t = {self.time_s:.4f} s: {self.quantity}'
-        return f"{sentence}; {self.hint}" if self.hint else sentence
+        return f"{self.finding}; {self.hint}" if self.hint else self.finding
 
 
 class Solver(Protocol):

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 Value = float | bool | tuple[float, float, float]
 Kind = Literal["number", "decades", "whole", "switch", "vector"]
 
+FEWEST_OF_KNOB, MOST_OF_KNOB = 2, 60
+"""Range of the substeps a frame, if the job does not ask for others."""
+
 
 @dataclass(frozen=True)
 class Knob:
@@ -75,9 +78,14 @@ _CLOTH: tuple[tuple[str, str, Kind, float, float], ...] = (
 )
 
 
-def knobs_of(job: Job) -> tuple[Knob, ...]:
-    """All that can be turned in the scene of a job. A value outside of a range widens it."""
-    found = list(_shared_knobs(job))
+def knobs_of(job: Job, *, written: Job | None = None) -> tuple[Knob, ...]:
+    """All that can be turned in the scene of a job. A value outside of a range widens it.
+
+    Args:
+        job: as it is simulated.
+        written: as it was read, if that differs: what it asks for can be had as well.
+    """
+    found = list(_shared_knobs(job, written or job))
     for number, cloth in enumerate(job.cloth):
         for key, label, kind, low, high in _CLOTH:
             value = getattr(cloth, key)
@@ -103,7 +111,7 @@ def knobs_of(job: Job) -> tuple[Knob, ...]:
     return tuple(found)
 
 
-def _shared_knobs(job: Job) -> list[Knob]:
+def _shared_knobs(job: Job, written: Job) -> list[Knob]:
     """Gravity, which fluids are sized for when they are built; the step of cloth, which explicit springs dictate."""
     found = []
     if not job.fluid:
@@ -120,9 +128,10 @@ def _shared_knobs(job: Job) -> list[Knob]:
         )
     if job.cloth and job.cloth[0].integrator == "xpbd":
         paths = tuple(("cloth", number, "substeps") for number in range(len(job.cloth)))
-        count = job.cloth[0].substeps or DEFAULT_SUBSTEPS
+        count, asked = (each.cloth[0].substeps or DEFAULT_SUBSTEPS for each in (job, written))
+        ends = min(FEWEST_OF_KNOB, asked), max(MOST_OF_KNOB, asked)
         found.append(
-            _knob("cloth.substeps", "substeps a frame", "Scene", paths=paths, kind="whole", ends=(2, 60), start=count)
+            _knob("cloth.substeps", "substeps a frame", "Scene", paths=paths, kind="whole", ends=ends, start=count)
         )
     return found
 

@@ -7,6 +7,7 @@ then its collisions with itself.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -19,18 +20,18 @@ if TYPE_CHECKING:
 
 NODE_SUBSTEP_S = 1.4e-6
 """Core time of a node in a substep of cloth in contact [s]. Twice what the scene alone was measured to take (10 000
-nodes, 20 substeps: 117 to 138 ms of processor time, docs/live.md): threads wait for each other, and page and browser
+nodes, 20 substeps: 101 to 144 ms of processor time, docs/live.md): threads wait for each other, and page and browser
 want their share of the cores."""
 
-APART_SHARE = 0.75
-"""Of it, where cloth does not collide with itself: measured are 0.5 to 0.6, of which threads wait for more."""
+APART_SHARE = 0.4
+"""Of it, where cloth does not collide with itself: measured are 0.25 to 0.35 on two cores."""
 
 FLUENT_FRAME_S = 1.0 / 30.0
 """What a frame of the scene may take for hands and eyes to go along [s]."""
 
 FEWEST_SUBSTEPS = 6
 """Nothing blows up in fewer, but cloth that hangs by its corners is drawn to a multiple of its length there: a dragged
-ball draws springs beside the pins to 5 times their length in 6, to 12 in 4, to one and a half in 20 (docs/live.md)."""
+ball draws springs beside the pins to 6 times their length in 6, to 14 in 4, to 1.6 in 20 (docs/live.md)."""
 
 FEWEST_COLLIDING = 10
 """Where cloth collides with itself, fewer substeps gain nothing: contacts have the more to do."""
@@ -38,11 +39,18 @@ FEWEST_COLLIDING = 10
 _PACE_KEYS = ("substeps", "self_collision")
 
 
+def fewest_for_bodies(job: Job) -> int:
+    """Substeps a frame that the bodies of a scene ask for: its cloths take as many, however few they ask for."""
+    from sim.rigid.solver import largest_dt
+
+    return max(1, math.ceil(1.0 / (job.fps * largest_dt(job.rigid))))
+
+
 def cloth_frame_s(job: Job, *, power: float) -> float:
     """About how long a frame of the cloths takes [s], on so many cores."""
     if not job.cloth:
         return 0.0
-    substeps = job.cloth[0].substeps or DEFAULT_SUBSTEPS
+    substeps = max(job.cloth[0].substeps or DEFAULT_SUBSTEPS, fewest_for_bodies(job))
     meets = any(cloth.self_collision for cloth in job.cloth) or len(job.cloth) > 1
     return estimated_cloth_nodes(job) * substeps * NODE_SUBSTEP_S * (1.0 if meets else APART_SHARE) / power
 
@@ -64,10 +72,12 @@ def fluent(job: Job, *, power: float) -> Job:
 
 
 def _in_fewer_substeps(job: Job, fewest: int, *, power: float) -> Job:
-    """The job in as many substeps as are fluent, but no more than it has, and no fewer than that many."""
-    substeps = job.cloth[0].substeps or DEFAULT_SUBSTEPS
-    fitting = int(substeps * FLUENT_FRAME_S / cloth_frame_s(job, power=power))
-    return job.model_copy(update={"cloth": with_substeps(job.cloth, min(substeps, max(fitting, fewest)))})
+    """The job in as many substeps as are fluent, but no more than it has, and no fewer than that many, or than its
+    bodies ask for."""
+    substeps, for_bodies = job.cloth[0].substeps or DEFAULT_SUBSTEPS, fewest_for_bodies(job)
+    fitting = int(max(substeps, for_bodies) * FLUENT_FRAME_S / cloth_frame_s(job, power=power))
+    count = min(substeps, max(fitting, fewest, for_bodies))
+    return job.model_copy(update={"cloth": with_substeps(job.cloth, count)})
 
 
 def told_pace(written: Job, values: Mapping[str, Value]) -> str:

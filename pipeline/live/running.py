@@ -64,7 +64,7 @@ def show_live(
 
         try:
             device = initialize(job.device, threads=threads)
-            session = Session(job)
+            session = Session(job, written=loaded.job)
         except DeviceUnavailableError as error:
             raise StageUnavailableError(str(error)) from error
         except (ShapeError, ValueError) as error:

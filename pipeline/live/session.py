@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError
 from pipeline.live.hands import FreeBody, Hand, LedBody, Nodes
 from pipeline.live.knobs import Knob, Value, knobs_of, turn
+from pipeline.live.pace import told_pace
 from sim.snapshots import Snapshot
 from sim.solver import SimulationDivergedError
 
@@ -85,20 +86,22 @@ class Session:
         is_paused: whether time stands still.
         speed: simulated over wall time that is wanted, 1 for real time.
         message: the last thing that has to be known.
+        report: of the last frame; None before the first.
         revision: grows when the scene or its knobs change otherwise than by time and by what was asked for.
         on_frame: called after each frame with its report, as a recording does; None: nobody.
         on_jump: called before time goes back, as a recording cannot; None: nobody.
 
     Args:
         job: cloth, bodies and fluid; `sim.runtime.initialize` must have run.
+        written: the job as it was read, if live has changed it for the sake of speed: after a blow-up that is named.
 
     Raises:
         ShapeError, ValueError: as `sim.build.build_world`.
     """
 
-    def __init__(self, job: Job) -> None:
-        self.job = job
-        self.knobs: dict[str, Knob] = {knob.name: knob for knob in knobs_of(job)}
+    def __init__(self, job: Job, *, written: Job | None = None) -> None:
+        self.job, self._written = job, written or job
+        self.knobs: dict[str, Knob] = {knob.name: knob for knob in knobs_of(job, written=written)}
         self.values: dict[str, Value] = {name: knob.start for name, knob in self.knobs.items()}
         self.is_paused = False
         self.speed = 1.0
@@ -112,6 +115,7 @@ class Session:
         self._frame_ms = 0.0
         self._substeps: Mapping[str, int] = {}
         self._begins: deque[float] = deque(maxlen=max(10, job.fps))
+        self.report: FrameReport | None = None
         self._build()
 
     def _build(self) -> None:
@@ -157,9 +161,13 @@ class Session:
                 self.world.tell_couplings()
             report = self.world.advance_frame()
             _require_sound(report)
-        except (SimulationDivergedError, FloatingPointError, np.linalg.LinAlgError) as error:
+        except SimulationDivergedError as error:
+            self._go_back(error.finding)  # its hint is about keys of a job that no knob turns
+            return
+        except (FloatingPointError, np.linalg.LinAlgError) as error:
             self._go_back(str(error))
             return
+        self.report = report
         if self.message == FIRST:
             self.message = ""
         self._frame_ms, self._substeps = 1e3 * (time.perf_counter() - began), report.substeps
@@ -350,17 +358,22 @@ class Session:
         return list(refused.values())
 
     def _go_back(self, what: str) -> None:
-        """Go back to the newest moment that can be trusted; else to the start with the job's own values, and stop."""
+        """Go back to the newest moment that can be trusted; else to the start with the values of then, and stop."""
         now = self.world.frame
         moment = next((each for each in reversed(self._moments) if now - each.frame >= FRAMES_TO_TRUST), None)
         turned = [change for frame, change in self._changes if moment is None or frame >= moment.frame]
         held = [f'"{name}" of the {kind}' if kind == "pin" else f'"{name}"' for kind, name in self._hands]
         if turned:
-            cause = f"Turned last: {turned[-1]}"
+            cause = f"Turned last: {turned[-1]}."
         elif held:
-            cause = f"In hand: {', '.join(held)}"
+            cause = f"In hand: {', '.join(held)}."
         else:
-            cause = "Nothing had been turned; the job may need more substeps"
+            cause = "Nothing had been turned."
+        if pace := told_pace(self._written, self.values):
+            is_lives = told_pace(self._written, {name: knob.start for name, knob in self.knobs.items()})
+            cause += f" {pace} Knobs bring that back{', and so does --as-written' if is_lives else ''}."
+        elif not (turned or held):
+            cause += " The job may need more substeps."
         self.message = ""
         self._begin_anew({} if moment is None else moment.values)
         if moment is None:
@@ -370,8 +383,8 @@ class Session:
                 self._solvers["rigid"].paths.update(moment.paths)
             self.world.restore(moment.frame, moment.arrays)
             self._moments.append(moment)
-        place = "the start, with the job's values" if moment is None else f"{self.world.time_s:.2f} s"
-        self.message = f"It blew up: {what}. {cause}. Back at {place}. {self.message}".rstrip()
+        place = "the start, with the values that it had there" if moment is None else f"{self.world.time_s:.2f} s"
+        self.message = f"It blew up: {what}. {cause} Back at {place}. {self.message}".rstrip()
 
 
 def _require_sound(report: FrameReport) -> None:

@@ -17,10 +17,12 @@ from sim.cloth.continuous_response import (
     repair_crossings,
 )
 from sim.cloth.continuous_zones import ImpactZones
+from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import SelfCollision, half_range
+from sim.host_access import copied
 from sim.reductions import LaneReduction
 from sim.short_loops import is_short
 
@@ -73,6 +75,8 @@ class ContinuousContacts:
     def __init__(self, state: ClothState, *, rigid: RigidContact | None = None) -> None:
         self.rigid = rigid or RigidContact((), (), ())
         self._pairs = SelfCollision(state)
+        self._patches = self._pairs.patches.patches
+        self._lone = LoneCloth(state, self._patches)
         self.rigid.set_spacing(self._pairs.mean_edge)
         n = state.vertex_count
         self._contacts = ContactList(4 * n)
@@ -84,6 +88,7 @@ class ContinuousContacts:
         self._missing, self._ends = LaneReduction(maxima=1, sums=0), LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
+        self._meets_cloth = False
         self.begin_frame()
 
     # --- what the solver asks ---------------------------------------------------------------------------------------
@@ -91,16 +96,20 @@ class ContinuousContacts:
     def stable_dt(self, state: ClothState) -> float:
         """Largest step [s] in which cloth moves little against itself and against bodies."""
         deviation, speed = half_range(state.velocity, state.vertex_count, self._ends)
-        meets_cloth = deviation > 0.0 and (len(state.names) > 1 or any(state.self_collision))
-        own = LARGEST_MOTION * self._pairs.mean_edge / deviation if meets_cloth else math.inf
+        own = LARGEST_MOTION * self._pairs.mean_edge / deviation if deviation > 0.0 and self._meets_cloth else math.inf
         return min(own, self.rigid.stable_dt(speed))
 
     def begin_frame(self) -> None:
         """Count anew, and expect of contacts what a run does that continues here."""
-        self._pairs.begin_frame(self._state)
-        self.rigid.set_thickness(self._pairs.thickness)
+        state = self._state
+        met_cloth, self._meets_cloth = self._meets_cloth, len(state.names) > 1 or any(state.self_collision)
+        if self._meets_cloth and not met_cloth:
+            self._pairs.forget()  # it has not followed the cloth
+        self._near: SelfCollision | LoneCloth = self._pairs if self._meets_cloth else self._lone
+        self._near.begin_frame(state)
+        self.rigid.set_thickness(self._near.thickness)
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
-        self._mean_mass = float(self._state.mass.to_numpy().mean())
+        self._mean_mass = float(copied(state.mass).mean())
 
     def diagnostics(self) -> Mapping[str, float]:
         """Numbers of the frame: contacts, with watched pairs, and iterations a substep.
@@ -126,27 +135,27 @@ class ContinuousContacts:
 
     def resolve(self, state: ClothState, dt: float) -> None:
         """Change the displacements of a substep of dt [s] so that nothing crosses."""
-        motion = self._pairs.look(state)
+        motion = self._near.look(state)
         if not math.isfinite(motion) or motion > 1.0e6:
             return  # the solver says which quantity is not finite, or ran away
         self.rigid.begin_substep(dt)
         self._impulse_unit = IMPULSE_UNIT * self._mean_mass * dt**2
         while True:
-            self._pairs.prepare(state)
+            self._near.prepare(state)
             found = self._find(state, dt)
             if not found:
                 left = 0
                 break
             self._push(state, found, is_first=True)
             left = self._keep_apart(state, found)
-            change, beyond = self._pairs.measure_changes(state, self._predicted)
+            change, beyond = self._near.measure_changes(state, self._predicted)
             if not math.isfinite(change):
                 return  # as above
             # What was pushed farther than foreseen may have met what was not looked at.
             if not beyond:
                 break
-            self._pairs.look(state)
-        self._pairs.follow(state, is_changed=found > 0)
+            self._near.look(state)
+        self._near.follow(state, is_changed=found > 0)
         self._substeps += 1
         self._found += found
         self._left += left
@@ -154,8 +163,8 @@ class ContinuousContacts:
     def _find(self, state: ClothState, dt: float) -> int:
         recovery = min(1.0, dt / RECOVERY_TIME_S)
         while True:
-            self._pairs.find(state, self._contacts, recovery)
-            self.rigid.find(state, self._pairs.patches, self._contacts, recovery)
+            self._near.find(state, self._contacts, recovery)
+            self.rigid.find(state, self._patches, self._near.motion_arrays, self._contacts, recovery)
             found = self._contacts.take_found()
             if not self._contacts.make_room_for(found):
                 return found
@@ -198,6 +207,8 @@ class ContinuousContacts:
 
     def _keep_apart(self, state: ClothState, count: int) -> int:
         """Push, and at last tie together, until no pair can have crossed; how many pairs still may have."""
+        if not self._meets_cloth:
+            return 0
         for _ in range(REPAIRS):
             failed = self._crossings(state, count)
             if not failed:

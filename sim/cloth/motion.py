@@ -53,7 +53,7 @@ def move_pinned(
 @ti.kernel
 def finish_step(
     displacement: Vectors, quantum: ti.f32, limit: ti.i32, dt: ti.f32, lattice: Lattice, position: Vectors,
-    carry: Vectors, velocity: Vectors,
+    carry: Vectors, velocity: Vectors, is_short: ti.template(),
 ):  # fmt: skip
     """Velocities from displacements; the whole quanta of these onto the lattice, the rest is carried on.
 
@@ -61,6 +61,8 @@ def finish_step(
     for the rounding of 1/dt, which would make all velocities grow or shrink alike. Nodes stop at the ends of the
     lattice. Where a displacement is not finite, the velocity shows it.
     """
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for i in range(position.shape[0]):
         u_i = displacement[i]
         v_i = velocity[i] + (u_i - (carry[i] + dt * velocity[i])) / dt

@@ -24,6 +24,9 @@ REGULARIZATION = 1.0e-5
 PATCHES_AT_A_TIME, PAIRS_AT_A_TIME, LANES_AT_A_TIME = 16, 256, 4
 """Patches, pairs of them, and lanes of a reduction over them that a thread takes at a time."""
 
+WIDENED = 1.25
+"""Contacts may push so many times as far as in the substep before without patches being looked at anew."""
+
 SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
@@ -335,7 +338,7 @@ def measure_changes(
     count: ti.i32, workers: ti.i32, taken: Integers, items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
     first_corner: Integers, corners: Integers, displacement: Vectors, predicted: Vectors, half_thickness: ti.f32,
     change: Floats, margin: Floats, more: Floats,
-    partial: Floats, lanes: ti.i32, nodes: Floats,
+    partial: Floats, lanes: ti.i32, nodes: Floats, is_short: ti.template(),
 ) -> ti.math.vec2:  # fmt: skip
     """How far contacts displaced the vertices of each patch, `change` [m]; where that is beyond the `margin` that was
     allowed for, half as much again is from now on.
@@ -343,6 +346,8 @@ def measure_changes(
     Returns the largest change, and the largest that is beyond its margin, or 0.
     """
     begin_sharing(taken, 0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for worker in range(workers):
         lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
         while lane < lanes:
@@ -379,8 +384,8 @@ def finish_patches(
 ):  # fmt: skip
     """The displacements of a substep are final: note where they lead, and what of the lists they use up.
 
-    Patches that contacts changed by more than `negligible` [m] are fitted anew. Margins for the next substep are a
-    quarter more than what contacts did in this one, and `least_margin` at least [m].
+    Patches that contacts changed by more than `negligible` [m] are fitted anew. Margins for the next substep are
+    `WIDENED` times what contacts did in this one, and `least_margin` at least [m].
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
     vertices_end, patches_end, pairs_end = vertex_count, count, pair_count
@@ -395,7 +400,7 @@ def finish_patches(
         while m < patches_end:
             change[m] = ti.select(is_changed == 1, change[m], 0.0)
             spent[m] += motion[m] + change[m] + astray
-            margin[m] = ti.max(least_margin, 1.25 * change[m])
+            margin[m] = ti.max(least_margin, WIDENED * change[m])
             more[m] = ti.max(margin[m] - half_thickness, 0.0)
             if change[m] > negligible:
                 fit_motion(

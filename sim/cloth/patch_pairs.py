@@ -323,7 +323,7 @@ class PatchPairs:
             patches.count, workers_for(lanes.count), self._taken, lanes.items(patches.count),
             lanes.lane_step(patches.count), lanes.item_step(), patches.first_corner, patches.corners,
             state.displacement, predicted,
-            self._half_thickness, self._change, self._margin, self._more, partial, lane_count, nodes,
+            self._half_thickness, self._change, self._margin, self._more, partial, lane_count, nodes, self._is_short,
         )  # fmt: skip
         return float(largest), float(beyond)
 

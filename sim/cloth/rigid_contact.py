@@ -9,8 +9,8 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.arrays import Floats, Integers, Matrices, Vectors
-from sim.cloth.loop_costs import PATCH_AT_WALLS_NS
-from sim.cloth.patch_pairs import PatchPairs
+from sim.cloth.loop_costs import NODE_AT_BODIES_NS, PATCH_AT_BODY_NS, PATCH_AT_WALLS_NS
+from sim.cloth.patches import Patches
 from sim.cloth.proximity import unit_or
 from sim.cloth.proximity_contacts import WALL, ContactList, Quadruples, Weights, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
@@ -151,17 +151,25 @@ class RigidContact:
             return math.inf
         return LARGEST_ADVANCE * 0.5 * self.bodies.shortest_edge / relative
 
-    def find(self, state: ClothState, moved: PatchPairs, contacts: ContactList, recovery: float) -> None:
+    def find(
+        self,
+        state: ClothState,
+        patches: Patches,
+        motion_arrays: tuple[ti.Ndarray, ...],
+        contacts: ContactList,
+        recovery: float,
+    ) -> None:
         """Append what touches in this substep.
 
         Args:
             state: at the start of a substep.
-            moved: where the cloths' patches are, and how they move in it.
+            patches: of the cloths.
+            motion_arrays: where they are and how they move in it, see `sim.cloth.patch_pairs.PatchPairs`.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
-        patches, lanes = moved.patches, LANES if runs_on_gpu() else 1
-        own = (patches.count, lanes, patches.first_vertex, patches.vertices, *moved.motion_arrays)
+        lanes = LANES if runs_on_gpu() else 1
+        own = (patches.count, lanes, patches.first_vertex, patches.vertices, *motion_arrays)
         cloth = (state.position, state.displacement, state.thickness, state.friction)
         if self._wall_count:
             find_wall_contacts(
@@ -178,14 +186,16 @@ class RigidContact:
             each.position, each.rotation, each.motion,
         )  # fmt: skip
         workers = workers_for(patches.count * lanes), self._taken
+        few_bodies = is_short(patches.count * each.count, PATCH_AT_BODY_NS)
         find_body_contacts_of_vertices(
-            *own[:2], *workers, *own[2:], self._largest_half, *cloth, *bodies, recovery, *contacts.found_arrays
+            *own[:2], *workers, *own[2:], self._largest_half, *cloth, *bodies, recovery, *contacts.found_arrays,
+            few_bodies and is_short(patches.vertex_count, NODE_AT_BODIES_NS),
         )  # fmt: skip
         if self._has_edges:
             find_body_contacts_between_vertices(
                 patches.count, lanes, *workers, patches.first_edge, patches.edges, patches.first_triangle,
-                patches.triangles, *moved.motion_arrays, self._largest_half, *cloth, *bodies, recovery,
-                *contacts.found_arrays,
+                patches.triangles, *motion_arrays, self._largest_half, *cloth, *bodies, recovery,
+                *contacts.found_arrays, few_bodies and is_short(patches.between_count, NODE_AT_BODIES_NS),
             )  # fmt: skip
 
 
@@ -321,10 +331,12 @@ def find_body_contacts_of_vertices(
     grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
     body_position: Vectors, rotation: Matrices, motion: Vectors, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
+    friction: Floats, counter: Integers, capacity: ti.i32, is_short: ti.template(),
 ):  # fmt: skip
     """Append the contacts of vertices with bodies."""
     begin_sharing(taken, 0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < patch_count * lanes:
@@ -358,10 +370,12 @@ def find_body_contacts_between_vertices(
     grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
     body_position: Vectors, rotation: Matrices, motion: Vectors, recovery: ti.f32,
     vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
+    friction: Floats, counter: Integers, capacity: ti.i32, is_short: ti.template(),
 ):  # fmt: skip
     """Append the contacts of midpoints of edges and triangles with bodies that have edges of their own."""
     begin_sharing(taken, 0)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while item < patch_count * lanes:

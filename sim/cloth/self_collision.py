@@ -18,6 +18,7 @@ from sim.cloth.self_collision_kernels import (
     range_of_vectors,
     search_patches,
 )
+from sim.host_access import copied
 from sim.reductions import LaneReduction
 from sim.short_loops import is_short
 from sim.work_sharing import workers_for
@@ -79,7 +80,7 @@ class SelfCollision:
         Lists are kept, unless thicknesses or flags have changed: no result depends on when they were made.
         """
         self._searched = 0
-        thickness = state.thickness.to_numpy()  # of each node, as pairs are listed with the distance that they keep
+        thickness = copied(state.thickness)  # of each node, as pairs are listed with the distance that they keep
         listed_for = thickness.tobytes(), state.self_collision
         if listed_for != self._listed_for:
             self._listed_for = listed_for
@@ -149,6 +150,11 @@ class SelfCollision:
                 state.position, state.displacement, self._rest, state.body, state.thickness, state.friction, recovery,
                 *contacts.found_arrays,
             )  # fmt: skip
+
+    @property
+    def motion_arrays(self) -> tuple[ti.Ndarray, ...]:
+        """See `PatchPairs`."""
+        return self._met.motion_arrays
 
     @property
     def patches(self) -> PatchPairs:

@@ -12,6 +12,7 @@ from sim.cloth.contacts import ClothContacts
 from sim.cloth.device_springs import DeviceSprings
 from sim.cloth.explicit import ExplicitSprings
 from sim.cloth.load import NodeLoad
+from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.motion import finish_step, predict_displacement
 from sim.cloth.parameters import DEFAULT_SUBSTEPS, RUNAWAY_SPEED, ClothParameters, shared_conflicts
 from sim.cloth.pins import Pins
@@ -25,6 +26,7 @@ from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
 from sim.domain import DomainParameters
 from sim.parameters import Vector3
+from sim.short_loops import is_short
 from sim.snapshots import Snapshot
 from sim.solver import Arrays, Diagnostics
 
@@ -100,6 +102,7 @@ class ClothSolver:
         self._integrator = INTEGRATORS[shared.integrator](self.state, self._springs, iterations=shared.iterations)
         self._totals = ClothTotals(self.state, self._springs)
         self._frame_dt = 1.0 / frames_per_second
+        self._is_short = is_short(self.state.vertex_count, NODE_NS)
         self.air = ClothAir(self.state)
         self._rectangles_in_wind = {
             number: RectangleAir(self.state, grid, int(host.first_node[number]), self.air.share)
@@ -213,7 +216,7 @@ class ClothSolver:
         state = self.state
         finish_step(
             state.displacement, state.quantum, state.limit, dt, state.lattice, state.position, state.carry,
-            state.velocity,
+            state.velocity, self._is_short,
         )  # fmt: skip
         if self.load is not None:
             self.load.take_off(state)

@@ -1,4 +1,7 @@
-"""Sums and maxima over the cloths, on the device: what the diagnostics tell of every frame."""
+"""Sums and maxima over the cloths, on the device: what the diagnostics tell of every frame.
+
+Loops over lanes are serial on a CPU: one thread has them all either way (`sim.work_sharing`), and none need wake.
+"""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +12,7 @@ from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.device_springs import DeviceSprings, Laws, coefficient, separation
 from sim.cloth.state import ClothState, Lattice
 from sim.launch import fast_launch
-from sim.reductions import LaneReduction, Results, is_finite, reduced
+from sim.reductions import LaneReduction, Results, is_finite, reduced, runs_on_gpu
 
 NODE_MAXIMA, NODE_SUMS = 1, 7
 SPRING_MAXIMA, SPRING_SUMS = 1, 1
@@ -61,6 +64,8 @@ def sum_over_nodes(
     partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
 ) -> Results:  # fmt: skip
     """Largest squared speed; momentum, kinetic and potential energy; how many are not finite, or at the ends."""
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for lane in range(lanes):
         fastest = 0.0
         momentum = ti.math.vec3(0.0)
@@ -100,6 +105,8 @@ def sum_over_springs(
     partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
 ) -> Results:  # fmt: skip
     """Largest strain of springs with two nodes; elastic energy."""
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
     for lane in range(lanes):
         largest = 0.0
         energy = 0.0

@@ -56,9 +56,12 @@ class SteadyPath:
 
     def __init__(self, position: Array, orientation: Array, velocity: Array, angular_velocity: Array) -> None:
         self._start = Motion(position, orientation, velocity, angular_velocity)
+        self._rests = not (velocity.any() or angular_velocity.any())
 
     def at(self, time_s: float) -> Motion:
         """Its motion at a simulated time [s]."""
+        if self._rests:  # asked in every substep
+            return self._start
         turned = rotation.exponential(time_s * self._start.angular_velocity)
         return self._start._replace(
             position=self._start.position + time_s * self._start.velocity,

@@ -114,8 +114,7 @@ class RigidSolver:
         dynamic = np.flatnonzero(self.bodies.is_dynamic)
         smallest = min((self._geometries[number].shortest_edge for number in dynamic), default=math.inf)
         self._largest_advance = LARGEST_ADVANCE * 0.5 * smallest
-        has_keyframes = any(body.keyframe for body in parameters)
-        self._largest_dt = LARGEST_DT if len(dynamic) or has_keyframes else math.inf
+        self._largest_dt = largest_dt(parameters)
         self.time_s = 0.0
         self.begin_frame(0.0)
 
@@ -260,7 +259,7 @@ class RigidSolver:
             arm = rotation.rotated(motion.orientation, self._geometries[number].centre_of_mass)
             self.bodies.position[number] = motion.position + arm
             self.bodies.orientation[number] = motion.orientation
-            self.bodies.velocity[number] = motion.velocity + np.cross(motion.angular_velocity, arm)
+            self.bodies.velocity[number] = motion.velocity + rotation.cross(motion.angular_velocity, arm)
             self.bodies.angular_velocity[number] = motion.angular_velocity
 
     def _set_mean_velocities_of_kinematic_bodies(self, dt: float) -> None:
@@ -368,6 +367,11 @@ class RigidSolver:
         if speeds[fastest] > RUNAWAY_SPEED:
             return f'the speed of "{self.bodies.names[fastest]}" is {speeds[fastest]:.3g} m/s'
         return None
+
+
+def largest_dt(parameters: Sequence[RigidBodyParameters]) -> float:
+    """Largest step [s] of these bodies, however slow they are."""
+    return LARGEST_DT if any(body.kind == "dynamic" or body.keyframe for body in parameters) else math.inf
 
 
 _STATE = ("position", "orientation", "velocity", "angular_velocity", "is_lost")

@@ -99,6 +99,8 @@ class MovingBodies:
 
     def inverse_inertia(self) -> Array:
         """Inverse inertia tensors in world axes [1/(kg m²)], (n, 3, 3); 0 for kinematic and lost bodies."""
+        if not self.is_dynamic.any():
+            return np.zeros_like(self._inverse_tensor)
         turned = self.rotation()
         inverse = np.einsum("nij,njk,nlk->nil", turned, self._inverse_tensor, turned)
         return np.where(self.is_free[:, None, None], inverse, 0.0)
@@ -124,6 +126,8 @@ class MovingBodies:
             linear: [N s], (n, 3).
             angular: about the centres of mass [N m s], (n, 3).
         """
+        if not self.is_dynamic.any():
+            return
         self.is_pushed = self.is_pushed | linear.any(axis=1)
         self.velocity = self.velocity + self.inverse_mass[:, None] * linear
         self.angular_velocity = self.angular_velocity + np.einsum("nij,nj->ni", self.inverse_inertia(), angular)

@@ -25,6 +25,14 @@ def test_a_knob_may_stay_where_the_job_has_it(tmp_path, odd: str, substeps: int)
         assert knob.checked(knob.start) == knob.start
 
 
+@pytest.mark.parametrize("asked", [1, 80])
+def test_what_the_job_asks_for_can_be_had_again_after_live_has_cut_it(tmp_path, asked: int):
+    written = loaded(tmp_path, BALL_OVER_SHEET.replace("substeps = 8", f"substeps = {asked}")).job
+    job = live_job(written, substeps=6)
+    (knob,) = (knob for knob in knobs_of(job, written=written) if knob.name == "cloth.substeps")
+    assert (knob.start, knob.checked(asked), knob.checked(2), knob.checked(60)) == (6, asked, 2, 60)
+
+
 @pytest.mark.usefixtures("taichi")
 def test_a_page_has_odd_values_and_tells_what_happens_while_time_stands_still(tmp_path):
     odd = "stretch_stiffness = 3e5\nbend_stiffness = 2e-9\nfriction = 3.0"
@@ -36,7 +44,9 @@ def test_a_page_has_odd_values_and_tells_what_happens_while_time_stands_still(tm
         page = LivePage(
             server, session, save=lambda: save_job(read, session.values, tmp_path), recorder=recorder, written=read.job
         )
+        session.advance()
         page.tell(session.status())
+        assert "substeps: cloth 9 (1 asked for), rigid 9" in page._state.content  # as many as the ball asks for
         session.message = "something new"
         page.tell(session.status())
         assert "something new" in page._notice.content

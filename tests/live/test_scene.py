@@ -10,7 +10,7 @@ from pipeline.cli import main
 from pipeline.errors import PipelineError
 from pipeline.job.loading import load_job
 from pipeline.live.knobs import knobs_of
-from pipeline.live.pace import FEWEST_SUBSTEPS, FLUENT_FRAME_S, cloth_frame_s, fluent, told_pace
+from pipeline.live.pace import FEWEST_SUBSTEPS, FLUENT_FRAME_S, cloth_frame_s, fewest_for_bodies, fluent, told_pace
 from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job, require_small
 
@@ -24,7 +24,7 @@ def test_a_scene_that_is_too_large_is_told_what_fits(tmp_path):
 
 @pytest.mark.parametrize(
     ("counts", "substeps", "collides"),
-    [("[17, 17]", 20, True), ("[65, 65]", 11, True), ("[80, 80]", 9, False), ("[100, 100]", FEWEST_SUBSTEPS, False)],
+    [("[17, 17]", 20, True), ("[65, 65]", 11, True), ("[80, 80]", 18, False), ("[100, 100]", 11, False)],
 )
 def test_cloth_that_is_too_slow_gives_up_substeps_then_its_collisions_and_that_is_told(
     tmp_path, counts: str, substeps: int, collides: bool
@@ -46,7 +46,20 @@ def test_a_job_that_is_saved_has_the_pace_that_it_was_played_with(tmp_path):
     read = loaded(tmp_path, BALL_OVER_SHEET.replace("[17, 17]", "[100, 100]").replace("substeps = 8\n", ""))
     values = {knob.name: knob.start for knob in knobs_of(fluent(live_job(read.job), power=2))}
     (cloth,) = load_job(save_job(read, values, tmp_path).path).cloth
-    assert (cloth.substeps, cloth.self_collision) == (FEWEST_SUBSTEPS, False)
+    assert (cloth.substeps, cloth.self_collision) == (11, False)
+
+
+@pytest.mark.parametrize(("kind", "substeps"), [("dynamic", 9), ("static", FEWEST_SUBSTEPS)])
+def test_no_fewer_substeps_are_told_than_bodies_take(tmp_path, kind: str, substeps: int):
+    text = BALL_OVER_SHEET.replace("[17, 17]", "[150, 150]").replace("substeps = 8\n", "")
+    if kind == "static":
+        text = text.replace('kind = "dynamic"\ndensity = 500.0\n', "")
+    written = loaded(tmp_path, text).job
+    job = fluent(live_job(written), power=2)
+    assert fewest_for_bodies(job) == (9 if kind == "dynamic" else 1)
+    assert (job.cloth[0].substeps, job.cloth[0].self_collision) == (substeps, False)
+    taken = live_job(written, substeps=9 if kind == "dynamic" else 2)
+    assert cloth_frame_s(live_job(written, substeps=2), power=2) == cloth_frame_s(taken, power=2)
 
 
 def test_explicit_springs_keep_the_steps_that_they_need(tmp_path):

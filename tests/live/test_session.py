@@ -126,6 +126,22 @@ def test_a_blow_up_goes_back_to_what_was_sound_and_names_what_was_turned(tmp_pat
     assert "Nothing had been turned" in session.message
 
 
+def test_after_a_blow_up_live_names_what_it_had_given_up_itself_and_how_to_have_it_back(tmp_path):
+    written = loaded(tmp_path).job
+    session = Session(live_job(written, substeps=5), written=written)
+    run(session, 1)
+    for substeps in (5, 8):
+        session.turn("cloth.substeps", substeps)
+        session._changes.clear()  # as if it had been long ago
+        session.world.solvers["rigid"].bodies.velocity[0] = (np.nan, 0.0, 0.0)
+        run(session, 1)
+        assert '"ball" is not finite. Nothing had been turned.' in session.message
+        assert ("5 substeps a frame instead of 8" in session.message) == (substeps == 5)
+        assert ("Knobs bring that back, and so does --as-written." in session.message) == (substeps == 5)
+        assert ("The job may need more substeps." in session.message) == (substeps == 8)
+        assert "Back at the start, with the values that it had there" in session.message
+
+
 def test_cloth_with_values_that_are_no_numbers_goes_back_too(tmp_path):
     session = session_of(tmp_path)
     run(session, 1)

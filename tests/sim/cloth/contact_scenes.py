@@ -69,7 +69,7 @@ def displace(solver: ClothSolver, displacement: NDArray[np.floating], dt: float 
     allowed = state.displacement.to_numpy().astype(np.float64)
     finish_step(
         state.displacement, state.quantum, state.limit, dt, state.lattice, state.position, state.carry,
-        state.velocity,
+        state.velocity, False,
     )  # fmt: skip
     return allowed
 

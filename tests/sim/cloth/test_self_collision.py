@@ -338,8 +338,9 @@ def test_contacts_do_not_depend_on_when_pairs_were_searched_for():
         np.testing.assert_array_equal(anew.checkpoint()[name], array, err_msg=name)
 
 
-def test_a_run_with_contacts_continues_bit_for_bit():
-    through, resumed = world_of(FALL), world_of(FALL)
+@pytest.mark.parametrize("self_collision", [True, False])
+def test_a_run_with_contacts_continues_bit_for_bit(self_collision):
+    through, resumed = (world_of({**FALL, "self_collision": self_collision}) for _ in range(2))
     for _ in range(10):
         through.advance_frame()
     saved = {name: array.copy() for name, array in through.checkpoint().items()}
@@ -361,7 +362,8 @@ from sim import short_loops
 short_loops.LONGEST_NS = float(sys.argv[2])
 from contact_scenes import cloth_of, contacts_of, world_of
 from cloth_scenes import rectangle
-sheet = {"shape": rectangle((0.2, 0.2), (11, 11)), "thickness": 4e-3, "rotation_deg": (60.0, 5.0, 0.0)}
+sheet = {"shape": rectangle((0.2, 0.2), (11, 11)), "thickness": 4e-3, "rotation_deg": (60.0, 5.0, 0.0),
+         "self_collision": sys.argv[3] == "True"}
 ball = {"kind": "dynamic", "density": 300.0, "shape": {"type": "sphere", "radius": 0.04}, "position": (0.0, 0.0, 0.3)}
 world = world_of({**sheet, "position": (0.0, 0.0, 0.12)}, bodies=[{**ball, "velocity": (0.0, 0.0, -2.0)}])
 for _ in range(14):
@@ -374,8 +376,10 @@ print(digest.hexdigest(), contacts_of(cloth_of(world)).diagnostics()["contacts"]
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("self_collision", [True, False])
 @pytest.mark.parametrize("longest_ns", [short_loops.LONGEST_NS, 0.0], ids=["short loops serial", "all parallel"])
-def test_contacts_do_not_depend_on_the_number_of_threads(longest_ns):
-    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, repr(longest_ns), beside=__file__, counts=(1, 2, 5))
+def test_contacts_do_not_depend_on_the_number_of_threads(longest_ns, self_collision):
+    arguments = repr(longest_ns), str(self_collision)
+    digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, *arguments, beside=__file__, counts=(1, 2, 5))
     assert digests[0].split()[1] == "True"
     assert len(set(digests)) == 1
