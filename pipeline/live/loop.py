@@ -9,6 +9,7 @@ from typing import Protocol
 from pipeline.live.session import Session, Status
 
 SHOWN_EVERY_S = 1.0 / 30.0
+"""What a page gets of a scene is so far apart at least, on average."""
 TOLD_EVERY_S = 0.2
 LONGEST_WAIT_S = 0.05
 """While time stands still or is slow: how long requests may wait, and the end."""
@@ -29,7 +30,7 @@ def run(session: Session, page: Shows, *, ends: Callable[[], bool]) -> None:
 
     Lost time is not made up for: after a slow frame the next is due at once, and no earlier ones are owed.
     """
-    due = shown_at = told_at = time.perf_counter()
+    due = show_due = told_at = time.perf_counter()
     shown = (-1, -1)
     while not ends():
         now = time.perf_counter()
@@ -40,9 +41,10 @@ def run(session: Session, page: Shows, *, ends: Callable[[], bool]) -> None:
             due = max(due + session.dt / session.speed, time.perf_counter())
         now = time.perf_counter()
         moment = (session.revision, session.world.frame)
-        if moment != shown and now - shown_at >= SHOWN_EVERY_S:
+        if moment != shown and now >= show_due:
             page.show()
-            shown, shown_at = moment, now
+            # Not so long after this one: of frames that take two thirds of that time, only every other would be seen.
+            shown, show_due = moment, max(show_due + SHOWN_EVERY_S, now)
         if now - told_at >= TOLD_EVERY_S:
             page.tell(session.status())
             told_at = now
