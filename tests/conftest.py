@@ -12,7 +12,7 @@ FAMILIES = {"cloth": "cloth", "coupling": "fluid", "fluid": "fluid", "rigid": "r
 """Folders of tests/sim whose tests share kernels, and a name for those that share them."""
 
 VALIDATION_CASES = "tests/validation/test_validation_cases.py"
-"""Most are of fluids. They begin their family, as those of smoke have the most kernels to find again."""
+"""Of all solvers, and long: a family of its own."""
 
 FILMS = {f"tests/acceptance/test_{name}.py" for name in ("end_to_end", "faults", "interruptions")}
 """Files that look at one and the same film: made once, where one process runs them all."""
@@ -20,12 +20,13 @@ FILMS = {f"tests/acceptance/test_{name}.py" for name in ("end_to_end", "faults",
 ON_THEIR_OWN = {"tests/acceptance/test_sample_jobs.py"}
 """Files of long tests that share nothing; they fill up whichever process is done first."""
 
-ORDER = ("smoke", "fluid", "cloth", "films", "rigid")
+ORDER = ("smoke", "fluid", "validation", "cloth", "films", "rigid")
 """Families that begin before all others, the longest first, so that none is left for the end of one process alone.
 
-The first two hold every test of smoke, whose kernels read fields. Taichi numbers the fields of a process, and looks for
-kept kernels by these numbers: tests that always come first, and in the same order, find theirs again. And a process
-has room for some hundred solvers with fields (`sim.runtime.require_room_for_fields`): they are two families for that.
+The first three, with which CI's three processes begin, hold every test of smoke, whose kernels read fields. Taichi
+numbers the fields of a process, and looks for kept kernels by these numbers: tests that always come first, and in the
+same order, find theirs again. And a process has room for some hundred solvers with fields
+(`sim.runtime.require_room_for_fields`): they are several families for that.
 """
 
 
@@ -58,7 +59,7 @@ def family_of(nodeid: str) -> str:
     if path in FILMS:
         return "films"
     if path == VALIDATION_CASES:
-        return FAMILIES["fluid"]
+        return "validation"
     folders = path.split("/")[:-1]
     is_kin = len(folders) == 3 and folders[:2] == ["tests", "sim"] and folders[2] in FAMILIES
     return FAMILIES[folders[2]] if is_kin else path
@@ -68,10 +69,10 @@ def in_order_of_families(nodeids: list[str]) -> list[str]:
     """Tests of each family together: those of `ORDER` first, then the others, the largest first."""
     sizes = Counter(map(family_of, nodeids))
 
-    def place(nodeid: str) -> tuple[int, int, str, bool]:
+    def place(nodeid: str) -> tuple[int, int, str]:
         family = family_of(nodeid)
         rank = ORDER.index(family) if family in ORDER else len(ORDER)
-        return rank, -sizes[family], family, not nodeid.startswith(VALIDATION_CASES)
+        return rank, -sizes[family], family
 
     return sorted(nodeids, key=place)
 
