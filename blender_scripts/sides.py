@@ -23,7 +23,9 @@ class Pseudonormals:
     """
 
     def __init__(self, positions: np.ndarray, triangles: np.ndarray) -> None:
-        self._triangles = triangles
+        # Vertices in the same place are one: what has flat normals has them split.
+        positions, vertices = np.unique(positions, axis=0, return_inverse=True)
+        self._triangles = triangles = vertices.ravel()[triangles]
         self._corners = positions[triangles].astype(np.float64)
         self._on_edge = _ON_EDGE * float(np.ptp(positions, axis=0).max())
         # Side k of a triangle goes from its corner k + 1 to k + 2.

@@ -170,12 +170,16 @@ def test_pseudonormals_of_a_cube_weigh_its_triangles_by_their_angles():
         + """
     from blender_scripts.sides import Pseudonormals
 
+    # Its vertices split as for flat normals, too.
+    split = Pseudonormals(box.positions[box.triangles].reshape(-1, 3), np.arange(36).reshape(12, 3))
     outwards = Pseudonormals(box.positions, box.triangles)
     for number, corners in enumerate(box.positions[box.triangles]):
         face = np.cross(corners[1] - corners[0], corners[2] - corners[0])
         face /= np.linalg.norm(face)
         third, half = np.array([1 / 3] * 3) @ corners, 0.5 * (corners[0] + corners[1])
-        found = outwards.at(np.full(5, number), np.array([third, half, *corners]))
+        places = np.array([third, half, *corners])
+        found = outwards.at(np.full(5, number), places)
+        np.testing.assert_array_equal(split.at(np.full(5, number), places), found)
         np.testing.assert_allclose(found[0], face, atol=1e-6)
         # In the middle of a side and at its corners all faces of the cube count alike, however they are divided.
         is_diagonal = np.linalg.norm(corners[1] - corners[0]) > 0.25
