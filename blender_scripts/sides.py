@@ -26,14 +26,13 @@ class Pseudonormals:
         # Vertices in the same place are one: what has flat normals has them split.
         positions, vertices = np.unique(positions, axis=0, return_inverse=True)
         self._triangles = triangles = vertices.ravel()[triangles]
-        self._corners = positions[triangles].astype(np.float64)
+        self._positions = positions.astype(np.float64)
         self._on_edge = _ON_EDGE * float(np.ptp(positions, axis=0).max())
-        # Side k of a triangle goes from its corner k + 1 to k + 2.
-        sides = np.roll(self._corners, 1, axis=1) - np.roll(self._corners, -1, axis=1)
+        sides = _sides(self._positions[triangles])
         self._of_triangles = _unit(np.cross(sides[:, 0], sides[:, 1]))
-        self._into = _unit(np.cross(self._of_triangles[:, None], sides))  # from each side, in the triangle's plane
         edges = _edges(triangles)
-        self._of_sides = _unit(_sums(edges, np.repeat(self._of_triangles, 3, axis=0)))[edges].reshape(-1, 3, 3)
+        self._edges = edges.reshape(-1, 3)
+        self._of_edges = _unit(_sums(edges, np.repeat(self._of_triangles, 3, axis=0)))
         ways = _unit(sides)
         cosines = -(np.roll(ways, 1, axis=1) * np.roll(ways, -1, axis=1)).sum(axis=2)
         angles = np.arccos(np.clip(cosines, -1.0, 1.0))
@@ -47,16 +46,23 @@ class Pseudonormals:
             numbers: of triangles, (k,).
             places: on them [m], (k, 3).
         """
-        from_corners = places[:, None] - self._corners[numbers]
+        outwards, corners = self._of_triangles[numbers], self._positions[self._triangles[numbers]]
+        from_corners = places[:, None] - corners
         distances = np.linalg.norm(from_corners, axis=2)
-        heights = (np.roll(from_corners, -1, axis=1) * self._into[numbers]).sum(axis=2)
-        outwards = self._of_triangles[numbers]
+        into = _unit(np.cross(outwards[:, None], _sides(corners)))  # from each side, in the triangle's plane
+        heights = (np.roll(from_corners, -1, axis=1) * into).sum(axis=2)
         is_on_edge = heights.min(axis=1) < self._on_edge
-        outwards[is_on_edge] = self._of_sides[numbers[is_on_edge], heights[is_on_edge].argmin(axis=1)]
+        edges = self._edges[numbers[is_on_edge], heights[is_on_edge].argmin(axis=1)]
+        outwards[is_on_edge] = self._of_edges[edges]
         is_on_vertex = distances.min(axis=1) < self._on_edge
         vertices = self._triangles[numbers[is_on_vertex], distances[is_on_vertex].argmin(axis=1)]
         outwards[is_on_vertex] = self._of_vertices[vertices]
         return outwards
+
+
+def _sides(corners: np.ndarray) -> np.ndarray:
+    """Sides of triangles (m, 3, 3) [m]: number k goes from corner k + 1 to k + 2."""
+    return np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)
 
 
 def _edges(triangles: np.ndarray) -> np.ndarray:
