@@ -29,6 +29,8 @@ from sim.shapes.parameters import BunnyShape, Placement, SphereShape
 WIDTH, HEIGHT = 240, 180
 BESIDE = (-1.1, 0.05, 1.2)
 """Where three things stand in a wide picture, along x [m]."""
+SHEETS_BESIDE = (-1.08, -0.04, 1.0)
+"""Where three sheets do, which are wider [m]."""
 LOW, HIGH = (-0.5, -0.5, 0.0), (0.5, 0.5, 1.0)
 SOLID_LOOKS = ("ceramic", "rubber", "plastic", "metal", "stone", "wood", "glass")
 LIQUID_LOOKS = ("water", "honey", "milk")
@@ -66,7 +68,7 @@ def write_shapes(folder: Path) -> None:
     lying = ball.vertices * (1.0, 1.0, 0.56)
     lying[:, 2] = np.maximum(lying[:, 2], -0.18) + 0.16
     write_ply(folder / "lying.ply", lying, ball.faces)
-    for place, x in enumerate(BESIDE):
+    for place, x in enumerate(SHEETS_BESIDE):
         write_table_cloth(folder / f"sheet{place}.ply", x)
 
 

@@ -98,7 +98,7 @@ class SceneRenderer:
         self._fires: dict[str, volumes.FireLight] = {}
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         self._fluids: list[tuple[dict[str, Any], Any]] = []
-        self._touched = wetting.TouchedSolids()
+        self._touched = wetting.TouchedBodies()
         # Workbench sees through nothing.
         is_plain = spec.get("engine") == "workbench"
         self._has_wet = not is_plain and any(_wets(description) for description in spec["objects"])
@@ -194,7 +194,7 @@ class SceneRenderer:
             exr.strip_metadata(master_path)
 
     def _is_touched(self, description: dict[str, Any]) -> bool:
-        """Whether fluids wet an object. Glass bends light as if from air, so they keep their surface against it.
+        """Whether fluids wet a body. Glass bends light as if from air, so they keep their surface against it.
 
         Through the sliver between them light is bent as between the two, at all but flat angles.
         """
@@ -219,22 +219,19 @@ class SceneRenderer:
 
     def _fill_fluids(self, frame: int, places: dict[str, poses.Pose], sheets: list[geometry.TriangleMesh]) -> None:
         solids = self._touched.at({name: pose.after(0.0) for name, pose in places.items()}, sheets)
-        surfaces = [self._read_surface(self._file(description["file"], frame)) for description, _ in self._fluids]
+        surfaces = [_read_surface(self._file(description["file"], frame)) for description, _ in self._fluids]
         for (description, blender_object), surface in zip(self._fluids, surfaces, strict=True):
             # Cycles follows light through one surface on its way to the floor, and not through two that are parallel.
             dips, reach = description["material"]["caustics"], description["wets_within"]
             others = [
-                wetting.Solid.of_fluid(other, near=surface, reach=reach) for other in surfaces if other is not surface
+                wetting.Touchable.of_fluid(other, near=surface, reach=reach)
+                for other in surfaces
+                if other is not surface
             ]
-            touching = wetting.wetted(surface, reach=reach, floor_z=self._floor_z, solids=[*solids, *others], dips=dips)
+            touching = wetting.wetted(
+                surface, reach=reach, floor_z=self._floor_z, touchables=[*solids, *others], dips=dips
+            )
             geometry.fill_mesh(blender_object.data, touching)
-
-    def _read_surface(self, path: Path) -> geometry.TriangleMesh:
-        """A fluid's surface."""
-        surface = geometry.read_ply(path)
-        if surface.normals is None:
-            raise RenderInputError(f"the surface {path} has no normals (nx, ny, nz)")
-        return surface
 
     def _place_camera(self, frame: int) -> None:
         if self._views is None:
@@ -287,6 +284,18 @@ class SceneRenderer:
                 self._fires[name] = volumes.FireLight(name, glow_of(context))
         blender_object.data.materials.append(material)
         return blender_object
+
+
+def _read_surface(path: Path) -> geometry.TriangleMesh:
+    """A fluid's surface.
+
+    Raises:
+        RenderInputError: it cannot be read, or has no normals.
+    """
+    surface = geometry.read_ply(path)
+    if surface.normals is None:
+        raise RenderInputError(f"the surface {path} has no normals (nx, ny, nz)")
+    return surface
 
 
 def _wets(description: dict[str, Any]) -> bool:

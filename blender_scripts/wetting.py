@@ -17,6 +17,7 @@ from mathutils import Quaternion
 from mathutils.bvhtree import BVHTree
 
 from blender_scripts.geometry import EMPTY_MESH, TriangleMesh
+from blender_scripts.sides import Pseudonormals
 
 _TOUCHES_WITHIN, _FREE_BEYOND = 2.0 / 3.0, 4.0 / 3.0
 """Distances between which a surface goes from touching to free, in `reach`."""
@@ -24,8 +25,6 @@ _ALONG, _TOWARDS = 0.1, 0.5
 """Cosines between the outward normal and the way to the solid: free below the first, touching above the second. A free
 surface that ends at a wall, and the outside of a film, do not face the solid although they are near it."""
 
-_RIGHT_ANGLE = 1.0e-3
-"""Cosine of what counts as a right angle; single precision leaves less."""
 _NO_WAY = 1.0e-3
 """A distance too short to have a direction, in `reach`."""
 
@@ -34,15 +33,15 @@ _DIP = 0.2
 
 
 @dataclass(frozen=True)
-class Solid:
+class Touchable:
     """What a fluid may touch, with its place: a body, a cloth or another fluid.
 
     Attributes:
         tree: its triangles, in its own axes; None without any.
         low: lower corner of the box around it, in its own axes [m], (3,).
         high: upper corner [m], (3,).
-        is_closed: whether it has an inside; a sheet has not.
-        takes_dips: whether what touches it may be moved into it. It would come out of a sheet again, and two fluids
+        outwards: which way is out of it; None of a sheet, which has no inside.
+        can_be_entered: whether what touches it may be moved into it. It would come out of a sheet again, and two fluids
             would be moved into each other.
         position: of its origin [m], (3,).
         rotation: from its own axes to the world's, (3, 3).
@@ -51,23 +50,24 @@ class Solid:
     tree: Any
     low: np.ndarray
     high: np.ndarray
-    is_closed: bool
-    takes_dips: bool
+    outwards: Pseudonormals | None
+    can_be_entered: bool
     position: np.ndarray
     rotation: np.ndarray
 
     @classmethod
-    def of(cls, mesh: TriangleMesh, *, is_closed: bool) -> Solid:
+    def of(cls, mesh: TriangleMesh, *, is_closed: bool) -> Touchable:
         """A mesh at the origin. Building its tree is most of the work: a rigid body needs one for all frames."""
         low, high = np.zeros(3), np.zeros(3)
-        tree = None
+        tree = outwards = None
         if len(mesh.triangles):
             low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
             tree = BVHTree.FromPolygons(mesh.positions.tolist(), mesh.triangles.tolist(), all_triangles=True)
-        return cls(tree, low, high, is_closed, is_closed, np.zeros(3), np.eye(3))
+            outwards = Pseudonormals(mesh.positions, mesh.triangles) if is_closed else None
+        return cls(tree, low, high, outwards, is_closed, np.zeros(3), np.eye(3))
 
     @classmethod
-    def of_fluid(cls, surface: TriangleMesh, *, near: TriangleMesh, reach: float) -> Solid:
+    def of_fluid(cls, surface: TriangleMesh, *, near: TriangleMesh, reach: float) -> Touchable:
         """The surface of another fluid, as far as one that wets it within this distance [m] may be near it."""
         if not len(near.positions):
             return cls.of(EMPTY_MESH, is_closed=True)
@@ -77,10 +77,10 @@ class Solid:
         touching = (corners.max(axis=1) >= low).all(axis=1) & (corners.min(axis=1) <= high).all(axis=1)
         used, triangles = np.unique(surface.triangles[touching], return_inverse=True)
         part = TriangleMesh(surface.positions[used], triangles.reshape(-1, 3))
-        return replace(cls.of(part, is_closed=True), takes_dips=False)
+        return replace(cls.of(part, is_closed=True), can_be_entered=False)
 
-    def placed(self, position: Sequence[float], orientation: Sequence[float]) -> Solid:
-        """The same solid somewhere else.
+    def placed(self, position: Sequence[float], orientation: Sequence[float]) -> Touchable:
+        """The same somewhere else.
 
         Args:
             position: of its origin [m], (3,).
@@ -90,34 +90,34 @@ class Solid:
         return replace(self, position=np.array(position), rotation=rotation)
 
 
-class TouchedSolids:
-    """The bodies of a scene that fluids touch."""
+class TouchedBodies:
+    """The bodies of a scene that fluids wet."""
 
     def __init__(self) -> None:
-        self._bodies: list[tuple[dict[str, Any], Solid]] = []
+        self._bodies: list[tuple[dict[str, Any], Touchable]] = []
 
     def add_body(self, description: dict[str, Any], mesh: TriangleMesh) -> None:
         """Take in a `mesh` or `moving_mesh` of the specification."""
-        self._bodies.append((description, Solid.of(mesh, is_closed=True)))
+        self._bodies.append((description, Touchable.of(mesh, is_closed=True)))
 
-    def at(self, places: Mapping[str, tuple[Any, Any]], sheets: Sequence[TriangleMesh]) -> list[Solid]:
-        """The solids of a frame.
+    def at(self, places: Mapping[str, tuple[Any, Any]], sheets: Sequence[TriangleMesh]) -> list[Touchable]:
+        """What fluids touch in a frame, but for each other.
 
         Args:
             places: position and orientation of the bodies that move, by name.
             sheets: cloths as they are in this frame.
         """
         bodies = []
-        for description, solid in self._bodies:
+        for description, body in self._bodies:
             if description["name"] in places:
-                bodies.append(solid.placed(*places[description["name"]]))
+                bodies.append(body.placed(*places[description["name"]]))
             else:
-                bodies.append(solid.placed(description["position"], description["orientation"]))
-        return bodies + [Solid.of(sheet, is_closed=False) for sheet in sheets]
+                bodies.append(body.placed(description["position"], description["orientation"]))
+        return bodies + [Touchable.of(sheet, is_closed=False) for sheet in sheets]
 
 
 def wetted(
-    mesh: TriangleMesh, *, reach: float, floor_z: float, solids: Sequence[Solid], dips: bool = False
+    mesh: TriangleMesh, *, reach: float, floor_z: float, touchables: Sequence[Touchable], dips: bool = False
 ) -> TriangleMesh:
     """A fluid's surface with how far each vertex touches the floor or a solid: 1 where it does, 0 where it is free.
 
@@ -126,7 +126,7 @@ def wetted(
         reach: distance at which it is half wet, if it faces the solid [m]. What lies inside of a closed solid, or below
             the floor, touches; sheets touch on both sides.
         floor_z: height of the floor [m].
-        solids: bodies, cloths and other fluids.
+        touchables: bodies, cloths and other fluids.
         dips: move what touches a body or the floor into it.
     """
     assert mesh.normals is not None
@@ -134,9 +134,9 @@ def wetted(
     down = np.broadcast_to((0.0, 0.0, -1.0), mesh.positions.shape)
     touch = _Touch(np.zeros(len(mesh.positions)), np.zeros(mesh.positions.shape), reach)
     touch.add(np.arange(len(height)), np.maximum(height, 0.0), down, -mesh.normals[:, 2], moves=True)
-    for solid in solids:
-        if solid.tree is not None:
-            _add_solid(touch, solid, mesh)
+    for touchable in touchables:
+        if touchable.tree is not None:
+            _add(touch, touchable, mesh)
     positions = (mesh.positions + touch.moves).astype(np.float32) if dips else mesh.positions
     return replace(mesh, positions=positions, wetness=touch.wet.astype(np.float32))
 
@@ -175,38 +175,37 @@ class _Touch:
         self.moves[numbers[more]] = depth[more, None] * inwards[more]
 
 
-def _add_solid(touch: _Touch, solid: Solid, mesh: TriangleMesh) -> None:
-    """Take a solid into account, for the vertices that are near it."""
+def _add(touch: _Touch, touchable: Touchable, mesh: TriangleMesh) -> None:
+    """Take a body, a cloth or a fluid into account, for the vertices that are near it."""
     farthest = _FREE_BEYOND * touch.reach
-    own = (mesh.positions - solid.position) @ solid.rotation
-    candidates = np.flatnonzero(((own > solid.low - farthest) & (own < solid.high + farthest)).all(axis=1))
-    near, places, normals = [], [], []
-    find = solid.tree.find_nearest
+    own = (mesh.positions - touchable.position) @ touchable.rotation
+    candidates = np.flatnonzero(((own > touchable.low - farthest) & (own < touchable.high + farthest)).all(axis=1))
+    near, places, triangles = [], [], []
+    find = touchable.tree.find_nearest
     for number, point in zip(candidates.tolist(), own[candidates].tolist(), strict=True):
-        place, normal, _, _ = find(point, farthest)
+        place, _, triangle, _ = find(point, farthest)
         if place is not None:
             near.append(number)
             places.append(place[:])
-            normals.append(normal[:])
+            triangles.append(triangle)
     if not near:
         return
     numbers = np.array(near)
     way = np.array(places) - own[numbers]
     distance = np.linalg.norm(way, axis=1)
     towards = way / np.maximum(distance, 1e-12)[:, None]
-    if solid.is_closed:
+    if touchable.outwards is not None:
         # The way to the nearest point turns around where the surface dips into the solid, which is as good as touching.
-        # Beyond an edge it may be at right angles with the normal of either side.
-        inwards = -np.array(normals)
-        is_outside = (towards * inwards).sum(axis=1) > -_RIGHT_ANGLE
+        inwards = -touchable.outwards.at(np.array(triangles), np.array(places))
+        is_outside = (towards * inwards).sum(axis=1) > 0.0
         is_outside &= distance > _NO_WAY * touch.reach
         distance = np.where(is_outside, distance, 0.0)
         inwards = np.where(is_outside[:, None], towards, inwards)
     else:
         inwards = towards
-    inwards = inwards @ solid.rotation.T
+    inwards = inwards @ touchable.rotation.T
     facing = (mesh.normals[numbers] * inwards).sum(axis=1)
-    touch.add(numbers, distance, inwards, facing, moves=solid.takes_dips)
+    touch.add(numbers, distance, inwards, facing, moves=touchable.can_be_entered)
 
 
 def _smoothstep(values: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -154,7 +154,9 @@ def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
         _check_crossings(start, starts[:number], findings)
     at_start = {
-        int(start.path[1]): ClothAtStart(start.longest_edge, [start.position[nodes] for nodes in start.pinned.values()])
+        int(start.path[1]): ClothAtStart(
+            start.longest_edge, {number: start.position[nodes] for number, nodes in start.pinned.items()}
+        )
         for start in starts
     }
     check_bodies_for_cloth(job, solids, at_start, findings)

@@ -235,6 +235,7 @@ def _decisive(spec: RenderSpec) -> dict[str, Any]:
 
 def _keep_decisive(drawn: dict[str, Any]) -> None:
     """Take out of an object what decides no pixel, as `_decisive` does."""
+    # Where fluids are wet has no revision yet: nothing was released since this key came.
     if drawn.get("wets_within", ...) is None:
         del drawn["wets_within"]
     material = drawn["material"]

@@ -20,3 +20,21 @@ def test_a_weave_of_period_n_shows_one_nth_of_weft_on_average():
         assert mean_appearance(COTTON)[0] == 0.5  # warp and weft of a plain weave are alike
         """
     )
+
+
+def test_fibres_of_matt_cloth_shine_in_the_colour_of_their_threads():
+    # In a picture of black cloth sheen is three of 255.
+    run_python(
+        """
+        import bpy
+        from blender_scripts.looks import new_material
+        from blender_scripts.shading import LookContext
+        for look in ("cotton", "denim", "silk"):
+            context = LookContext.of({}, domain_size=1.0, pixel_angle=1e-3, surface="sheet")
+            nodes = new_material("sheet", look, context).node_tree.nodes
+            (shader,) = (node for node in nodes if node.type == "BSDF_PRINCIPLED")
+            assert shader.inputs["Sheen Weight"].default_value > 0.1
+            sheen, base = (shader.inputs[key].links[0].from_socket for key in ("Sheen Tint", "Base Color"))
+            assert sheen == base
+        """
+    )

@@ -271,6 +271,38 @@ def test_a_rod_that_cloth_is_pinned_along_may_be_thinner_than_two_of_its_edges(t
     assert "cloth[1].shape" in of_the_other
 
 
+LEAVES = "keyframe = [{ time_s = 0.0 }, { time_s = 0.5, offset = [-0.1, 0.0, 0.0] }]\n"
+GOES_ALONG = """kind = "kinematic"
+keyframe = [
+    { time_s = 0.0, position = [-0.2, 0.0, 0.475], rotation_deg = [90.0, 0.0, 0.0] },
+    { time_s = 0.5, position = [-0.3, 0.0, 0.475], rotation_deg = [90.0, 0.0, 0.0] },
+]
+"""
+
+
+@pytest.mark.parametrize(
+    ("pin", "body", "is_told"),
+    [
+        ('edge = "x-"\n' + LEAVES, ROD + GOES_ALONG, False),
+        ('edge = "x-"\n' + LEAVES, ROD, True),
+        ('edge = "x-"\nrelease_s = 0.001\n' + LEAVES.replace("0.0 }", "0.0005 }", 1), ROD, False),
+        ('edge = "x-"\n', ROD + GOES_ALONG, True),
+        ('edge = "x-"\n', ROD + 'kind = "kinematic"\nvelocity = [0.5, 0.0, 0.0]\n', True),
+        ('edge = "x-"\n', ROD + 'kind = "kinematic"\n', False),
+        ('edge = "x-"\n', ROD + 'kind = "dynamic"\ndensity = 600.0\n', True),
+        ("index = [36, 27]\n", ROD, True),  # two nodes in the middle of the edge
+        ("index = [0, 72]\n", ROD, True),  # its two ends
+        ('edge = "x-"\n', ROD.replace('"cylinder", radius = 0.02, height = 0.5', '"box", size = [0.5, 0.5, 0.04]')
+         .replace("-0.2, 0.0, 0.475", "0.0, 0.0, 0.475").replace("[90.0, 0.0", "[0.0, 0.0"), True),
+    ],
+    ids=["both move alike", "the pin leaves", "it lets go before", "the rod leaves", "it sweeps", "it rests",
+         "it falls", "two neighbours", "two ends", "a plate"],
+)  # fmt: skip
+def test_only_a_rod_that_stays_along_a_pin_may_be_thin(pin, body, is_told, tmp_path):
+    told = [line for line in warnings(f"{SHEET}[[cloth.pin]]\n{pin}{body}", tmp_path) if "may show or pass" in line]
+    assert len(told) == is_told
+
+
 @pytest.mark.parametrize(("wall", "is_told"), [(0.001, True), (0.004, False)])
 def test_shells_with_thinner_walls_than_cloth_can_feel_are_told(wall, is_told, tmp_path):
     shell = trimesh.creation.icosphere(3, 0.2)

@@ -107,11 +107,12 @@ def brightness_lying(folder: Path, look: str, color: tuple[float, float, float])
     return float((read(folder / "0.png")[16:20, 27:37] @ [0.2126, 0.7152, 0.0722]).mean())
 
 
-@pytest.mark.parametrize(("look", "darkest", "brightest"), [("cotton", 50, 125), ("denim", 50, 155)])
+@pytest.mark.parametrize(("look", "darkest", "brightest"), [("cotton", 75, 125), ("denim", 127, 155)])
 def test_matt_cloth_stays_dark_where_light_grazes_it(tmp_path, look, darkest, brightest):
     """With white sheen and more gloss both were pale, 183 and 172 of 255; they are 100 and 136.
 
-    With neither, black cotton has 51 and denim, whose weft is undyed, more; cloth as light as paper has 227.
+    With neither sheen nor gloss they have 50 and 117 (denim's weft is undyed), without sheen alone 97 and 134, too near
+    to tell; cloth as light as paper has 227.
     """
     assert darkest < brightness_lying(tmp_path, look, (0.02, 0.02, 0.022)) < brightest
 
