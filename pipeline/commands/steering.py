@@ -82,6 +82,7 @@ def live(
             loaded,
             job,
             Address(host, port),
+            gave_up=bool(pace) and substeps is None,
             output=output,
             folder=Path.cwd(),
             threads=cores,

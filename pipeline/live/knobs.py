@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 Value = float | bool | tuple[float, float, float]
 Kind = Literal["number", "decades", "whole", "switch", "vector"]
 
-FEWEST_OF_KNOB, MOST_OF_KNOB = 2, 60
-"""Range of the substeps a frame, if the job does not ask for others."""
+SUBSTEPS_RANGE = 2, 60
+"""Fewest and most substeps a frame, if the job does not ask for others."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _shared_knobs(job: Job, written: Job) -> list[Knob]:
     if job.cloth and job.cloth[0].integrator == "xpbd":
         paths = tuple(("cloth", number, "substeps") for number in range(len(job.cloth)))
         count, asked = (each.cloth[0].substeps or DEFAULT_SUBSTEPS for each in (job, written))
-        ends = min(FEWEST_OF_KNOB, asked), max(MOST_OF_KNOB, asked)
+        ends = min(SUBSTEPS_RANGE[0], asked), max(SUBSTEPS_RANGE[1], asked)
         found.append(
             _knob("cloth.substeps", "substeps a frame", "Scene", paths=paths, kind="whole", ends=ends, start=count)
         )

@@ -85,11 +85,11 @@ def told_pace(written: Job, values: Mapping[str, Value]) -> str:
 
     Args:
         written: the job.
-        values: of the scene's knobs, by name.
+        values: of the scene's knobs, by name; what is left out is as in the job.
     """
     told = []
     for knob in knobs_of(written):
-        value = values[knob.name]
+        value = values.get(knob.name, knob.start)
         if knob.paths[0][0] != "cloth" or knob.paths[0][-1] not in _PACE_KEYS or value == knob.start:
             continue
         if knob.kind == "whole":

@@ -79,7 +79,7 @@ class LivePage:
         self._pace.content = _plain(told_pace(self._written, self._session.values))
         self._pause.label = "Go on" if status.is_paused else "Pause"
         self._record.label = "Stop recording" if self._recorder.is_recording else "Record"
-        written = _written(status, self._session.speed, self._session.values.get("cloth.substeps"))
+        written = _written(status, self._session.speed)
         if written != self._said:
             self._said = written
             self._state.content = written
@@ -180,8 +180,9 @@ def _meant(knob: Knob, shown: Any) -> object:
     return tuple(map(float, shown)) if knob.kind == "vector" else shown
 
 
-def _written(status: Status, speed: float, asked: Value | None) -> str:
-    """How it goes; `asked`: the substeps a frame that cloth asks for, where contacts may take more."""
+def _written(status: Status, speed: float) -> str:
+    """How it goes."""
+    asked = status.substeps_asked
     counts = [
         f"{name} {count}{f' ({asked} asked for)' if name == 'cloth' and asked not in (None, count) else ''}"
         for name, count in status.substeps.items()

@@ -31,6 +31,7 @@ def show_live(
     job: Job,
     address: Address,
     *,
+    gave_up: bool,
     output: Path,
     folder: Path,
     threads: int | None,
@@ -45,6 +46,7 @@ def show_live(
         loaded: the job as it was read.
         job: as it is simulated, `pipeline.live.scene.live_job`.
         address: to listen at.
+        gave_up: whether live changed the job for the sake of speed.
         output: where recordings become jobs' folders.
         folder: where jobs are saved.
         threads: of the processor; all if omitted.
@@ -64,7 +66,7 @@ def show_live(
 
         try:
             device = initialize(job.device, threads=threads)
-            session = Session(job, written=loaded.job)
+            session = Session(job, written=loaded.job, gave_up=gave_up)
         except DeviceUnavailableError as error:
             raise StageUnavailableError(str(error)) from error
         except (ShapeError, ValueError) as error:

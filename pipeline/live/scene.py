@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import PipelineError
 from pipeline.live.knobs import with_substeps
-from pipeline.live.pace import cloth_frame_s
+from pipeline.live.pace import cloth_frame_s, fewest_for_bodies
 from pipeline.stages.inputs import estimated_cloth_nodes, most_particles
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
 
@@ -61,7 +61,6 @@ def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
     """
     nodes, particles = estimated_cloth_nodes(job), most_particles(job)
     power = computing_power(cores=cores, on_gpu=on_gpu)
-    substeps = (job.cloth[0].substeps or DEFAULT_SUBSTEPS) if job.cloth else 0
     cloth_s = cloth_frame_s(job, power=power)
     fluid_s = 0.0
     if job.fluid:
@@ -72,10 +71,15 @@ def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
     share = MOST_FRAME_S / (cloth_s + fluid_s)
     sizes, remedies = [], []
     if nodes:
+        for_bodies = fewest_for_bodies(job)
+        substeps = max(job.cloth[0].substeps or DEFAULT_SUBSTEPS, for_bodies)
         sizes.append(f"{nodes:,} cloth nodes at {substeps} substeps a frame")
         remedies.append(f"about {int(nodes * share):,} nodes fit")
-        if any(cloth.self_collision for cloth in job.cloth):  # else substeps were given up already
-            remedies[-1] += f", or --substeps {max(1, int(substeps * share))}"
+        fitting = int(substeps * share)
+        if (
+            any(cloth.self_collision for cloth in job.cloth) and fitting >= for_bodies
+        ):  # else they were given up already
+            remedies[-1] += f", or --substeps {fitting}"
     if particles:
         sizes.append(f"up to {particles:,.0f} particles")
         remedies.append(f"about {particles * share:,.0f} particles fit")

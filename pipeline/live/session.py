@@ -49,6 +49,8 @@ class Status:
         frame, time_s: where the scene is.
         frame_ms: wall time of the last frame's computation [ms].
         substeps: of the last frame, by solver.
+        substeps_asked: of that frame, by its cloth, where contacts and bodies may want more; None without a frame or
+            without cloth in fixed steps.
         real_time: simulated over wall time in the last second or so; 0 while it is paused.
         is_paused: whether it stands still.
         message: the last thing that has to be known, "" if there is none.
@@ -58,6 +60,7 @@ class Status:
     time_s: float
     frame_ms: float
     substeps: Mapping[str, int]
+    substeps_asked: Value | None
     real_time: float
     is_paused: bool
     message: str
@@ -93,14 +96,15 @@ class Session:
 
     Args:
         job: cloth, bodies and fluid; `sim.runtime.initialize` must have run.
-        written: the job as it was read, if live has changed it for the sake of speed: after a blow-up that is named.
+        written: the job as it was read, if it is simulated in other substeps, say: after a blow-up that is named.
+        gave_up: whether it was live that changed it for the sake of speed, which --as-written prevents.
 
     Raises:
         ShapeError, ValueError: as `sim.build.build_world`.
     """
 
-    def __init__(self, job: Job, *, written: Job | None = None) -> None:
-        self.job, self._written = job, written or job
+    def __init__(self, job: Job, *, written: Job | None = None, gave_up: bool = False) -> None:
+        self.job, self._written, self._gave_up = job, written or job, gave_up
         self.knobs: dict[str, Knob] = {knob.name: knob for knob in knobs_of(job, written=written)}
         self.values: dict[str, Value] = {name: knob.start for name, knob in self.knobs.items()}
         self.is_paused = False
@@ -112,10 +116,7 @@ class Session:
         self.dt = 1.0 / job.fps
         self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._hands: dict[tuple[str, str], tuple[Hand, int]] = {}  # by what is held: and by which browser
-        self._frame_ms = 0.0
-        self._substeps: Mapping[str, int] = {}
         self._begins: deque[float] = deque(maxlen=max(10, job.fps))
-        self.report: FrameReport | None = None
         self._build()
 
     def _build(self) -> None:
@@ -127,6 +128,9 @@ class Session:
         self.pins = self._pins()
         self._changes: list[tuple[int, str]] = []
         self._moments: deque[_Moment] = deque(maxlen=3)
+        self.report: FrameReport | None = None
+        self._frame_ms = 0.0
+        self._substeps_asked: Value | None = None
 
     # --- from any thread --------------------------------------------------------------------------------------------
 
@@ -170,7 +174,8 @@ class Session:
         self.report = report
         if self.message == FIRST:
             self.message = ""
-        self._frame_ms, self._substeps = 1e3 * (time.perf_counter() - began), report.substeps
+        self._frame_ms = 1e3 * (time.perf_counter() - began)
+        self._substeps_asked = self.values.get("cloth.substeps")
         if self.on_frame is not None:
             self.on_frame(report, self.world.snapshots())
         if report.frame % FRAMES_BETWEEN_MOMENTS == 0:
@@ -180,9 +185,11 @@ class Session:
         """How it goes."""
         span = time.perf_counter() - self._begins[0] if len(self._begins) > 1 else 0.0
         rate = 0.0 if self.is_paused or span <= 0.0 else (len(self._begins) - 1) * self.dt / span
+        substeps = {} if self.report is None else self.report.substeps
         return Status(
-            self.world.frame, self.world.time_s, self._frame_ms, self._substeps, rate, self.is_paused, self.message
-        )
+            self.world.frame, self.world.time_s, self._frame_ms, substeps, self._substeps_asked, rate, self.is_paused,
+            self.message,
+        )  # fmt: skip
 
     def bodies(self) -> dict[str, Snapshot]:
         """What there is to see now; arrays that no later frame changes."""
@@ -369,11 +376,6 @@ class Session:
             cause = f"In hand: {', '.join(held)}."
         else:
             cause = "Nothing had been turned."
-        if pace := told_pace(self._written, self.values):
-            is_lives = told_pace(self._written, {name: knob.start for name, knob in self.knobs.items()})
-            cause += f" {pace} Knobs bring that back{', and so does --as-written' if is_lives else ''}."
-        elif not (turned or held):
-            cause += " The job may need more substeps."
         self.message = ""
         self._begin_anew({} if moment is None else moment.values)
         if moment is None:
@@ -383,6 +385,11 @@ class Session:
                 self._solvers["rigid"].paths.update(moment.paths)
             self.world.restore(moment.frame, moment.arrays)
             self._moments.append(moment)
+        began_with = {name: value for name, value in self.values.items() if value == self.knobs[name].start}
+        if pace := told_pace(self._written, began_with):
+            cause += f" {pace} Knobs bring that back{', and so does --as-written' if self._gave_up else ''}."
+        elif not (turned or held):
+            cause += " The job may need more substeps."
         place = "the start, with the values that it had there" if moment is None else f"{self.world.time_s:.2f} s"
         self.message = f"It blew up: {what}. {cause} Back at {place}. {self.message}".rstrip()
 

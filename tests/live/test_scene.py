@@ -23,6 +23,22 @@ def test_a_scene_that_is_too_large_is_told_what_fits(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("counts", "substeps", "remedy"),
+    [
+        ("[175, 175]", 20, " fit, or --substeps 11 (--preview"),
+        ("[230, 230]", 20, " fit (--preview"),
+        ("[230, 230]", 6, " fit (--preview"),
+    ],
+)
+def test_no_substeps_are_offered_that_bodies_do_not_let_cloth_take(tmp_path, counts: str, substeps: int, remedy: str):
+    job = live_job(loaded(tmp_path, BALL_OVER_SHEET.replace("[17, 17]", counts)).job, substeps=substeps)
+    with pytest.raises(PipelineError) as refused:
+        require_small(job, cores=2, on_gpu=False)
+    assert f"at {max(substeps, fewest_for_bodies(job))} substeps a frame" in str(refused.value)
+    assert remedy in str(refused.value)
+
+
+@pytest.mark.parametrize(
     ("counts", "substeps", "collides"),
     [("[17, 17]", 20, True), ("[65, 65]", 11, True), ("[80, 80]", 18, False), ("[100, 100]", 11, False)],
 )

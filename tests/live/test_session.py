@@ -1,5 +1,6 @@
 """A scene that is played with, without a page: knobs and hands change what happens, and a blow-up is no end."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,11 @@ def run(session: Session, frames: int) -> None:
     for _ in range(frames):
         session.meet_requests()
         session.advance()
+
+
+def blow_up(session: Session) -> None:
+    session.world.solvers["rigid"].bodies.velocity[0] = (np.nan, 0.0, 0.0)
+    run(session, 1)
 
 
 def lowest(session: Session) -> float:
@@ -128,18 +134,44 @@ def test_a_blow_up_goes_back_to_what_was_sound_and_names_what_was_turned(tmp_pat
 
 def test_after_a_blow_up_live_names_what_it_had_given_up_itself_and_how_to_have_it_back(tmp_path):
     written = loaded(tmp_path).job
-    session = Session(live_job(written, substeps=5), written=written)
-    run(session, 1)
-    for substeps in (5, 8):
-        session.turn("cloth.substeps", substeps)
-        session._changes.clear()  # as if it had been long ago
-        session.world.solvers["rigid"].bodies.velocity[0] = (np.nan, 0.0, 0.0)
+    five = "Other than in the job: 5 substeps a frame instead of 8. Knobs bring that back"
+    for gave_up, remedy in ((True, ", and so does --as-written."), (False, ".")):  # or --substeps 5 was asked for
+        session = Session(live_job(written, substeps=5), written=written, gave_up=gave_up)
         run(session, 1)
-        assert '"ball" is not finite. Nothing had been turned.' in session.message
-        assert ("5 substeps a frame instead of 8" in session.message) == (substeps == 5)
-        assert ("Knobs bring that back, and so does --as-written." in session.message) == (substeps == 5)
-        assert ("The job may need more substeps." in session.message) == (substeps == 8)
-        assert "Back at the start, with the values that it had there" in session.message
+        blow_up(session)
+        assert f'"ball" is not finite. Nothing had been turned. {five}{remedy} Back at the start' in session.message
+        # What was turned since is not live's; what is gone back to is.
+        session.turn("cloth.substeps", 4)
+        blow_up(session)
+        assert f"Turned last: cloth.substeps = 4. {five}{remedy} Back at the start" in session.message
+
+
+@pytest.mark.parametrize("substeps", [4, 30])
+def test_after_a_blow_up_live_does_not_take_for_its_own_what_was_turned_long_ago(tmp_path, substeps):
+    written = loaded(tmp_path).job
+    session = Session(live_job(written), written=written)
+    session.turn("cloth.substeps", substeps)
+    run(session, 1)
+    session._moments.append(replace(session._moment(), frame=1 - FRAMES_TO_TRUST))
+    session._changes.clear()
+    blow_up(session)
+    assert session.values["cloth.substeps"] == substeps
+    assert "Nothing had been turned. The job may need more substeps. Back at" in session.message
+
+
+def test_substeps_are_told_beside_those_that_their_frame_was_asked_for_and_not_after_a_jump(tmp_path):
+    session = session_of(tmp_path)
+    run(session, 1)
+    taken = session.status().substeps["cloth"]
+    session.turn("cloth.substeps", 6)
+    assert (session.status().substeps["cloth"], session.status().substeps_asked) == (taken, 8)
+    session.reset()
+    assert session.report is None
+    assert (session.status().substeps, session.status().substeps_asked) == ({}, None)
+    run(session, 1)
+    assert session.status().substeps_asked == 6
+    blow_up(session)
+    assert (session.status().substeps, session.status().substeps_asked) == ({}, None)
 
 
 def test_cloth_with_values_that_are_no_numbers_goes_back_too(tmp_path):
