@@ -183,7 +183,7 @@ def test_a_browser_that_never_reads_holds_up_neither_the_scene_nor_another_brows
             reader.start()
             try:
                 longest = 0.0
-                for _ in range(150):  # of 45 kB each, 7 MB: more than a connection keeps
+                for _ in range(150):  # of 45 kB each, faster than browsers get them: the newest replaces the others
                     session.advance()
                     began = time.perf_counter()
                     page.show()
@@ -194,7 +194,7 @@ def test_a_browser_that_never_reads_holds_up_neither_the_scene_nor_another_brows
                     if len(received) != count:
                         quiet, count = time.monotonic(), len(received)
                     time.sleep(0.05)
-                for _ in range(10):
+                for _ in range(30):
                     before = states()
                     session.advance()
                     page.show()
@@ -206,6 +206,8 @@ def test_a_browser_that_never_reads_holds_up_neither_the_scene_nor_another_brows
             with suppress(TimeoutError):
                 while True:
                     late += len(stuck.recv(timeout=1.0)) > STATE_BYTES
-            assert late < 160, "it was not held up at all"
+            # What its connection keeps, and the newest: 1. The other one gets each of the last 30 at least, and so does
+            # one that reads with a buffer of the usual size.
+            assert late < states() / 2, "it was not held up at all"
         # A picture takes 3 ms; a wait for a full connection would end with the timeout of a ping, after 20 s.
         assert longest < 2.0
