@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import taichi as ti
@@ -53,6 +53,35 @@ IMPULSE_UNIT = 1.0e-5
 steps are; 64 bits hold the sum of ten million vertices stopped from 100 m/s in a step of 0.1 ms."""
 
 
+class NearCloth(Protocol):
+    """Finds what of the cloths is near other cloth, and tells bodies and walls where to look for it."""
+
+    thickness: float
+    """The largest [m]."""
+
+    @property
+    def motion_arrays(self) -> tuple[ti.Ndarray, ...]:
+        """Where patches are and how they move in the substep, see `PatchPairs`."""
+
+    def begin_frame(self, state: ClothState) -> None:
+        """Expect of contacts what a run does that continues here."""
+
+    def look(self, state: ClothState) -> float:
+        """Note how cloth moves in this substep; returns a bound [m], which is not finite or huge after a blow-up."""
+
+    def prepare(self, state: ClothState) -> None:
+        """After `look`: have all pairs listed that may meet in this substep."""
+
+    def find(self, state: ClothState, contacts: ContactList, recovery: float) -> None:
+        """Append the pairs that are too near; `recovery` is the share of a missing distance that comes back [-]."""
+
+    def measure_changes(self, state: ClothState, predicted: ti.Ndarray) -> tuple[float, float]:
+        """How far contacts displaced vertices at most [m]; and those that they displaced farther than allowed for."""
+
+    def follow(self, state: ClothState, *, is_changed: bool) -> None:
+        """A substep is over, in which `measure_changes` was asked, or not."""
+
+
 class ContinuousContacts:
     """Contacts of all cloths of a scene; implements `sim.cloth.contacts.ClothContacts`.
 
@@ -75,7 +104,7 @@ class ContinuousContacts:
     def __init__(self, state: ClothState, *, rigid: RigidContact | None = None) -> None:
         self.rigid = rigid or RigidContact((), (), ())
         self._pairs = SelfCollision(state)
-        self._patches = self._pairs.patches.patches
+        self._patches = self._pairs.patches
         self._lone = LoneCloth(state, self._patches)
         self.rigid.set_spacing(self._pairs.mean_edge)
         n = state.vertex_count
@@ -89,6 +118,7 @@ class ContinuousContacts:
         self._state = state
         self._impulse_unit = 0.0
         self._meets_cloth = False
+        self._near: NearCloth = self._lone
         self.begin_frame()
 
     # --- what the solver asks ---------------------------------------------------------------------------------------
@@ -102,10 +132,9 @@ class ContinuousContacts:
     def begin_frame(self) -> None:
         """Count anew, and expect of contacts what a run does that continues here."""
         state = self._state
-        met_cloth, self._meets_cloth = self._meets_cloth, len(state.names) > 1 or any(state.self_collision)
-        if self._meets_cloth and not met_cloth:
-            self._pairs.forget()  # it has not followed the cloth
-        self._near: SelfCollision | LoneCloth = self._pairs if self._meets_cloth else self._lone
+        self._meets_cloth = len(state.names) > 1 or any(state.self_collision)
+        # Pairs that have not followed the cloth for a while find, as they look, how far it is from where they left it.
+        self._near = self._pairs if self._meets_cloth else self._lone
         self._near.begin_frame(state)
         self.rigid.set_thickness(self._near.thickness)
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0

@@ -37,7 +37,8 @@ class LoneCloth:
         m = max(patches.count, 1)
         self._centre, self._shift, self._turn = (ti.Vector.ndarray(3, ti.f32, m) for _ in range(3))
         self._turn.fill(0.0)
-        self._radius, self._rest, self._change, self._margin, self._more = (ti.ndarray(ti.f32, m) for _ in range(5))
+        self._radius, self._rest, self._change, self._margin = (ti.ndarray(ti.f32, m) for _ in range(4))
+        self._more = ti.ndarray(ti.f32, m)  # `measure_changes` writes it, for pairs of patches; nothing reads it here
         self._taken = ti.ndarray(ti.i32, 1)
         self._maxima = LaneReduction(maxima=2, sums=0)
         self._is_short = is_short(patches.vertex_count, NODE_NS)

@@ -157,8 +157,13 @@ class SelfCollision:
         return self._met.motion_arrays
 
     @property
-    def patches(self) -> PatchPairs:
-        """Where patches of the cloths are, and how they move."""
+    def patches(self) -> Patches:
+        """Of the cloths."""
+        return self._patches
+
+    @property
+    def patch_pairs(self) -> PatchPairs:
+        """Which patches may meet, where they are, and how they move."""
         return self._met
 
     def _search(self, state: ClothState, count: int) -> None:

@@ -127,7 +127,7 @@ def point_triangle_distances(x: NDArray, a: NDArray, b: NDArray, c: NDArray) -> 
 
 def listed_places(pairs: SelfCollision, each: PairList) -> NDArray[np.int64]:
     """Places of a list where a pair of elements is, in the order of their pairs of patches."""
-    first, _, found, _ = each.pieces.to_numpy()[: pairs.patches.count].T
+    first, _, found, _ = each.pieces.to_numpy()[: pairs.patch_pairs.count].T
     return np.concatenate([np.arange(a, a + n) for a, n in zip(first, found, strict=True)])
 
 

@@ -64,3 +64,47 @@ def test_cloth_that_begins_to_collide_with_itself_between_frames_does_not_cross_
         for world in (switched, never)
     )
     assert count == 0 < count_of_never
+
+
+def test_cloth_that_collides_with_itself_again_moves_as_a_fresh_scene_that_continues_there():
+    """What was listed before it stopped colliding is not what is near it now: it has folded meanwhile."""
+    fall = {"shape": rectangle((0.2, 0.3), (11, 16)), "thickness": 3e-3, "rotation_deg": (85.0, 5.0, 0.0)}
+    switched = world_of({**fall, "position": (0.0, 0.0, 0.17)})
+    for frame in range(15):
+        if frame in (6, 12):
+            cloth_of(switched).change("cloth0", self_collision=frame == 12)
+        if frame == 12:
+            fresh = world_of({**fall, "position": (0.0, 0.0, 0.17)})
+            fresh.restore(12, {name: array.copy() for name, array in switched.checkpoint().items()})
+        switched.advance_frame()
+        if frame >= 12:
+            fresh.advance_frame()
+            for name, array in switched.checkpoint().items():
+                np.testing.assert_array_equal(fresh.checkpoint()[name], array, err_msg=f"{name}, frame {frame}")
+
+
+@pytest.mark.parametrize("self_collision", [True, False])
+def test_a_run_in_the_middle_of_a_push_continues_bit_for_bit(self_collision):
+    """Every frame begins with the margins of a run's start.
+
+    The ball gets faster where the run is restored, and pushes in a substep by more than these allow, but by no more
+    than margins kept from the frame before would.
+    """
+    sheet = {**SHEET, "self_collision": self_collision, "position": (0.0, 0.0, 0.2)}
+    through, resumed = (world_of(sheet, bodies=[BALL], domain=ROOM) for _ in range(2))
+
+    def push(world, frame):
+        height = 0.1 + 0.032 * min(frame, 2) + 0.036 * max(frame - 2, 0)
+        rigid_of(world).lead("body0", (0.0, 0.0, height), within_s=1.0 / 60.0)
+        world.advance_frame()
+
+    for frame in (1, 2):
+        push(through, frame)
+    saved = {name: array.copy() for name, array in through.checkpoint().items()}
+    rigid_of(resumed).paths.update(rigid_of(through).paths)
+    resumed.restore(2, saved)
+    for frame in (3, 4, 5):
+        for world in (through, resumed):
+            push(world, frame)
+        for name, array in through.checkpoint().items():
+            np.testing.assert_array_equal(resumed.checkpoint()[name], array, err_msg=f"{name}, frame {frame}")

@@ -218,8 +218,8 @@ def test_one_wild_vertex_has_only_its_own_surroundings_watched():
     assert change == beyond == np.float32(0.02)
     pairs.look(state)
     pairs.prepare(state)
-    allowed = pairs.patches.allowed.to_numpy()[: pairs.patches.count]
-    both = pairs.patches.pairs.to_numpy()[: pairs.patches.count]
+    allowed = pairs.patch_pairs.allowed.to_numpy()[: pairs.patch_pairs.count]
+    both = pairs.patch_pairs.pairs.to_numpy()[: pairs.patch_pairs.count]
     of_wild = np.isin(both, [m for m, corners in enumerate(corners_of(pairs)) if 0 in corners]).any(axis=1)
     assert 0 < np.count_nonzero(of_wild) < len(both) / 20
     np.testing.assert_allclose(allowed[~of_wild & (allowed > 0.0)], thickness, rtol=1e-6)
@@ -228,7 +228,7 @@ def test_one_wild_vertex_has_only_its_own_surroundings_watched():
 
 
 def corners_of(pairs: SelfCollision) -> list[np.ndarray]:
-    return pieces(pairs.patches.patches.corners, pairs.patches.patches.first_corner)
+    return pieces(pairs.patches.corners, pairs.patches.first_corner)
 
 
 def test_lists_that_grow_keep_what_they_had_and_need_no_search_more():
@@ -255,13 +255,13 @@ def test_patches_that_are_paired_anew_keep_the_lists_they_had():
         step[:, 2] = generator.uniform(-4e-4, 4e-4, len(x)) + 4e-3 * np.sin(40.0 * x[:, 0])
         state.set_positions(x)
         state.displacement.from_numpy(step.astype(np.float32))
-        before = pairs.patches.count, pairs.searches
+        before = pairs.patch_pairs.count, pairs.searches
         pairs.look(state)
-        is_met, known = pairs._is_outrun and before[0] > 0, pairs.patches.slack.to_numpy()[: before[0]] > 0.0
+        is_met, known = pairs._is_outrun and before[0] > 0, pairs.patch_pairs.slack.to_numpy()[: before[0]] > 0.0
         pairs.prepare(state)
         if is_met:
             meetings += 1
-            carried = pairs.patches.carried.to_numpy()[: pairs.patches.count]
+            carried = pairs.patch_pairs.carried.to_numpy()[: pairs.patch_pairs.count]
             assert np.isin(np.flatnonzero(known), carried).mean() > 0.9
             searched.append(pairs.searches - before[1])
             # And what they list is what is there, and what is not near is not missed.
