@@ -76,9 +76,9 @@ def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
         sizes.append(f"{nodes:,} cloth nodes at {substeps} substeps a frame")
         remedies.append(f"about {int(nodes * share):,} nodes fit")
         fitting = int(substeps * share)
-        if (
-            any(cloth.self_collision for cloth in job.cloth) and fitting >= for_bodies
-        ):  # else they were given up already
+        # Explicit springs dictate theirs, and cloth that does not collide with itself has given up what it could.
+        can_take_fewer = job.cloth[0].integrator == "xpbd" and any(cloth.self_collision for cloth in job.cloth)
+        if can_take_fewer and fitting >= for_bodies:
             remedies[-1] += f", or --substeps {fitting}"
     if particles:
         sizes.append(f"up to {particles:,.0f} particles")

@@ -38,6 +38,12 @@ def test_no_substeps_are_offered_that_bodies_do_not_let_cloth_take(tmp_path, cou
     assert remedy in str(refused.value)
 
 
+def test_explicit_springs_are_offered_no_substeps(tmp_path):
+    text = BALL_OVER_SHEET.replace("[17, 17]", "[175, 175]").replace("substeps = 8\n", 'integrator = "explicit"\n')
+    with pytest.raises(PipelineError, match=r"nodes fit \(--preview"):
+        require_small(live_job(loaded(tmp_path, text).job), cores=2, on_gpu=False)
+
+
 @pytest.mark.parametrize(
     ("counts", "substeps", "collides"),
     [("[17, 17]", 20, True), ("[65, 65]", 11, True), ("[80, 80]", 18, False), ("[100, 100]", 11, False)],
