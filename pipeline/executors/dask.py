@@ -39,7 +39,11 @@ from pipeline.task import FailureKind, Resources, TaskId
 PATIENCE_S = 300.0
 """How long a run waits for a scheduler or for workers [s]: a restart, or a queue that gives out machines."""
 GATHER_S = 3.0
-"""How long a run waits for further workers once there is one [s]: what the largest has is settled by them."""
+"""How long a run waits for further workers once there is one [s]: what the largest has is settled by them.
+
+Those of the runner's own terminal are all there when the first one is, but may take their time to say who they are: a
+run waits until all have, and no longer than this.
+"""
 _CONNECT_S = 2.0
 """How long one try to connect may take [s]; the run stops for it."""
 _RECONNECT_PAUSE_S = 2.0
@@ -98,6 +102,7 @@ class DaskExecutor(ShutDownOnExit):
         self._said: set[str] = set()
         self._obstacle = ""
         self._slots = Slots()
+        self._all_offer = False
         self._waiting: dict[TaskId, tuple[Assignment, float]] = {}
         self._running: dict[TaskId, _Attempt] = {}
         self._events: list[ExecutorEvent] = []
@@ -111,8 +116,10 @@ class DaskExecutor(ShutDownOnExit):
             gathered_at = inf
             while not self._slots.offers or time.monotonic() < gathered_at:
                 self._turn(0.5)
-                if self._slots.offers:  # those of the runner's own terminal are all there when the first one is
-                    gathered_at = min(gathered_at, time.monotonic() + (0.0 if of_runner else GATHER_S))
+                if self._slots.offers:
+                    gathered_at = min(gathered_at, time.monotonic() + GATHER_S)
+                    if of_runner and self._all_offer:
+                        break
         except BaseException:
             self.shutdown()
             raise
@@ -223,6 +230,7 @@ class DaskExecutor(ShutDownOnExit):
                     task_id, FailureKind.WORKER_LOST, f"the Dask worker {address} on {attempt.offer.host} is gone"
                 )
         self._slots.update(workers.offers, workers.present)
+        self._all_offer = workers.present <= workers.offers.keys()
         self._obstacle = "; ".join(workers.remarks)
         for remark in workers.remarks:
             self._say_once(remark)

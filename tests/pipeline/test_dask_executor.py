@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import threading
 import time
@@ -34,6 +35,7 @@ from synthetic_stages import write_faults
 from pipeline.commands.executing import ExecutorChoice, open_machines
 from pipeline.executors.base import CapacityChanged, Committed, ExecutorEvent, Failed, Finished, Started
 from pipeline.executors.dask import ClusterError, DaskExecutor
+from pipeline.executors.dask_connection import Connection
 from pipeline.executors.dask_local import local_cluster
 from pipeline.executors.inline import InlineExecutor
 from pipeline.layout import JobLayout
@@ -237,6 +239,24 @@ def test_a_machine_that_was_too_busy_to_connect_tries_again(
     with DaskExecutor(cluster, tmp_path, of_runner=True, say=said.append) as executor:
         assert executor.capacity.cores == 2
     assert ["very busy, or was asleep" in sentence for sentence in said] == [True]
+
+
+def test_all_workers_of_the_terminal_are_waited_for(
+    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy machine one may say who it is long after the other."""
+    greet, late = Connection._greet, []
+
+    async def greet_one_late(self: Connection, address: str, host: str) -> None:
+        if not late or address in late:
+            late.append(address)
+            await asyncio.sleep(1.5)
+        await greet(self, address, host)
+
+    monkeypatch.setattr(Connection, "_greet", greet_one_late)
+    with DaskExecutor(cluster, tmp_path, of_runner=True) as executor:
+        assert executor.capacity.cores == 2
+    assert len(late) == 1
 
 
 def test_a_worker_that_does_not_see_the_folder_gets_no_task(cluster: str, tmp_path: Path) -> None:
