@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -54,6 +54,8 @@ class World:
     Attributes:
         frame: number of the frame that was reached last.
         max_substeps_per_frame: a frame that needs more counts as diverged; may be changed between frames.
+        watch: asked after every substep what is wrong with the frame, which counts as diverged then; None: nobody is.
+            What it raises leaves the frame half done: only `restore` goes on from there.
 
     All land exactly on the frame: with dt_max stable, the rest of the frame is cut into n = ceil(rest / dt_max) equal
     steps, one is taken, and the division is made anew for what is left; in the same way substeps land on a longer step.
@@ -69,6 +71,7 @@ class World:
     ) -> None:
         self.frame = 0
         self.max_substeps_per_frame = MAX_SUBSTEPS_PER_FRAME
+        self.watch: Callable[[], str | None] | None = None
         self._frames_per_second = frames_per_second
         self._solvers = {solver.name: solver for solver in solvers}
         self._couplings = tuple(couplings)
@@ -98,7 +101,8 @@ class World:
         """Advance to the next frame.
 
         Raises:
-            SimulationDivergedError: the state became non-finite or ran away, or the step size collapsed.
+            SimulationDivergedError: the state became non-finite or ran away, the step size collapsed, or `watch` found
+                something.
         """
         substeps: dict[str, int] = {}
         smallest_dt: dict[str, float] = {}
@@ -156,6 +160,7 @@ class World:
                 self._advance_team(team.ahead, dt, elapsed_s)
             team.substep(dt)
             remaining = remaining - dt if left > 1 else 0.0
+            self._ask_watch(team, start_s + (duration_s - remaining))
             if team.taken % SUBSTEPS_BETWEEN_CHECKS == 0 or remaining == 0.0:
                 self._check(team, start_s + (duration_s - remaining))
 
@@ -171,6 +176,12 @@ class World:
                 "lower initial speeds, or give a larger particle radius or cell size",
             )
         return max(1, math.ceil(remaining / stable_dt * (1.0 - 1.0e-9)))
+
+    def _ask_watch(self, team: _Team, elapsed_s: float) -> None:
+        finding = None if self.watch is None else self.watch()
+        if finding is not None:
+            names = " + ".join(solver.name for solver in team.solvers)
+            raise SimulationDivergedError(names, self.frame + 1, self.time_s + elapsed_s, finding)
 
     def _check(self, team: _Team, elapsed_s: float) -> None:
         for solver in team.solvers:

@@ -45,6 +45,17 @@ class Oscillator:
         return None if math.isfinite(self.x) else f"x is {self.x}"
 
 
+def test_a_watch_is_asked_after_every_substep_and_may_end_a_frame():
+    asked = []
+    world = World([Oscillator("a", 1 / 240), Oscillator("b", 1 / 120)], frames_per_second=60)
+    world.watch = lambda: asked.append(1)
+    world.advance_frame()
+    assert len(asked) == 4 + 2
+    world.watch = lambda: asked.append(1) or ("it takes too long" if len(asked) == 9 else None)
+    with pytest.raises(SimulationDivergedError, match=r'"a" diverged at frame 2, t = 0\.0292 s: it takes too long'):
+        world.advance_frame()
+
+
 class Spring:
     """Counts the exchanges, to show that coupled solvers share their substeps."""
 
