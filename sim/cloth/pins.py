@@ -22,6 +22,11 @@ ROUND_OFF_S = 1.0e-9
 """Times that differ by less [s] are the same: sums of steps."""
 
 
+def holds(release_s: float, time_s: float) -> bool:
+    """Whether a pin that lets go at a time [s] holds its nodes at another [s]."""
+    return bool(time_s < release_s - ROUND_OFF_S)
+
+
 class Pin:
     """One pin of one cloth.
 
@@ -51,16 +56,17 @@ class Pin:
     def drop(self, nodes: NDArray[np.int64]) -> bool:
         """Hold these nodes no longer; returns whether any others are left."""
         kept = ~np.isin(self.nodes, nodes)
-        if not kept.any():
-            return False
-        if self.path is not None:
+        if kept.all() or not kept.any():
+            return bool(kept.all())
+        if self.path is None:
+            self.nodes = self.nodes[kept]
+        else:
             self._take(self.nodes[kept], self._host_arm[kept])
-        self.nodes = self.nodes[kept]
         return True
 
     def holds(self, time_s: float) -> bool:
         """Whether it holds its nodes at a simulated time [s]."""
-        return bool(time_s < self.release_s - ROUND_OFF_S)
+        return holds(self.release_s, time_s)
 
     def displace(self, state: ClothState, time_s: float, dt: float) -> None:
         """Move its nodes from where they are at a time [s] to where they will be dt later."""
@@ -127,17 +133,15 @@ class Pins:
     def grip(self, nodes: NDArray[np.int64], shift: Vector3, *, time_s: float, within_s: float) -> None:
         """Hold more nodes from a time [s] on, and lead them by a way [m] in so many seconds; `hold` does the rest.
 
+        Nodes that a pin leads along its own path leave that for good.
+
         Raises:
-            ValueError: a pin leads one of the nodes along its own path; the way is not finite, or takes no time.
+            ValueError: the way is not finite, or takes no time.
         """
         if not (np.isfinite(shift).all() and 0.0 < within_s < np.inf):
             raise ValueError(f"a finite way in more than 0 s is needed, got {tuple(shift)} m within {within_s:g} s")
-        for pin in self._pins:
-            leads = pin.path is not None and pin not in self._grips and pin.holds(time_s)
-            if leads and np.isin(nodes, pin.nodes).any():
-                raise ValueError("a pin that moves holds one of the nodes; let it go first")
-        # Those that were gripped before are led on from where they are.
-        self._pins = [pin for pin in self._pins if pin not in self._grips or pin.drop(nodes)]
+        # Those that were gripped before are led on from where they are; one leader is enough for a node.
+        self._pins = [pin for pin in self._pins if (pin.path is None and pin not in self._grips) or pin.drop(nodes)]
         keys: dict[str, object] = {"index": nodes.tolist()}
         if any(shift):
             keys["keyframe"] = [{"time_s": time_s}, {"time_s": time_s + within_s, "offset": shift}]

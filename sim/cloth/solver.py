@@ -147,8 +147,9 @@ class ClothSolver:
     ) -> None:
         """Hold nodes of a cloth from now on, as a hand would, and lead them straight by a way; between frames.
 
-        Called again for the same nodes, it leads them on. A checkpoint does not know of it. What was sized when the
-        scene was built does not follow: the speeds that a fluid expects, and the stiffness that it has from them.
+        Called again for the same nodes, it leads them on; nodes of a pin with keyframes leave its path. A checkpoint
+        does not know of it. What was sized when the scene was built does not follow: the speeds that a fluid expects,
+        and the stiffness that it has from them.
 
         Args:
             name: of the cloth.
@@ -157,8 +158,7 @@ class ClothSolver:
             within_s: time that it takes [s]; a frame if omitted.
 
         Raises:
-            ValueError: there is no such cloth or node, or a pin leads one of them along its own path; the way is not
-                finite, or takes no time.
+            ValueError: there is no such cloth or node; the way is not finite, or takes no time.
         """
         numbers = self._nodes_of(name, nodes)
         within_s = self._frame_dt if within_s is None else within_s
