@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
@@ -52,6 +53,7 @@ def live(
     """
     from pipeline.job.checks import load_checked_job
     from pipeline.job.loading import read_job
+    from pipeline.live.frame_watch import PATIENCE_S
     from pipeline.live.knobs import knobs_of
     from pipeline.live.pace import fluent, told_pace
     from pipeline.live.scene import computing_power, live_job, require_small
@@ -83,6 +85,7 @@ def live(
             job,
             Address(host, port),
             gave_up=bool(pace) and substeps is None,
+            patience_s=math.inf if anyway else PATIENCE_S,
             output=output,
             folder=Path.cwd(),
             threads=cores,

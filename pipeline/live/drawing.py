@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -66,8 +66,13 @@ class SceneDrawing:
                 piece = mesh.piece(part)
                 self._pieces.append((body.name, part, piece.vertices.astype(np.float32), piece.faces.astype(np.uint32)))
 
-    def show(self, bodies: Mapping[str, Snapshot], pins: Sequence[tuple[str, NDArray[np.int64]]]) -> None:
-        """Show where everything is: a ball at the middle of each pin's nodes leads them."""
+    def show(self, bodies: Mapping[str, Snapshot], pins: Mapping[int, tuple[str, NDArray[np.int64]]]) -> None:
+        """Show where everything is: a ball at the middle of each pin's nodes leads them.
+
+        Args:
+            bodies: where they are, by name.
+            pins: cloth and nodes of those that hold, by number.
+        """
         job, drawing = self._job, self._drawing
         with drawing.picture():
             for name, part, vertices, faces in self._pieces:
@@ -83,7 +88,7 @@ class SceneDrawing:
                 color = color_of(job, fluid.name, BODY, SURFACE)
                 position = np.asarray(bodies[fluid.name].arrays["position"], np.float32)
                 drawing.points(f"/fluid/{fluid.name}", position, color, radius=fluid.particle_radius)
-            for number, (cloth_name, nodes) in enumerate(pins):
+            for number, (cloth_name, nodes) in pins.items():
                 middle = bodies[cloth_name].arrays["position"][nodes].mean(axis=0)
                 drawing.mesh(f"/pin/{number}", self._ball.vertices, self._ball.faces, PIN, position=middle)
 

@@ -94,11 +94,15 @@ class LedBody:
 
 
 class Nodes:
-    """Nodes of a cloth, led as one; let go they fly on, unless they are a pin's."""
+    """Nodes of a cloth, led as one; let go they fly on, unless they are a pin's.
+
+    Attributes:
+        nodes: that are held, in the numbers of the cloth, (k,).
+    """
 
     def __init__(self, cloth: Any, name: str, nodes: NDArray[np.int64], *, stays: bool) -> None:
         """Hold nodes of the cloth of this name; `stays`: for ever, as a pin does."""
-        self._cloth, self._name, self._nodes, self._stays = cloth, name, nodes, stays
+        self._cloth, self._name, self.nodes, self._stays = cloth, name, nodes, stays
         first = cloth.state.host.first_node[cloth.state.names.index(name)]
         self._place: Vector = cloth.state.positions()[first + nodes].mean(axis=0)
         self._velocity = np.zeros(3)
@@ -111,12 +115,12 @@ class Nodes:
         shift = dt * self._velocity
         if float(np.linalg.norm(shift)) < AT_REST:
             return
-        self._cloth.hold(self._name, self._nodes.tolist(), shift=tuple(map(float, shift)), within_s=dt)
+        self._cloth.hold(self._name, self.nodes.tolist(), shift=tuple(map(float, shift)), within_s=dt)
         self._place = self._place + shift
 
     def release(self) -> None:
         """Let them fly on with the velocity that they have, or stay pinned."""
         if self._stays:
-            self._cloth.hold(self._name, self._nodes.tolist())
+            self._cloth.hold(self._name, self.nodes.tolist())
         else:
-            self._cloth.let_go(self._name, self._nodes.tolist())
+            self._cloth.let_go(self._name, self.nodes.tolist())

@@ -102,7 +102,7 @@ class LivePage:
         self._pause = gui.add_button("Pause")
         self._pause.on_click(lambda _: session.ask(lambda: session.pause(not session.is_paused)))
         gui.add_button("Step").on_click(lambda _: session.ask(session.step))
-        gui.add_button("Reset").on_click(lambda _: session.ask(session.reset))
+        gui.add_button("Reset").on_click(lambda _: session.ask_reset())
         speed = gui.add_slider("speed", 0.05, 1.0, 0.05, 1.0, hint="1: real time, where the machine keeps up")
         speed.on_update(lambda _: session.ask(session.set_speed, float(speed.value)))
         gui.add_button("Save as job").on_click(lambda _: session.ask(self._do_save))

@@ -32,6 +32,7 @@ def show_live(
     address: Address,
     *,
     gave_up: bool,
+    patience_s: float,
     output: Path,
     folder: Path,
     threads: int | None,
@@ -47,6 +48,7 @@ def show_live(
         job: as it is simulated, `pipeline.live.scene.live_job`.
         address: to listen at.
         gave_up: whether live changed the job for the sake of speed.
+        patience_s: a frame that takes longer counts as blown up [s].
         output: where recordings become jobs' folders.
         folder: where jobs are saved.
         threads: of the processor; all if omitted.
@@ -66,7 +68,8 @@ def show_live(
 
         try:
             device = initialize(job.device, threads=threads)
-            session = Session(job, written=loaded.job, gave_up=gave_up)
+            session = Session(job, written=loaded.job, gave_up=gave_up, patience_s=patience_s)
+            session.ends = ends
         except DeviceUnavailableError as error:
             raise StageUnavailableError(str(error)) from error
         except (ShapeError, ValueError) as error:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
+from pipeline.executors.failures import classify, describe
+from pipeline.live.frame_watch import PATIENCE_S, FrameWatch
 from pipeline.live.hands import FreeBody, Hand, LedBody, Nodes
 from pipeline.live.knobs import Knob, Value, knobs_of, turn
 from pipeline.live.pace import told_pace
+from pipeline.task import FailureKind
 from sim.snapshots import Snapshot
 from sim.solver import SimulationDivergedError
 
@@ -24,7 +29,7 @@ if TYPE_CHECKING:
     from sim.world import FrameReport
 
 MOST_SUBSTEPS = 2000
-"""A frame that needs more counts as blown up: the page is not to wait for minutes."""
+"""A frame that needs more counts as blown up, before it has taken long."""
 
 FASTEST = 200.0
 """What moves faster [m/s] has blown up: nothing of a tabletop does, and a jet's water comes with half of that."""
@@ -76,11 +81,31 @@ class _Moment:
     values: dict[str, Value]
 
 
+class _Held(NamedTuple):
+    """Something in a hand: a body, a pin by its number, or a place of a cloth, of which each browser may hold one."""
+
+    kind: str
+    name: str
+    holder: int
+
+
+class _JobPin(NamedTuple):
+    """A pin as the job has it: its cloth, its nodes there, and when it lets go [s]."""
+
+    cloth: str
+    nodes: NDArray[np.int64]
+    release_s: float
+
+
+class _FrameLeftError(Exception):
+    """Nobody wants the frame any more that is being computed."""
+
+
 class Session:
     """A scene, its knobs, what is held, and its clock.
 
-    Requests come from any thread (`ask`) and are met between frames (`meet_requests`) by the thread that owns the
-    session; all other methods are that thread's.
+    Requests come from any thread (`ask`, `ask_reset`) and are met between frames (`meet_requests`) by the thread that
+    owns the session; all other methods are that thread's.
 
     Attributes:
         job: as it is simulated.
@@ -88,34 +113,49 @@ class Session:
         values: where knobs are now, by name.
         is_paused: whether time stands still.
         speed: simulated over wall time that is wanted, 1 for real time.
-        message: the last thing that has to be known.
+        message: the last thing that has to be known: what was refused last, until another request is met; else the last
+            result.
         report: of the last frame; None before the first.
         revision: grows when the scene or its knobs change otherwise than by time and by what was asked for.
         on_frame: called after each frame with its report, as a recording does; None: nobody.
         on_jump: called before time goes back, as a recording cannot; None: nobody.
+        ends: asked within frames whether all is over, so that the frame need not be computed to its end.
 
     Args:
         job: cloth, bodies and fluid; `sim.runtime.initialize` must have run.
         written: the job as it was read, if it is simulated in other substeps, say: after a blow-up that is named.
         gave_up: whether it was live that changed it for the sake of speed, which --as-written prevents.
+        patience_s: a frame that takes longer counts as blown up [s]; infinite where slow frames were asked for.
+        clock: tells the time [s].
 
     Raises:
         ShapeError, ValueError: as `sim.build.build_world`.
     """
 
-    def __init__(self, job: Job, *, written: Job | None = None, gave_up: bool = False) -> None:
+    def __init__(
+        self,
+        job: Job,
+        *,
+        written: Job | None = None,
+        gave_up: bool = False,
+        patience_s: float = PATIENCE_S,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
         self.job, self._written, self._gave_up = job, written or job, gave_up
+        self._clock, self._watch = clock, FrameWatch(patience_s, clock=clock)
         self.knobs: dict[str, Knob] = {knob.name: knob for knob in knobs_of(job, written=written)}
         self.values: dict[str, Value] = {name: knob.start for name, knob in self.knobs.items()}
         self.is_paused = False
         self.speed = 1.0
-        self.message = FIRST
+        self._result, self._refusal = FIRST, ""
         self.revision = 0
         self.on_frame: Callable[[FrameReport, Mapping[str, Snapshot]], None] | None = None
         self.on_jump: Callable[[], None] | None = None
+        self.ends: Callable[[], bool] = lambda: False
         self.dt = 1.0 / job.fps
-        self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
-        self._hands: dict[tuple[str, str], tuple[Hand, int]] = {}  # by what is held: and by which browser
+        self._requests: SimpleQueue[tuple[Callable[..., object], tuple[Any, ...]]] = SimpleQueue()
+        self._is_reset_asked = threading.Event()
+        self._hands: dict[_Held, Hand] = {}
         self._begins: deque[float] = deque(maxlen=max(10, job.fps))
         self._build()
 
@@ -124,8 +164,10 @@ class Session:
 
         self.world = build_world(self.job, frames_per_second=self.job.fps)
         self.world.max_substeps_per_frame = MOST_SUBSTEPS
+        self.world.watch = self._after_substep
         self._solvers: Mapping[str, Any] = self.world.solvers
-        self.pins = self._pins()
+        self._pins = self._job_pins()
+        self._led_pins: set[int] = set()
         self._changes: list[tuple[int, str]] = []
         self._moments: deque[_Moment] = deque(maxlen=3)
         self.report: FrameReport | None = None
@@ -136,45 +178,63 @@ class Session:
 
     def ask(self, request: Callable[..., object], *arguments: Any) -> None:
         """Have a method called between two frames; an error that is meant for people becomes the message."""
-        self._requests.put(lambda: request(*arguments))
+        self._requests.put((request, arguments))
+
+    def ask_reset(self) -> None:
+        """Have all begin anew; a frame that is being computed is left for it."""
+        self._is_reset_asked.set()
+        self.ask(self.reset)
 
     # --- the owner's: the loop --------------------------------------------------------------------------------------
 
     def meet_requests(self, wait_s: float = 0.0) -> None:
         """Do all that was asked for; wait for the first request for so long at most [s]."""
         try:
-            request = self._requests.get(timeout=wait_s) if wait_s > 0.0 else self._requests.get_nowait()
+            asked = self._requests.get(timeout=wait_s) if wait_s > 0.0 else self._requests.get_nowait()
             while True:
+                request, arguments = asked
                 try:
-                    request()
+                    request(*arguments)
                 except (ValueError, PipelineError, OSError) as error:
-                    self.message = str(error)
+                    self._refusal = str(error)
                     self.revision += 1
-                request = self._requests.get_nowait()
+                else:
+                    # A grab that is refused is followed by what the mouse does with nothing in hand.
+                    if request not in (self.drag, self.let_go, self.let_go_all):
+                        self._refusal = ""
+                asked = self._requests.get_nowait()
         except Empty:
             return
 
     def advance(self) -> None:
         """Compute a frame; after a blow-up, go back to where the scene was sound."""
-        began = time.perf_counter()
+        began = self._clock()
         self._begins.append(began)
         try:
-            for hand, _ in self._hands.values():
+            for hand in self._hands.values():
                 hand.move(self.dt)
             if self._hands:
                 self.world.tell_couplings()
+            self._watch.begin_frame()
             report = self.world.advance_frame()
             _require_sound(report)
-        except SimulationDivergedError as error:
-            self._go_back(error.finding)  # its hint is about keys of a job that no knob turns
+        except _FrameLeftError:
             return
-        except (FloatingPointError, np.linalg.LinAlgError) as error:
-            self._go_back(str(error))
+        except SimulationDivergedError as error:
+            self._go_back(f"It blew up: {error.finding}")  # its hint is about keys of a job that no knob turns
+            return
+        except (ArithmeticError, np.linalg.LinAlgError) as error:
+            self._go_back(f"It blew up: {error}")
+            return
+        except (MemoryError, RuntimeError) as error:
+            if classify(error) is not FailureKind.OUT_OF_MEMORY:
+                raise
+            self._go_back(f"No memory was left: {describe(error)}", remedy="")
             return
         self.report = report
-        if self.message == FIRST:
-            self.message = ""
-        self._frame_ms = 1e3 * (time.perf_counter() - began)
+        if self._result == FIRST:
+            self._result = ""
+        self._frame_ms = 1e3 * (self._clock() - began)
         self._substeps_asked = self.values.get("cloth.substeps")
         if self.on_frame is not None:
             self.on_frame(report, self.world.snapshots())
@@ -183,7 +243,7 @@ class Session:
 
     def status(self) -> Status:
         """How it goes."""
-        span = time.perf_counter() - self._begins[0] if len(self._begins) > 1 else 0.0
+        span = self._clock() - self._begins[0] if len(self._begins) > 1 else 0.0
         rate = 0.0 if self.is_paused or span <= 0.0 else (len(self._begins) - 1) * self.dt / span
         substeps = {} if self.report is None else self.report.substeps
         return Status(
@@ -215,6 +275,7 @@ class Session:
 
     def reset(self) -> None:
         """Begin anew, with the knobs where they are."""
+        self._is_reset_asked.clear()
         self.message = ""
         self._begin_anew(dict(self.values))
 
@@ -238,45 +299,62 @@ class Session:
         """Take a body in hand at a point of the world [m].
 
         Raises:
-            ValueError: there is none of this name that moves.
+            ValueError: there is none of this name that moves, or another browser holds it.
         """
         rigid = self._solvers.get("rigid")
         if rigid is None or name not in rigid.bodies.names:
             raise ValueError(f'"{name}" cannot be moved')
         number = rigid.bodies.names.index(name)
         at = np.asarray(point, dtype=np.float64)
+        key = self._freed(_Held("body", name, holder), called=f'"{name}"')
         if rigid.bodies.is_dynamic[number]:
-            hand: Hand = FreeBody(rigid, number, arm=at - rigid.bodies.position[number])
+            self._hands[key] = FreeBody(rigid, number, arm=at - rigid.bodies.position[number])
         else:
-            hand = LedBody(rigid, number, arm=at - rigid.paths[number].at(rigid.time_s).position)
-        self._take(("body", name), hand, holder)
+            self._hands[key] = LedBody(rigid, number, arm=at - rigid.paths[number].at(rigid.time_s).position)
 
     def grab_cloth(self, name: str, point: tuple[float, float, float], holder: int = 0) -> None:
-        """Take a cloth in hand at its node nearest to a point [m], or its pin, if a pin holds that."""
+        """Take a cloth in hand at its node nearest to a point [m], or its pin, if a pin holds that.
+
+        Raises:
+            ValueError: another browser holds that.
+        """
         cloth = self._solvers["cloth"]
         position, first = self._nodes_of(name)
         distance = np.linalg.norm(position - np.asarray(point), axis=1)
         nearest = int(np.argmin(distance))
-        for number, (of_cloth, nodes) in enumerate(self.pins):
-            if of_cloth == name and nearest in nodes:
+        pins = {number: nodes for number, (of_cloth, nodes) in self.pins.items() if of_cloth == name}
+        for number, nodes in pins.items():
+            if nearest in nodes:
                 self.grab_pin(number, holder)
                 return
+        key = _Held("cloth", name, holder)
+        theirs = [
+            hand.nodes
+            for (kind, of_cloth, whose), hand in self._hands.items()
+            if isinstance(hand, Nodes) and (kind, of_cloth) == key[:2] and whose != holder
+        ]
+        if any(nearest in nodes for nodes in theirs):
+            raise ValueError(f'another browser holds "{name}" there')
         area = cloth.state.host.node_area[first + nearest]
         around = np.linalg.norm(position - position[nearest], axis=1) <= GRABBED_SPACINGS * np.sqrt(area)
-        held = [nodes for of_cloth, nodes in self.pins if of_cloth == name]
-        free = np.setdiff1d(np.flatnonzero(around), np.concatenate([np.empty(0, np.int64), *held]))
-        self._take(("cloth", name), Nodes(cloth, name, free, stays=False), holder)
+        free = np.setdiff1d(np.flatnonzero(around), np.concatenate([np.empty(0, np.int64), *pins.values(), *theirs]))
+        self._release(key)
+        self._hands[key] = Nodes(cloth, name, free, stays=False)
 
     def grab_pin(self, number: int, holder: int = 0) -> None:
-        """Take the nodes of a pin in hand.
+        """Take the nodes of a pin in hand: its keyframes and its release are not for them any more.
 
         Raises:
-            ValueError: there is no such pin, or it follows a path of its own.
+            ValueError: there is no such pin, it has let go, or another browser holds it.
         """
-        if not 0 <= number < len(self.pins):
+        if not 0 <= number < len(self._pins):
             raise ValueError(f"there is no pin {number}")
+        if number not in self.pins:
+            raise ValueError(f"pin {number} has let go")
         name, nodes = self.pins[number]
-        self._take(("pin", str(number)), Nodes(self._solvers["cloth"], name, nodes, stays=True), holder)
+        key = self._freed(_Held("pin", str(number), holder), called=f'pin {number} of "{name}"')
+        self._hands[key] = Nodes(self._solvers["cloth"], name, nodes, stays=True)
+        self._led_pins.add(number)
 
     def drag(self, kind: str, name: str, target: tuple[float, float, float], holder: int = 0) -> None:
         """Lead what a browser holds to a place [m]; nothing if it holds it no more."""
@@ -284,38 +362,78 @@ class Session:
         if not np.isfinite(place).all():
             return
         for key in self._held_by(holder, kind, name):
-            self._hands[key][0].target = place
+            self._hands[key].target = place
 
     def let_go(self, kind: str, name: str, holder: int = 0) -> None:
         """Let go what a browser holds."""
         for key in self._held_by(holder, kind, name):
-            self._hands.pop(key)[0].release()
+            self._release(key)
 
     def let_go_all(self, holder: int | None = None) -> None:
         """Let go all that a browser holds, such as one that is gone; all there is if omitted."""
-        for key, (hand, whose) in list(self._hands.items()):
-            if holder is None or whose == holder:
-                del self._hands[key]
-                hand.release()
+        for key in list(self._hands):
+            if holder is None or key.holder == holder:
+                self._release(key)
 
     @property
     def is_holding(self) -> bool:
         """Whether anything is held."""
         return bool(self._hands)
 
+    @property
+    def pins(self) -> dict[int, tuple[str, NDArray[np.int64]]]:
+        """Cloth and nodes, in its own numbers, of every pin that holds now, by the pin's number."""
+        from sim.cloth.pins import holds
+
+        return {
+            number: (pin.cloth, pin.nodes)
+            for number, pin in enumerate(self._pins)
+            if number in self._led_pins or holds(pin.release_s, self.world.time_s)
+        }
+
+    @property
+    def message(self) -> str:
+        """What was refused last, until another request is met; else the last result."""
+        return self._refusal or self._result
+
+    @message.setter
+    def message(self, result: str) -> None:
+        self._result, self._refusal = result, ""
+
     # --- inside -----------------------------------------------------------------------------------------------------
 
-    def _held_by(self, holder: int, kind: str, name: str) -> list[tuple[str, str]]:
-        """What a browser means by a thing: of a cloth, it may be a pin that its mouse got hold of."""
-        mine = [key for key, (_, whose) in self._hands.items() if whose == holder]
-        if (kind, name) in mine or kind != "cloth":
-            return [key for key in mine if key == (kind, name)]
-        return [key for key in mine if key[0] == "pin" and self.pins[int(key[1])][0] == name]
+    def _after_substep(self) -> str | None:
+        """What is wrong with the frame that is being computed.
 
-    def _take(self, key: tuple[str, str], hand: Hand, holder: int) -> None:
+        Raises:
+            _FrameLeftError: nobody waits for it.
+        """
+        if self.ends() or self._is_reset_asked.is_set():
+            raise _FrameLeftError
+        return self._watch.after_substep()
+
+    def _held_by(self, holder: int, kind: str, name: str) -> list[_Held]:
+        """What a browser means by a thing: of a cloth, it may be a pin that its mouse got hold of."""
+        key = _Held(kind, name, holder)
         if key in self._hands:
-            self._hands.pop(key)[0].release()
-        self._hands[key] = (hand, holder)
+            return [key]
+        mine = [held for held in self._hands if held.holder == holder and held.kind == "pin"]
+        return [held for held in mine if self._pins[int(held.name)].cloth == name] if kind == "cloth" else []
+
+    def _freed(self, key: _Held, *, called: str) -> _Held:
+        """The key of a thing that only one browser can hold, after its own hand has let it go.
+
+        Raises:
+            ValueError: another browser holds it.
+        """
+        if any(held[:2] == key[:2] and held.holder != key.holder for held in self._hands):
+            raise ValueError(f"another browser holds {called}")
+        self._release(key)
+        return key
+
+    def _release(self, key: _Held) -> None:
+        if (hand := self._hands.pop(key, None)) is not None:
+            hand.release()
 
     def _nodes_of(self, name: str) -> tuple[NDArray[np.float64], int]:
         """Positions of a cloth's nodes [m], (n, 3), and the number of the first among all nodes."""
@@ -324,11 +442,15 @@ class Session:
         first, last = state.host.first_node[number : number + 2]
         return state.positions()[first:last], int(first)
 
-    def _pins(self) -> list[tuple[str, NDArray[np.int64]]]:
-        """Cloth and nodes, in its own numbers, of every pin."""
+    def _job_pins(self) -> list[_JobPin]:
+        """All pins, as the job has them."""
         from sim.cloth.start import pins_of
 
-        return [(cloth.name, nodes) for cloth in self.job.cloth for nodes in pins_of(cloth)]
+        return [
+            _JobPin(cloth.name, nodes, math.inf if pin.release_s is None else pin.release_s)
+            for cloth in self.job.cloth
+            for pin, nodes in zip(cloth.pin, pins_of(cloth), strict=True)
+        ]
 
     def _moment(self) -> _Moment:
         paths = dict(self._solvers["rigid"].paths) if "rigid" in self._solvers else {}
@@ -364,12 +486,17 @@ class Session:
                     refused[name] = f"{name} = {value} ({error})"
         return list(refused.values())
 
-    def _go_back(self, what: str) -> None:
-        """Go back to the newest moment that can be trusted; else to the start with the values of then, and stop."""
+    def _go_back(self, what: str, *, remedy: str = " The job may need more substeps.") -> None:
+        """Go back to the newest moment that can be trusted; else to the start with the values of then, and stop.
+
+        Args:
+            what: happened, a sentence without its stop.
+            remedy: a sentence that follows a space: what may help if nobody turned or held anything.
+        """
         now = self.world.frame
         moment = next((each for each in reversed(self._moments) if now - each.frame >= FRAMES_TO_TRUST), None)
         turned = [change for frame, change in self._changes if moment is None or frame >= moment.frame]
-        held = [f'"{name}" of the {kind}' if kind == "pin" else f'"{name}"' for kind, name in self._hands]
+        held = dict.fromkeys(f"pin {name}" if kind == "pin" else f'"{name}"' for kind, name, _ in self._hands)
         if turned:
             cause = f"Turned last: {turned[-1]}."
         elif held:
@@ -389,9 +516,9 @@ class Session:
         if pace := told_pace(self._written, began_with):
             cause += f" {pace} Knobs bring that back{', and so does --as-written' if self._gave_up else ''}."
         elif not (turned or held):
-            cause += " The job may need more substeps."
+            cause += remedy
         place = "the start, with the values that it had there" if moment is None else f"{self.world.time_s:.2f} s"
-        self.message = f"It blew up: {what}. {cause} Back at {place}. {self.message}".rstrip()
+        self.message = f"{what}. {cause} Back at {place}. {self.message}".rstrip()
 
 
 def _require_sound(report: FrameReport) -> None:

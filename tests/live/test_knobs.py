@@ -71,3 +71,17 @@ def test_a_scene_has_the_colours_of_the_viewer(tmp_path):
             "/body/post/body": srgb((0.5, 0.1, 0)),
         }
         assert {name: tuple(nodes[name].color) for name in expected} == expected
+
+
+@pytest.mark.usefixtures("taichi")
+def test_the_ball_of_a_pin_goes_when_the_pin_lets_go(tmp_path):
+    read = loaded(tmp_path, BALL_OVER_SHEET.replace('edge = "y-"', 'edge = "y-"\nrelease_s = 0.02'))
+    session = Session(live_job(read.job))
+    with page_server(port=0, label="drape") as server:
+        drawn = SceneDrawing(server, session.job, lambda *_: None)
+        balls = []
+        for _ in range(3):
+            drawn.show(session.bodies(), session.pins)
+            balls.append([name for name in server.scene._handle_from_node_name if name.startswith("/pin/")])
+            session.advance()
+        assert balls == [["/pin/0", "/pin/1"], ["/pin/0", "/pin/1"], ["/pin/1"]]

@@ -26,10 +26,12 @@ LOOKED_AT = (
     BALL_OVER_SHEET.replace("counts = [17, 17]", "counts = [9, 9]")
     + """
 [camera]
-position = [0.0, -1.6, 0.62]
+position = [0.0, -1.2, 1.3]
 look_at = [0.0, 0.0, 0.62]
 """
 )
+BALL, PIN, SHEET = (0.0, 0.0), (0.0, 93.0), (-45.0, 55.0)
+"""Where they are at the start, from the middle of a picture of 480 rows [pixels]."""
 PATIENCE_S = 60.0
 """Browsers that draw on the CPU take seconds for a picture where others compute."""
 
@@ -65,15 +67,20 @@ def play(address: str, session: Session, folder: Path) -> None:
         page.get_by_role("button", name="Reset").click()
         until(lambda: session.world.frame == 0, "it was not reset")
 
-        def take_ball() -> None:
-            page.mouse.move(*middle)  # onto the ball, which is in the middle of the picture
+        def drag_up(place: tuple[float, float], *, kind: str, name: str) -> None:
+            x, y = middle[0] + place[0], middle[1] + place[1]
+            page.mouse.move(x, y)
             page.mouse.down()
             for share in np.linspace(0.0, 1.0, 8):
-                page.mouse.move(middle[0], middle[1] - 60.0 * share)
+                page.mouse.move(x, y - 60.0 * share)
                 time.sleep(0.05)
-            until(lambda: session.is_holding, "the ball is not in hand")
+            until(lambda: [held[:2] for held in session._hands] == [(kind, name)], f"{kind} {name} is not in hand")
 
-        take_ball()
+        for place, kind, name in ((SHEET, "cloth", "sheet"), (PIN, "pin", "0")):
+            drag_up(place, kind=kind, name=name)
+            page.mouse.up()
+            until(lambda: not session.is_holding, "it is not let go")
+        drag_up(BALL, kind="body", name="ball")
         page.get_by_role("button", name="Go on").focus()
         page.keyboard.press("Enter")
         until(lambda: session.world.solvers["rigid"].bodies.position[0, 2] > 0.68, "the ball does not follow")
@@ -97,7 +104,7 @@ def play(address: str, session: Session, folder: Path) -> None:
         page.get_by_role("button", name="Reset").click()
         until(lambda: session.world.frame == 0, "it was not reset")
         time.sleep(1.0)  # until the ball is seen where it was
-        take_ball()  # and the browser is closed
+        drag_up(BALL, kind="body", name="ball")  # and the browser is closed
 
 
 @needs_browser

@@ -1,5 +1,7 @@
 """A scene that is played with, without a page: knobs and hands change what happens, and a blow-up is no end."""
 
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +10,7 @@ import pytest
 from live_jobs import BALL_OVER_SHEET, loaded
 
 from pipeline.live.scene import live_job
-from pipeline.live.session import FRAMES_TO_TRUST, Session
+from pipeline.live.session import FIRST, FRAMES_TO_TRUST, Session
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -262,3 +264,191 @@ def test_nobody_moves_or_drops_what_another_browser_holds(tmp_path):
     assert session.is_holding  # the first one's
     session.let_go("cloth", "sheet", 1)
     assert not session.is_holding
+
+
+class Clock:
+    """Goes on by so much at every look [s], and does something at one of them."""
+
+    def __init__(self, step_s: float = 1e-3) -> None:
+        self.now, self.step_s, self.looks = 0.0, step_s, 0
+        self.at_look: dict[int, Callable[[], object]] = {}
+
+    def __call__(self) -> float:
+        self.now += self.step_s
+        self.looks += 1
+        self.at_look.get(self.looks, lambda: None)()
+        return self.now
+
+
+def test_a_frame_that_takes_too_long_goes_back_and_names_what_was_turned(tmp_path):
+    clock = Clock()
+    session = Session(live_job(loaded(tmp_path).job), patience_s=1.0, clock=clock)
+    run(session, 2)
+    session.turn("cloth.sheet.stretch_stiffness", 10.0)
+    clock.step_s, clock.looks = 0.4, 0
+    run(session, 1)
+    assert clock.looks == 5  # as the frame began, as its substeps did, and after three
+    assert " diverged at frame 3, t = " in session.message
+    assert ": a frame takes longer than 1 s. Turned last: cloth.sheet.stretch_stiffness = 10.0." in session.message
+    assert (session.world.frame, session.values["cloth.sheet.stretch_stiffness"]) == (0, 500.0)
+    clock.step_s = 1e-3
+    run(session, 2)
+    assert session.world.frame == 2
+
+
+@pytest.mark.parametrize("is_over", [False, True])
+def test_a_reset_and_the_end_do_not_wait_for_the_frame(tmp_path, is_over):
+    clock = Clock()
+    session = Session(live_job(loaded(tmp_path).job), clock=clock)
+    run(session, 2)
+    before = place(session, "ball")
+    ended = threading.Event()
+    session.ends = ended.is_set
+    clock.at_look[clock.looks + 4] = ended.set if is_over else session.ask_reset  # after two substeps of nine
+    looks = clock.looks
+    session.advance()
+    assert (session.world.frame, clock.looks - looks) == (2, 4)
+    ended.clear()
+    run(session, 1)
+    if not is_over:
+        assert session.world.frame == 1
+        assert place(session, "ball")[2] > before[2]
+        assert session.message == ""
+
+
+def raises(error: BaseException) -> Callable[[], None]:
+    def advance_frame() -> None:
+        raise error
+
+    return advance_frame
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OverflowError("more than 268435456 pairs"), "It blew up: more than 268435456 pairs. "),
+        (ZeroDivisionError("float division by zero"), "It blew up: float division by zero. "),
+        (MemoryError("Unable to allocate 9 GiB"), "No memory was left: MemoryError: Unable to allocate 9 GiB. "),
+        (RuntimeError("[cuda] CUDA_ERROR_OUT_OF_MEMORY: out of memory"), "No memory was left: RuntimeError: [cuda] "),
+    ],
+)
+def test_too_many_pairs_and_too_little_memory_go_back_too(tmp_path, error, told):
+    session = session_of(tmp_path)
+    run(session, 1)
+    session.world.advance_frame = raises(error)
+    session.advance()
+    assert session.message.startswith(told)
+    assert "Nothing had been turned." in session.message
+    assert ("substeps" in session.message) == isinstance(error, ArithmeticError)
+    run(session, 2)
+    assert session.world.frame == 2
+
+
+@pytest.mark.parametrize("error", [TypeError("no"), RuntimeError("generator raised StopIteration"), KeyError("no")])
+def test_errors_of_the_program_are_no_blow_ups(tmp_path, error):
+    session = session_of(tmp_path)
+    session.world.advance_frame = raises(error)
+    with pytest.raises(type(error)):
+        session.advance()
+
+
+def test_pins_that_have_let_go_are_gone_but_for_those_that_a_hand_has_taken(tmp_path):
+    session = session_of(tmp_path, WITHOUT_BALL.replace('edge = "y-"', 'edge = "y-"\nrelease_s = 0.1'))
+    assert sorted(session.pins) == [0, 1]
+    run(session, 6)
+    assert sorted(session.pins) == [1]
+    session.ask(session.grab_pin, 0)
+    run(session, 6)
+    assert (session.message, session.is_holding) == ("pin 0 has let go", False)
+    corner = session.bodies()["sheet"].arrays["position"][8]
+    session.ask(session.grab_cloth, "sheet", tuple(map(float, corner)))
+    session.ask(session.drag, "cloth", "sheet", (0.0, -0.2, 0.6))
+    run(session, 40)
+    raised = session.bodies()["sheet"].arrays["position"][8, 2]
+    assert raised > 0.55
+    session.ask(session.let_go, "cloth", "sheet")
+    run(session, 20)
+    assert session.bodies()["sheet"].arrays["position"][8, 2] < raised - 0.1  # it falls, as no pin holds it
+    session.reset()
+    assert sorted(session.pins) == [0, 1]
+    session.grab_pin(0)
+    session.let_go("pin", "0")
+    run(session, 12)
+    assert sorted(session.pins) == [0, 1]  # it stays where the hand has left it
+    np.testing.assert_allclose(session.bodies()["sheet"].arrays["position"][:17, 2], 0.5, atol=1e-6)
+
+
+def test_a_pin_with_keyframes_follows_the_hand_that_takes_it_and_stays_where_it_is_let_go(tmp_path):
+    keys = 'interpolation = "linear"\nkeyframe = [{ time_s = 0.0 }, { time_s = 2.0, offset = [0.0, 0.0, 0.2] }]'
+    session = session_of(tmp_path, WITHOUT_BALL.replace('edge = "y-"', f'edge = "y-"\n{keys}'))
+    run(session, 3)
+    session.ask(session.grab_pin, 0)
+    session.ask(session.drag, "pin", "0", (0.0, -0.25, 0.45))
+    run(session, 30)
+    session.ask(session.let_go, "pin", "0")
+    run(session, 10)
+    assert session.message == ""
+    edge = session.bodies()["sheet"].arrays["position"][:17]
+    np.testing.assert_allclose(edge[:, 1:], np.broadcast_to([-0.25, 0.45], (17, 2)), atol=2e-3)
+    session.reset()
+    run(session, 3)
+    assert session.bodies()["sheet"].arrays["position"][8, 2] > 0.502  # on its path again
+
+
+@pytest.mark.parametrize(
+    ("grab", "what", "told"),
+    [
+        ("grab_body", ("ball", (0.0, 0.0, 0.62)), 'another browser holds "ball"'),
+        ("grab_pin", (0,), 'another browser holds pin 0 of "sheet"'),
+        ("grab_cloth", ("sheet", (0.0, 0.0, 0.5)), 'another browser holds "sheet" there'),
+    ],
+)
+def test_nobody_takes_away_what_another_browser_holds(tmp_path, grab, what, told):
+    session = session_of(tmp_path)
+    kind, name = grab.removeprefix("grab_"), str(what[0])
+    getattr(session, grab)(*what, 1)
+    session.ask(getattr(session, grab), *what, 2)
+    session.ask(session.drag, kind, name, (0.3, 0.0, 0.5), 2)
+    session.meet_requests()
+    assert session.message == told
+    session.let_go_all(2)
+    assert session.is_holding
+    session.let_go(kind, name, 1)
+    assert not session.is_holding
+    session.ask(getattr(session, grab), *what, 2)
+    session.meet_requests()
+    assert (session.message, session.is_holding) == (FIRST, True)
+
+
+def test_two_browsers_hold_two_places_of_one_cloth(tmp_path):
+    session = session_of(tmp_path, WITHOUT_BALL)
+    places = {1: (-0.1, 0.0, 0.5), 2: (0.1, 0.0, 0.5)}
+    for holder, place_of_it in places.items():
+        session.grab_cloth("sheet", place_of_it, holder)
+    session.drag("cloth", "sheet", (-0.1, 0.0, 0.57), 1)
+    session.drag("cloth", "sheet", (0.1, 0.0, 0.54), 2)
+    run(session, 25)
+    heights = session.bodies()["sheet"].arrays["position"][[140, 148], 2]
+    np.testing.assert_allclose(heights, [0.57, 0.54], atol=5e-3)
+    session.let_go_all(1)
+    run(session, 10)
+    heights = session.bodies()["sheet"].arrays["position"][[140, 148], 2]
+    assert heights[0] < 0.56
+    assert heights[1] == pytest.approx(0.54, abs=5e-3)
+
+
+def test_a_refusal_goes_with_the_next_request_that_is_met_and_a_result_stays(tmp_path):
+    session = session_of(tmp_path)
+    run(session, 1)
+    session.message = "wrote drape-live.toml"
+    session.ask(session.turn, "cloth.sheet.friction", -1.0)
+    session.ask(session.drag, "body", "ball", (0.0, 0.0, 0.0))  # of what is in no hand, which no one waits for
+    session.ask(session.let_go_all, 3)
+    session.meet_requests()
+    assert "cloth.sheet.friction must lie between" in session.message
+    session.ask(session.turn, "cloth.sheet.friction", 0.4)
+    session.meet_requests()
+    assert session.message == "wrote drape-live.toml"
+    session.ask(session.pause, True)
+    session.meet_requests()
+    assert session.message == "wrote drape-live.toml"

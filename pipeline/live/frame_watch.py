@@ -1,0 +1,37 @@
+"""How long a frame may take: requests are met between frames, so a page answers no sooner."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+PATIENCE_S = 5.0
+"""A frame that takes longer counts as blown up."""
+
+MOST_OF_A_SUBSTEP_S = 0.5
+"""A substep counts for no more: kernels compile, and machines sleep, within a few of them, and that passes."""
+
+
+class FrameWatch:
+    """Looks at the clock after every substep of a frame.
+
+    Attributes:
+        patience_s: longest time that a frame may take [s]; infinite where people asked for slow frames.
+
+    Args:
+        clock: tells the time [s].
+    """
+
+    def __init__(self, patience_s: float, *, clock: Callable[[], float]) -> None:
+        self.patience_s, self._clock = patience_s, clock
+        self.begin_frame()
+
+    def begin_frame(self) -> None:
+        """A frame begins now."""
+        self._spent_s, self._seen_s = 0.0, self._clock()
+
+    def after_substep(self) -> str | None:
+        """What is wrong with the frame, if it has taken too long."""
+        now = self._clock()
+        self._spent_s += min(now - self._seen_s, MOST_OF_A_SUBSTEP_S)
+        self._seen_s = now
+        return f"a frame takes longer than {self.patience_s:g} s" if self._spent_s > self.patience_s else None
