@@ -182,9 +182,12 @@ Look = Literal[
 
 
 class MaterialParameters(Parameters):
-    """What a body looks like: a look, or a material of one's own."""
+    """What a body looks like: a look, or a material of one's own.
 
-    look: Look | None = Field(default=None, description="Name of the look; give this or blend.")
+    Without either, the keys that are given change what the body looks like by itself.
+    """
+
+    look: Look | None = Field(default=None, description="Name of the look; the body's own if omitted, or blend.")
     blend: str | None = Field(
         default=None,
         description='Material of a .blend file, relative to the job file: "materials.blend:Old gold". Its pictures '
@@ -235,9 +238,22 @@ class MaterialParameters(Parameters):
 
     @model_validator(mode="after")
     def _is_one_material(self) -> Self:
-        if (self.look is None) == (self.blend is None):
-            raise ValueError('give look, such as look = "metal", or blend, one of them')
+        if self.look is not None and self.blend is not None:
+            raise ValueError("give look or blend, one of them")
+        if not self.model_fields_set:
+            raise ValueError('says nothing; give a key, such as look = "metal"')
         return self
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it says what to draw, and not only how that differs from something else."""
+        return self.look is not None or self.blend is not None
+
+    def upon(self, usual: MaterialParameters) -> MaterialParameters:
+        """This material, or another one with the keys of this where this names none itself."""
+        if self.is_whole:
+            return self
+        return usual.model_copy(update={key: getattr(self, key) for key in self.model_fields_set})
 
 
 RenderDevice = Literal["auto", "cpu", "gpu", "optix", "cuda", "hip", "oneapi", "metal"]
@@ -259,7 +275,7 @@ class RenderParameters(Parameters):
     motion_blur: bool = Field(default=True, description="Blur what moves while the shutter is open.")
     shutter: Fraction = Field(default=0.5, description="Time the shutter is open [frames].")
     exposure: float = Field(default=0.0, description="Exposure [stops].")
-    seed: int = Field(default=0, ge=0, description="Seed of the sampling pattern.")
+    seed: int = Field(default=0, ge=0, lt=2**31, description="Seed of the sampling pattern.")
     device: RenderDevice = Field(
         default="auto",
         description="What Cycles renders on. auto: GPUs where there are any, else the processor; gpu: GPUs of whatever "
@@ -314,6 +330,8 @@ Codec = Literal["h264", "h265", "av1", "prores"]
 USUAL_CRF = {"h264": 16, "h265": 18, "av1": 20}
 """Within 2 dB of each other on the quickstart; docs/rendering.md has the table."""
 HIGHEST_CRF = {"h264": 51, "h265": 51, "av1": 63}
+HIGHEST_FPS: dict[Codec, float] = {"av1": 240.0}
+"""Frames a second that a codec's encoder takes; the others take whatever a job may have [1/s]."""
 
 
 class MovieParameters(Parameters):
@@ -332,9 +350,10 @@ class MovieParameters(Parameters):
     preset: Literal["ultrafast", "veryfast", "fast", "medium", "slow", "veryslow"] = Field(
         default="medium", description="Speed against size; prores has none."
     )
-    playback_fps: Positive | None = Field(
+    playback_fps: Annotated[float, Field(ge=0.01, le=1000.0)] | None = Field(
         default=None,
-        description="Frames a second of the film; the job's fps if omitted (less is slow motion).",
+        description="Frames a second of the film [1/s]; the job's fps if omitted (less is slow motion). av1 has at most "
+        "240.",
     )
     so_far: bool = Field(
         default=True,

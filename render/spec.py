@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from render.camera_path import CameraPath
 from render.parameters import (
@@ -26,6 +26,15 @@ from render.parameters import (
 SPEC_VERSION: Literal[3] = 3
 
 
+def _whole(material: MaterialParameters) -> MaterialParameters:
+    if not material.is_whole:
+        raise ValueError("an object needs a look or a material of a .blend file")
+    return material
+
+
+Material = Annotated[MaterialParameters, AfterValidator(_whole)]
+
+
 class MeshObject(Parameters):
     """A mesh that stays: one PLY file, placed once."""
 
@@ -36,7 +45,7 @@ class MeshObject(Parameters):
     orientation: tuple[float, float, float, float] = Field(
         default=(1.0, 0.0, 0.0, 0.0), description="Unit quaternion w, x, y, z."
     )
-    material: MaterialParameters
+    material: Material
     shade_smooth_angle_deg: float = Field(default=40.0, description="Edges sharper than this stay sharp [degrees].")
 
 
@@ -48,7 +57,7 @@ class MovingMeshObject(Parameters):
     file: str
     body: str = Field(description="Name of the body in the poses; parts of one body share it.")
     poses: str = Field(description="Path with {frame} of a JSON document; see docs/formats.md.")
-    material: MaterialParameters
+    material: Material
     shade_smooth_angle_deg: float = Field(default=40.0, description="Edges sharper than this stay sharp [degrees].")
 
 
@@ -61,7 +70,7 @@ class MeshSequenceObject(Parameters):
     type: Literal["mesh_sequence"] = "mesh_sequence"
     name: str
     file: str = Field(description="Path with {frame}.")
-    material: MaterialParameters
+    material: Material
     wets_within: float | None = Field(
         default=None,
         gt=0.0,
@@ -76,7 +85,7 @@ class PointSequenceObject(Parameters):
     name: str
     file: str = Field(description="Path with {frame}.")
     kind: Literal["spray", "foam", "bubbles"] = Field(description="Which of the file's points are drawn.")
-    material: MaterialParameters
+    material: Material
 
 
 class VolumeSequenceObject(Parameters):
@@ -89,7 +98,7 @@ class VolumeSequenceObject(Parameters):
     box_max: Vector3 = Field(description="Upper corner of the smoke's grid [m].")
     open_faces: tuple[str, ...] = Field(description="Sides that smoke may leave by: x-, x+, y-, y+, z-, z+.")
     ambient_temperature: float = Field(description="What the temperature grid is counted from [K].")
-    material: MaterialParameters
+    material: Material
 
 
 SceneObject = Annotated[

@@ -23,10 +23,10 @@ from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.scene_checks import check_scene
-from pipeline.job.stage_checks import check_blend, check_stage
+from pipeline.job.stage_checks import check_blend, check_keys_beside_blend, check_stage
 from pipeline.stages import STAGES
 from pipeline.stages.movie import MovieStage
-from render.parameters import MaterialParameters
+from render.parameters import HIGHEST_FPS, MaterialParameters
 
 MANY_FRAMES = 100_000
 
@@ -106,10 +106,14 @@ def _check_materials(job: Job, findings: Findings) -> None:
     for body in job.rigid:
         kinds |= {f"{body.name}.{part}": "rigid" for part in parts_of(body.shape.type) if part != BODY}
     kinds |= {f"{fluid}.{part}": "fluid" for fluid in job.whitewater for part in WHITEWATER}
-    for name, material in job.material.items():
+    for name, said in job.material.items():
         path: KeyPath = ("material", name)
-        if material.blend is not None:
-            check_blend(material, path, kinds.get(name), findings)
+        owner, _, part = name.partition(".")
+        material = job.described_material(owner, part or BODY) if name in kinds else said
+        if said.blend is not None:
+            check_blend(said, path, kinds.get(name), findings)
+        elif material.blend is not None:
+            check_keys_beside_blend(said, path, findings)
         if name not in kinds:
             hint = suggestion(name, kinds) or (f"; bodies are {', '.join(kinds)}" if kinds else "")
             findings.error(path, f'no body is named "{name}"{hint}')
@@ -194,6 +198,13 @@ def _check_pictures(job: Job, findings: Findings) -> None:
         )
     for obstacle in MovieStage().obstacles(job):
         findings.error(("movie", "codec"), obstacle)
+    rate, highest = job.movie.playback_fps or job.fps, HIGHEST_FPS.get(job.movie.codec)
+    if highest is not None and rate > highest:
+        findings.error(
+            ("movie", "codec"),
+            f'"{job.movie.codec}" has at most {highest:g} frames a second, got {rate:g}; set movie.playback_fps, or '
+            "another codec",
+        )
     if job.render.blender is not None and not Path(job.render.blender).is_file():
         findings.error(("render", "blender"), f"no such file: {job.render.blender}; omit it to use the bpy module")
     if job.camera.position is not None and job.camera.position == job.camera.look_at:

@@ -26,7 +26,7 @@ NATURAL_MATERIALS: dict[str, dict[str, MaterialParameters]] = {
 """Materials by shape and part. A shape that is not here has one part."""
 
 PAINTED_LOOKS = ("rubber", "plastic", "ceramic")
-"""A body of another look, of metal or glass, is of one piece: its parts take the body's material."""
+"""A body of another look, of metal or glass, is of one piece: parts that the job file gives no look take the body's."""
 
 WHITEWATER = {part: MaterialParameters(look=part) for part in ("spray", "foam", "bubbles")}
 """Materials of the parts of a fluid that has whitewater; each is a look of its own."""

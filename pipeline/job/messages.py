@@ -149,7 +149,7 @@ def _out_of_bounds(path: KeyPath, details: ErrorDetails, value: object) -> str:
     sign, key = _BOUNDS[details["type"]]
     node = schema.node_at(path)
     unit = f" {node.unit}" if node is not None and node.unit else ""
-    return f"must be {sign} {details['ctx'][key]:g}{unit}, got {spelled(value)}"
+    return f"must be {sign} {details['ctx'][key]:.10g}{unit}, got {spelled(value)}"
 
 
 def _wrong_length(path: KeyPath, details: ErrorDetails, value: object) -> str:

@@ -97,20 +97,27 @@ class Job(SceneParameters):
 
         Caustics are asked for only of what bends light: they change the light of the whole scene.
         """
-        material = self._material_of(body, part)
+        material = self.described_material(body, part)
         if material.caustics and material.look not in REFRACTING_LOOKS:
             return material.model_copy(update={"caustics": False})
         return material
 
-    def _material_of(self, body: str, part: str) -> MaterialParameters:
+    def described_material(self, body: str, part: str = BODY) -> MaterialParameters:
+        """The same with every key that the job file gives, also those that have no effect."""
+        usual = self._usual_material(body, part)
+        if part != BODY and part not in WHITEWATER:
+            of_body = self.described_material(body)
+            usual = usual if of_body.look in PAINTED_LOOKS else of_body
+        said = self.material.get(body if part == BODY else f"{body}.{part}")
+        return usual if said is None else said.upon(usual)
+
+    def _usual_material(self, body: str, part: str) -> MaterialParameters:
+        """What it looks like by itself."""
         if part in WHITEWATER:
-            return self.material.get(f"{body}.{part}", WHITEWATER[part])
+            return WHITEWATER[part]
         shape = next((rigid.shape.type for rigid in self.rigid if rigid.name == body), "")
-        own = self.material.get(body, NATURAL_MATERIALS.get(shape, {}).get(BODY))
-        if part != BODY and (own is None or own.look in PAINTED_LOOKS):
-            return self.material.get(f"{body}.{part}", NATURAL_MATERIALS[shape][part])
-        if own is not None:
-            return own
+        if shape in NATURAL_MATERIALS:
+            return NATURAL_MATERIALS[shape][part]
         if any(fluid.name == body for fluid in self.fluid):
             return FLUID
         for cloth in self.cloth:

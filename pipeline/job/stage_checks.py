@@ -48,6 +48,11 @@ def check_blend(material: MaterialParameters, path: KeyPath, kind: str | None, f
     file_exists(split_blend(material.blend)[0], ".blend file", (*path, "blend"), findings)
     if kind == "smoke":
         findings.error((*path, "blend"), 'is for surfaces; smoke can only look like "smoke" or "fire"')
+    check_keys_beside_blend(material, path, findings)
+
+
+def check_keys_beside_blend(material: MaterialParameters, path: KeyPath, findings: Findings) -> None:
+    """Note keys that change nothing, as the body or the part has a material of a .blend file."""
     for key in sorted(material.model_fields_set - {"blend"}):
         findings.warn((*path, key), "has no effect beside blend, whose material says all")
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked_jobs import checked
 from PIL import Image
 
 from pipeline.executors.attempt import AttemptContext
@@ -62,3 +63,14 @@ def test_a_frame_that_repeats_or_pops_up_is_told_with_its_picture(tmp_path, fram
     (told,) = warnings_of(tmp_path, [*EVEN[:frame], place, *EVEN[frame + 1 :]])
     assert told.startswith(f"frame {frame} {kind}")
     assert told.endswith(f"look at it: frames/{frame:06d}.png")
+
+
+@pytest.mark.parametrize(("of_job", "of_film"), [("fps = {rate}", ""), ("", "playback_fps = {rate}.0")])
+def test_a_film_faster_than_its_encoder_takes_is_refused_before_anything_is_drawn(tmp_path, of_job, of_film):
+    def errors(rate: int) -> list[str]:
+        head, film = of_job.format(rate=rate), of_film.format(rate=rate)
+        return checked(f'{head}\n{JOB}[movie]\ncodec = "av1"\n{film}\n', tmp_path / "pond.toml").errors
+
+    assert errors(240) == []
+    (error,) = errors(300)
+    assert 'movie.codec: "av1" has at most 240 frames a second, got 300' in error

@@ -59,6 +59,14 @@ BAD = {
         'name = "dam"\n[[rigid]]\nname = "r"\nshape = {type = "box", size = [1, 0, 1]}',
         ["dam.toml:4 rigid[0].shape.size[1]: must be > 0 m, got 0"],
     ),
+    "seed that Cycles cannot hold": (
+        'name = "dam"\n[render]\nseed = 3000000000',
+        ["dam.toml:3 render.seed: must be < 2147483648, got 3000000000"],
+    ),
+    "frames that stand for hours": (
+        'name = "dam"\n[movie]\nplayback_fps = 0.0001',
+        ["dam.toml:3 movie.playback_fps: must be >= 0.01, got 0.0001"],
+    ),
     "zero frames": ('name = "dam"\nframes = 0', ["dam.toml:2 frames: must be >= 1, got 0"]),
     "half a frame": ('name = "dam"\nframes = 2.5', ["dam.toml:2 frames: expected a whole number, got 2.5"]),
     "number in quotes": ('name = "dam"\nfps = "60"', ['dam.toml:2 fps: expected a whole number, got the text "60"']),

@@ -122,8 +122,8 @@ def test_a_material_of_a_blend_file_is_found_beside_the_job_and_kept_with_it(tmp
     [
         ('blend = "on.blend:Gold"', 'no such file: {folder}/on.blend; did you mean "own.blend"?'),
         ('blend = "own.blend"', "film.toml:10 material.ball.blend: must name a file and a material in it, such as"),
-        ('blend = "own.blend:Gold"\nlook = "metal"', "give look, such as look ="),
-        ("roughness = 0.3", 'give look, such as look = "metal", or blend, one of them'),
+        ('blend = "own.blend:Gold"\nlook = "metal"', "give look or blend, one of them"),
+        ("", 'material.ball: says nothing; give a key, such as look = "metal"'),
     ],
 )
 def test_a_material_that_is_not_one_is_refused(tmp_path, keys, expected):

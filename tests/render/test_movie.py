@@ -61,7 +61,7 @@ def decode(path: Path) -> tuple[list[np.ndarray], list[Fraction]]:
     return list(planes), list(times)
 
 
-@pytest.mark.parametrize("fps", [60, 24, 23.976, 7.3])
+@pytest.mark.parametrize("fps", [60, 24, 23.976, 7.3, 0.01])
 def test_the_film_shows_the_segments_frames_at_exact_times(tmp_path, pictures, fps):
     segments = encode_all(tmp_path, pictures, fps)
     film = tmp_path / "film.mp4"
