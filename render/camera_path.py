@@ -164,7 +164,7 @@ class CameraPath:
         framed: Array | None = None,
     ) -> None:
         self._camera, self._aimed_at = camera, camera.look_at if isinstance(camera.look_at, str) else None
-        named = (camera.follow, camera.focus, self._aimed_at)
+        named = (camera.follow, camera.focus if isinstance(camera.focus, str) else None, self._aimed_at)
         self.bodies = tuple(dict.fromkeys(name for name in named if name is not None))
         self._starts = {name: np.asarray(starts[name], dtype=np.float64) for name in self.bodies}
         self.moves = camera.moves
@@ -202,7 +202,8 @@ class CameraPath:
         distance = float(np.linalg.norm(look_at - position))
         if camera.focus is not None:
             forward = (look_at - position) / max(distance, NEAREST_FOCUS_M)
-            distance = float((places[camera.focus] - position) @ forward)
+            in_focus = places[camera.focus] if isinstance(camera.focus, str) else np.asarray(camera.focus)
+            distance = float((in_focus - position) @ forward)
         return View(_vector(position), _vector(look_at), focal_length, max(distance, NEAREST_FOCUS_M))
 
     def first(self) -> View:

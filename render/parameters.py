@@ -70,12 +70,14 @@ class CameraParameters(Parameters):
     )
     look_at: Vector3 | str | None = Field(
         default=None,
-        description="What it looks at: a point [m], or a moving body by its name; the domain's middle if omitted.",
+        description="What it looks at: a point [m], or a rigid body by its name; the domain's middle if omitted.",
     )
     focal_length_mm: Positive = Field(default=50.0, description="Focal length on a 36 mm sensor [mm].")
     f_stop: Positive | None = Field(default=None, description="Aperture; everything is in focus if omitted.")
-    focus: str | None = Field(
-        default=None, description="Name of the moving body in focus; the point that it looks at if omitted."
+    focus: Vector3 | str | None = Field(
+        default=None,
+        description="What is in focus: a point [m], or a rigid body by its name; the point that it looks at if "
+        "omitted.",
     )
     follow: str | None = Field(default=None, description="Name of the moving body that it travels along with.")
     orbit_deg_per_s: float = Field(
@@ -93,7 +95,7 @@ class CameraParameters(Parameters):
     @property
     def moves(self) -> bool:
         """Whether its view differs from frame to frame."""
-        with_body = self.follow is not None or self.focus is not None or isinstance(self.look_at, str)
+        with_body = self.follow is not None or isinstance(self.focus, str) or isinstance(self.look_at, str)
         return bool(self.keyframe) or self.orbit_deg_per_s != 0.0 or with_body
 
     @property
@@ -109,6 +111,12 @@ class CameraParameters(Parameters):
                 f'framing = "action" has no meaning beside {place}, which say where the camera is; remove one of them, '
                 'or set framing = "domain"'
             )
+        if self.frames_action and (self.follow is not None or self.look_at is not None):
+            key = "look_at" if self.follow is None else "follow"
+            raise ValueError(
+                f'framing = "action" has no meaning beside {key}, which turns the view away from what it frames; '
+                'remove one of them, or set framing = "domain"'
+            )
         if self.keyframe and self.orbit_deg_per_s:
             raise ValueError("orbit_deg_per_s has no meaning beside keyframes; remove one of them")
         if self.keyframe and self.position is not None:
@@ -117,7 +125,7 @@ class CameraParameters(Parameters):
             raise ValueError(
                 "look_at of a keyframe has no meaning beside a body that the camera looks at; remove one of them"
             )
-        if not self.keyframe and "easing" in self.model_fields_set:
+        if not self.keyframe and self.easing != "smooth":
             raise ValueError("easing has no meaning without keyframes; remove it or add [[camera.keyframe]]")
         if self.focus is not None and self.f_stop is None:
             raise ValueError("focus has no effect without f_stop, such as f_stop = 2.8")
@@ -352,8 +360,8 @@ class MovieParameters(Parameters):
     )
     playback_fps: Annotated[float, Field(ge=0.01, le=1000.0)] | None = Field(
         default=None,
-        description="Frames a second of the film [1/s]; the job's fps if omitted (less is slow motion). av1 has at most "
-        "240.",
+        description="Frames a second of the film [1/s]; the job's fps if omitted (less is slow motion). av1 has 240 at "
+        "most.",
     )
     so_far: bool = Field(
         default=True,

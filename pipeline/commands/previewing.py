@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from pipeline.task import Resources
 
 _QUALITIES = ("draft", "preview", "final")
-_PLACES = ("camera.position", "camera.keyframe")
+_POSITION, _KEYFRAMES = "camera.position", "camera.keyframe"
 _TOLD_FRAMES = 10
 """One of so many frames of an animatic is told."""
 
@@ -64,8 +65,7 @@ def still(
 
     layout = JobLayout(find_job(job, output).root.absolute())
     changes = [f"render.quality={quality}"]
-    if any(each.partition("=")[0].strip() in _PLACES for each in overrides):
-        changes.append("camera.framing=domain")  # who says where the camera stands means it
+    changes += _other_ways_off([each.partition("=")[0].strip() for each in overrides])
     changes += [] if resolution is None else [f"render.resolution=[{resolution[0]}, {resolution[1]}]"]
     loaded = read_job(layout.job_file, [*changes, *overrides])
     require_own_programs(loaded, overrides)
@@ -96,6 +96,15 @@ def still(
             say=lambda sentence: click.echo(f"  {sentence}", err=True),
         )
     click.echo(path)
+
+
+def _other_ways_off(keys: Sequence[str]) -> list[str]:
+    """Overrides that keep the job from leading the camera elsewhere: who says where it stands means it."""
+    if _KEYFRAMES in keys:
+        return ["camera.framing=domain"]
+    if _POSITION in keys:
+        return ["camera.framing=domain", f"{_KEYFRAMES}=[]", "camera.easing=smooth"]
+    return []
 
 
 def _words(loaded: LoadedJob, overrides: tuple[str, ...]) -> str:

@@ -35,7 +35,7 @@ def check_camera(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) 
         return  # its place follows from the film, which it then shows
     width, height = job.render.resolution
     starts = {body.name: body.position for body in job.rigid}
-    path = CameraPath(job.camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts)
+    path = CameraPath(job.placed_camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts)
     last_s = (job.frame_count - 1) / job.fps
     views = {0.0: path.first()}
     if path.moves and not path.bodies:

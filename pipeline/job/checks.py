@@ -65,7 +65,7 @@ def named_bodies(job: Job) -> Iterator[tuple[KeyPath, str, str]]:
 def _check_bodies(job: Job, findings: Findings) -> None:
     if not job.body_names:
         findings.error((), "has no body; add [[fluid]], [[smoke]], [[cloth]] or [[rigid]]")
-    elif not (job.fluid or job.smoke or job.cloth or job.moving_bodies or job.camera.moves):
+    elif not (job.fluid or job.smoke or job.cloth or job.moving_bodies or job.placed_camera.moves):
         findings.warn((), "has neither fluid nor smoke nor cloth, so nothing will move")
     for kind, solver in (("rigid", "moving bodies"), ("cloth", "cloths")):
         moves = job.cloth if kind == "cloth" else [body for body in job.rigid if body.kind != "static"]
@@ -207,10 +207,11 @@ def _check_pictures(job: Job, findings: Findings) -> None:
         )
     if job.render.blender is not None and not Path(job.render.blender).is_file():
         findings.error(("render", "blender"), f"no such file: {job.render.blender}; omit it to use the bpy module")
-    if job.camera.position is not None and job.camera.position == job.camera.look_at:
+    camera = job.placed_camera
+    if camera.position is not None and camera.position == camera.look_at:
         findings.error(("camera", "look_at"), "is where the camera stands; it must be somewhere else")
-    for number, key in enumerate(job.camera.keyframe):
-        if key.position == (key.look_at or job.camera.look_at or job.domain.middle):
+    for number, key in enumerate(camera.keyframe):
+        if key.position == (key.look_at or camera.look_at or job.domain.middle):
             findings.error(
                 ("camera", "keyframe", number, "look_at"), "is where the camera is; it must be somewhere else"
             )

@@ -140,15 +140,34 @@ class Job(SceneParameters):
         """Names of the rigid bodies whose pose changes from frame to frame."""
         return tuple(body.name for body in self.rigid if body.kind != "static")
 
+    @property
+    def placed_camera(self) -> CameraParameters:
+        """The camera, with places for the bodies that stand still: what it sees of them never changes."""
+        stands = {body.name: body.position for body in self.rigid if body.kind == "static"}
+        named = {key: getattr(self.camera, key) for key in ("look_at", "focus")}
+        places = {key: stands[name] for key, name in named.items() if isinstance(name, str) and name in stands}
+        return self.camera.model_copy(update=places) if places else self.camera
+
     @model_validator(mode="after")
     def _camera_knows_its_bodies(self) -> Self:
         for key in ("look_at", "follow", "focus"):
             name = getattr(self.camera, key)
-            if isinstance(name, str) and name not in self.moving_bodies:
-                known = f"; moving bodies are {', '.join(self.moving_bodies)}" if self.moving_bodies else ""
-                hint = suggestion(name, self.moving_bodies) or known
-                raise ValueError(f'camera.{key}: no dynamic or kinematic rigid body is named "{name}"{hint}')
+            if isinstance(name, str):
+                self._require_body_of_camera(key, name)
         return self
+
+    def _require_body_of_camera(self, key: str, name: str) -> None:
+        rigid = tuple(body.name for body in self.rigid)
+        if name in self.body_names and name not in rigid:
+            raise ValueError(f'camera.{key}: "{name}" is no rigid body; its shape changes, so it has no one place')
+        if key == "follow" and name in rigid and name not in self.moving_bodies:
+            raise ValueError(f'camera.follow: "{name}" is static; set camera.look_at to look at it')
+        known = self.moving_bodies if key == "follow" else rigid
+        if name not in known:
+            kind = "dynamic or kinematic rigid body" if key == "follow" else "rigid body"
+            kinds = "moving bodies" if key == "follow" else "rigid bodies"
+            hint = suggestion(name, known) or (f"; {kinds} are {', '.join(known)}" if known else "")
+            raise ValueError(f'camera.{key}: no {kind} is named "{name}"{hint}')
 
     @model_validator(mode="after")
     def _frames_or_duration(self) -> Self:

@@ -53,7 +53,13 @@ def parse_override(argument: str, document: Mapping[str, Any]) -> Override:
         raise OverrideError(f"--set {argument}: expected path.to.key=value")
     path, node = _resolve(written_path, document)
     value = _parse_value(written_value.strip())
-    if node.is_array_of_tables or (node.is_table and (isinstance(path[-1], int) or not isinstance(value, dict))):
+    if node.is_array_of_tables:
+        if not (isinstance(value, list) and all(isinstance(each, dict) for each in value)):
+            raise OverrideError(
+                f"--set {argument}: {format_path(path)} is a list of tables; give all of it, such as [{{...}}], with "
+                f"the keys {', '.join(node.keys)}, or set a key of one"
+            )
+    elif node.is_table and (isinstance(path[-1], int) or not isinstance(value, dict)):
         raise OverrideError(f"--set {argument}: {format_path(path)} is a table; set its keys: {', '.join(node.keys)}")
     return Override(path, value, "--set")
 
@@ -85,6 +91,8 @@ def _put(document: Any, override: Override) -> None:
     for part in override.path[:-1]:
         if isinstance(part, str) and part not in table:
             table[part] = tomlkit.table()
+        if isinstance(part, int) and part >= len(table):
+            raise OverrideError(f"{override.origin}: {format_path(override.path)} is not there once the list is set")
         table = table[part]
         if not isinstance(table, Mapping | Sequence) or isinstance(table, str):
             raise OverrideError(f"{override.origin}: {format_path((part,))} is not a table in the job file")

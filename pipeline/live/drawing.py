@@ -50,10 +50,10 @@ class SceneDrawing:
                 "/floor", width=width, height=depth, plane="xy", cell_size=0.1, section_size=0.5, position=place,
                     cell_color=FLOOR_COLOR, section_color=FLOOR_COLOR,
             )  # fmt: skip
-        camera = server.initial_camera
-        if job.camera.position is not None and not isinstance(job.camera.look_at, str):
-            camera.position = np.asarray(job.camera.position)
-            camera.look_at = middle if job.camera.look_at is None else np.asarray(job.camera.look_at)
+        camera, of_film = server.initial_camera, job.placed_camera
+        if of_film.position is not None and not isinstance(of_film.look_at, str):
+            camera.position = np.asarray(of_film.position)
+            camera.look_at = middle if of_film.look_at is None else np.asarray(of_film.look_at)
         else:
             camera.position, camera.look_at = middle + size * np.array([0.35, -0.8, 0.35]), middle
         camera.up = (0.0, 0.0, 1.0)

@@ -68,9 +68,9 @@ class RenderStage:
         spec = _decisive(drawn)
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
-            spec["camera"] = {"framing": job.camera.model_dump(mode="json")}
-        elif job.camera.moves:
-            spec["camera"]["path"] = job.camera.model_dump(mode="json", exclude={"framing"})
+            spec["camera"] = {"framing": job.placed_camera.model_dump(mode="json")}
+        elif job.placed_camera.moves:
+            spec["camera"]["path"] = job.placed_camera.model_dump(mode="json", exclude={"framing"})
         parameters = ParameterSet.of(
             spec,
             stage=self.name,

@@ -98,12 +98,12 @@ def _check_picture(context: TaskContext, frame: int, path: Path, view: View, bod
     cells = expected_cells(job, view, bodies, (rows, columns))
     if cells is None:
         return
-    if job.camera.moves or "still" not in _EMPTY_STAGE:
+    if job.placed_camera.moves or "still" not in _EMPTY_STAGE:
         with tempfile.TemporaryDirectory(prefix="stage-") as folder:
             picture = Path(folder) / "stage.png"
             warm_renderer(context).render_stage(frame, picture, resolution=(columns, rows))
             stage = read_shown(picture)
-        if not job.camera.moves:
+        if not job.placed_camera.moves:
             _EMPTY_STAGE["still"] = stage
     else:
         stage = _EMPTY_STAGE["still"]

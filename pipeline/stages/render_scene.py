@@ -122,7 +122,9 @@ def camera_path(job: Job, framed: NDArray[np.float64] | None = None) -> CameraPa
     """
     width, height = job.render.resolution
     starts = {body.name: body.position for body in job.rigid}
-    return CameraPath(job.camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts, framed=framed)
+    return CameraPath(
+        job.placed_camera, job.domain.min, job.domain.max, aspect=width / height, starts=starts, framed=framed
+    )
 
 
 def framed_points(job: Job, layout: JobLayout) -> NDArray[np.float64] | None:

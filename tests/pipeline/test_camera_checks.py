@@ -1,5 +1,6 @@
 """What `check` tells of a camera that moves."""
 
+import numpy as np
 import pytest
 from checked_jobs import checked
 
@@ -7,6 +8,8 @@ from pipeline.errors import JobFileError
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
 from pipeline.stages.render import RenderStage
+from pipeline.stages.render_scene import render_spec
+from render.spec import Camera
 
 DUCK = """
 name = "pond"
@@ -22,23 +25,44 @@ name = "rock"
 shape = { type = "sphere", radius = 0.1 }
 position = [0.4, 0.0, 0.5]
 """
+FLAG = """
+[[cloth]]
+name = "flag"
+shape = { type = "rectangle", size = [0.2, 0.1], counts = [9, 5] }
+position = [0.0, 0.3, 0.5]
+"""
 
 
 @pytest.mark.parametrize(
     ("camera", "complaint"),
     [
         ('follow = "dukc"', 'camera.follow: no dynamic or kinematic rigid body is named "dukc"; did you mean "duck"?'),
-        (
-            'look_at = "rock"',
-            'camera.look_at: no dynamic or kinematic rigid body is named "rock"; moving bodies are duck',
-        ),
-        ('focus = "pike"\nf_stop = 2.8', 'camera.focus: no dynamic or kinematic rigid body is named "pike"'),
+        ('follow = "rock"', 'camera.follow: "rock" is static; set camera.look_at to look at it'),
+        ('focus = "pike"\nf_stop = 2.8', 'no rigid body is named "pike"; rigid bodies are duck, rock'),
+        ('look_at = "flag"', 'camera.look_at: "flag" is no rigid body; its shape changes, so it has no one place'),
     ],
 )
 def test_a_camera_follows_only_bodies_that_move(tmp_path, camera, complaint):
     with pytest.raises(JobFileError) as refused:
-        checked(f"{DUCK}[camera]\n{camera}\n", tmp_path / "pond.toml")
+        checked(f"{DUCK}{FLAG}[camera]\n{camera}\n", tmp_path / "pond.toml")
     assert complaint in str(refused.value)
+
+
+def test_a_camera_that_looks_at_a_body_that_stands_is_the_same_as_one_that_looks_at_its_place(tmp_path):
+    def planned(camera: str) -> tuple[Camera, str]:
+        assert checked(f"{DUCK}[camera]\nf_stop = 2.8\n{camera}\n", tmp_path / "pond.toml").errors == []
+        job = load_job(tmp_path / "pond.toml")
+        digest = RenderStage().plan(job, JobLayout(tmp_path))[0].parameters.digest
+        return render_spec(job, JobLayout(tmp_path)).camera, digest
+
+    for keys in ("look_at = {}", "look_at = [0.0, 0.0, 0.3]\nfocus = {}"):
+        by_name, by_place = (planned(keys.format(rock)) for rock in ('"rock"', "[0.4, 0.0, 0.5]"))
+        assert by_name == by_place
+        assert by_name[0].views is None, "it does not move"
+    view = planned('look_at = [0.0, 0.0, 0.3]\nfocus = "rock"')[0]
+    forward = np.subtract(view.look_at, view.position)
+    distance = np.subtract((0.4, 0.0, 0.5), view.position) @ forward / np.linalg.norm(forward)
+    assert view.focus_distance == pytest.approx(distance)
 
 
 def test_a_camera_that_follows_a_body_is_fine(tmp_path):

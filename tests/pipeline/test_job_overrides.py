@@ -77,6 +77,38 @@ def test_saved_text_holds_the_overrides_keeps_comments_and_gives_the_same_job(tm
     assert loaded(tmp_path, text=changed.text).job == changed.job
 
 
+LED = """
+[camera]
+f_stop = 2.8
+easing = "linear"
+[[camera.keyframe]]
+time_s = 0.0
+position = [0.0, -2.0, 1.0]
+[[camera.keyframe]]
+time_s = 1.0
+position = [2.0, -2.0, 1.0]
+[[light]]
+position = [1.0, 1.0, 1.0]
+[stage]
+name = "night"
+"""
+
+
+def test_a_list_of_tables_is_replaced_by_another_or_by_none(tmp_path):
+    changes = ("camera.keyframe=[{time_s = 0.5, position = [0, -3, 1]}]", "light=[]", "camera.f_stop=4.0")
+    changed = loaded(tmp_path, *changes, text=TEXT + LED)
+    assert [key.time_s for key in changed.job.camera.keyframe] == [0.5]
+    assert (changed.job.light, changed.job.camera.f_stop, changed.job.stage.name) == ((), 4.0, "night")
+    assert loaded(tmp_path, text=changed.text).job == changed.job
+    assert len(loaded(tmp_path, "light=[{position = [0, 0, 1]}, {position = [1, 0, 1]}]").job.light) == 2
+
+
+def test_an_element_that_a_new_list_does_not_have_is_told(tmp_path):
+    with pytest.raises(JobFileError) as error:
+        loaded(tmp_path, "camera.keyframe=[]", "camera.keyframe.1.time_s=2", text=TEXT + LED)
+    assert error.value.problems == ["--set: camera.keyframe[1].time_s is not there once the list is set"]
+
+
 def test_later_override_wins(tmp_path):
     assert loaded(tmp_path, "fps=24", "fps=25").job.fps == 25
 
@@ -98,6 +130,11 @@ def test_later_override_wins(tmp_path):
             "rigid.ball=3",
             "--set rigid.ball=3: rigid[0] is a table; set its keys: shape, position, rotation_deg, scale, name, kind, "
             "density, ballast, velocity, angular_velocity, friction, restitution, keyframe, interpolation",
+        ),
+        (
+            "camera.keyframe=3",
+            "--set camera.keyframe=3: camera.keyframe is a list of tables; give all of it, such as [{...}], with the "
+            "keys time_s, position, look_at, focal_length_mm, or set a key of one",
         ),
         ("rigid.ball.shape.radius=-1", "--set rigid[0].shape.radius: must be > 0 m, got -1"),
         ("fps=fast", '--set fps: expected a whole number, got the text "fast"'),

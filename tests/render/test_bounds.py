@@ -217,8 +217,9 @@ def test_without_a_box_the_domain_is_framed():
     assert action.first() == domain.first()
 
 
-def test_framing_the_action_beside_a_place_is_refused():
-    for place in ({"position": (0, -2, 1)}, {"keyframe": ({"time_s": 0, "position": (0, -2, 1)},)}):
+def test_framing_the_action_beside_what_says_where_the_camera_is_or_looks_is_refused():
+    places = ({"position": (0, -2, 1)}, {"keyframe": ({"time_s": 0, "position": (0, -2, 1)},)})
+    for place in (*places, {"follow": "duck"}, {"look_at": "duck"}, {"look_at": (0, 0, 1)}):
         with pytest.raises(ValidationError, match='framing = "action" has no meaning beside'):
             CameraParameters.model_validate({"framing": "action", **place})
         assert not CameraParameters.model_validate({"framing": "domain", **place}).frames_action

@@ -46,6 +46,31 @@ def test_a_still_is_drawn_beside_the_jobs_frames_and_touches_nothing_else(job):
 
 
 @needs_bpy
+def test_a_still_is_seen_from_elsewhere_where_keyframes_lead_the_films_camera(tmp_path):
+    led = """
+[camera]
+easing = "linear"
+[[camera.keyframe]]
+time_s = 0.0
+position = [0.0, -2.0, 0.5]
+[[camera.keyframe]]
+time_s = 1.0
+position = [1.0, -2.0, 0.5]
+"""
+    pictures = []
+    for name, camera in (("led", led), ("standing", "[camera]\nposition = [1.0, -2.0, 0.5]\n")):
+        (tmp_path / name).mkdir()
+        job = half_simulated_job(tmp_path / name, camera)
+        arguments = ("--set", "camera.position=[0, -3, 1]", "--set", "render.samples=1")
+        result = pipeline("still", job.root, "--frame", 1, "--quality", "draft", *arguments)
+        render_drawing.close_renderers()
+        assert result.exit_code == 0, result.output
+        (drawn,) = job.stills.iterdir()
+        pictures.append(drawn.read_bytes())
+    assert pictures[0] == pictures[1]
+
+
+@needs_bpy
 def test_a_still_goes_where_it_is_wanted_and_replaces_what_is_there(job, tmp_path):
     target = tmp_path / "pictures" / "poster.png"
     target.parent.mkdir()
