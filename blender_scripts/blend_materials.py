@@ -4,8 +4,9 @@
 
 writes the names to standard output as a line `MATERIALS ["...", ...]`, among the lines that Blender itself writes, or a
 line `MATERIALS_FAILED reason`; so does `python blend_materials.py FILE` with the bpy module. Those that are named are
-also tried, if they are there, and before that line comes one of the pictures in them, each once, as
-`TEXTURES [{"width": 4096, "height": 4096, "float": false}, ...]`.
+also tried, if they are there, and before that line come one of the pictures in them, each once, as
+`TEXTURES [{"width": 4096, "height": 4096, "float": false}, ...]`, and one of the materials whose pictures lie by the
+texture coordinates of a mesh, `PICTURES_BY_UV ["..."]`.
 """
 
 from __future__ import annotations
@@ -81,6 +82,17 @@ def textures(materials: Iterable[Any]) -> list[dict[str, Any]]:
     return [{"width": each.size[0], "height": each.size[1], "float": each.is_float} for each in images.values()]
 
 
+def has_pictures_by_uv(material: Any) -> bool:
+    """Whether a picture in it lies by a UV map of its mesh, as one does that nothing else is linked to."""
+    nodes = [node for tree in _trees(material.node_tree) for node in tree.nodes]
+    asks = any(
+        node.bl_idname == "ShaderNodeUVMap" or (node.bl_idname == "ShaderNodeTexCoord" and node.outputs["UV"].is_linked)
+        for node in nodes
+    )
+    pictures = [node for node in nodes if node.bl_idname == "ShaderNodeTexImage" and node.image is not None]
+    return any(asks or not node.inputs["Vector"].is_linked for node in pictures)
+
+
 def _trees(tree: Any) -> Iterator[Any]:
     """A node tree, and those of the groups in it."""
     if tree is None:
@@ -113,6 +125,7 @@ def main(arguments: list[str]) -> int:
         names = material_names(path)
         tried = [append_material(path, name) for name in wanted if name in names]
         sys.stdout.write(f"TEXTURES {json.dumps(textures(tried))}\n")
+        sys.stdout.write(f"PICTURES_BY_UV {json.dumps([each.name for each in tried if has_pictures_by_uv(each)])}\n")
         sys.stdout.write(f"MATERIALS {json.dumps(names)}\n")
     except RenderInputError as error:
         sys.stdout.write(f"MATERIALS_FAILED {str(error).replace(chr(10), ' ')}\n")

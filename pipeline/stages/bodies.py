@@ -9,6 +9,8 @@ from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import by_content, tool_version
 from pipeline.task import Task, TaskId
+from sim.rigid.parameters import RigidBodyParameters
+from sim.shapes.parameters import MeshShape
 
 
 class BodiesStage:
@@ -31,6 +33,7 @@ class BodiesStage:
                     tools={name: tool_version(name) for name in ("libigl", "trimesh")},
                     shape=by_content(body).shape,
                     scale=body.scale,
+                    **({"textured": True} if _is_textured(job, body) else {}),
                 ),
                 subject=body.name,
             )
@@ -45,11 +48,22 @@ class BodiesStage:
         """Mesh one body."""
         from render.meshes import validate_ply, write_ply
         from sim.rigid.static import StaticBody
+        from sim.shapes.solid import TriangleMesh
+        from sim.shapes.texture_coordinates import texture_coordinates
 
         parameters = next(body for body in context.job.rigid if body.name == context.task.subject)
         mesh = StaticBody(parameters).rest_mesh()
+        shape, uv = parameters.shape, None
+        if isinstance(shape, MeshShape) and _is_textured(context.job, parameters):
+            at_own_size = TriangleMesh(mesh.vertices / parameters.scale, mesh.faces)
+            uv = texture_coordinates(at_own_size, shape)
         for part, output in zip(parts_of(parameters.shape.type), context.task.outputs, strict=True):
             piece = mesh.piece(part)
             with context.committing(output, validate_ply) as path:
-                write_ply(path, piece.vertices, piece.faces)
+                write_ply(path, piece.vertices, piece.faces, corner_uv=uv)
         context.progress(1, 1)
+
+
+def _is_textured(job: Job, body: RigidBodyParameters) -> bool:
+    """Whether its file's texture coordinates are kept: a material of a .blend file may hang pictures on them."""
+    return isinstance(body.shape, MeshShape) and job.material_of(body.name).blend is not None

@@ -17,6 +17,7 @@ from pipeline.layout import JobLayout
 from pipeline.own_pictures import own_picture_bytes
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
+from pipeline.stages.flat_pictures import warn_of_flat_pictures
 from pipeline.stages.inputs import blender_version, content_name
 from pipeline.stages.render_drawing import CPU, close_renderers, draw_until_good, may_be_empty, warm_renderer
 from pipeline.stages.render_scene import render_spec, write_motion
@@ -127,6 +128,7 @@ class RenderStage:
         poses, view = write_motion(job, layout, task.frame, attempt=context.attempt)
         bodies = list(bodies_at(job, layout, task.frame, poses))
         warn_of_sight(context, view, bodies)
+        warn_of_flat_pictures(context)
 
         def validate(path: Path) -> None:
             validate_picture(path, job.render.resolution, may_be_empty=may_be_empty(job))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,50 @@ def read_upright_triangles(shape: MeshShape) -> tuple[Points, NDArray[np.int64]]
         ShapeError: the file is missing, of an unknown kind, or unreadable.
     """
     vertices, faces = read_triangles(Path(shape.file))
+    return _upright(vertices, faces, shape), faces
+
+
+def read_texture_coordinates(shape: MeshShape) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Corners of a file's triangles [m], (m, 3, 3), upright and centred as above, and their coordinates on pictures.
+
+    Returns:
+        The corners and, from a picture's lower left corner (0, 0) to its upper right (1, 1), their places (m, 3, 2);
+        None if the file has none. A part of the file without them has 0.
+
+    Raises:
+        ShapeError: as of `read_triangles`.
+    """
+    path = Path(shape.file)
+    vertices, faces = read_triangles(path)
+    if not len(faces):
+        return None
+    content = path.read_bytes()
+    if path.suffix.lower() == ".obj":
+        uv = read_obj(_obj_text(content))[2]
+        corners = _upright(vertices, faces, shape)[faces]
+        return None if uv is None else (corners, uv)
+    pieces = _load(content, path.suffix.lower().removeprefix(".")).dump()
+    uvs = [_uv_of(piece) for piece in pieces]
+    if all(uv is None for uv in uvs):
+        return None
+    corners = np.concatenate([np.asarray(piece.triangles, dtype=np.float64) for piece in pieces])
+    corners = _upright(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), shape).reshape(-1, 3, 3)
+    filled = [
+        np.zeros((len(piece.faces), 3, 2)) if uv is None else uv[piece.faces]
+        for piece, uv in zip(pieces, uvs, strict=True)
+    ]
+    return corners, np.concatenate(filled)
+
+
+def _uv_of(piece: Any) -> NDArray[np.float64] | None:
+    """Texture coordinates of a mesh's vertices (n, 2), or None."""
+    uv = getattr(piece.visual, "uv", None)
+    fits = uv is not None and np.shape(uv) == (len(piece.vertices), 2) and np.isfinite(uv).all()
+    return np.asarray(uv, dtype=np.float64) if fits else None
+
+
+def _upright(vertices: Points, faces: NDArray[np.int64], shape: MeshShape) -> Points:
+    """The vertices upright, the bounding box of those that faces use centred, scaled to `size` [m]."""
     if shape.up == "y":
         vertices = vertices @ _Y_UP_TO_Z_UP.T
     used = vertices[np.unique(faces)] if len(faces) else vertices
@@ -45,7 +90,7 @@ def read_upright_triangles(shape: MeshShape) -> tuple[Points, NDArray[np.int64]]
         extent = float((upper - lower).max())
         scale = shape.size / extent if shape.size is not None and extent > 0.0 else 1.0
         vertices = scale * (vertices - 0.5 * (lower + upper))
-    return vertices, faces
+    return vertices
 
 
 def read_triangles(path: Path) -> tuple[Points, NDArray[np.int64]]:
@@ -73,11 +118,18 @@ def read_triangles(path: Path) -> tuple[Points, NDArray[np.int64]]:
 
 def _read_kind(content: bytes, kind: str) -> tuple[Points, NDArray[np.int64]]:
     if kind == "obj":
-        return read_obj(content.decode("utf-8-sig", errors="replace"))
+        return read_obj(_obj_text(content))[:2]
+    # Texture coordinates of a PLY would split its vertices.
+    mesh = _load(content, kind, **({"fix_texture": False} if kind == "ply" else {})).to_mesh()
+    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+
+
+def _obj_text(content: bytes) -> str:
+    return content.decode("utf-8-sig", errors="replace")
+
+
+def _load(content: bytes, kind: str, **options: Any) -> Any:
+    """The scene in the bytes alone: given the path, trimesh would follow references to files beside it."""
     import trimesh
 
-    # Of the bytes alone: given the path, trimesh would follow references to files beside it.
-    # Texture coordinates of a PLY would split its vertices.
-    options = {"fix_texture": False} if kind == "ply" else {}
-    mesh = trimesh.load_scene(BytesIO(content), file_type=kind, process=False, **options).to_mesh()
-    return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    return trimesh.load_scene(BytesIO(content), file_type=kind, process=False, **options)

@@ -1,7 +1,8 @@
 """The geometry of Wavefront OBJ files: vertices as the file numbers them, and triangles.
 
-Only `v` and `f` lines are read. A reader that also wants texture coordinates or materials has to split vertices at
-seams, and sorts them by object: their numbers are then no longer those of the file, by which pins name them.
+Only `v`, `vt` and `f` lines are read. Texture coordinates belong to the corners of triangles: a reader that gives them
+to vertices has to split these at seams, and their numbers are then no longer those of the file, by which pins name
+them.
 """
 
 from __future__ import annotations
@@ -17,14 +18,20 @@ ROUND_OFF = 1.0e-2
 """Part of a polygon's area by which a triangle may lie over others: corners on a line, in files of few digits."""
 
 
-def read_obj(text: str) -> tuple[Points, NDArray[np.int64]]:
-    """Vertices (n, 3) in the order of the file, and triangles (m, 3); polygons become fans about their first corner.
+def read_obj(text: str) -> tuple[Points, NDArray[np.int64], NDArray[np.float64] | None]:
+    """Vertices and triangles of a file; polygons become fans about their first corner.
+
+    Returns:
+        Vertices (n, 3) in the order of the file, triangles (m, 3), and texture coordinates of their corners (m, 3, 2),
+        0 where a corner names none that is there; None for a file without any.
 
     Raises:
         ValueError: a line cannot be read, or has a polygon that such a fan does not fill; the message names it.
     """
     vertices: list[tuple[float, float, float]] = []
     triangles: list[tuple[int, int, int]] = []
+    texture: list[tuple[float, float]] = [(0.0, 0.0)]  # numbered from 1, as in the file
+    textured: list[tuple[int, int, int]] = []
     lines: list[int] = []  # of each triangle
     begun = ""
     for number, line in enumerate([*text.splitlines(), ""], start=1):  # the empty one ends what the last one began
@@ -38,18 +45,25 @@ def read_obj(text: str) -> tuple[Points, NDArray[np.int64]]:
             if key == "v":
                 x, y, z = (float(value) for value in values[:3])
                 vertices.append((x, y, z))
+            elif key == "vt":
+                u, v, *_ = (*(float(value) for value in values[:2]), 0.0)  # one alone is a place on a strip
+                texture.append((u, v))
             elif key == "f":
                 corners = [_vertex_number(value, len(vertices)) for value in values]
                 if len(corners) < 3:
                     raise ValueError(f"a face needs three corners or more, got {len(corners)}")
                 triangles.extend((corners[0], after, last) for after, last in pairwise(corners[1:]))
+                places = [_texture_number(value, len(texture)) for value in values]
+                textured.extend((places[0], after, last) for after, last in pairwise(places[1:]))
                 lines.extend([number] * (len(corners) - 2))
         except ValueError as error:
             raise ValueError(f'line {number}, "{whole.strip()[:60]}": {error}') from error
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     faces = np.array(triangles, dtype=np.int64).reshape(-1, 3)
     _refuse_overlaps(points, faces, np.array(lines, dtype=np.int64))
-    return points, faces
+    if len(texture) == 1:
+        return points, faces, None
+    return points, faces, np.array(texture)[np.array(textured, dtype=np.int64).reshape(-1, 3)]
 
 
 def _refuse_overlaps(vertices: Points, triangles: NDArray[np.int64], lines: NDArray[np.int64]) -> None:
@@ -81,3 +95,12 @@ def _vertex_number(corner: str, count: int) -> int:
     if number == 0 or number < -count:
         raise ValueError(f"a face names vertex {number}; {count} are there, numbered from 1")
     return number - 1 if number > 0 else count + number
+
+
+def _texture_number(corner: str, count: int) -> int:
+    """From 1, of the texture coordinates in v/vt or v/vt/vn, of fewer than `count`; 0 where there are none."""
+    _, _, rest = corner.partition("/")
+    word = rest.partition("/")[0]
+    number = int(word) if word else 0
+    number = count + number if number < 0 else number
+    return number if 0 < number < count else 0

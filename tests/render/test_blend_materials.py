@@ -9,21 +9,30 @@ import pytest
 from blender_scenes import RENDER_FRAMES, read, spec_of, sphere, write_mesh
 from blender_stand_in import write_blender_stand_in
 from fresh_python import run_python
+from inline_tasks import run_task
 from needed_blender import needs_bpy
 
+from pipeline.executors.attempt import AttemptContext
+from pipeline.executors.base import Assignment, Finished, TaskEvent, Warned
+from pipeline.job.loading import load_job
 from pipeline.job.models import Job
+from pipeline.layout import JobLayout
+from pipeline.stages.bodies import BodiesStage
+from pipeline.stages.flat_pictures import warn_of_flat_pictures
 from pipeline.stages.render import RenderStage
 from render.blend_file import read_material_names
 from render.blender import script_argv
 from render.errors import InvalidFileError
+from render.meshes import write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshObject
 
 pytestmark = needs_bpy
 
-NAMES = "Driven, Green: bright, Lamp, Pictured, Projected"
+NAMES = "Driven, Green: bright, Halves, Lamp, Pictured, Projected"
 
-# A green one, one whose strength a program of a driver decides, and one with a picture outside of the file.
+# A green one, one whose strength a program of a driver decides, one with a picture outside of the file, and one with a
+# picture in it, red at the left and green at the right.
 WRITE = """
     import sys
     import bpy
@@ -49,6 +58,12 @@ WRITE = """
     picture = tree.nodes.new("ShaderNodeTexImage")
     picture.image = bpy.data.images.new("bricks", 8, 8)
     picture.image.source, picture.image.filepath = "FILE", "//bricks.png"
+    tree, shader = new("Halves", (1.0, 1.0, 1.0))
+    halves = tree.nodes.new("ShaderNodeTexImage")
+    halves.image, halves.interpolation = bpy.data.images.new("halves", 2, 1), "Closest"
+    halves.image.pixels[:] = (0.8, 0.02, 0.02, 1.0, 0.02, 0.8, 0.02, 1.0)
+    halves.image.pack()
+    tree.links.new(halves.outputs[0], shader.inputs["Color"])
     tree, shader = new("Lamp", (1.0, 1.0, 1.0))
     light = tree.nodes.new("ShaderNodeTexIES")
     light.mode, light.filepath = "EXTERNAL", "//lamp.ies"
@@ -58,6 +73,17 @@ WRITE = """
     text.write(f"open({proof!r}, 'w').write('ran')")
     text.use_module = True
     bpy.ops.wm.save_as_mainfile(filepath=file)
+"""
+
+
+JOB = """
+name = "film"
+frames = 2
+[[rigid]]
+name = "ball"
+shape = {{ type = "sphere", radius = 0.1 }}
+[material.ball]
+blend = '{blend}'
 """
 
 
@@ -83,6 +109,40 @@ def test_a_body_takes_the_material_of_a_blend_file(materials, tmp_path):
     red, green, blue = draw(tmp_path, f"{materials}:Green: bright")
     assert green > 1.5 * red
     assert green > 1.5 * blue
+
+
+def test_a_picture_lies_where_the_bodys_texture_coordinates_say(materials, tmp_path):
+    square = np.array([[-0.3, 0.0, 0.2], [0.3, 0.0, 0.2], [0.3, 0.0, 0.8], [-0.3, 0.0, 0.8]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[faces]
+    material = MaterialParameters(blend=f"{materials}:Halves")
+    for name, uv, left in (("upright", places, 0), ("mirrored", places * [-1.0, 1.0] + [1.0, 0.0], 1)):
+        folder = tmp_path / name
+        folder.mkdir()
+        write_ply(folder / "square.ply", square, faces, corner_uv=uv)
+        spec_of(MeshObject(name="square", file="square.ply", material=material)).write(folder / "spec.json")
+        run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
+        picture = read(folder / "0.png")[14:22]
+        sides = [picture[:, columns].mean(axis=(0, 1)) for columns in (slice(26, 30), slice(34, 38))]
+        assert [int(side[:2].argmax()) for side in sides] == [left, 1 - left]
+        assert all(side[:2].max() > 1.5 * side[:2].min() for side in sides)
+
+
+@pytest.mark.parametrize(("name", "flat"), [("Halves", True), ("Green: bright", False)])
+def test_a_picture_on_a_body_without_texture_coordinates_is_told_once(materials, tmp_path, name, flat):
+    layout = JobLayout(tmp_path)
+    layout.job_file.write_text(JOB.format(blend=f"{materials}:{name}"))
+    film = load_job(layout.job_file)
+    (body,) = BodiesStage().plan(film, layout)
+    assert isinstance(run_task(body, layout), Finished)
+    told = []
+    for frame, task in enumerate(RenderStage().plan(film, layout)[:2]):
+        events: list[TaskEvent] = []
+        assignment = Assignment(task, 1, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES")
+        warn_of_flat_pictures(AttemptContext(assignment, events.append, lambda: False))
+        told += [(frame, event.message) for event in events if isinstance(event, Warned)]
+    assert [frame for frame, _ in told] == ([0] if flat else [])
+    assert all('"ball" has no texture coordinates, so pictures in its material "Halves"' in line for _, line in told)
 
 
 def test_no_program_of_the_file_is_run(materials, tmp_path):

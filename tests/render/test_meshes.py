@@ -49,6 +49,30 @@ def test_a_mesh_reads_back_as_written(tmp_path, tetrahedron, with_normals, with_
             np.testing.assert_array_equal(read, written)
 
 
+def test_texture_coordinates_belong_to_corners_of_faces(tmp_path, tetrahedron):
+    vertices, faces = tetrahedron
+    places = np.linspace(0.0, 1.0, 24, dtype=np.float32).reshape(4, 3, 2)
+    path = tmp_path / "mesh.ply"
+    write_ply(path, vertices, faces, corner_uv=places)
+    validate_ply(path)
+    mesh = read_ply(path)
+    assert mesh.corner_uv is not None
+    np.testing.assert_array_equal(mesh.corner_uv, places)
+    np.testing.assert_array_equal(mesh.faces, faces)
+    content = path.read_bytes()
+    elsewhere = trimesh.load(path, process=False)  # splits vertices
+    np.testing.assert_array_equal(elsewhere.triangles, vertices[faces])
+    np.testing.assert_array_equal(elsewhere.visual.uv[elsewhere.faces], places)
+    path.write_bytes(content[:-24] + np.full(6, np.nan, "<f4").tobytes())
+    with pytest.raises(InvalidFileError, match="texture coordinates of face 3 are not finite"):
+        validate_ply(path)
+    path.write_bytes(content[:-25] + b"\x04" + content[-24:])
+    with pytest.raises(InvalidFileError, match="without two texture coordinates for each corner"):
+        validate_ply(path)
+    with pytest.raises(ValueError, match=r"corner_uv must have the shape \(4, 3, 2\)"):
+        write_ply(path, vertices, faces, corner_uv=places[:3])
+
+
 def test_other_software_reads_the_file(file, tetrahedron):
     mesh = trimesh.load(file, process=False)
     np.testing.assert_array_equal(mesh.vertices, tetrahedron[0])
