@@ -72,6 +72,8 @@ def append_material(path: Path, name: str) -> Any:
             raise RenderInputError(f'the material "{name}" of {path} uses "{tree.name}" of another file; make it local')
         for node in tree.nodes:
             _require_nothing_else(path, name, node)
+            if hasattr(node, "uv_map"):
+                node.uv_map = ""  # a mesh has one map at most, by a name that the file does not know
     return material
 
 

@@ -29,10 +29,10 @@ from render.spec import MeshObject
 
 pytestmark = needs_bpy
 
-NAMES = "Driven, Green: bright, Halves, Lamp, Pictured, Projected"
+NAMES = "Driven, Green: bright, Halves, Lamp, Named, Pictured, Projected"
 
-# A green one, one whose strength a program of a driver decides, one with a picture outside of the file, and one with a
-# picture in it, red at the left and green at the right.
+# A green one, one whose strength a program of a driver decides, one with a picture outside of the file, and two with a
+# picture in it, red at the left and green at the right, one of which names the UV map.
 WRITE = """
     import sys
     import bpy
@@ -58,12 +58,17 @@ WRITE = """
     picture = tree.nodes.new("ShaderNodeTexImage")
     picture.image = bpy.data.images.new("bricks", 8, 8)
     picture.image.source, picture.image.filepath = "FILE", "//bricks.png"
-    tree, shader = new("Halves", (1.0, 1.0, 1.0))
-    halves = tree.nodes.new("ShaderNodeTexImage")
-    halves.image, halves.interpolation = bpy.data.images.new("halves", 2, 1), "Closest"
-    halves.image.pixels[:] = (0.8, 0.02, 0.02, 1.0, 0.02, 0.8, 0.02, 1.0)
-    halves.image.pack()
-    tree.links.new(halves.outputs[0], shader.inputs["Color"])
+    for name in ("Halves", "Named"):
+        tree, shader = new(name, (1.0, 1.0, 1.0))
+        halves = tree.nodes.new("ShaderNodeTexImage")
+        halves.image, halves.interpolation = bpy.data.images.new("halves", 2, 1), "Closest"
+        halves.image.pixels[:] = (0.8, 0.02, 0.02, 1.0, 0.02, 0.8, 0.02, 1.0)
+        halves.image.pack()
+        tree.links.new(halves.outputs[0], shader.inputs["Color"])
+        if name == "Named":
+            places = tree.nodes.new("ShaderNodeUVMap")
+            places.uv_map = "of the scan"
+            tree.links.new(places.outputs[0], halves.inputs["Vector"])
     tree, shader = new("Lamp", (1.0, 1.0, 1.0))
     light = tree.nodes.new("ShaderNodeTexIES")
     light.mode, light.filepath = "EXTERNAL", "//lamp.ies"
@@ -115,8 +120,13 @@ def test_a_picture_lies_where_the_bodys_texture_coordinates_say(materials, tmp_p
     square = np.array([[-0.3, 0.0, 0.2], [0.3, 0.0, 0.2], [0.3, 0.0, 0.8], [-0.3, 0.0, 0.8]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     places = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[faces]
-    material = MaterialParameters(blend=f"{materials}:Halves")
-    for name, uv, left in (("upright", places, 0), ("mirrored", places * [-1.0, 1.0] + [1.0, 0.0], 1)):
+    mirrored = places * [-1.0, 1.0] + [1.0, 0.0]
+    for name, inside, uv, left in (
+        ("upright", "Halves", places, 0),
+        ("mirrored", "Halves", mirrored, 1),
+        ("named", "Named", mirrored, 1),
+    ):
+        material = MaterialParameters(blend=f"{materials}:{inside}")
         folder = tmp_path / name
         folder.mkdir()
         write_ply(folder / "square.ply", square, faces, corner_uv=uv)
@@ -128,7 +138,7 @@ def test_a_picture_lies_where_the_bodys_texture_coordinates_say(materials, tmp_p
         assert all(side[:2].max() > 1.5 * side[:2].min() for side in sides)
 
 
-@pytest.mark.parametrize(("name", "flat"), [("Halves", True), ("Green: bright", False)])
+@pytest.mark.parametrize(("name", "flat"), [("Halves", True), ("Named", True), ("Green: bright", False)])
 def test_a_picture_on_a_body_without_texture_coordinates_is_told_once(materials, tmp_path, name, flat):
     layout = JobLayout(tmp_path)
     layout.job_file.write_text(JOB.format(blend=f"{materials}:{name}"))
@@ -142,7 +152,7 @@ def test_a_picture_on_a_body_without_texture_coordinates_is_told_once(materials,
         warn_of_flat_pictures(AttemptContext(assignment, events.append, lambda: False))
         told += [(frame, event.message) for event in events if isinstance(event, Warned)]
     assert [frame for frame, _ in told] == ([0] if flat else [])
-    assert all('"ball" has no texture coordinates, so pictures in its material "Halves"' in line for _, line in told)
+    assert all(f'"ball" has no texture coordinates, so pictures in its material "{name}"' in line for _, line in told)
 
 
 def test_no_program_of_the_file_is_run(materials, tmp_path):
