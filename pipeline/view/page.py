@@ -228,14 +228,16 @@ class ViewPage:
 
     def _tell(self, frame: int | None, settings: Shown, top_speed: float) -> None:
         """Text and plot; viser sends only what differs."""
-        controls, shown, count = self._controls, self._shown, self._job.frame_count
+        controls, shown = self._controls, self._shown
+        # A take that is being recorded has more frames than its job asks for, until it ends.
+        count = max(self._job.frame_count, 1 + max(self.frames, default=0))
         controls.title.content = title(self._job.name, shown, frame, done=len(self.frames), count=count)
         remarks = [*thinned(shown), *lacking(shown)] if shown is not None else []
         controls.notice.content = notice(self._troubles(frame, settings), remarks)
         controls.legend.content = self._legend(settings.color_by, top_speed)
         controls.play.label = "Pause" if self.playback.plays else "Play"
         chosen = controls.chosen_numbers()
-        panel = (frame, chosen, self._series.version)
+        panel = (frame, chosen, self._series.version, count)
         if panel != self._panel:
             self._panel = panel
             values = self._series.of(*chosen) if chosen is not None else ([], [])

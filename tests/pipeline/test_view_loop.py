@@ -89,6 +89,17 @@ def test_a_job_file_that_cannot_be_used_is_a_line_and_frames_stay(server, layout
     assert "/fluids/water" in page.things
 
 
+def test_a_take_that_is_being_recorded_has_all_frames_that_are_there(server, layout):
+    layout.job_file.write_text(layout.job_file.read_text().replace("frames = 10", "frames = 1"))
+    page = page_of(server, layout)
+    assert ">6 of 6 frames simulated<" in page._controls.title.content
+    assert 'text-anchor="end" opacity=".7">5</text>' in page._controls.plot.content  # where the axis ends
+    layout.job_file.write_text(layout.job_file.read_text().replace("frames = 1", "frames = 10"))
+    page.turn(10.0)
+    assert ">6 of 10 frames simulated<" in page._controls.title.content
+    assert 'text-anchor="end" opacity=".7">9</text>' in page._controls.plot.content
+
+
 def test_a_folder_that_is_removed_leaves_a_page(server, layout):
     page = page_of(server, layout)
     shutil.rmtree(layout.root)
