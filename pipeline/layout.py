@@ -22,6 +22,11 @@ class JobLayout:
         return self.root / "job.toml"
 
     @property
+    def take_story(self) -> Path:
+        """What a take of `pipeline live` is, beside its job file; written at its end."""
+        return self.root / "take.json"
+
+    @property
     def manifest(self) -> Path:
         """The record of every task."""
         return self.root / "manifest.db"

@@ -65,6 +65,10 @@ class PageQueries(ABC):
         )
         return int(rows[0][0]), int(rows[0][1])
 
+    def is_empty(self) -> bool:
+        """Whether there is no artifact on record."""
+        return not self._rows("SELECT 1 FROM artifact LIMIT 1")
+
     def frame_count(self) -> int:
         """How many frames the planned tasks are about."""
         return int(self._rows("SELECT coalesce(max(frame) + 1, 0) FROM task WHERE position IS NOT NULL")[0][0])

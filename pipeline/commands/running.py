@@ -232,15 +232,17 @@ def run(
             raise click.UsageError("--cores is for this machine; on a cluster the workers' tags say what they offer")
         require_named_devices(job, todo)
     _make_folder(layout)
-    job_text = None
-    if submitted is not None:
-        job, job_text = _keep(submitted, layout)
     from pipeline.commands.turns import run_now, stand_in_queue
     from pipeline.lease import live_holder, refuse_if_held
     from pipeline.spool import Spool, checked_name, submission
 
     spool = Spool.of(layout)
     name = checked_name(layout.root.absolute().name)
+    if job.recorded is not None and spool.find(name) is None:
+        refuse_if_held(layout.lease)  # by who records it: only the end of a take writes how many frames it has
+    job_text = None
+    if submitted is not None:
+        job, job_text = _keep(submitted, layout)
     entry = submission(
         name,
         text=job_text,

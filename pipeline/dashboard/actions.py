@@ -47,6 +47,8 @@ def actions_of(card: JobCard, *, has_runner: bool) -> tuple[Action, ...]:
     state, queued = card.state, card.entry is not None
     turn = "It goes on when its turn comes." if has_runner else "Nobody runs the queue: a runner starts for it."
     resume = Action("resume", "Resume", turn)
+    if state in (JobState.RECORDED, JobState.NOT_STARTED):
+        resume = Action("resume", "Start", turn.replace("goes on", "begins"))
     retry = Action("retry", "Retry", f"The failed tasks are tried again. {turn}")
     pause = Action(
         "pause",
@@ -72,7 +74,7 @@ def actions_of(card: JobCard, *, has_runner: bool) -> tuple[Action, ...]:
             return (resume, cancel)
         case JobState.FAILED if queued:
             return (retry, cancel)
-        case JobState.FAILED | JobState.INTERRUPTED | JobState.STOPPED:
+        case JobState.FAILED | JobState.INTERRUPTED | JobState.STOPPED | JobState.RECORDED | JobState.NOT_STARTED:
             return (resume,)
         case _:
             return (cancel,) if queued else ()

@@ -256,6 +256,7 @@ def _grouped(jobs: list[JobCard]) -> list[tuple[str, list[JobCard]]]:
         "Running": (JobState.RUNNING, JobState.PAUSING),
         "Waiting": (JobState.QUEUED,),
         "Need attention": (JobState.FAILED, JobState.PAUSED, JobState.INTERRUPTED, JobState.UNKNOWN),
+        "Not started": (JobState.RECORDED, JobState.NOT_STARTED),
         "Stopped": (JobState.STOPPED,),
         "Done": (JobState.DONE,),
     }

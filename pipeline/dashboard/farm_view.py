@@ -46,6 +46,10 @@ class JobState(StrEnum):
     """Its last run neither ended nor goes on: it was killed."""
     STOPPED = "stopped"
     """It was cancelled, or stopped otherwise, and is not in the queue."""
+    RECORDED = "recorded"
+    """A take: its frames are there, and nothing has been asked to make a film of them."""
+    NOT_STARTED = "not started"
+    """It has never run, and nothing is there of it."""
     DONE = "done"
     UNKNOWN = "unknown"
     """Its record cannot be read."""
@@ -65,6 +69,7 @@ class Record:
     Attributes:
         stages: its stages.
         last_run: how it ended.
+        is_empty: whether nothing is there that was made.
         running: attempts that are not closed.
         picture: the newest frame; None before there is one.
         pictures: how many frames there are.
@@ -73,6 +78,7 @@ class Record:
 
     stages: tuple[StageRow, ...] = ()
     last_run: LastRun = _NO_RUN
+    is_empty: bool = True
     running: tuple[AttemptRow, ...] = ()
     picture: Picture | None = None
     pictures: int = 0
@@ -255,10 +261,19 @@ class FarmView:
             state = JobState.RUNNING
         elif flaw:
             state = JobState.UNKNOWN
+        elif record.last_run.run is None:
+            state = self._state_without_run(name, layout, record)
         else:
             state = _state_of_outcome(record.last_run.outcome)
         changed = max(submitted, remembered.version.changed_ns / 1e9)
         return JobCard(name, state, entry, holder, record, flaw, changed)
+
+    def _state_without_run(self, name: str, layout: JobLayout, record: Record) -> JobState:
+        """Where a job stands whose record tells of no run: one that a lost record was made anew of had some."""
+        with suppress(NotThereError):
+            self.places.file(name, layout.take_story.name)
+            return JobState.RECORDED
+        return JobState.NOT_STARTED if record.is_empty else JobState.INTERRUPTED
 
     def _record(self, name: str, layout: JobLayout, *, runs: bool) -> _Remembered:
         now = time.time()
@@ -304,6 +319,7 @@ def read_record(manifest: ManifestReader, *, runs: bool) -> Record:
     return Record(
         stages=rows,
         last_run=manifest.last_run(),
+        is_empty=manifest.is_empty(),
         running=running,
         picture=None if picture is None else picture_of(*picture),
         pictures=pictures,

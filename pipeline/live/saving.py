@@ -11,13 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple
 from pipeline.files import sync
 from pipeline.job.loading import changed_text, job_of_text
 from pipeline.job.overrides import Override, without_key
+from pipeline.layout import JobLayout
 from pipeline.live.knobs import Value, knobs_of, overrides_of
 
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
-
-TAKE_STORY = "take.json"
-"""Beside a take's job file: what the take is."""
 
 
 class Saved(NamedTuple):
@@ -78,7 +76,8 @@ def save_job(loaded: LoadedJob, values: Mapping[str, Value], folder: Path) -> Sa
         except BaseException:
             path.unlink()
             raise
-        note = f"; {TAKE_STORY} is not there, so bodies that rested before the take may be kinematic in it"
+        story = JobLayout(loaded.path.parent).take_story.name
+        note = f"; {story} is not there, so bodies that rested before the take may be kinematic in it"
         return Saved(path, note if led is None and loaded.job.rigid else "")
     raise AssertionError("numbers do not end")
 
@@ -88,7 +87,7 @@ def bodies_led_before(loaded: LoadedJob) -> list[str] | None:
     if loaded.job.recorded is None:
         return []
     try:
-        story = json.loads((loaded.path.parent / TAKE_STORY).read_text(encoding="utf-8"))
+        story = json.loads(JobLayout(loaded.path.parent).take_story.read_text(encoding="utf-8"))
         led = story["led"] if story["take"] == loaded.job.recorded else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -11,6 +11,7 @@ import shlex
 import sqlite3
 import uuid
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,10 +26,11 @@ from pipeline.job.loading import job_of_text
 from pipeline.job.overrides import Override
 from pipeline.layout import JobLayout
 from pipeline.lease import Lease
-from pipeline.live.saving import TAKE_STORY, bodies_led_before, numbered_paths, text_with_values
+from pipeline.live.saving import bodies_led_before, numbered_paths, text_with_values
 from pipeline.live.session import Session
+from pipeline.manifest import Manifest
 from pipeline.provenance import maker
-from pipeline.reconcile import rebuild_manifest
+from pipeline.reconcile import reconcile
 from pipeline.stages.ordered_writer import OrderedWriter
 from pipeline.stages.simulate import SimulateStage
 from sim.world import FrameReport
@@ -106,7 +108,7 @@ class Recorder:
 
 
 class _Take:
-    """One take on its way to the disk.
+    """One take on its way to the disk. It holds its folder's lease: nobody runs a job whose frames are still to come.
 
     Attributes:
         layout: its folder.
@@ -119,16 +121,25 @@ class _Take:
         self.layout = JobLayout(_new_folder(output, f"{loaded.job.name}-take"))
         self.frames = self._handed_in = 0
         self._values = {"first": dict(session.values)}
-        self._write_job(frames=1)
-        job = job_of_text(self._text(frames=1), self.layout.job_file)
-        self._dt = 1.0 / job.fps
-        (self._task,) = SimulateStage().plan(job, self.layout)
-        self._fingerprint = task_fingerprint(self._task, {})
-        self._writer = OrderedWriter()
-        self._writer.__enter__()
+        with ExitStack() as held:
+            self._lease = held.enter_context(Lease.acquire(self.layout.lease))
+            self._write_job(frames=1)
+            Manifest(self.layout.manifest).close()  # without a record, commands take the folder for none of a job's
+            job = job_of_text(self._text(frames=1), self.layout.job_file)
+            self._dt = 1.0 / job.fps
+            (self._task,) = SimulateStage().plan(job, self.layout)
+            self._fingerprint = task_fingerprint(self._task, {})
+            self._writer = OrderedWriter()
+            self._writer.__enter__()
+            self._held = held.pop_all()
 
     def add(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
-        """Have a frame written; waits while another one waits."""
+        """Have a frame written; waits while another one waits.
+
+        Raises:
+            LeaseLostError: the folder is another process's now.
+        """
+        self._lease.check()
         mine = replace(report, frame=self._handed_in, time_s=self._handed_in * self._dt)
         self._writer.submit(partial(self._commit, mine, bodies))
         self._handed_in += 1
@@ -139,12 +150,14 @@ class _Take:
         Raises:
             OSError, PipelineError, RuntimeError, sqlite3.Error: something of it could not be written.
         """
-        try:
-            self._writer.__exit__(None, None, None)
-        finally:
-            self._write_what_it_is()
+        with self._held:
+            try:
+                self._writer.__exit__(None, None, None)
+            finally:
+                self._write_what_it_is()
 
     def _write_what_it_is(self) -> None:
+        self._lease.check()
         self._write_job(frames=max(1, self.frames))  # no job has none
         story = {
             "take": self._name,
@@ -156,9 +169,9 @@ class _Take:
             "led": self._led(),
             "note": "Steered by hand: no job file makes these frames again.",
         }
-        replace_durably(self.layout.root / TAKE_STORY, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
-        with Lease.acquire(self.layout.lease):
-            rebuild_manifest(self.layout)  # without a record, commands take the folder for none of a job's
+        replace_durably(self.layout.take_story, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
+        with Manifest(self.layout.manifest) as manifest:
+            reconcile(manifest, self.layout, clean=False)
 
     def _led(self) -> list[str]:
         """Bodies that the job has at rest, and that could be led here."""

@@ -13,14 +13,21 @@ from live_jobs import BALL_OVER_SHEET, loaded
 
 from pipeline.cache import read_frame
 from pipeline.cli import main
+from pipeline.dashboard.actions import actions_of
+from pipeline.dashboard.farm_view import FarmView
+from pipeline.dashboard.places import Places
+from pipeline.errors import JobBusyError, LeaseLostError
 from pipeline.job.checks import load_checked_job
 from pipeline.job.loading import load_job, read_job
 from pipeline.layout import JobLayout
+from pipeline.lease import Lease
 from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job
 from pipeline.live.session import Session
 from pipeline.live.take import Recorder
+from pipeline.queue_changes import continuation
 from pipeline.resources import machine_capacity
+from pipeline.spool import Spool
 from pipeline.stage_run import run_stage
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -113,6 +120,57 @@ def take_of(folder, frames: int = 3, text: str = BALL_OVER_SHEET) -> tuple[Sessi
         session.advance()
     recorder.toggle()
     return session, recorder, JobLayout(folder / "elsewhere" / "drape-take")
+
+
+def test_nobody_runs_a_take_while_it_is_recorded_and_then_it_waits_to_be_started(tmp_path):
+    read = loaded(tmp_path)
+    session = Session(live_job(read.job))
+    recorder = Recorder(read, session, tmp_path / "farm", device="cpu")
+    recorder.toggle()
+    session.advance()
+    spool = Spool(tmp_path / "farm")
+    view = FarmView(Places(spool.farm), spool)
+
+    def card() -> tuple[str, list[str]]:
+        view.kept.forget()
+        (found,) = view.glance().jobs
+        return found.state, [action.label for action in actions_of(found, has_runner=False)]
+
+    layout = spool.layout("drape-take")
+    assert card() == ("running", [])
+    for command in (
+        ["submit", str(layout.job_file)],
+        ["resume", str(layout.root)],
+        ["clean", str(layout.root), "--all"],
+    ):
+        refused = CliRunner().invoke(main, command)
+        assert refused.exit_code != 0, command
+        assert "is being run already, by process" in refused.output
+    with pytest.raises(JobBusyError):
+        continuation(spool, "drape-take")
+    assert spool.find("drape-take") is None
+    recorder.stop()
+    assert card() == ("recorded", ["Start"])
+    assert continuation(spool, "drape-take").name == "drape-take"
+
+
+def test_a_take_whose_folder_another_process_has_taken_over_writes_nothing_more(tmp_path, monkeypatch):
+    read = loaded(tmp_path)
+    session = Session(live_job(read.job))
+    recorder = Recorder(read, session, tmp_path, device="cpu")
+    recorder.toggle()
+    session.advance()
+
+    def lost(_lease: Lease) -> None:
+        raise LeaseLostError("drape-take was taken over")
+
+    monkeypatch.setattr(Lease, "check", lost)
+    session.advance()
+    assert not recorder.is_recording
+    assert "the take ends early: drape-take was taken over" in session.message
+    folder = tmp_path / "drape-take"
+    assert load_job(folder / "job.toml").frame_count == 1
+    assert not (folder / "take.json").exists()
 
 
 def test_a_take_that_cannot_be_written_on_keeps_the_frames_that_were(tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ import time
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import psutil
 import pytest
@@ -20,9 +21,9 @@ from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 
 from pipeline.dashboard.access import Access, access_of, host_of
-from pipeline.dashboard.actions import Queue
+from pipeline.dashboard.actions import Queue, actions_of
 from pipeline.dashboard.estimates import LongTask, remaining, stage_rows
-from pipeline.dashboard.farm_view import Kept, read_record
+from pipeline.dashboard.farm_view import SETTLED_S, FarmView, JobState, Kept, read_record
 from pipeline.dashboard.machine import Machine
 from pipeline.dashboard.places import NotThereError, Places
 from pipeline.dashboard.serving import config_of, listen, remark_of
@@ -34,6 +35,7 @@ from pipeline.manifest import Manifest
 from pipeline.manifest_glance import glance
 from pipeline.manifest_pages import StagePace
 from pipeline.manifest_reader import ManifestReader, StageSummary
+from pipeline.reconcile import rebuild_manifest
 from pipeline.spool import Spool
 from pipeline.task import FailureKind, TaskId, TaskState
 
@@ -141,6 +143,54 @@ def test_a_stage_s_pace_is_that_of_its_attempts_and_its_work_that_of_a_span(layo
         [pace] = manifest.stage_paces(100.0, 112.0).values()
     assert pace.mean_seconds == 3.0
     assert (pace.busy_s, pace.busy_since) == (10.0 + 5.0 + 4.0, 100.0)
+
+
+def test_an_unchanged_farm_costs_no_reading_of_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.dashboard import farm_view
+
+    for name in ("one", "two", "three"):
+        frame_job(JobLayout(tmp_path / name), 3)
+    read: list[str] = []
+
+    def counting(path: Path, query: Any) -> Any:
+        read.append(path.parent.name)
+        return glance(path, query)
+
+    monkeypatch.setattr(farm_view, "glance", counting)
+    view = FarmView(Places(tmp_path), Spool(tmp_path))
+
+    def looks(count: int) -> list[str]:
+        read.clear()
+        for _ in range(count):
+            view.kept.forget()
+            view.glance()
+        return sorted(read)
+
+    now = (
+        time.time() + 2.0 * SETTLED_S
+    )  # what was just written may change again within a tick of the file system's clock
+    monkeypatch.setattr(farm_view.time, "time", lambda: now)
+    assert looks(1) == ["one", "three", "two"]
+    assert looks(20) == []
+    with Manifest(JobLayout(tmp_path / "two").manifest) as manifest:
+        manifest.log_event("test", "something")
+    assert looks(1) == ["two"]
+
+
+def test_a_job_that_never_ran_has_not_started_and_one_with_a_lost_record_was_interrupted(tmp_path: Path) -> None:
+    (tmp_path / "new").mkdir()
+    Manifest(JobLayout(tmp_path / "new").manifest).close()
+    film = JobLayout(tmp_path / "film")
+    tasks = frame_job(film, 3)
+    with Manifest(film.manifest) as manifest:
+        draw_frame(film, manifest, tasks[0])
+    rebuild_manifest(film)
+    view = FarmView(Places(tmp_path), Spool(tmp_path))
+    assert {card.name: card.state for card in view.glance().jobs} == {
+        "new": JobState.NOT_STARTED,
+        "film": JobState.INTERRUPTED,
+    }
+    assert [action.label for action in actions_of(view.job("new"), has_runner=False)] == ["Start"]
 
 
 # --- estimates ---
