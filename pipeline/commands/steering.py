@@ -70,9 +70,9 @@ def live(
     threads, on_gpu = cores or machine_capacity().cores, resolve_device(job.device) != "cpu"
     if not as_written and substeps is None:
         job = fluent(job, power=computing_power(cores=threads, on_gpu=on_gpu))
+    loaded, findings = load_checked_job(job_file, overrides, preview=preview)
     if not anyway:
-        require_small(job, cores=threads, on_gpu=on_gpu)
-    loaded, _ = load_checked_job(job_file, overrides, preview=preview)
+        require_small(job, findings.particles, cores=threads, on_gpu=on_gpu)
     print_warnings(loaded.warnings)
     if pace := told_pace(loaded.job, {knob.name: knob.start for knob in knobs_of(job)}):
         click.echo(pace)

@@ -47,7 +47,7 @@ def check_time_steps(job: Job, solids: Mapping[KeyPath, Solid], findings: Findin
         if fluid.dt == "adaptive":
             continue
         speed = expected_speed(job, solids)
-        stable, bearing = _stable_dt(job, fluid, speed), _dt_bearing_impacts(fluid, speed)
+        stable, bearing = stable_dt(job, fluid, speed), _dt_bearing_impacts(fluid, speed)
         if fluid.dt > stable:
             findings.warn(
                 ("fluid", index, "dt"),
@@ -88,8 +88,8 @@ def _body_speed(body: RigidBodyParameters, solid: Solid, fall: float) -> float:
     return math.sqrt(fall + math.hypot(*body.velocity) ** 2) + math.hypot(*body.angular_velocity) * reach
 
 
-def _stable_dt(job: Job, fluid: FluidParameters, speed: float) -> float:
-    """The limits by signals, cfl k d / (c_s + v), and by gravity [s]."""
+def stable_dt(job: Job, fluid: FluidParameters, speed: float) -> float:
+    """Largest step [s] at a largest speed [m/s], by signals, cfl k d / (c_s + v), and by gravity."""
     spacing, gravity = 2.0 * fluid.particle_radius, math.hypot(*job.gravity)
     sound = _speed_of_sound(fluid, speed)
     way = fluid.cfl * WAY_IN_SPACINGS[fluid.solver] * spacing

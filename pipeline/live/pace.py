@@ -29,6 +29,9 @@ APART_SHARE = 0.4
 FLUENT_FRAME_S = 1.0 / 30.0
 """What a frame of the scene may take for hands and eyes to go along [s]."""
 
+FLUENT_SLOWDOWN = 2.0
+"""And how much slower than real time it may be: at 240 frames a second a thirtieth of one would be eight times."""
+
 FEWEST_SUBSTEPS = 6
 """Nothing blows up in fewer, but cloth that hangs by its corners is drawn to a multiple of its length there: a dragged
 ball draws springs beside the pins to 6 times their length in 6, to 14 in 4, to 1.6 in 20 (docs/live.md)."""
@@ -55,6 +58,11 @@ def cloth_frame_s(job: Job, *, power: float) -> float:
     return estimated_cloth_nodes(job) * substeps * NODE_SUBSTEP_S * (1.0 if meets else APART_SHARE) / power
 
 
+def fluent_frame_s(job: Job) -> float:
+    """What a frame may take for the scene to be fluent [s]."""
+    return min(FLUENT_FRAME_S, FLUENT_SLOWDOWN / job.fps)
+
+
 def fluent(job: Job, *, power: float) -> Job:
     """The job with what it takes to run fluently given up, if it has any cloth that is too slow.
 
@@ -62,10 +70,10 @@ def fluent(job: Job, *, power: float) -> Job:
         job: as it is simulated live.
         power: cores that compute it.
     """
-    if not job.cloth or job.cloth[0].integrator != "xpbd" or cloth_frame_s(job, power=power) <= FLUENT_FRAME_S:
+    if not job.cloth or job.cloth[0].integrator != "xpbd" or cloth_frame_s(job, power=power) <= fluent_frame_s(job):
         return job
     fewer = _in_fewer_substeps(job, FEWEST_COLLIDING, power=power)
-    if cloth_frame_s(fewer, power=power) <= FLUENT_FRAME_S or len(job.cloth) > 1:
+    if cloth_frame_s(fewer, power=power) <= fluent_frame_s(job) or len(job.cloth) > 1:
         return fewer  # several cloths collide with each other anyway
     apart = tuple(cloth.model_copy(update={"self_collision": False}) for cloth in job.cloth)
     return _in_fewer_substeps(job.model_copy(update={"cloth": apart}), FEWEST_SUBSTEPS, power=power)
@@ -75,7 +83,7 @@ def _in_fewer_substeps(job: Job, fewest: int, *, power: float) -> Job:
     """The job in as many substeps as are fluent, but no more than it has, and no fewer than that many, or than its
     bodies ask for."""
     substeps, for_bodies = job.cloth[0].substeps or DEFAULT_SUBSTEPS, fewest_for_bodies(job)
-    fitting = int(max(substeps, for_bodies) * FLUENT_FRAME_S / cloth_frame_s(job, power=power))
+    fitting = int(max(substeps, for_bodies) * fluent_frame_s(job) / cloth_frame_s(job, power=power))
     count = min(substeps, max(fitting, fewest, for_bodies))
     return job.model_copy(update={"cloth": with_substeps(job.cloth, count)})
 

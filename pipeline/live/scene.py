@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from pipeline.errors import PipelineError
+from pipeline.live.fluid_pace import fluid_frame_s, steps_a_frame
 from pipeline.live.knobs import with_substeps
 from pipeline.live.pace import cloth_frame_s, fewest_for_bodies
-from pipeline.stages.inputs import estimated_cloth_nodes, most_particles
+from pipeline.stages.inputs import estimated_cloth_nodes
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
-
-PARTICLE_STEP_S = {"wcsph": 0.45e-6, "dfsph": 1.7e-6, "pcisph": 1.7e-6}
-"""Core time of a particle in a step [s] (docs/performance.md)."""
-
-STEPS_A_SECOND = {"wcsph": 1800.0, "dfsph": 700.0, "pcisph": 700.0}
-"""Steps in a simulated second; their number grows with the speed and as particles get smaller."""
 
 GPU_CORES = 20
 """A GPU counts as so many cores: scenes that fit here are too small to fill it."""
 
 MOST_FRAME_S = 0.25
 """What a frame may take [s]: slower than four pictures a second nobody can steer anything."""
+
+MOST_SLOWDOWN = 15.0
+"""And how much slower than real time it may be, which is as much at 60 frames a second: of what hardly moves nobody
+sees what a hand has done."""
 
 
 def live_job(job: Job, *, substeps: int | None = None) -> Job:
@@ -53,22 +53,26 @@ def computing_power(*, cores: int, on_gpu: bool) -> int:
     return GPU_CORES if on_gpu else cores
 
 
-def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
+def require_small(job: Job, particles: int, *, cores: int, on_gpu: bool) -> None:
     """Refuse a scene whose frames would take too long.
+
+    Args:
+        job: as it is simulated live.
+        particles: that its fluids will have, as the checks count them: of emitters, what flows in during the film.
+        cores: of the processor.
+        on_gpu: whether a GPU computes it.
 
     Raises:
         PipelineError: says about how long a frame takes, and what would fit.
     """
-    nodes, particles = estimated_cloth_nodes(job), most_particles(job)
+    nodes = estimated_cloth_nodes(job)
     power = computing_power(cores=cores, on_gpu=on_gpu)
     cloth_s = cloth_frame_s(job, power=power)
-    fluid_s = 0.0
-    if job.fluid:
-        kind = job.fluid[0].solver
-        fluid_s = particles * STEPS_A_SECOND[kind] / job.fps * PARTICLE_STEP_S[kind] / power
-    if cloth_s + fluid_s <= MOST_FRAME_S:
+    fluid_s = fluid_frame_s(job, particles, power=power)
+    most_s = min(MOST_FRAME_S, MOST_SLOWDOWN / job.fps)
+    if cloth_s + fluid_s <= most_s:
         return
-    share = MOST_FRAME_S / (cloth_s + fluid_s)
+    share = most_s / (cloth_s + fluid_s)
     sizes, remedies = [], []
     if nodes:
         for_bodies = fewest_for_bodies(job)
@@ -81,10 +85,12 @@ def require_small(job: Job, *, cores: int, on_gpu: bool) -> None:
         if can_take_fewer and fitting >= for_bodies:
             remedies[-1] += f", or --substeps {fitting}"
     if particles:
-        sizes.append(f"up to {particles:,.0f} particles")
-        remedies.append(f"about {particles * share:,.0f} particles fit")
+        steps = math.ceil(steps_a_frame(job))
+        sizes.append(f"about {particles:,} particles at {steps} {'step' if steps == 1 else 'steps'} a frame")
+        # Larger particles, which are fewer, take longer steps: a frame goes by the inverse fourth power of the radius.
+        remedies.append(f"about {particles * share**0.75:,.0f} particles fit")
     where = "the GPU" if on_gpu else f"{cores} cores"
     raise PipelineError(
         f"{job.name} is too large to steer: {' and '.join(sizes)} take some {cloth_s + fluid_s:.2g} s a frame on "
-        f"{where}, {MOST_FRAME_S:g} s at most; {', '.join(remedies)} (--preview may do); --anyway runs it"
+        f"{where}, {most_s:.2g} s at most; {', '.join(remedies)} (--preview may do); --anyway runs it"
     )

@@ -1,6 +1,7 @@
 """Which jobs run live, and what the others are told."""
 
 import sys
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -9,17 +10,69 @@ from live_jobs import BALL_OVER_SHEET, loaded
 from pipeline.cli import main
 from pipeline.errors import PipelineError
 from pipeline.job.loading import load_job
+from pipeline.job.starter import write_starter
+from pipeline.live.fluid_pace import fluid_frame_s, steps_a_frame
 from pipeline.live.knobs import knobs_of
-from pipeline.live.pace import FEWEST_SUBSTEPS, FLUENT_FRAME_S, cloth_frame_s, fewest_for_bodies, fluent, told_pace
+from pipeline.live.pace import (
+    FEWEST_SUBSTEPS,
+    FLUENT_FRAME_S,
+    cloth_frame_s,
+    fewest_for_bodies,
+    fluent,
+    fluent_frame_s,
+    told_pace,
+)
 from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job, require_small
+
+JOBS = Path(__file__).parents[2] / "jobs"
 
 
 def test_a_scene_that_is_too_large_is_told_what_fits(tmp_path):
     large = live_job(loaded(tmp_path, BALL_OVER_SHEET.replace("[17, 17]", "[401, 401]")).job, substeps=20)
     with pytest.raises(PipelineError, match=r"160,801 cloth nodes at 20 substeps .* about [\d,]+ nodes fit.*--anyway"):
-        require_small(large, cores=2, on_gpu=False)
-    require_small(live_job(loaded(tmp_path).job), cores=1, on_gpu=False)
+        require_small(large, 0, cores=2, on_gpu=False)
+    require_small(live_job(loaded(tmp_path).job), 0, cores=1, on_gpu=False)
+
+
+def told_of(monkeypatch, *arguments: str) -> str:
+    """What the command says of a job on two cores, without running it."""
+    monkeypatch.setattr("pipeline.live.running.show_live", lambda *_, **__: None)
+    monkeypatch.setattr("sim.runtime.resolve_device", lambda _: "cpu")
+    return CliRunner().invoke(main, ["live", *arguments, "--cores", "2"]).output
+
+
+def test_the_drop_to_start_from_is_let_in(tmp_path, monkeypatch):
+    job_file = write_starter(tmp_path / "my-film", "drop")
+    assert "too large" not in told_of(monkeypatch, str(job_file))
+
+
+def test_honey_is_told_by_what_flows_in_during_the_film_and_what_its_viscosity_takes(monkeypatch):
+    told = told_of(monkeypatch, str(JOBS / "honey.toml"))
+    assert "honey is too large to steer: about 13,440 particles at 7 steps a frame" in told
+    honey = live_job(load_job(JOBS / "honey.toml"))
+    thin = honey.model_copy(update={"fluid": (honey.fluid[0].model_copy(update={"viscosity": 1e-6}),)})
+    step_s = [fluid_frame_s(job, 3360, power=1) / steps_a_frame(job) for job in (honey, thin)]
+    assert step_s[0] > 4.0 * step_s[1]
+    assert "too large" not in told_of(monkeypatch, str(JOBS / "honey.toml"), "--preview")
+
+
+def test_finer_particles_take_more_steps_and_fixed_ones_what_they_say():
+    job = live_job(load_job(JOBS / "dam_break.toml"))
+
+    def steps(**changes: object) -> float:
+        return steps_a_frame(job.model_copy(update={"fluid": (job.fluid[0].model_copy(update=changes),)}))
+
+    radius = job.fluid[0].particle_radius
+    assert steps(particle_radius=radius / 2.0) == pytest.approx(2.0 * steps())
+    assert steps(dt=1.0e-3) == pytest.approx(1.0e3 / job.fps)
+    assert steps(solver="wcsph") > 4.0 * steps()
+    assert steps(viscosity=0.1, viscosity_solver="explicit") > 4.0 * steps()
+
+
+@pytest.mark.parametrize(("fps", "most"), [(24, "0.25 s at most"), (60, "0.25 s at most"), (240, "0.062 s at most")])
+def test_a_scene_may_be_as_many_times_slower_than_real_time_at_any_rate_of_frames(monkeypatch, fps: int, most: str):
+    assert most in told_of(monkeypatch, str(JOBS / "dam_break.toml"), "--set", f"fps={fps}")
 
 
 @pytest.mark.parametrize(
@@ -33,7 +86,7 @@ def test_a_scene_that_is_too_large_is_told_what_fits(tmp_path):
 def test_no_substeps_are_offered_that_bodies_do_not_let_cloth_take(tmp_path, counts: str, substeps: int, remedy: str):
     job = live_job(loaded(tmp_path, BALL_OVER_SHEET.replace("[17, 17]", counts)).job, substeps=substeps)
     with pytest.raises(PipelineError) as refused:
-        require_small(job, cores=2, on_gpu=False)
+        require_small(job, 0, cores=2, on_gpu=False)
     assert f"at {max(substeps, fewest_for_bodies(job))} substeps a frame" in str(refused.value)
     assert remedy in str(refused.value)
 
@@ -41,7 +94,7 @@ def test_no_substeps_are_offered_that_bodies_do_not_let_cloth_take(tmp_path, cou
 def test_explicit_springs_are_offered_no_substeps(tmp_path):
     text = BALL_OVER_SHEET.replace("[17, 17]", "[175, 175]").replace("substeps = 8\n", 'integrator = "explicit"\n')
     with pytest.raises(PipelineError, match=r"nodes fit \(--preview"):
-        require_small(live_job(loaded(tmp_path, text).job), cores=2, on_gpu=False)
+        require_small(live_job(loaded(tmp_path, text).job), 0, cores=2, on_gpu=False)
 
 
 @pytest.mark.parametrize(
@@ -62,6 +115,15 @@ def test_cloth_that_is_too_slow_gives_up_substeps_then_its_collisions_and_that_i
     assert ('"sheet" does not collide with itself' in told) == (not collides)
     written_values = {knob.name: knob.start for knob in knobs_of(written)}
     assert told_pace(written, written_values) == ""
+
+
+@pytest.mark.parametrize("fps", [24, 60, 120, 240])
+def test_cloth_is_fluent_if_it_is_half_as_fast_as_in_real_time(tmp_path, fps: int):
+    text = BALL_OVER_SHEET.replace("[17, 17]", "[65, 65]").replace("substeps = 8\n", "")
+    text = text.replace('kind = "dynamic"\ndensity = 500.0\n', "")
+    job = fluent(live_job(loaded(tmp_path, f"fps = {fps}\n{text}").job), power=2)
+    assert cloth_frame_s(job, power=2) <= fluent_frame_s(job) == pytest.approx(min(1.0 / 30.0, 2.0 / fps))
+    assert job.cloth[0].self_collision == (fps <= 60)
 
 
 def test_a_job_that_is_saved_has_the_pace_that_it_was_played_with(tmp_path):
