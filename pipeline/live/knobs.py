@@ -13,6 +13,7 @@ from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
+    from sim.rigid.parameters import RigidBodyParameters
     from sim.world import World
 
 Value = float | bool | tuple[float, float, float]
@@ -94,25 +95,67 @@ def knobs_of(job: Job, *, written: Job | None = None) -> tuple[Knob, ...]:
                 found.append(
                     _knob(name, label, f"Cloth {cloth.name}", paths=paths, kind=kind, ends=(low, high), start=value)
                 )
+    surface = _surface_keys(job)
     for number, body in enumerate(job.rigid):
-        if body.density is not None and not body.ballast:
-            name, paths = f"rigid.{body.name}.density", (("rigid", number, "density"),)
-            found.append(
-                _knob(
-                    name,
-                    "density [kg/m³]",
-                    f"Body {body.name}",
-                    paths=paths,
-                    kind="decades",
-                    ends=(10.0, 2.0e4),
-                    start=body.density,
-                )
+        found += _knobs_of_body(number, body, surface)
+    for number, fluid in enumerate(job.fluid):
+        found.append(
+            _knob(
+                f"fluid.{fluid.name}.viscosity",
+                "viscosity [m²/s]",
+                f"Fluid {fluid.name}",
+                paths=(("fluid", number, "viscosity"),),
+                kind="decades",
+                ends=(1.0e-7, 1.0),
+                start=fluid.viscosity,
             )
+        )
     return tuple(found)
 
 
+def _surface_keys(job: Job) -> list[tuple[str, float]]:
+    """Which numbers of bodies' surfaces mean something, and their largest values: the same of a job and its live one.
+
+    Beside a fluid, bodies that rest are fixed when no other moves.
+    """
+    falls = any(body.kind == "dynamic" for body in job.rigid)
+    rubs = falls or (bool(job.cloth) and (not job.fluid or bool(job.moving_bodies)))
+    return [("friction", 2.0)] * rubs + [("restitution", 1.0)] * falls
+
+
+def _knobs_of_body(number: int, body: RigidBodyParameters, surface: list[tuple[str, float]]) -> list[Knob]:
+    """Density, except with ballast, whose share in the mass is fixed, and these numbers of its surface."""
+    found, folder = [], f"Body {body.name}"
+    if body.density is not None and not body.ballast:
+        found.append(
+            _knob(
+                f"rigid.{body.name}.density",
+                "density [kg/m³]",
+                folder,
+                paths=(("rigid", number, "density"),),
+                kind="decades",
+                ends=(10.0, 2.0e4),
+                start=body.density,
+            )
+        )
+    for key, high in surface:
+        found.append(
+            _knob(
+                f"rigid.{body.name}.{key}",
+                key,
+                folder,
+                paths=(("rigid", number, key),),
+                kind="number",
+                ends=(0.0, high),
+                start=getattr(body, key),
+            )
+        )
+    return found
+
+
 def _shared_knobs(job: Job, written: Job) -> list[Knob]:
-    """Gravity, which fluids are sized for when they are built; the step of cloth, which explicit springs dictate."""
+    """Gravity, which fluids are sized for when they are built; the steps of cloth, which explicit springs dictate, and
+    those of fluids, if the job does not fix them."""
     found = []
     if not job.fluid:
         found.append(
@@ -133,6 +176,10 @@ def _shared_knobs(job: Job, written: Job) -> list[Knob]:
         found.append(
             _knob("cloth.substeps", "substeps a frame", "Scene", paths=paths, kind="whole", ends=ends, start=count)
         )
+    if job.fluid and job.fluid[0].dt == "adaptive":
+        paths = tuple(("fluid", number, "cfl") for number in range(len(job.fluid)))
+        label, cfl = "steps of fluids (cfl)", job.fluid[0].cfl
+        found.append(_knob("fluid.cfl", label, "Scene", paths=paths, kind="number", ends=(0.1, 2.0), start=cfl))
     return found
 
 
@@ -172,9 +219,19 @@ def turn(world: World, job: Job, knob: Knob, value: Value, *, before: Value) -> 
         if "rigid" in solvers:
             solvers["rigid"].set_gravity(value)
     elif first == "rigid":
-        assert isinstance(value, float)
-        assert isinstance(before, float)
-        solvers["rigid"].scale_mass(job.rigid[int(knob.paths[0][1])].name, value / before)
+        body = job.rigid[int(knob.paths[0][1])].name
+        if key == "density":
+            assert isinstance(value, float)
+            assert isinstance(before, float)
+            solvers["rigid"].scale_mass(body, value / before)
+        else:
+            solvers["rigid"].set_surface(body, **{str(key): value})
+    elif first == "fluid":
+        tank = solvers["+".join(fluid.name for fluid in job.fluid)]
+        if key == "cfl":
+            tank.set_cfl(value)
+        else:
+            tank.set_viscosity(job.fluid[int(knob.paths[0][1])].name, value)
     elif key == "substeps":
         solvers["cloth"].take_substeps(value)
     else:

@@ -59,8 +59,13 @@ class CollisionBodies(DeviceShapes):
         self.load_unit = 1.0
         self.shortest_edge = min((geometry.shortest_edge for geometry in geometries), default=np.inf)
         if self.count:
-            self.friction.from_numpy(np.asarray(friction, dtype=np.float32))
+            self.set_friction(np.asarray(friction, dtype=np.float64))
             self.look_between_vertices(0.0)
+
+    def set_friction(self, friction: Array) -> None:
+        """Say how rough the bodies are: Coulomb's coefficients [-], (b,)."""
+        if self.count:
+            put(self.friction, friction)
 
     def place(self, poses: Poses, inverse_mass: Array, inverse_inertia: Array) -> None:
         """Say where the bodies are, and how easily they move.

@@ -74,7 +74,8 @@ class ClothRigidCoupling:
         self._contacts.rigid.place(self._rigid.poses(), motion)
 
     def resume(self) -> None:
-        """Tell the cloth's contacts where the restored bodies are."""
+        """Tell the cloth's contacts where the restored bodies are, and how rough they are now."""
+        self._contacts.rigid.bodies.set_friction(self._rigid.friction)
         self.follow(0.0)
 
 

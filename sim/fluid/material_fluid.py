@@ -31,6 +31,10 @@ which decides whether it converged, says nothing about single particles. Corners
 gaps that close reach just under 0.2; a dam that hits a wall squeezes single particles by up to 0.5, for moments."""
 
 
+LARGEST_CFL = 2.0
+"""As in a job file."""
+
+
 class MaterialFluid(ParticleFluid):
     """A particle fluid whose viscosity may be implicit, and whose surface tension may be that of Akinci et al. 2013.
 
@@ -56,14 +60,7 @@ class MaterialFluid(ParticleFluid):
         self._expected_speed = _expected_speed(fluids, spacing, stress, body_speed, keywords)
 
         self._stiffest = max(fluid.viscosity for fluid in fluids) * max(1.0, fluids[0].wall_friction)
-        implicit = is_implicit(
-            fluids[0].viscosity_solver,
-            viscosity=self._stiffest,
-            spacing=spacing,
-            speed=fluids[0].sound_speed or self.speed_ratio * self._expected_speed,
-            dt=fluids[0].dt,
-            cfl=fluids[0].cfl,
-        )
+        implicit = self._asks_for_implicit_viscosity(fluids[0], self._stiffest)
         self._implicit_viscosity: ImplicitViscosity | None = None
         if implicit:
             self.carried = (*self.carried, *CARRIED)
@@ -79,6 +76,53 @@ class MaterialFluid(ParticleFluid):
             self._akinci2013 = SurfaceTensionAkinci2013(self.capacity)
             self._cohesion, self._largest_cohesion = device_table(cohesion), float(cohesion.max())
             self._adhesion = device_table(np.array([fluid.adhesion for fluid in fluids]))
+
+    def set_viscosity(self, name: str, viscosity: float) -> None:
+        """Change the kinematic viscosity of a fluid [m²/s] between frames; no checkpoint knows of it.
+
+        Raises:
+            ValueError: there is no such fluid, or built with that it would be solved in the other way.
+        """
+        phases = self.phases
+        if name not in phases.names or not 0.0 <= viscosity < math.inf:
+            raise ValueError(f'fluid "{name}": its viscosity cannot become {viscosity:g} m²/s')
+        viscosities = phases.viscosities.copy()
+        viscosities[phases.names.index(name)] = viscosity
+        stiffest = float(viscosities.max()) * max(1.0, self.parameters.wall_friction)
+        self._require_same_viscosity_solver(f"viscosity = {viscosity:g}", self.parameters, stiffest)
+        phases.set_viscosities(viscosities)
+        self._stiffest = stiffest
+
+    def set_cfl(self, cfl: float) -> None:
+        """Change the factor on the CFL time step [-] between frames; no checkpoint knows of it.
+
+        Raises:
+            ValueError: it is out of range, or with that viscosity would be solved in the other way.
+        """
+        if not 0.0 < cfl <= LARGEST_CFL:
+            raise ValueError(f"cfl must lie above 0 and be {LARGEST_CFL:g} at most, got {cfl:g}")
+        parameters = self.parameters.model_copy(update={"cfl": cfl})
+        self._require_same_viscosity_solver(f"cfl = {cfl:g}", parameters, self._stiffest)
+        self.parameters = parameters
+
+    def _require_same_viscosity_solver(self, change: str, parameters: FluidParameters, stiffest: float) -> None:
+        implicit = self._implicit_viscosity is not None
+        if self._asks_for_implicit_viscosity(parameters, stiffest) != implicit:
+            raise ValueError(
+                f"with {change} viscosity would be {'explicit' if implicit else 'implicit'}, which is decided at the "
+                f"start; set it in the job, or viscosity_solver there"
+            )
+
+    def _asks_for_implicit_viscosity(self, parameters: FluidParameters, stiffest: float) -> bool:
+        """Whether these parameters, with this largest viscosity, against walls too [m²/s], have it solved for."""
+        return is_implicit(
+            parameters.viscosity_solver,
+            viscosity=stiffest,
+            spacing=2.0 * parameters.particle_radius,
+            speed=parameters.sound_speed or self.speed_ratio * self._expected_speed,
+            dt=parameters.dt,
+            cfl=parameters.cfl,
+        )
 
     def begin_frame(self, time_s: float) -> None:
         """Restart the counters of the frame, and its largest speed at the present one."""

@@ -9,6 +9,8 @@ import numpy as np
 import taichi as ti
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from sim.fluid.parameters import FluidParameters
 
 
@@ -33,6 +35,11 @@ class Phases:
         self.rest_density = device_table(self.rest_densities)
         self.dynamic_viscosity = device_table(self.rest_densities * self.viscosities)
         self.surface_tension = device_table(np.array([fluid.surface_tension for fluid in parameters]))
+
+    def set_viscosities(self, viscosities: NDArray[np.float64]) -> None:
+        """Change nu of each fluid [m²/s], (k,), in the arrays that solvers hold."""
+        self.viscosities[:] = viscosities
+        self.dynamic_viscosity.from_numpy((self.rest_densities * viscosities).astype(np.float32))
 
     def __len__(self) -> int:
         return len(self.parameters)

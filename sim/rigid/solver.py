@@ -102,11 +102,11 @@ class RigidSolver:
         self.walls = tuple(walls_of(domain))
         can_move = np.concatenate([self.bodies.is_dynamic, np.zeros(len(fixed), dtype=bool)])
         self._detector = CollisionDetector(self.all_geometries, can_move, self.walls)
-        surfaces = Surfaces(
+        self._surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
         )
-        self._response = ContactResponse(surfaces, self.gravity)
+        self._response = ContactResponse(self._surfaces, self.gravity)
         corners = np.array([domain.min, domain.max])
         self._domain_centre = corners.mean(axis=0)
         self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
@@ -124,6 +124,11 @@ class RigidSolver:
         return tuple(warning for geometry in self._geometries for warning in geometry.warnings)
 
     # --- what a coupling needs of the bodies ------------------------------------------------------------------------
+
+    @property
+    def friction(self) -> Array:
+        """Coulomb's coefficients [-] of all bodies, the static ones last, (n,)."""
+        return self._surfaces.friction
 
     @property
     def solids(self) -> tuple[BodyGeometry, ...]:
@@ -227,6 +232,24 @@ class RigidSolver:
         if not 0.0 < factor < math.inf:
             raise ValueError(f'the mass of "{name}" can only be scaled by a finite number above 0, got {factor:g}')
         self.bodies.scale_mass(number, factor)
+
+    def set_surface(self, name: str, *, friction: float | None = None, restitution: float | None = None) -> None:
+        """Change how a body rubs and rebounds [-] between frames, static ones included; no checkpoint knows of it.
+
+        Raises:
+            ValueError: there is no such body, or a number is out of range.
+        """
+        if name not in self.all_names:
+            raise ValueError(f'no rigid body is named "{name}"')
+        if friction is not None and not 0.0 <= friction < math.inf:
+            raise ValueError(f'the friction of "{name}" must be finite and at least 0, got {friction:g}')
+        if restitution is not None and not 0.0 <= restitution <= 1.0:
+            raise ValueError(f'the restitution of "{name}" must lie between 0 and 1, got {restitution:g}')
+        number = self.all_names.index(name)
+        if friction is not None:
+            self._surfaces.friction[number] = friction
+        if restitution is not None:
+            self._surfaces.restitution[number] = restitution
 
     def set_gravity(self, gravity: Vector3) -> None:
         """Change gravity [m/s²] between frames, for contacts as well; no checkpoint knows of it."""

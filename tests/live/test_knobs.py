@@ -3,6 +3,7 @@
 import pytest
 from live_jobs import BALL_OVER_SHEET, loaded
 
+from pipeline.job.loading import load_job
 from pipeline.live.drawing import SceneDrawing
 from pipeline.live.knobs import knobs_of
 from pipeline.live.page import LivePage
@@ -31,6 +32,73 @@ def test_what_the_job_asks_for_can_be_had_again_after_live_has_cut_it(tmp_path, 
     job = live_job(written, substeps=6)
     (knob,) = (knob for knob in knobs_of(job, written=written) if knob.name == "cloth.substeps")
     assert (knob.start, knob.checked(asked), knob.checked(2), knob.checked(60)) == (6, asked, 2, 60)
+
+
+BODIES = BALL_OVER_SHEET[: BALL_OVER_SHEET.index("[[cloth]]")]
+WATER = """
+name = "drape"
+[domain]
+min = [-0.1, -0.1, 0.0]
+max = [0.1, 0.1, 0.2]
+[[fluid]]
+name = "water"
+solver = "dfsph"
+particle_radius = 0.01
+[[fluid.block]]
+shape = { type = "box", size = [0.1, 0.1, 0.1] }
+position = [0.0, 0.0, 0.05]
+"""
+
+
+@pytest.mark.usefixtures("taichi")
+def test_bodies_alone_have_their_surfaces_as_knobs_and_a_saved_job_has_them(tmp_path):
+    read = loaded(tmp_path, BODIES)
+    session = Session(live_job(read.job))
+    surfaces = {f"rigid.{name}.{key}": 0.75 for name in ("ball", "post") for key in ("friction", "restitution")}
+    assert set(session.knobs) == {"gravity", "rigid.ball.density", *surfaces}
+    for name, value in surfaces.items():
+        session.turn(name, value)
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        session.turn("rigid.ball.restitution", 1.5)
+    session.reset()
+    assert session.world.solvers["rigid"].friction.tolist() == [0.75, 0.75]
+    session.advance()
+    saved = load_job(save_job(read, session.values, tmp_path).path)
+    assert [(body.friction, body.restitution) for body in saved.rigid] == [(0.75, 0.75)] * 2
+    assert saved.rigid[1].kind == "static"
+
+
+@pytest.mark.usefixtures("taichi")
+def test_cloth_feels_how_rough_a_body_has_been_made_also_one_that_rests(tmp_path):
+    read = loaded(tmp_path, BALL_OVER_SHEET.replace('kind = "dynamic"\ndensity = 500.0\n', ""))
+    session = Session(live_job(read.job))
+    assert "rigid.post.restitution" not in session.knobs  # nothing rebounds
+    session.turn("rigid.post.friction", 1.5)
+    (coupling,) = session.world._couplings
+    assert coupling._contacts.rigid.bodies.friction.to_numpy().tolist() == [0.5, 1.5]
+    saved = load_job(save_job(read, session.values, tmp_path).path)
+    assert [body.friction for body in saved.rigid] == [0.5, 1.5]
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_fluid_alone_has_viscosity_and_steps_and_a_saved_job_has_them(tmp_path):
+    read = loaded(tmp_path, WATER)
+    session = Session(live_job(read.job))
+    assert set(session.knobs) == {"fluid.water.viscosity", "fluid.cfl"}
+    session.turn("fluid.water.viscosity", 1.0e-4)
+    session.turn("fluid.cfl", 0.5)
+    with pytest.raises(ValueError, match="viscosity would be implicit, which is decided at the start"):
+        session.turn("fluid.water.viscosity", 1.0)
+    session.advance()
+    session.reset()
+    assert session.message == ""
+    assert session.values == {"fluid.water.viscosity": 1.0e-4, "fluid.cfl": 0.5}
+    tank = session.world.solvers["water"]
+    assert (tank.phases.viscosities.tolist(), tank.parameters.cfl) == ([1.0e-4], 0.5)
+    saved = load_job(save_job(read, session.values, tmp_path).path)
+    assert (saved.fluid[0].viscosity, saved.fluid[0].cfl) == (1.0e-4, 0.5)
+    fixed = loaded(tmp_path, WATER.replace("particle_radius", "dt = 1e-3\nparticle_radius")).job
+    assert [knob.name for knob in knobs_of(fixed)] == ["fluid.water.viscosity"]
 
 
 @pytest.mark.usefixtures("taichi")

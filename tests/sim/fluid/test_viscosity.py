@@ -168,3 +168,41 @@ def test_a_stiff_fluid_continues_from_a_checkpoint_bit_for_bit(dam_break):
 )
 def test_viscosity_is_solved_for_where_it_would_shorten_the_step(solver, viscosity, dt, expected):
     assert is_implicit(solver, viscosity=viscosity, spacing=0.02, speed=30.0, dt=dt, cfl=1.0) is expected
+
+
+@pytest.mark.parametrize("solver", ["explicit", "implicit"])
+def test_a_viscosity_that_is_changed_between_frames_acts_as_it_does_from_the_start(taichi_cpu, solver):
+    def decayed(start: float, then: float) -> np.ndarray:
+        fluid, _ = swirling_cylinder(viscosity=start, viscosity_solver=solver)
+        fluid.set_viscosity("water", then)
+        dt = fluid.stable_dt()
+        for _ in range(3):
+            fluid.substep(dt)
+        return np.array([dt, *fluid.snapshots()["water"].arrays["velocity"].ravel()])
+
+    np.testing.assert_array_equal(decayed(0.003, 0.01), decayed(0.01, 0.01))
+
+
+def test_a_viscosity_or_a_step_for_which_another_solver_would_be_built_is_refused(taichi_cpu):
+    fluid, _ = swirling_cylinder(viscosity=1.0e-4)
+    before = fluid.stable_dt()
+    with pytest.raises(ValueError, match="viscosity would be implicit, which is decided at the start"):
+        fluid.set_viscosity("water", 1.0)
+    with pytest.raises(ValueError, match='"milk"'):
+        fluid.set_viscosity("milk", 1.0e-4)
+    with pytest.raises(ValueError, match="cfl must"):
+        fluid.set_cfl(2.5)
+    assert fluid.stable_dt() == before
+    stiff, _ = swirling_cylinder(viscosity=1.0)
+    with pytest.raises(ValueError, match="would be explicit"):
+        stiff.set_viscosity("water", 1.0e-6)
+
+
+@pytest.mark.parametrize("solver", ["wcsph", "dfsph", "pcisph"])
+def test_steps_follow_the_factor_on_them(taichi_cpu, solver):
+    points = lattice((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), SPACING)
+    fast = np.full_like(points, 3.0)
+    fluid = make_fluid(OPEN_SPACE, points, fast, solver=solver, artificial_viscosity=0.0, gravity=(0.0, 0.0, 0.0))
+    before = fluid.stable_dt()
+    fluid.set_cfl(0.5)
+    assert fluid.stable_dt() == pytest.approx(0.5 * before)

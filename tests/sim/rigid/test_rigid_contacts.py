@@ -236,3 +236,32 @@ def test_bunny_on_its_side_comes_to_rest_on_the_bumps_that_it_stands_on():
     # As in a stack, a micrometre of overlap is left alone, and creeping is a matter of microns.
     assert solver.diagnostics()["max_penetration"] < 1e-5
     np.testing.assert_allclose(solver.bodies.position, start, atol=1e-5)
+
+
+def test_a_surface_that_is_changed_between_frames_rubs_and_rebounds_as_it_does_from_the_start():
+    def motion(*, changed: bool, friction: float, restitution: float) -> np.ndarray:
+        surface = {"friction": friction, "restitution": restitution}
+        begins = {} if changed else surface
+        solver = in_room(
+            body("slides", cube(0.1), (0.0, 0.0, 0.05), velocity=(1.0, 0.0, 0.0), **begins),
+            body("falls", ball(0.1), (0.5, 0.5, 0.15), **begins),
+            obstacles=[body("post", cube(0.1), (1.0, 1.0, 0.05), kind="static", **begins)],
+        )
+        if changed:
+            for name in ("slides", "falls", "post"):
+                solver.set_surface(name, **surface)
+        advance(solver, 0.2)
+        return solver.bodies.position
+
+    for surface in ({"friction": 0.1, "restitution": 0.0}, {"friction": 0.9, "restitution": 0.7}):
+        np.testing.assert_array_equal(motion(changed=True, **surface), motion(changed=False, **surface))
+
+
+@pytest.mark.parametrize("surface", [{"friction": -0.1}, {"friction": np.inf}, {"restitution": 1.1}])
+def test_a_surface_that_is_none_is_refused_and_changes_nothing(surface):
+    solver = in_room(body("ball", ball(0.1), (0.0, 0.0, 0.2), friction=0.4))
+    with pytest.raises(ValueError, match="ball"):
+        solver.set_surface("ball", **surface)
+    with pytest.raises(ValueError, match="no rigid body"):
+        solver.set_surface("cube", friction=1.0)
+    assert solver.friction.tolist() == [0.4]
