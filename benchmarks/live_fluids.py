@@ -81,6 +81,7 @@ def main() -> None:
             "particles": findings.particles,
             "steps_a_frame": steps_a_frame(job),
             "frame_ms": 1e3 * fluid_frame_s(job, findings.particles, power=arguments.cores),
+            "processor_ms": 1e3 * fluid_frame_s(job, findings.particles, power=1),
         },
         "parts": parts,
     }

@@ -15,7 +15,7 @@ from sim.fluid.time_step import VISCOUS_NUMBER
 if TYPE_CHECKING:
     from pipeline.job.models import Job
 
-PARTICLE_STEP_S = {"wcsph": 0.45e-6, "dfsph": 2.3e-6, "pcisph": 2.0e-6}
+PARTICLE_STEP_S = {"wcsph": 0.45e-6, "dfsph": 2.3e-6, "pcisph": 1.7e-6}
 """Core time of a particle in a step at a support of two spacings [s] (docs/live.md)."""
 
 VISCOUS_STEP_S = 12.0e-6
