@@ -68,19 +68,32 @@ def run(solver: str, *, quick: bool = False) -> CaseResult:
     return CaseResult("smoke-projection", solver, settings, checks, series)
 
 
+def count_iterations(n: int, sides: str, *, ball: bool) -> tuple[int, float]:
+    """Project a jet with noise once in a box n cells across: iterations, and max|div u| h / max|u| that they leave."""
+    grid = _grid(n, SIDES[sides], ball=ball)
+    left, iterations = _Bench(grid, TOLERANCE).project(_jet_with_noise(grid), MAX_ITERATIONS)
+    return iterations, left
+
+
 def _project_rough(n: int, sides: str, *, ball: bool) -> list[float]:
     """max|div u| h / max|u| of a jet with noise before its projection and after each iteration of it."""
     grid = _grid(n, SIDES[sides], ball=ball)
+    flow = _jet_with_noise(grid)
+    bench = _Bench(grid, TOLERANCE)
+    left = [bench.project(flow, 0)[0]]
+    while left[-1] > TOLERANCE and len(left) <= MAX_ITERATIONS:
+        left.append(bench.project(flow, len(left))[0])
+    return left
+
+
+def _jet_with_noise(grid: SmokeGrid) -> list[Array]:
+    """Velocities by axis at the middles of faces, all of them alike but for the noise."""
     random = np.random.default_rng(1)
     flow = []
     for axis in range(3):
         distance = ((grid.face_centres(axis) - 0.5) ** 2).sum(axis=1)
         flow.append(np.exp(-distance / 0.02) + 0.1 * random.standard_normal(len(distance)))
-    bench = _Bench(grid, TOLERANCE)
-    left = [bench.project(flow, 0)]
-    while left[-1] > TOLERANCE and len(left) <= MAX_ITERATIONS:
-        left.append(bench.project(flow, len(left)))
-    return left
+    return flow
 
 
 def _projection_error(n: int, *, closed: bool) -> float:
@@ -142,21 +155,22 @@ class _Bench:
             Obstacles(grid), self._fields, tolerance=tolerance, max_iterations=MAX_ITERATIONS
         )
 
-    def project(self, flow: list[Array], iterations: int) -> float:
+    def project(self, flow: list[Array], iterations: int) -> tuple[float, int]:
         """Project a flow, given at the middles of faces, in so many iterations at most.
 
         Returns:
-            The divergence that is left, max|div u| h / max|u|, in double precision.
+            The divergence that is left, max|div u| h / max|u|, in double precision, and the iterations it took.
         """
         grid = self._grid
         for axis, (field, values) in enumerate(zip(self._fields, flow, strict=True)):
             open_values = values.reshape(grid.face_shape(axis)) * (grid.open_area[axis] > 0.0)
             field.from_numpy(grid.pad(open_values.astype(np.float32)).ravel())
         self._projection._max_iterations = iterations
-        self._projection.project()
+        report = self._projection.project()
         faces = self.faces()
         divergence = sum(np.diff(face, axis=axis) for axis, face in enumerate(faces))[~grid.solid]
-        return float(np.abs(divergence).max() / max(np.abs(face).max() for face in faces))
+        left = float(np.abs(divergence).max() / max(np.abs(face).max() for face in faces))
+        return left, report.iterations
 
     def faces(self) -> list[Array]:
         """Velocities by axis, `face_shape(axis)`."""
