@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from pipeline.job.models import Job
     from sim.shapes import Solid
 
-BYTES_PER_CELL = 250
-"""Upper bound of what the smoke solver takes, multigrid levels and snapshot included: 101 for itself and what moves in
-it, 32 for fluid, 24 for cloth, 14 for turbulence."""
+BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 320, 250
+"""Upper bounds of what a smoke takes: 171 for the solver and all that it may be coupled to (101 for itself and what
+moves in it, multigrid levels included, 32 for fluid, 24 for cloth, 14 for turbulence), and where a CPU computes 144 on
+top for the six snapshots and checkpoints that the simulation may hold at once. On a GPU these are not in its memory."""
 BYTES_PER_ROW_ON_GPU = 5 * 32 * 8
 """On top for each row of cells along z: five reductions (`sim.smoke.reductions`) of 32 lanes, two numbers each. Boxes
 of few cells along z take more for these than for their cells. A CPU has one lane a row, within the bound above."""
@@ -125,12 +126,13 @@ def _check_size(
 def _bytes_of(layers: NDArray[np.float64], *, on_gpu: bool) -> float:
     """Upper bound of the memory of a box of so many cells along x, y, z."""
     rows = float(layers[0] * layers[1])
-    return float(np.prod(layers)) * BYTES_PER_CELL + (rows * BYTES_PER_ROW_ON_GPU if on_gpu else 0.0)
+    cells = float(np.prod(layers))
+    return cells * BYTES_PER_CELL_ON_GPU + rows * BYTES_PER_ROW_ON_GPU if on_gpu else cells * BYTES_PER_CELL
 
 
 def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, room: float, *, on_gpu: bool) -> float:
     """The smallest cell size [m], not below a given one, that cuts a box into cells of so many bytes, or into one."""
-    most = max(1.0, room // BYTES_PER_CELL)
+    most = max(1.0, room // (BYTES_PER_CELL_ON_GPU if on_gpu else BYTES_PER_CELL))
     size = max(cell_size, float(np.cbrt(np.prod(extent) / most)))
     layers = np.ceil(extent / size)
     while _bytes_of(layers, on_gpu=on_gpu) > room and layers.max() > 1.0:
