@@ -28,6 +28,7 @@ CASES = {
     "smoke-vortices": "smoke_vortices",
     "smoke-projection": "smoke_projection",
     "smoke-plume": "smoke_plume",
+    "smoke-front": "smoke_front",
     "smoke-mass": "smoke_mass",
     "submerged-sphere": "submerged_sphere",
     "buoyancy": "buoyancy",

@@ -81,6 +81,17 @@ def draw_smoke_plume(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
+def draw_smoke_front(results: Sequence[CaseResult]) -> Figure:
+    """Height of the front of a plume at several resolutions."""
+    figure, (front,) = make_panels(1, width=4.2)
+    series = results[0].series
+    for count, shade in zip(series["cells"], SHADES, strict=False):
+        front.plot(series["times"], series[f"front_{count}"], "o-", markersize=3, color=shade,
+                   label=f"{count} cells a metre")  # fmt: skip
+    label_axes(front, "time [s]", "height of the front [m]", "plume from a smooth source")
+    return figure
+
+
 def draw_smoke_mass(results: Sequence[CaseResult]) -> Figure:
     """Smoke left in an even wind, balance of a plume that leaves, smoke around a moving ball."""
     figure, (blown, leaving, stirred) = make_panels(3)
@@ -107,5 +118,6 @@ DRAWINGS: dict[str, Callable[[Sequence[CaseResult]], Figure]] = {
     "smoke-vortices": draw_smoke_vortices,
     "smoke-projection": draw_smoke_projection,
     "smoke-plume": draw_smoke_plume,
+    "smoke-front": draw_smoke_front,
     "smoke-mass": draw_smoke_mass,
 }
