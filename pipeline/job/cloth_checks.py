@@ -320,34 +320,41 @@ def _middles(start: _Start, parts: NDArray[np.int32]) -> NDArray[np.float64]:
 
 
 def _check_crossings(start: _Start, earlier: Sequence[_Start], findings: Findings) -> None:
-    """Refuse cloth that passes through another, or a mesh through itself: contacts keep what crosses crossed."""
-    from sim.cloth.start import first_crossing
+    """Refuse cloth that passes through another or touches it, or a mesh itself.
+
+    Contacts keep what crosses crossed, and what touches has no side to be kept on.
+    """
+    from sim.cloth.start import TOUCHING, first_crossing
 
     if start.cloth.self_collision and not isinstance(start.cloth.shape, RectangleSheet):
         point = first_crossing(start.position, start.edges, start.sheet.triangles)
         if point is not None:
             findings.error(
                 (*start.path, "shape"),
-                f"passes through itself at {_place(point)}; take it apart, or use self_collision = false",
+                f"passes through or touches itself at {_place(point)}; take it apart by its thickness, or use "
+                "self_collision = false",
             )
     for other in earlier:
-        if not touch(start.box, other.box, margin=0.0):
+        if not touch(start.box, other.box, margin=TOUCHING):
             continue
         points = (_crossing_of(one, two) for one, two in ((start, other), (other, start)))
         point = next((each for each in points if each is not None), None)
         if point is not None:
             findings.error(
-                start.path, f'passes through cloth "{other.cloth.name}" at {_place(point)}; move one of them'
+                start.path,
+                f'passes through or touches cloth "{other.cloth.name}" at {_place(point)}; move one of them, '
+                f"{max(start.cloth.thickness, other.cloth.thickness):g} m or more apart",
             )
 
 
 def _crossing_of(one: _Start, other: _Start) -> NDArray[np.float64] | None:
-    """Where an edge of one cloth passes through a triangle of another [m]."""
-    from sim.cloth.start import first_crossing
+    """Where an edge of one cloth passes through or touches a triangle of another [m]."""
+    from sim.cloth.start import TOUCHING, first_crossing
 
     position = np.concatenate([one.position, other.position])
-    edges = one.edges[_reaching(one.position[one.edges], other.box)]
-    triangles = other.sheet.triangles[_reaching(other.position[other.sheet.triangles], one.box)]
+    margin = np.array([[-TOUCHING], [TOUCHING]])
+    edges = one.edges[_reaching(one.position[one.edges], other.box + margin)]
+    triangles = other.sheet.triangles[_reaching(other.position[other.sheet.triangles], one.box + margin)]
     return first_crossing(position, edges, triangles + len(one.position))
 
 

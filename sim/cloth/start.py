@@ -18,6 +18,9 @@ Indices = NDArray[np.integer]
 REGION_MARGIN = 1.0e-6
 """Nodes so far outside of a region still count [m]: sizes written in decimal do not add up exactly."""
 
+TOUCHING = 1.0e-6
+"""Elements so near [m] count as meeting: which side of the other one is on is little more than rounding."""
+
 PAIRS_AT_ONCE = 1_000_000
 """Pairs of an edge and a triangle that are looked at together, up to 400 MB; more only where one edge has more."""
 
@@ -97,11 +100,11 @@ def _nodes_in_region(pin: PinParameters, position: Floats) -> NDArray[np.int64]:
 
 
 def first_crossing(position: Floats, edges: Indices, triangles: Indices) -> Floats | None:
-    """Where an edge passes through a triangle with which it shares no node [m], (3,); None if none does.
+    """Where an edge passes through or touches a triangle with which it shares no node [m], (3,); None if none does.
 
-    Two triangles that cross have such an edge. One that just touches counts, as in scenes made of round numbers sheets
-    cross at their nodes; sheets that lie in one plane do not cross. Triangles of like size are searched together, so
-    that large ones do not make the search around small ones wide.
+    Two triangles that cross have such an edge. One that comes within `TOUCHING` counts: in scenes made of round numbers
+    sheets cross at their nodes, and sheets that overlap in one plane have no side of each other to be kept on.
+    Triangles of like size are searched together, so that large ones do not make the search around small ones wide.
 
     Args:
         position: of nodes [m], (n, 3).
@@ -140,19 +143,71 @@ def _near_pairs(
 
 
 def _first_piercing(ends: Floats, corners: Floats) -> Floats | None:
-    """The first point where a segment passes through the triangle of the same row, by signed volumes."""
+    """The first point where a segment passes through or touches the triangle of the same row."""
+    low = np.maximum(ends.min(axis=1), corners.min(axis=1))
+    high = np.minimum(ends.max(axis=1), corners.max(axis=1))
+    near = np.flatnonzero((low <= high + TOUCHING).all(axis=1))
+    for meeting in (_piercings, _touches_at_end, _touches_at_side):
+        point = meeting(ends[near], corners[near])
+        if len(point):
+            first: Floats = point[0]
+            return first
+    return None
+
+
+def _piercings(ends: Floats, corners: Floats) -> Floats:
+    """Where segments (m, 2, 3) pass through the triangles (m, 3, 3) of the same rows [m], (k, 3), by signed volumes."""
     (p, q), (a, b, c) = np.moveaxis(ends, 1, 0), np.moveaxis(corners, 1, 0)
     normal = np.cross(b - a, c - a)
     above, below = _dot(p - a, normal), _dot(q - a, normal)
     sides = [_dot(q - p, np.cross(u - p, v - p)) for u, v in ((a, b), (b, c), (c, a))]
     through = (above * below <= 0.0) & (above != below)
     through &= np.all([side >= 0.0 for side in sides], axis=0) | np.all([side <= 0.0 for side in sides], axis=0)
-    if not through.any():
-        return None
-    row = int(np.flatnonzero(through)[0])
-    share = above[row] / (above[row] - below[row])
-    point: Floats = p[row] + share * (q[row] - p[row])
+    share = above[through] / (above - below)[through]
+    point: Floats = p[through] + share[:, None] * (q - p)[through]
     return point
+
+
+def _touches_at_end(ends: Floats, corners: Floats) -> Floats:
+    """Ends of segments within `TOUCHING` above or below the triangles of the same rows [m], (k, 3)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normal = np.cross(b - a, c - a)
+    squared = _dot(normal, normal)
+    touching = []
+    for p in np.moveaxis(ends, 1, 0):
+        beside = np.abs(_dot(p - a, normal)) <= TOUCHING * np.sqrt(squared)
+        for u, v in ((a, b), (b, c), (c, a)):
+            beside &= _dot(np.cross(v - u, p - u), normal) >= 0.0
+        touching.append(p[beside & (squared > 0.0)])
+    return np.concatenate(touching)
+
+
+def _touches_at_side(ends: Floats, corners: Floats) -> Floats:
+    """Points of segments within `TOUCHING` of a side of the triangles of the same rows [m], (k, 3)."""
+    p, q = np.moveaxis(ends, 1, 0)
+    touching = []
+    for number in range(3):
+        a, b = corners[:, number], corners[:, (number + 1) % 3]
+        point, other = _nearest_points(p, q - p, a, b - a)
+        touching.append(point[np.linalg.norm(point - other, axis=1) <= TOUCHING])
+    return np.concatenate(touching)
+
+
+def _nearest_points(p: Floats, along: Floats, a: Floats, along_other: Floats) -> tuple[Floats, Floats]:
+    """Where segments p + s d, a + t e are nearest each other [m], (m, 3) each (Ericson 2005, section 5.1.9)."""
+    between = p - a
+    dd, ee, de = _dot(along, along), _dot(along_other, along_other), _dot(along, along_other)
+    db, eb = _dot(along, between), _dot(along_other, between)
+    area_squared = dd * ee - de * de
+    s = np.clip(_quotient(de * eb - ee * db, area_squared), 0.0, 1.0)
+    t = np.clip(_quotient(de * s + eb, ee), 0.0, 1.0)
+    s = np.clip(_quotient(de * t - db, dd), 0.0, 1.0)
+    return p + s[:, None] * along, a + t[:, None] * along_other
+
+
+def _quotient(numerator: Floats, denominator: Floats) -> Floats:
+    """Their quotient; 0 where the denominator is."""
+    return np.divide(numerator, denominator, out=np.zeros_like(numerator), where=denominator != 0.0)
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

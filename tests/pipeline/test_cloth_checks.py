@@ -50,7 +50,14 @@ def test_a_cloth_over_a_ball_is_fine_and_its_nodes_are_counted(tmp_path):
         ),
         (
             SHEET + SECOND + "rotation_deg = [0.0, 90.0, 0.0]",
-            'drape.toml:9 cloth[1]: passes through cloth "sheet" at (0.03, -0.15, 0.5) m; move one of them',
+            'drape.toml:9 cloth[1]: passes through or touches cloth "sheet" at (0.03, -0.15, 0.5) m; '
+            "move one of them, 0.0005 m or more apart",
+        ),
+        (
+            # Nothing passes through anything, and contacts would not know which of the two is above.
+            SHEET + SECOND + "rotation_deg = [0.0, 0.0, 27.0]\nthickness = 2e-3",
+            'drape.toml:9 cloth[1]: passes through or touches cloth "sheet" at (0.008998, -0.1791, 0.5) m; '
+            "move one of them, 0.002 m or more apart",
         ),
         (
             SHEET + "[[cloth.pin]]\nindex = [3, 81]",
@@ -91,8 +98,8 @@ def test_a_cloth_over_a_ball_is_fine_and_its_nodes_are_counted(tmp_path):
             'drape.toml:5 cloth[0].name: "sheet" is taken by rigid[0]; names are unique in a job',
         ),
     ],
-    ids=["outside", "wall", "inside", "inside a cell", "crossing", "pin index", "pin region", "moving pins", "shared",
-         "file", "smoke look", "woven look", "name of the solver", "name of a body"],
+    ids=["outside", "wall", "inside", "inside a cell", "crossing", "in one plane", "pin index", "pin region",
+         "moving pins", "shared", "file", "smoke look", "woven look", "name of the solver", "name of a body"],
 )  # fmt: skip
 def test_what_cannot_start_is_refused_with_its_place(text, expected, tmp_path):
     assert expected.replace("FOLDER", str(tmp_path)) in errors(text, tmp_path)
@@ -159,7 +166,7 @@ def test_cloth_beside_smokes_whose_boxes_overlap_is_refused(tmp_path):
 def test_cloths_of_two_airs_beside_smoke_are_refused(tmp_path):
     other = SHEET[SHEET.index("[[cloth]]") :].replace('"sheet"', '"other"')
     thin, none = "air_density = 0.6\n", "air_density = 0.0\n"
-    apart = other.replace("0.3]", "0.9]")
+    apart = other.replace("0.5]", "0.9]")
     with pytest.raises(JobFileError, match=r'air_density of cloth "other" is 0\.6 kg/m³, but that of "sheet" 1\.2'):
         warnings(SHEET + apart + thin + PLUME, tmp_path)
     assert warnings(SHEET + apart + none + PLUME, tmp_path) == []
@@ -204,8 +211,8 @@ def test_a_mesh_that_passes_through_itself_is_refused_unless_it_need_not_collide
     text = mesh_job([*SQUARE, *spike], [[0, 1, 2], [0, 2, 3], [4, 5, 6]], tmp_path)
     (problem,) = errors(text, tmp_path)
     assert problem == (
-        "drape.toml:6 cloth[0].shape: passes through itself at (0, 0, 0.5) m; "
-        "take it apart, or use self_collision = false"
+        "drape.toml:6 cloth[0].shape: passes through or touches itself at (0, 0, 0.5) m; "
+        "take it apart by its thickness, or use self_collision = false"
     )
     assert errors(text + "self_collision = false", tmp_path) == []
 
@@ -267,7 +274,7 @@ def test_a_rod_that_cloth_is_pinned_along_may_be_thinner_than_two_of_its_edges(t
     assert len(told(ROD)) == len(told(pin.replace('edge = "x-"', 'corner = "x-y-"'), ROD)) == 1
     assert len(told(pin.replace("x-", "x+"), ROD)) == 1
     # Another sheet may come to it too.
-    (of_the_other,) = told(pin, SECOND, ROD)
+    (of_the_other,) = told(pin, SECOND.replace("0.5]", "0.51]"), ROD)
     assert "cloth[1].shape" in of_the_other
 
 

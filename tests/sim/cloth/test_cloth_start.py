@@ -10,7 +10,7 @@ from sim.build import build_world
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import edges_of
-from sim.cloth.start import first_crossing, start_positions
+from sim.cloth.start import TOUCHING, first_crossing, start_positions
 from sim.scene import SceneParameters
 
 
@@ -73,13 +73,41 @@ def test_a_giant_triangle_that_passes_through_small_ones_is_found():
     np.testing.assert_allclose(point, [0.013, 0.0, 0.0], atol=0.011)
 
 
-def test_sheets_in_one_plane_do_not_cross_but_one_that_touches_with_an_edge_does():
-    position = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 0], [0.9, 0.2, 0], [0.2, 0.9, 0]], dtype=float)
+NEAR = 0.9 * TOUCHING
+FAR = 1.1 * TOUCHING
+BELOW = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("triangle", "meets"),
+    [
+        pytest.param([[0.2, 0.2, 0], [0.9, 0.2, 0.5], [0.2, 0.9, 0.5]], True, id="a corner stands on it"),
+        pytest.param([[0.2, 0.2, NEAR], [0.9, 0.2, 0.5], [0.2, 0.9, 0.5]], True, id="a corner is just above it"),
+        pytest.param([[0.2, 0.2, -FAR], [0.9, 0.2, -0.5], [0.2, 0.9, -0.5]], False, id="a corner is farther below it"),
+        pytest.param([[0.2, 0.2, 0], [0.9, 0.2, 0], [0.2, 0.9, 0]], True, id="in its plane, a corner in it"),
+        pytest.param([[-1, -1, 0], [3, -1, 0], [-1, 3, 0]], True, id="in its plane, all around it"),
+        pytest.param([[0.7, 0.7, 0], [-0.3, 0.7, 0], [0.7, -0.3, 0]], True, id="in its plane, only sides cross"),
+        pytest.param([[1, 1, 0], [2, 1, 0], [1, 2, 0]], False, id="in its plane, beside it"),
+        pytest.param([[0, -NEAR, 0], [0.8, -NEAR, 0], [0, -1, 0]], True, id="in its plane, a side along one of its"),
+        pytest.param([[0, -FAR, 0], [0.8, -FAR, 0], [0, -1, 0]], False, id="in its plane, a side farther off"),
+        pytest.param(
+            [[0.5, -NEAR, -1], [0.5, -NEAR, 1], [0.5, -1, 0]], True, id="a side crosses just beside one of its"
+        ),
+        pytest.param([[0.5, -FAR, -1], [0.5, -FAR, 1], [0.5, -1, 0]], False, id="a side crosses farther off"),
+    ],
+)
+def test_triangles_meet_where_they_come_within_what_rounding_tells_apart(triangle, meets):
+    position = np.array([*BELOW, *triangle], dtype=float)
     triangles = np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32)
-    edges = edges_of(triangles).nodes
-    assert first_crossing(position, edges, triangles) is None
-    position[5] += [0.0, 0.0, 0.5]
-    assert first_crossing(position, edges, triangles) is not None
+    point = first_crossing(position, edges_of(triangles).nodes, triangles)
+    assert (point is not None) == meets
+
+
+def test_flat_sheets_do_not_meet_themselves():
+    sheet = build_sheet(
+        ClothParameters(name="s", shape={"type": "rectangle", "size": (1, 1), "counts": (26, 26)}).shape
+    )
+    assert first_crossing(sheet.vertices, edges_of(sheet.triangles).nodes, sheet.triangles) is None
 
 
 def test_a_cloth_starts_turned_about_its_middle_and_moved():
