@@ -99,6 +99,7 @@ _KNOWN = {
         Quantity("repaired_crossings", "crossings repaired", "", "Cloth crossings repaired", counted=True),
         Quantity("crossings_left", "crossings left", "", "Cloth crossings left", counted=True),
         Quantity("impact_zone_vertices", "nodes moved as one", "", "Cloth nodes moved as one", counted=True),
+        Quantity("overlong_springs", "springs too long", "", "Cloth springs too long", counted=True),
         Quantity("max_strain", "largest strain", SHARE, "Strain"),
         Quantity("wall_contacts", "wall contacts", "", "Contacts", counted=True),
         Quantity("max_penetration", "deepest penetration", "m", "Penetration"),
@@ -179,6 +180,11 @@ WARNINGS = (
         "crossings_left",
         "crossing of cloth could not be prevented",
         "crossings of cloth could not be prevented",
+    ),
+    CountedEvent(
+        "overlong_springs",
+        "spring of a cloth is half too long: give more substeps or iterations, or pin more nodes",
+        "springs of cloth are half too long: give more substeps or iterations, or pin more nodes",
     ),
     CountedEvent(
         "nodes_lost",

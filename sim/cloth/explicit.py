@@ -1,6 +1,6 @@
 """Springs as explicit forces: symplectic Euler, the reference mode, with the longest step that is stable."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import taichi as ti
@@ -47,6 +47,13 @@ class ExplicitSprings:
 
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
         """Springs hold their own stiffness."""
+
+    def begin_frame(self) -> None:
+        """There is nothing to count."""
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """None of its own: springs are as long as their forces make them."""
+        return {}
 
     def stable_dt(self) -> float:
         """Longest stable step [s]."""

@@ -219,7 +219,7 @@ class ClothParameters(Parameters):
         default=1,
         description="Sweeps of xpbd over its springs in every step [-]. A sweep does not let every spring know of all "
         "that hangs on it: cloth that hangs from single points, and any mesh, stretches too much there, by less with "
-        "each sweep and with the square of the step; max_strain in the diagnostics tells.",
+        "each sweep and with the square of the step; a run warns of springs that get half too long by it.",
     )
 
     @model_validator(mode="before")

@@ -5,6 +5,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.loop_costs import NODE_IN_ROWS_NS
+from sim.cloth.overlong import count_overlong_in_lines
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.row_blocks import LANES, load_blocks, row_blocks, store_blocks, strips_of
 from sim.cloth.row_springs import bend_lines, solve_diagonals
@@ -89,6 +90,21 @@ class RectangleSprings:
         for axis in (ALONG_X, ALONG_Y):
             straighten_lines(blocks, *self._lines(axis), short)
         store_blocks(blocks, self._first, grid.columns, grid.rows, self._strips[ALONG_Y], state.displacement, short)
+
+    def count_overlong(self, dt: float) -> int:
+        """Right after `displace`: how many springs are much longer than their tension makes them, see `overlong`."""
+        state, columns, rows = self._state, self._grid.columns, self._grid.rows
+        across = {ALONG_Y: (columns, columns, 1), ALONG_X: (rows, 1, columns)}
+        return sum(
+            int(
+                count_overlong_in_lines(
+                    self._blocks, axis, self._lengths[axis], self._strips[axis], lines, self._first, node_step,
+                    line_step, self._thread_stiffness[axis], self._steps[axis], state.lattice, state.quantum,
+                    state.inverse_mass, dt * dt, state.displacement,
+                )
+            )
+            for axis, (lines, node_step, line_step) in across.items()
+        )  # fmt: skip
 
     def _lines(self, axis: int) -> tuple[int, int, int, int]:
         """Whether lines are turned, how many nodes one has, their strips, and those of the other direction."""

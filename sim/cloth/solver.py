@@ -226,6 +226,7 @@ class ClothSolver:
         """A frame starts at simulated time `time_s` [s]."""
         self._time_s = time_s
         self._hold_pins()  # as `restore` does: both take their first step from what pins hold now
+        self._integrator.begin_frame()
         for contacts in self.contacts:
             contacts.begin_frame()
 
@@ -335,6 +336,7 @@ class ClothSolver:
             "node_count": float(self.state.vertex_count),
             **nodes,
             **self._totals.of_springs(),
+            **self._integrator.diagnostics(),
             "nodes_lost": lost,
             **contacts,
         }

@@ -5,6 +5,7 @@ import taichi as ti
 
 from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, colour_bounds
+from sim.cloth.overlong import count_overlong
 from sim.cloth.state import ClothState, Lattice
 from sim.launch import fast_launch
 
@@ -67,6 +68,16 @@ class ThreadSolver:
                 colour, self._is_taut, self._tension, state.inverse_mass, state.carry, state.velocity, dt, self._lower,
                 self._diagonal, self._solved, state.displacement,
             )  # fmt: skip
+
+    def count_overlong(self, state: ClothState, dt: float) -> int:
+        """After `straighten`: how many springs are much longer than their tension makes them, see `overlong`."""
+        springs = self._springs
+        return int(
+            count_overlong(
+                springs.nodes, springs.law, springs.count, self._multiplier, state.lattice, state.quantum,
+                state.inverse_mass, dt * dt, state.displacement,
+            )
+        )  # fmt: skip
 
 
 @fast_launch

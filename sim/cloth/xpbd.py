@@ -1,6 +1,6 @@
 """Compliant springs with small steps: XPBD with one iteration a step (Macklin et al. 2019, "Small steps")."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import taichi as ti
 
@@ -39,6 +39,7 @@ class XPBDSprings:
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], *, iterations: int) -> None:
         self._state, self._springs, self._iterations = state, springs, iterations
         self._spin = FreeSpin(state)
+        self._overlong, self._is_counted = 0, True
         self._rectangles = {
             number: RectangleSprings(state, grid, int(state.host.first_node[number]))
             for number, grid in rectangles_in_rows(state.host).items()
@@ -56,6 +57,14 @@ class XPBDSprings:
         """Stiffness of the rectangles as it is now; lists of springs hold theirs."""
         for number, rectangle in self._rectangles.items():
             rectangle.take_parameters(cloths[number])
+
+    def begin_frame(self) -> None:
+        """Count overlong springs in the next step; once a frame, as it costs a good part of a sweep."""
+        self._overlong, self._is_counted = 0, False
+
+    def diagnostics(self) -> Mapping[str, float]:
+        """`overlong_springs`: at the start of the frame, along the threads of rectangles and the edges of meshes."""
+        return {"overlong_springs": float(self._overlong)}
 
     def stable_dt(self) -> float:
         """Any step is stable [s]."""
@@ -90,8 +99,13 @@ class XPBDSprings:
                 threads.displace(self._state, dt, is_first=iteration == 0)
         for threads in self._threads:
             threads.straighten(self._state, dt)
+            if not self._is_counted:
+                self._overlong += threads.count_overlong(self._state, dt)
         for rectangle in self._rectangles.values():
             rectangle.displace(dt, self._iterations)
+            if not self._is_counted:
+                self._overlong += rectangle.count_overlong(dt)
+        self._is_counted = True
         self._spin.restore(dt)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:

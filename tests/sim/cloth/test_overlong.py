@@ -1,0 +1,67 @@
+"""Springs that are longer than their tension makes them are told from those that the material lets stretch."""
+
+import numpy as np
+import pytest
+from cloth_scenes import FRAMES_PER_SECOND, VACUUM, cloth, rectangle, solver_of
+from test_rectangles import by_lists
+
+from sim.cloth.solver import ClothSolver
+
+pytestmark = pytest.mark.usefixtures("taichi_cpu")
+
+
+def after(solver: ClothSolver, frames: int) -> ClothSolver:
+    for frame in range(frames):
+        solver.begin_frame(frame / FRAMES_PER_SECOND)
+        for _ in range(round(1.0 / (FRAMES_PER_SECOND * solver.stable_dt()))):
+            solver.substep(solver.stable_dt())
+    return solver
+
+
+def hung_by_a_corner(**keys) -> ClothSolver:
+    """A metre of cotton whose weight 1024 nodes have to pass on to one."""
+    sheet = {"shape": rectangle((1.0, 1.0), (32, 32)), "pin": [{"corner": "x-y+"}], "rotation_deg": (90.0, 0.0, 0.0)}
+    return solver_of(cloth(**sheet, **VACUUM, **keys))
+
+
+def test_too_few_substeps_draw_springs_out_and_more_of_them_and_of_sweeps_do_not():
+    few, enough = after(hung_by_a_corner(substeps=4), 20), after(hung_by_a_corner(substeps=20, iterations=4), 20)
+    assert few.diagnostics()["max_strain"] > 0.5
+    assert few.diagnostics()["overlong_springs"] > 0
+    assert enough.diagnostics()["max_strain"] < 0.5
+    assert enough.diagnostics()["overlong_springs"] == 0
+
+
+def test_soft_cloth_that_stretches_by_its_own_weight_has_no_overlong_springs():
+    """0.15 kg/m² on an edge strain 1 m of 1 N/m by 1.5 at the top at rest, and by more as it falls into its pins."""
+    soft = cloth(
+        shape=rectangle((0.2, 1.0), (5, 33)), pin=[{"edge": "y+"}], rotation_deg=(90.0, 0.0, 0.0),
+        stretch_stiffness=1.0, shear_stiffness=0.2, **VACUUM,
+    )  # fmt: skip
+    numbers = after(solver_of(soft), 30).diagnostics()
+    assert numbers["max_strain"] > 1.0
+    assert numbers["overlong_springs"] == 0
+
+
+def test_springs_between_pins_are_not_counted():
+    """Those that hold both ends of a spring say how long it is."""
+    led = [{"time_s": 0.0}, {"time_s": 0.1, "offset": (0.4, 0.0, 0.0)}]
+    pins = [{"edge": "x-"}, {"edge": "x+", "keyframe": led}]
+    numbers = after(solver_of(cloth(shape=rectangle((0.2, 0.2), (2, 9)), pin=pins)), 6).diagnostics()
+    assert numbers["max_strain"] > 1.0
+    assert numbers["overlong_springs"] == 0
+
+
+def test_rows_and_lists_count_the_same(taichi_cpu, monkeypatch):
+    if taichi_cpu != "cpu":
+        pytest.skip("a GPU solves rectangles by lists")
+    # 70 nodes along x are two pieces of thread; a wave and a quarter more length are more than one sweep takes back.
+    parameters = cloth(shape=rectangle((0.7, 0.2), (70, 21)), substeps=2, **VACUUM)
+    counts = []
+    for solver in (solver_of(parameters), by_lists(monkeypatch, parameters)):
+        positions = solver.state.positions() * (1.25, 1.25, 1.0)
+        positions[:, 2] += 0.01 * np.sin(np.arange(len(positions)))
+        solver.state.set_positions(positions)
+        after(solver, 1)
+        counts.append(solver.diagnostics()["overlong_springs"])
+    assert counts[0] == counts[1] > 0.0
