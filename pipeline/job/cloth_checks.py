@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.job.amounts import count, gigabytes
 from pipeline.job.boxes import Box, domain_box, span, touch
 from pipeline.job.cloth_bodies import ClothAtStart, check_bodies_for_cloth
+from pipeline.job.cloth_fluid_checks import check_buoyancy, fluid_over
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.mesh_checks import mesh_exists
 from pipeline.job.pin_checks import check_pin_load, check_pin_speed, check_pin_times
@@ -112,6 +113,11 @@ class _Start:
         return float(np.linalg.norm(rest[:, 1] - rest[:, 0], axis=1).min())
 
     @property
+    def mass(self) -> float:
+        """Of the cloth [kg]."""
+        return float(self.sheet.node_area.sum()) * self.cloth.mass_per_area
+
+    @property
     def box(self) -> Box:
         """What it spans."""
         return np.array([self.position.min(axis=0), self.position.max(axis=0)])
@@ -146,8 +152,10 @@ def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
         _check_pin_speeds(start, job.fps, findings)
         check_pin_load(
             start.path, start.cloth, nodes=len(start.position), pinned=int(start.kept.sum()), edge=start.shortest_edge,
+            fluid_share=fluid_over(job, solids, start.box) / start.mass,
             gravity=float(np.linalg.norm(job.gravity)), fps=job.fps, findings=findings,
         )  # fmt: skip
+        check_buoyancy(job, start.path, start.cloth, findings)
         _check_substeps(start, job.fps, findings)
         for path, solid in solids.items():
             if path[0] == "rigid":

@@ -35,7 +35,7 @@ def check_fluids(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) 
     openings: dict[KeyPath, Opening] = {}
     for index, fluid in enumerate(job.fluid):
         _check_speeds(job, index, findings)
-        for number, opening in _openings(fluid, index, findings):
+        for number, opening in openings_of(fluid, index, findings):
             path = ("fluid", index, "emitter", number)
             _check_emitter(job, path, opening, obstacles, findings)
             _check_nozzle(path, opening, openings, 2.0 * fluid.particle_radius, findings)
@@ -54,7 +54,7 @@ def particle_room(job: Job, fluid: FluidParameters, block_volume: float) -> floa
     """
     spacing = 2.0 * fluid.particle_radius
     start = block_volume / spacing**3
-    emitted = sum(opening.total_particles() for _, opening in _openings(fluid))
+    emitted = sum(opening.total_particles() for _, opening in openings_of(fluid))
     domain = math.prod(high - low for low, high in zip(job.domain.min, job.domain.max, strict=True))
     cap = math.inf if fluid.max_particles is None else fluid.max_particles
     return max(start, min(start + emitted, cap, domain / spacing**3))
@@ -63,10 +63,10 @@ def particle_room(job: Job, fluid: FluidParameters, block_volume: float) -> floa
 def emitted_particles(job: Job, fluid: FluidParameters) -> int:
     """Particles that the emitters of a fluid add until the film's end, about."""
     end = job.frame_count / job.fps
-    return sum(len(opening.points) * opening.layers_due(end) for _, opening in _openings(fluid))
+    return sum(len(opening.points) * opening.layers_due(end) for _, opening in openings_of(fluid))
 
 
-def _openings(
+def openings_of(
     fluid: FluidParameters, index: int = 0, findings: Findings | None = None
 ) -> Iterator[tuple[int, Opening]]:
     """The openings of a fluid's emitters that are wide enough; the others are noted."""

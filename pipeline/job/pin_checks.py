@@ -77,8 +77,8 @@ FIRM = 0.5
 
 
 def check_pin_load(
-    path: KeyPath, cloth: ClothParameters, *, nodes: int, pinned: int, edge: float, gravity: float, fps: int,
-    findings: Findings,
+    path: KeyPath, cloth: ClothParameters, *, nodes: int, pinned: int, edge: float, fluid_share: float, gravity: float,
+    fps: int, findings: Findings,
 ) -> None:  # fmt: skip
     """Warn of pins that hold so many nodes each that compliant springs have no time to pass the weight on.
 
@@ -88,6 +88,8 @@ def check_pin_load(
         nodes: of the cloth.
         pinned: those of them that pins hold for ever; none say nothing, as it falls then.
         edge: shortest distance of neighbouring nodes [m].
+        fluid_share: mass of the fluid that falls onto the cloth over its own: dry nodes at the pins are as light as
+            without it, and have so much more to pass on.
         gravity: [m/s²].
         fps: frames of the film per second.
         findings: where warnings go.
@@ -95,12 +97,13 @@ def check_pin_load(
     if cloth.integrator != "xpbd" or not pinned:
         return
     substeps = cloth.substeps or DEFAULT_SUBSTEPS
-    softness = nodes / pinned * gravity / (fps * substeps) ** 2 / cloth.iterations / edge
+    softness = (1.0 + fluid_share) * nodes / pinned * gravity / (fps * substeps) ** 2 / cloth.iterations / edge
     if softness > SOFTEST:
+        load = f" and fluid of {fluid_share:.2g} times their mass" if fluid_share else ""
         enough = math.ceil(substeps * math.sqrt(softness / FIRM))
         findings.warn(
             (*path, "pin"),
-            f"{pinned} pinned nodes hold {nodes}, and {substeps} substeps a frame are too few to pass on their weight: "
-            f"springs at the pins get much too long; pin regions of more nodes, as eyelets do, or give substeps = "
-            f"{enough}",
+            f"{pinned} pinned nodes hold {nodes}{load}, and {substeps} substeps a frame are too few to pass on their "
+            f"weight: springs at the pins get much too long; pin regions of more nodes, as eyelets do, or give more "
+            f"iterations, or substeps = {enough}",
         )

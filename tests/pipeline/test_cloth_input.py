@@ -219,7 +219,7 @@ CORNERS = '[[cloth.pin]]\ncorner = "x-y-"\n[[cloth.pin]]\ncorner = "x+y-"\n'
     ("count", "text", "said"),
     [
         # 128² / 2 nodes g dt² are 56 mm, at 7.9 mm between them: 7.09 times.
-        (128, CORNERS, "give substeps = 76"),
+        (128, CORNERS, "or substeps = 76"),
         (128, "substeps = 76\n" + CORNERS, None),
         (128, EDGE, None),
         (32, CORNERS, None),
@@ -233,3 +233,62 @@ def test_fine_cloth_on_single_nodes_is_warned_of_with_the_steps_that_do(count, t
     ]
     assert len(found) == (said is not None)
     assert said is None or said in found[0]
+
+
+BLOCK = """
+[[fluid.block]]
+shape = { type = "box", size = [0.2, 0.2, 0.2] }
+position = [0.0, 0.0, 0.8]
+"""
+WATER = """
+[[fluid]]
+name = "water"
+particle_radius = 0.01
+"""
+JET = (
+    WATER
+    + """[[fluid.emitter]]
+shape = { type = "disc", radius = 0.05 }
+position = [0.0, 0.0, 0.9]
+direction = [0.0, 0.0, -1.0]
+speed = 1.0
+"""
+)
+
+
+@pytest.mark.parametrize(
+    ("water", "said"),
+    [
+        # 7.9 kg in a second are 52 times the sheet: 32²/2 nodes g dt² / 3.2 cm is 0.11, and 53 times that 5.9.
+        (JET, "2 pinned nodes hold 1024 and fluid of 5"),
+        (JET.replace("0.9]", "0.4]"), None),
+        (JET.replace("[0.0, 0.0, 0.9]", "[0.8, 0.0, 0.9]"), None),
+        # Thrown aside: 0.35 s down to the sheet, with 3 m/s.
+        (JET.replace("[0.0, 0.0, -1.0]", "[1.0, 0.0, 0.0]").replace("speed = 1.0", "speed = 3.0"), None),
+        (JET.replace("particle_radius", "max_particles = 100\nparticle_radius"), None),
+        (WATER + BLOCK, "and fluid of 53 times their mass"),
+        (WATER + BLOCK.replace("0.8]", "0.2]"), None),
+        (WATER + BLOCK.replace("[0.0, 0.0", "[0.9, 0.0"), None),
+    ],
+    ids=["jet", "jet below", "jet beside", "jet thrown aside", "few particles", "block", "block below", "block beside"],
+)
+def test_water_over_cloth_weighs_on_its_pins(water, said, tmp_path):
+    text = FINE.replace("COUNT", "32") + CORNERS + water
+    found = [line for line in warnings(text, tmp_path) if "pinned nodes hold" in line]
+    assert len(found) == (said is not None)
+    assert said is None or said in found[0]
+
+
+def test_loose_cloth_that_weighs_what_it_displaces_is_told_to_go_with_the_water(tmp_path):
+    def told(**keys: float) -> list[str]:
+        lines = "".join(f"{key} = {value}\n" for key, value in keys.items())
+        text = FINE.replace("COUNT", "9") + lines + JET.replace('"water"', '"water"\nsolver = "dfsph"')
+        return [line for line in warnings(text, tmp_path) if "mass_per_area" in line]
+
+    # Cotton of 0.15 kg/m² displaces 0.5 kg/m²; 1.2 kg/m² is what particles of 2 cm tell apart.
+    (warning,) = told()
+    assert '0.15 kg/m², and the "water" that its thickness displaces 0.5 kg/m²: ' in warning
+    assert "they must differ by 1.2 kg/m² for it to sink or float" in warning
+    assert told(mass_per_area=1.75) == told(thickness=1.4e-3) == []
+    pinned = FINE.replace("COUNT", "9") + EDGE + JET
+    assert not [line for line in warnings(pinned, tmp_path) if "displaces" in line]
