@@ -106,7 +106,7 @@ class ContinuousContacts:
         self._pairs = SelfCollision(state)
         self._patches = self._pairs.patches
         self._lone = LoneCloth(state, self._patches)
-        self.rigid.set_spacing(self._pairs.mean_edge)
+        self.rigid.set_spacing(self._pairs.coarsest_edge)
         n = state.vertex_count
         self._contacts = ContactList(4 * n)
         self._shares, self._touched = ti.ndarray(ti.i32, n), ti.ndarray(ti.i32, n)

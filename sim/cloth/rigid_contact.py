@@ -111,7 +111,7 @@ class RigidContact:
             self._joined_high.from_numpy(joined[-1.0].astype(np.float32))
 
     def set_spacing(self, mean_edge: float) -> None:
-        """Say how far vertices of the cloth are from each other [m]: what is small, and how deep walls hold."""
+        """Say how far vertices of the coarsest cloth are apart [m]: what is small, and how deep walls hold."""
         self._spacing = mean_edge
         self.bodies.look_between_vertices(SMALL_BODY * mean_edge)
         self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())

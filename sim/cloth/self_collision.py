@@ -47,7 +47,8 @@ class SelfCollision:
     Attributes:
         with_triangles, of_edges: the listed pairs.
         thickness: the largest [m].
-        mean_edge: at rest [m].
+        mean_edge: at rest, of all cloths together [m]; how far lists reach.
+        coarsest_edge: mean edge of the cloth where that is largest [m]; how far nodes are apart.
         searches: how many pairs of patches were searched since `begin_frame`, over the number of patches.
 
     Args:
@@ -64,7 +65,10 @@ class SelfCollision:
         self.with_triangles = PairList(capacity=state.vertex_count, pieces=self._met.capacity)
         self.of_edges = PairList(capacity=state.edge_count, pieces=self._met.capacity)
         edges = state.host.position[state.host.edges]
-        self.mean_edge = float(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1).mean())
+        lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+        self.mean_edge = float(lengths.mean())
+        cloth_of = state.host.body[state.host.edges[:, 0]]
+        self.coarsest_edge = max(float(lengths[cloth_of == cloth].mean()) for cloth in np.unique(cloth_of))
         self.thickness = 0.0
         self._listed_for: tuple[bytes, tuple[bool, ...]] = (b"", ())
         self._is_forgotten, self._is_outrun = True, False

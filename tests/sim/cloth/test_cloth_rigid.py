@@ -174,6 +174,21 @@ def test_a_ball_smaller_than_a_cell_of_the_sheet_does_not_fall_through_it():
     assert rigid_of(world).bodies.position[0, 2] > cloth_of(world).state.positions()[:, 2].min()
 
 
+def test_a_ball_held_between_the_nodes_of_a_sheet_is_held_beside_a_finer_sheet_too():
+    """What counts as small is measured by the coarse sheet, not by the mean over all edges."""
+    ball = {"kind": "dynamic", "density": 100.0, "shape": {"type": "sphere", "radius": 0.03},
+            "position": (0.025, 0.025, 0.535), "velocity": (0.0, 0.0, -0.5)}  # fmt: skip
+    coarse = {"shape": rectangle((0.2, 0.2), (5, 5)), "position": (0.0, 0.0, 0.5),
+              "pin": [{"edge": edge} for edge in ("x-", "x+", "y-", "y+")]}  # fmt: skip
+    fine = {"shape": rectangle((0.2, 0.2), (41, 41)), "position": (0.0, 0.4, 0.5), "pin": [{"edge": "x-"}]}
+    for cloths in ((coarse,), (coarse, fine)):
+        world = world_of(*cloths, bodies=[ball])
+        for _ in range(15):
+            world.advance_frame()
+        # In 0.25 s it would fall 0.43 m; it rests on the sheet, which is 1 mm thick at most.
+        assert 0.5 < rigid_of(world).bodies.position[0, 2] < 0.535
+
+
 @pytest.mark.parametrize("shape", [BALL, {"type": "box", "size": (0.08, 0.08, 0.08)}])
 def test_a_fast_heavy_body_does_not_pass_through_a_sheet(shape):
     """At 20 m/s, 25 times as heavy as the sheet: it takes the sheet along, and no node ends up inside."""
