@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -42,6 +43,19 @@ class SimulationDivergedError(RuntimeError):
         return f"{self.finding}; {self.hint}" if self.hint else self.finding
 
 
+@dataclass(frozen=True, slots=True)
+class Remedies:
+    """What a job may change where a solver fails: its own keys, in words.
+
+    Attributes:
+        runaway: against a state that is not finite any more, or beyond all reason.
+        short_steps: against stable steps that get too short.
+    """
+
+    runaway: str
+    short_steps: str
+
+
 class Solver(Protocol):
     """One family of bodies that steps together. Owns its arrays; knows no file and no other solver."""
 
@@ -49,6 +63,9 @@ class Solver(Protocol):
 
     def stable_dt(self) -> float:
         """Largest time step [s] for the current state."""
+
+    def remedies(self) -> Remedies:
+        """What may help where it fails, with its parameters of the moment."""
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -165,7 +166,7 @@ class World:
                 self._check(team, start_s + (duration_s - remaining))
 
     def _steps_left(self, team: _Team, remaining: float, elapsed_s: float) -> int:
-        stable_dt = min(solver.stable_dt() for solver in team.solvers)
+        stable_dt, shortest = min(((solver.stable_dt(), solver) for solver in team.solvers), key=itemgetter(0))
         if not stable_dt > 0.0 or team.taken + remaining / stable_dt > self.max_substeps_per_frame:
             self._check(team, elapsed_s)
             raise SimulationDivergedError(
@@ -173,7 +174,7 @@ class World:
                 self.frame + 1,
                 self.time_s + elapsed_s,
                 f"the stable time step fell to {stable_dt:.3g} s",
-                "lower initial speeds, or give a larger particle radius or cell size",
+                shortest.remedies().short_steps,
             )
         return max(1, math.ceil(remaining / stable_dt * (1.0 - 1.0e-9)))
 
@@ -192,7 +193,7 @@ class World:
                     self.frame + 1,
                     self.time_s + elapsed_s,
                     quantity,
-                    'use dt = "adaptive", or a smaller dt or cfl',
+                    solver.remedies().runaway,
                 )
 
 

@@ -28,7 +28,7 @@ from sim.domain import DomainParameters
 from sim.parameters import Vector3
 from sim.short_loops import is_short
 from sim.snapshots import Snapshot
-from sim.solver import Arrays, Diagnostics
+from sim.solver import Arrays, Diagnostics, Remedies
 
 SOLVER_NAME = "cloth"
 
@@ -340,6 +340,18 @@ class ClothSolver:
             "nodes_lost": lost,
             **contacts,
         }
+
+    def remedies(self) -> Remedies:
+        """Softer cloth, more steps, or springs that are stable at any; slower wind, pins and bodies."""
+        if self.parameters[0].integrator == "explicit":
+            return Remedies(
+                runaway='give more substeps, a softer stretch_stiffness, or use integrator = "xpbd"',
+                short_steps='give a softer stretch_stiffness or a coarser sheet, or use integrator = "xpbd"',
+            )
+        return Remedies(
+            runaway="give more substeps, a softer stretch_stiffness, or slower wind and pins",
+            short_steps="give lower speeds to cloth, pins and bodies, or make small bodies larger",
+        )
 
     def first_bad_quantity(self) -> str | None:
         """Nodes whose motion is not finite, or beyond all reason."""

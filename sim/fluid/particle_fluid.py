@@ -24,6 +24,7 @@ from sim.fluid.phases import Phases
 from sim.fluid.stepping import MotionSummary, ParticleStepper
 from sim.neighbors import cells_per_radius
 from sim.snapshots import Snapshot
+from sim.solver import Remedies
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -307,6 +308,13 @@ class ParticleFluid(ABC):
     @abstractmethod
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
+
+    def remedies(self) -> Remedies:
+        """Smaller steps against pressures that overshoot; larger particles, or slower ones, cross less in a step."""
+        return Remedies(
+            runaway='use dt = "adaptive", or a smaller dt or cfl',
+            short_steps="lower its initial speeds, or give it a larger particle_radius",
+        )
 
     def first_bad_quantity(self) -> str | None:
         """The first non-finite or runaway quantity of any step since the start or `restore`, in words; costs nothing.

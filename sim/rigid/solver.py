@@ -22,7 +22,7 @@ from sim.rigid.states import Inertia, MovingBodies
 from sim.rigid.walls import walls_of
 from sim.shapes.solid import Points
 from sim.snapshots import Snapshot
-from sim.solver import Arrays, Diagnostics
+from sim.solver import Arrays, Diagnostics, Remedies
 
 Array = NDArray[np.float64]
 
@@ -378,6 +378,14 @@ class RigidSolver:
             "not_converged": float(self._not_converged),
             "bodies_lost": float(np.count_nonzero(bodies.is_lost)),
         }
+
+    def remedies(self) -> Remedies:
+        """Slower bodies: they choose their steps by how fast their surfaces move and how thick they are."""
+        return Remedies(
+            runaway="give bodies a lower velocity and angular_velocity, slower keyframes, or densities less far apart",
+            short_steps="give bodies a lower velocity and angular_velocity or slower keyframes, or make small and thin "
+            "ones larger",
+        )
 
     def first_bad_quantity(self) -> str | None:
         """The first body with a value that is no number, or a velocity beyond all reason."""

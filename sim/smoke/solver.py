@@ -28,7 +28,7 @@ from sim.smoke.sources import build_sources
 from sim.smoke.turbulence import Turbulence
 from sim.smoke.wind import Wind
 from sim.snapshots import Snapshot
-from sim.solver import Arrays, Diagnostics
+from sim.solver import Arrays, Diagnostics, Remedies
 
 RUNAWAY_SPEED = 1.0e4
 """No smoke of this kind moves at thirty times the speed of sound [m/s]."""
@@ -309,6 +309,13 @@ class SmokeSolver:
             numbers["uncovered_mass"] = self._uncovered_mass
             numbers["compression"] = self._compression
         return numbers
+
+    def remedies(self) -> Remedies:
+        """Smaller steps; larger cells, or slower air, cross less in one."""
+        return Remedies(
+            runaway="give it a smaller cfl, or slower or cooler sources",
+            short_steps="give it slower or cooler sources, or a larger cell_size",
+        )
 
     def first_bad_quantity(self) -> str | None:
         """The first field with a value that is no number, or a velocity beyond all reason."""

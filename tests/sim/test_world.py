@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sim.solver import SimulationDivergedError
+from sim.solver import Remedies, SimulationDivergedError
 from sim.world import World
 
 
@@ -20,6 +20,9 @@ class Oscillator:
 
     def stable_dt(self) -> float:
         return self._dt
+
+    def remedies(self) -> Remedies:
+        return Remedies(runaway=f"slow {self.name} down", short_steps=f"soften {self.name}")
 
     def substep(self, dt: float) -> None:
         self.v -= dt * self._omega**2 * self.x
@@ -157,7 +160,7 @@ def test_a_checkpoint_of_another_scene_is_refused():
 def test_divergence_names_body_frame_time_and_quantity():
     # omega dt = 50: explicit integration grows about 2500-fold a step and overflows within the third frame.
     world = World([Oscillator("spring", 1 / 6000, omega=3.0e5)], frames_per_second=60)
-    with pytest.raises(SimulationDivergedError, match=r'"spring" diverged at frame 1.*x is') as caught:
+    with pytest.raises(SimulationDivergedError, match=r'"spring" diverged at frame 1.*x is .*; slow spring') as caught:
         for _ in range(10):
             world.advance_frame()
     assert caught.value.body == "spring"
@@ -166,8 +169,14 @@ def test_divergence_names_body_frame_time_and_quantity():
 
 
 def test_a_collapsing_step_ends_instead_of_running_for_ever():
-    with pytest.raises(SimulationDivergedError, match="stable time step fell"):
+    with pytest.raises(SimulationDivergedError, match=r"stable time step fell to .*; soften a$"):
         World([Oscillator("a", 1.0e-12)], frames_per_second=60).advance_frame()
+
+
+def test_of_coupled_solvers_the_one_with_the_shortest_steps_says_what_helps():
+    pair = [Oscillator("a", 1.0e-2), Oscillator("b", 1.0e-12)]
+    with pytest.raises(SimulationDivergedError, match=r'"a \+ b" .* fell to .*; soften b$'):
+        World(pair, frames_per_second=60, couplings=[Spring("a", "b")]).advance_frame()
 
 
 def test_a_coupling_needs_its_first_solver_first():
