@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import hypot, prod
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,6 +37,9 @@ VAST = 20.0
 """A mesh that is so many times as large as the domain is in other units, most likely."""
 ROUND_OFF = 1.0e-6
 """Cloth that is laid onto a body, in decimal numbers, may be so deep in it [m]."""
+
+MANY_SUBSTEPS = 3000
+"""Of explicit springs in a frame: 150 times as many as XPBD takes."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,7 @@ def _start(job: Job, index: int, room: _Room, findings: Findings) -> _Start | No
         return None
     if isinstance(cloth.shape, RectangleSheet):
         key = "counts" if cloth.shape.counts is not None else "resolution"
-        if refusal := room.refusal(prod(cloth.shape.node_counts)):
+        if refusal := room.refusal(math.prod(cloth.shape.node_counts)):
             findings.error((*path, "shape", key), f"{refusal}: divide it less finely")
             return None
     try:
@@ -249,7 +252,7 @@ def _check_place(start: _Start, domain: DomainParameters, findings: Findings) ->
 def _check_speeds(path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:
     """Refuse speeds at which the simulation stops; warn of wind that blows through the cloth."""
     for key in ("velocity", "wind"):
-        if (speed := hypot(*getattr(cloth, key))) >= RUNAWAY_SPEED:
+        if (speed := math.hypot(*getattr(cloth, key))) >= RUNAWAY_SPEED:
             findings.error((*path, key), f"must be below {RUNAWAY_SPEED:g} m/s, got {speed:g} m/s; units are SI")
     if any(cloth.wind) and not cloth.air_density * (cloth.drag + cloth.skin_drag) > 0.0:
         none = "air_density" if not cloth.air_density else "drag and skin_drag"
@@ -293,18 +296,30 @@ def _check_pin_speeds(start: _Start, fps: int, findings: Findings) -> None:
 
 
 def _check_substeps(start: _Start, fps: int, findings: Findings) -> None:
-    """Explicit springs are unstable beyond their step."""
+    """Explicit springs are unstable beyond their step, and without a number of substeps dictate theirs."""
     from sim.cloth.springs import springs_of
-    from sim.cloth.stable_step import longest_explicit_step, too_few_substeps
+    from sim.cloth.stable_step import ACCURATE_SHARE, longest_explicit_step, too_few_substeps
+    from sim.world import MAX_SUBSTEPS_PER_FRAME
 
     cloth = start.cloth
-    if cloth.integrator != "explicit" or cloth.substeps is None:
+    if cloth.integrator != "explicit":
         return
     families = [(springs, springs.stiffness(cloth), springs.damping(cloth)) for springs in springs_of(start.sheet)]
     # Nodes that are let go later need shorter steps from then on.
     inverse_mass = np.where(start.kept, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
-    if reason := too_few_substeps(cloth.substeps, 1.0 / fps, longest_explicit_step(families, inverse_mass)):
-        findings.error((*start.path, "substeps"), reason)
+    longest = longest_explicit_step(families, inverse_mass)
+    if cloth.substeps is not None:
+        if reason := too_few_substeps(cloth.substeps, 1.0 / fps, longest):
+            findings.error((*start.path, "substeps"), reason)
+        return
+    substeps = math.ceil(1.0 / (fps * ACCURATE_SHARE * longest))
+    takes = f'"explicit" takes {count(substeps)} substeps a frame of springs of this stiffness and mass'
+    helps = 'give a softer stretch_stiffness or a coarser sheet, or use "xpbd"'
+    if substeps > MAX_SUBSTEPS_PER_FRAME:
+        most = count(MAX_SUBSTEPS_PER_FRAME)
+        findings.error((*start.path, "integrator"), f"{takes}, more than the {most} at which a run ends: {helps}")
+    elif substeps > MANY_SUBSTEPS:
+        findings.warn((*start.path, "integrator"), f"{takes}, which takes long: {helps}")
 
 
 def _check_inside(start: _Start, body: str, solid: Solid, findings: Findings) -> None:

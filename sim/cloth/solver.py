@@ -20,7 +20,7 @@ from sim.cloth.rectangles import rectangles_in_rows
 from sim.cloth.row_air import RectangleAir
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import joined_springs, springs_of
-from sim.cloth.stable_step import too_few_substeps
+from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
 from sim.cloth.state import ClothState, HostCloths
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
@@ -36,10 +36,6 @@ INTEGRATORS = {"xpbd": XPBDSprings, "explicit": ExplicitSprings}
 
 LOST_DISTANCE = 10.0
 """Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
-
-ACCURATE_SHARE = 0.34
-"""Share of the longest stable step that explicit springs take if no number of substeps is given: the energy of a sheet
-that swings undamped for 10 s then stays within 0.3 %, and the error falls with the square of the step."""
 
 LIVE_KEYS = frozenset(
     ("mass_per_area", "stretch_stiffness", "shear_stiffness", "bend_stiffness", "damping", "bend_damping", "thickness",

@@ -17,6 +17,10 @@ STEP_SAFETY = 0.7
 swing once in three or four steps (omega dt = 3^(1/2) and 2^(1/2)) resonate (Schlick et al. 1998, "Nonlinear resonance
 artifacts in molecular dynamics simulations")."""
 
+ACCURATE_SHARE = 0.34
+"""Share of the longest stable step that explicit springs take if no number of substeps is given: the energy of a sheet
+that swings undamped for 10 s then stays within 0.3 %, and the error falls with the square of the step."""
+
 
 def longest_explicit_step(families: Iterable[tuple[Springs, Floats, Floats]], inverse_mass: Floats) -> float:
     """Longest stable step of symplectic Euler [s]; infinite without springs.

@@ -10,7 +10,8 @@ from checked_jobs import checked
 from cloth_jobs import BALL, SHEET, errors, warnings
 
 from pipeline.errors import JobFileError
-from pipeline.job.cloth_checks import BYTES_PER_NODE
+from pipeline.job.cloth_checks import BYTES_PER_NODE, MANY_SUBSTEPS
+from sim.world import MAX_SUBSTEPS_PER_FRAME
 
 SECOND = """
 [[cloth]]
@@ -232,6 +233,21 @@ def test_too_few_substeps_for_explicit_springs_are_refused_with_a_number_that_is
     least = int(re.search(place + r".* give substeps = (\d+) or more", problem)[1])
     assert problems(least) == []
     assert len(problems(least - 1)) == 1
+
+
+def test_explicit_springs_without_substeps_are_told_how_many_they_take(tmp_path):
+    def told(found, stiffness: float) -> list[str]:
+        keys = f'integrator = "explicit"\nmass_per_area = 0.01\nstretch_stiffness = {stiffness:g}\n'
+        lines = found(SHEET + keys, tmp_path)
+        return [line for line in lines if "substeps a frame" in line]
+
+    assert told(warnings, 1.0e3) == told(errors, 1.0e7) == []
+    (slow,) = told(warnings, 1.0e7)
+    taken = int(re.search(r'cloth\[0\]\.integrator: "explicit" takes (\d+) substeps a frame', slow)[1])
+    assert taken > MANY_SUBSTEPS
+    # They grow with the root of the stiffness.
+    (endless,) = told(errors, 1.0e7 * (1.01 * MAX_SUBSTEPS_PER_FRAME / taken) ** 2)
+    assert "more than the 200000 at which a run ends: give a softer stretch_stiffness or a coarser sheet" in endless
 
 
 def test_explicit_springs_need_the_substeps_of_nodes_that_are_let_go_from_the_start(tmp_path):
