@@ -14,6 +14,7 @@ from typing import Any
 
 from pipeline.job import schema
 from pipeline.job.problems import quoted_list
+from sim.cloth.materials import MATERIAL_UNITS, MATERIALS, SOURCES
 
 BEGIN = "<!-- reference: begin; written by `python -m pipeline.job.reference docs/job-file.md` -->"
 END = "<!-- reference: end -->"
@@ -26,6 +27,8 @@ _KEYS_OF_TYPED = {
 }
 """The key that tables of several types stand under, by the end of their models' names."""
 FEW_TYPES = 3
+CLOTH = "ClothParameters"
+"""Title of the table whose keys come from its material."""
 
 _SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 
@@ -95,6 +98,20 @@ def _section(heading: str, about: str, node: schema.Node) -> Iterator[str]:
     yield "|---|---|---|---|"
     yield from rows
     yield ""
+    if node.get("title") == CLOTH:
+        yield from _materials_of_cloth()
+
+
+def _materials_of_cloth() -> Iterator[str]:
+    """A table of what each material gives where its keys are omitted."""
+    yield "What the materials give where a key is omitted:"
+    yield ""
+    yield f"| material | {' | '.join(f'`{key}` [{unit}]' for key, unit in MATERIAL_UNITS.items())} | what it is |"
+    yield "|---" * (len(MATERIAL_UNITS) + 2) + "|"
+    for material, numbers in MATERIALS.items():
+        written = " | ".join(f"{numbers[key]:.5g}" for key in MATERIAL_UNITS)
+        yield f'| "{material}" | {written} | {SOURCES[material]} |'
+    yield ""
 
 
 def _rows(node: schema.Node) -> Iterator[str]:
@@ -108,6 +125,8 @@ def _rows(node: schema.Node) -> Iterator[str]:
         ):
             continue
         default = "required" if key in required else _written(property_.get("default"))
+        if node.get("title") == CLOTH and key in MATERIAL_UNITS:
+            default = "the material's"
         cells = (f"`{key}`", _kind(property_), default, property_.get("description", ""))
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 

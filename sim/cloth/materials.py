@@ -59,3 +59,23 @@ plain cotton, a light habotai silk and a 12 oz denim. His units convert so:
 
 Rubber is an isotropic elastic sheet: stretch E h, shear E h / (2 (1 + nu)), bending E h³ / (12 (1 - nu²)).
 """
+
+_WOVEN = "within Kawabata's ranges at small loads (Kawabata 1980; Hu 2004, ch. 4-6)"
+
+SOURCES: Mapping[Material, str] = {
+    "cotton": f"a shirting of plain cotton, {_WOVEN}",
+    "silk": f"a light habotai, {_WOVEN}",
+    "denim": f"12 oz, {_WOVEN}",
+    "rubber": "1 mm of soft natural rubber of 1.5 MPa, incompressible, an isotropic elastic sheet (Gent 2012, ch. 3)",
+}
+"""What each is, and where its numbers are from, for people."""
+
+MATERIAL_UNITS: Mapping[str, str] = {
+    "mass_per_area": "kg/m²",
+    "stretch_stiffness": "N/m",
+    "shear_stiffness": "N/m",
+    "bend_stiffness": "N m",
+    "thickness": "m",
+    "friction": "-",
+}
+"""Keys that a material gives, in the order of `MATERIALS`."""

@@ -6,10 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from pipeline.job.checks import load_checked_job
 from pipeline.job.loading import load_job
-from pipeline.job.reference import with_reference
+from pipeline.job.reference import reference, with_reference
 from pipeline.job.schema import job_schema, node_at
+from sim.cloth.materials import MATERIALS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -82,6 +85,17 @@ def test_examples_in_the_documentation_are_valid_jobs(tmp_path):
 def test_reference_in_the_documentation_is_current():
     document = (ROOT / "docs" / "job-file.md").read_text(encoding="utf-8")
     assert with_reference(document) == document, "run: python -m pipeline.job.reference docs/job-file.md"
+
+
+def test_the_reference_has_what_each_material_of_cloth_gives():
+    lines = reference().splitlines()
+    rows = {line.split('"')[1]: line.split(" | ")[1:] for line in lines if line.startswith('| "')}
+    assert rows.keys() == MATERIALS.keys()
+    for material, numbers in MATERIALS.items():
+        assert [float(cell) for cell in rows[material][:6]] == pytest.approx(list(numbers.values()), rel=1e-4)
+    # Those of cotton are no defaults of another material.
+    (mass,) = (line for line in lines if line.startswith("| `mass_per_area`"))
+    assert "| the material's |" in mass
 
 
 def test_the_schema_that_the_sample_jobs_name_is_current():
