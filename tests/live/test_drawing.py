@@ -39,7 +39,7 @@ def test_a_moved_sheet_costs_its_positions_and_no_triangles(tmp_path):
             for number in range(4):
                 position = np.random.default_rng(number).uniform(size=(NODES, 3)).astype(np.float32)
                 sheet = Snapshot("cloth", {"position": position, "triangles": triangles.copy()}, {})
-                drawing.show({"sheet": sheet}, [("sheet", EDGE)])
+                drawing.show({"sheet": sheet}, {0: ("sheet", EDGE)})
                 end.content = f"end of picture {number}"
                 sizes.append(bytes_until(browser, end.content.encode()))
     assert sizes[0] > 12 * (NODES + len(triangles))  # the first one has them, so that they would be seen
