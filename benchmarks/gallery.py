@@ -1,14 +1,18 @@
 """The gallery of the sample jobs: docs/gallery.md, with a picture and a contact sheet of each.
 
-    python -m benchmarks.gallery renders --machine "32 cores and two NVIDIA H200" [-o docs] [--hero dam_break=60]
+    python -m benchmarks.gallery renders --machine "32 cores and two NVIDIA H200" [-o docs]
 
 Takes the frames that are there of each job of jobs/, as it was submitted, and the time that they took by its record;
-a job may be drawn in part, with `render.order = "spread"`. Jobs without frames are left out, and named.
+a job may be drawn in part, with `render.order = "spread"`. The frame that is shown large may be there better drawn, as
+`pipeline still` leaves it. Jobs without frames keep the section that they have, as it was drawn on another day and
+machine; those that have none either are left out, and named.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,14 +26,34 @@ from pipeline.task import ArtifactPath
 from render.sheet import contact_sheet
 
 JOBS = Path(__file__).resolve().parent.parent / "jobs"
-HERO_WIDTH, SHEET_WIDTH = 800, 1200
+HEROES = {
+    "ball_into_cloth": 53,
+    "cloth_over_bunny": 33,
+    "drop_on_bunny_dfsph": 186,
+    "drop_on_bunny_wcsph": 186,
+    "duck_in_pool_pcisph": 51,
+    "everything": 126,
+    "smoke_moving_duck": 242,
+}
+"""The frame of a job to show large, or the drawn one next to it; of other jobs the one in the middle."""
+HERO_WIDTH, SHEET_WIDTH = 1280, 1200
 """Of the pictures [pixels]."""
 PICTURES, COLUMNS = 12, 4
 """On a contact sheet."""
-QUALITY = 80
+QUALITY = 85
 """Of WebP."""
+QUALITIES = ("draft", "preview", "final")
 STAGES = ("simulate", "surface", "volume", "render")
 """Whose times are told."""
+
+
+class Hero(NamedTuple):
+    """The picture that is shown large."""
+
+    picture: Path
+    frame: int
+    resolution: tuple[int, int]
+    quality: str
 
 
 class Shot(NamedTuple):
@@ -42,6 +66,7 @@ class Shot(NamedTuple):
     drawn: int
     frames: int
     seconds: dict[str, float]
+    hero: Hero
 
 
 def description(job_file: Path) -> str:
@@ -56,10 +81,12 @@ def description(job_file: Path) -> str:
     return " ".join(lines)
 
 
-def shot_of(job_file: Path, layout: JobLayout) -> tuple[Shot, list[Path]]:
-    """What there is to tell of a job, and its frames."""
+def shot_of(job_file: Path, layout: JobLayout) -> tuple[Shot, list[Path]] | None:
+    """What there is to tell of a job, and its frames; None if it has no frame."""
     job = load_job(layout.job_file)
     pictures = picture_set(job, layout).all
+    if not pictures:
+        return None
     with ManifestReader.open_readonly(layout.manifest) as reader:
         frames: dict[str, set[str]] = {}
         for path, row in reader.artifacts().items():
@@ -69,11 +96,21 @@ def shot_of(job_file: Path, layout: JobLayout) -> tuple[Shot, list[Path]]:
             for timing in reader.stage_timings()
             if frames.get(timing.stage) and timing.seconds
         }
-    render, text = job.render, description(job_file)
-    return (
-        Shot(job_file.stem, text, render.resolution, render.quality, len(pictures), job.frame_count, seconds),
-        pictures,
-    )
+    resolution, quality = job.render.resolution, job.render.quality
+    shown = nearest(pictures, HEROES.get(job_file.stem, job.frame_count // 2))
+    hero = best_still(layout, int(shown.stem)) or Hero(shown, int(shown.stem), resolution, quality)
+    text, drawn = description(job_file), len(pictures)
+    return Shot(job_file.stem, text, resolution, quality, drawn, job.frame_count, seconds, hero), pictures
+
+
+def best_still(layout: JobLayout, frame: int) -> Hero | None:
+    """The largest still of a frame that `pipeline still` drew since the job was submitted, none of its keys changed."""
+    found = []
+    for path in layout.stills.glob(f"{frame:06d}-*.png"):
+        named = re.fullmatch(r"\d+-(draft|preview|final)-(\d+)x(\d+)", path.stem)
+        if named is not None and path.stat().st_mtime_ns >= layout.job_file.stat().st_mtime_ns:
+            found.append(Hero(path, frame, (int(named[2]), int(named[3])), named[1]))
+    return max(found, key=lambda hero: (hero.resolution, QUALITIES.index(hero.quality)), default=None)
 
 
 def frame_of(artifact: ArtifactPath) -> list[str]:
@@ -94,9 +131,9 @@ def spread_in_time(frames: list[Path], count: int) -> list[Path]:
     return sorted(chosen)
 
 
-def write_pictures(shot: Shot, frames: list[Path], images: Path, hero: int) -> None:
+def write_pictures(shot: Shot, frames: list[Path], images: Path) -> None:
     """`gallery-NAME.webp` and `gallery-NAME-sheet.webp`."""
-    with Image.open(nearest(frames, hero)) as picture:
+    with Image.open(shot.hero.picture) as picture:
         shown = picture.convert("RGB")
     if shown.width > HERO_WIDTH:
         shown = shown.resize((HERO_WIDTH, round(shown.height * HERO_WIDTH / shown.width)), Image.Resampling.LANCZOS)
@@ -105,21 +142,48 @@ def write_pictures(shot: Shot, frames: list[Path], images: Path, hero: int) -> N
     contact_sheet(spread_in_time(frames, PICTURES), path, columns=COLUMNS, width=SHEET_WIDTH)
 
 
-def section(shot: Shot) -> str:
-    """A job in Markdown."""
-    width, height = shot.resolution
+def section(shot: Shot, machine: str) -> str:
+    """A job in Markdown, which begins with its heading and ends with a line break."""
     times = "; ".join(f"{stage} {figure(shot.seconds[stage])} s" for stage in STAGES if stage in shot.seconds)
     took = f" A frame took: {times}." if times else ""
     drawn = "all" if shot.drawn == shot.frames else str(shot.drawn)
+    frames = f"{drawn} of {shot.frames} frames drawn, on {machine}.{took}"
+    film, large = how(shot.resolution, shot.quality), how(shot.hero.resolution, shot.hero.quality)
+    told = f"{film}; {frames}" if film == large else f"Large: frame {shot.hero.frame}, {large}. Below: {film}; {frames}"
     return f"""## {shot.name}
 ![{shot.name}](images/gallery-{shot.name}.webp)
 
 {shot.text}
 
-{width}x{height}, {shot.quality} quality; {drawn} of {shot.frames} frames drawn.{took}
+{told}
 
 ![frames of {shot.name}](images/gallery-{shot.name}-sheet.webp)
 """
+
+
+def how(resolution: tuple[int, int], quality: str) -> str:
+    """How a picture is drawn."""
+    width, height = resolution
+    return f"{width}x{height}, {quality} quality"
+
+
+def sections_of(page: Path) -> dict[str, str]:
+    """The sections of a gallery by the jobs that they are of; none where there is no gallery yet."""
+    text = page.read_text(encoding="utf-8") if page.exists() else ""
+    parts = re.split(r"^(?=## )", text, flags=re.MULTILINE)[1:]
+    return {part.partition("\n")[0].removeprefix("## "): part.rstrip("\n") + "\n" for part in parts}
+
+
+def write_page(page: Path, sections: Mapping[str, str]) -> None:
+    """All sections under one head, in the order of their names."""
+    head = """# Gallery
+
+The jobs of [jobs/](../jobs), one after the other. Each can be made with `pipeline submit jobs/NAME.toml`. A section
+says what it was drawn on, and stays until its job is drawn again. Seconds are what a stage's tasks took beside all
+others; what a frame takes alone is in [rendering](rendering.md#quality-presets). Where not all frames are drawn, they
+are from all over what was simulated. Written by `python -m benchmarks.gallery`.
+"""
+    page.write_text("\n".join([head, *(sections[name] for name in sorted(sections))]), encoding="utf-8")
 
 
 def figure(seconds: float) -> str:
@@ -132,29 +196,27 @@ def main() -> int:
     parser.add_argument("renders", type=Path, help="folder that holds the jobs' folders")
     parser.add_argument("--machine", required=True, help="what they ran on")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs"))
-    parser.add_argument("--hero", action="append", default=[], metavar="JOB=FRAME", help="frame to show large")
     arguments = parser.parse_args()
-    heroes = {name: int(frame) for name, _, frame in (each.partition("=") for each in arguments.hero)}
-    images = arguments.output / "images"
+    page, images = arguments.output / "gallery.md", arguments.output / "images"
     images.mkdir(parents=True, exist_ok=True)
-    sections, missing = [], []
-    for job_file in sorted(JOBS.glob("*.toml")):
+    jobs = sorted(JOBS.glob("*.toml"))
+    there = sections_of(page)
+    sections = {path.stem: there[path.stem] for path in jobs if path.stem in there}
+    drawn = []
+    for job_file in jobs:
         layout = JobLayout(arguments.renders / job_file.stem)
-        shot, frames = shot_of(job_file, layout) if layout.manifest.exists() else (None, [])
-        if shot is None or not frames:
-            missing.append(job_file.stem)
+        found = shot_of(job_file, layout) if layout.manifest.exists() else None
+        if found is None:
             continue
-        write_pictures(shot, frames, images, heroes.get(shot.name, shot.frames // 2))
-        sections.append(section(shot))
-    head = f"""# Gallery
-
-The jobs of [jobs/](../jobs) as they are, one after the other. Each can be made with `pipeline submit jobs/NAME.toml`.
-Made on {arguments.machine}. Seconds are what a stage's tasks took beside all others; what a
-frame takes alone is in [rendering](rendering.md#quality-presets). Where not all frames are drawn, the run ended before
-they were: they are from all over what was simulated until then. Written by `python -m benchmarks.gallery`.
-"""
-    (arguments.output / "gallery.md").write_text("\n".join([head, *sections]), encoding="utf-8")
-    print(f"{len(sections)} jobs; without frames: {', '.join(missing) or 'none'}")
+        shot, frames = found
+        write_pictures(shot, frames, images)
+        sections[shot.name] = section(shot, arguments.machine)
+        drawn.append(shot.name)
+    write_page(page, sections)
+    kept = [name for name in sections if name not in drawn]
+    missing = [path.stem for path in jobs if path.stem not in sections]
+    for what, names in (("drawn", drawn), ("kept", kept), ("missing", missing)):
+        print(f"{what}: {', '.join(names) or 'none'}")
     return 0
 
 

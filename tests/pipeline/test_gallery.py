@@ -1,15 +1,18 @@
-"""The gallery tells what was submitted and drawn, not what the job file of today says."""
+"""The gallery tells what was submitted and drawn, not what the job file of today says, and keeps what is not drawn."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import drawing_stages
 import pytest
 from drawn_films import draw_film
+from PIL import Image
 
-from benchmarks.gallery import section, shot_of
+from benchmarks import gallery
+from benchmarks.gallery import main, section, sections_of, shot_of
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.receipts import read_receipt
@@ -51,11 +54,16 @@ def layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobLayout:
     return layout
 
 
+def told(job_file: Path, layout: JobLayout) -> str:
+    shot, _ = shot_of(job_file, layout)
+    return section(shot, "an abacus")
+
+
 def test_size_quality_and_times_are_those_of_what_was_drawn(job_file, layout):
-    shot, pictures = shot_of(job_file, layout)
-    assert len(pictures) == 3
-    assert "A ball." in section(shot)
-    assert "96x64, draft quality; 3 of 4 frames drawn. A frame took: render 3 s." in section(shot)
+    assert len(shot_of(job_file, layout)[1]) == 3
+    assert "A ball." in told(job_file, layout)
+    expected = "96x64, draft quality; 3 of 4 frames drawn, on an abacus. A frame took: render 3 s."
+    assert expected in told(job_file, layout)
 
 
 def test_a_record_that_was_made_anew_of_receipts_has_no_times_and_is_told(job_file, layout):
@@ -64,4 +72,50 @@ def test_a_record_that_was_made_anew_of_receipts_has_no_times_and_is_told(job_fi
         file.unlink()
     with Manifest(layout.manifest) as manifest:
         manifest.record_artifacts(receipts)
-    assert "3 of 4 frames drawn.\n" in section(shot_of(job_file, layout)[0])
+    assert "3 of 4 frames drawn, on an abacus.\n" in told(job_file, layout)
+
+
+def still(layout: JobLayout, name: str, size: tuple[int, int]) -> Path:
+    layout.stills.mkdir(exist_ok=True)
+    Image.new("RGB", size, (90, 120, 150)).save(layout.stills / name)
+    return layout.stills / name
+
+
+def test_the_best_still_of_the_chosen_frame_is_shown_large_and_told(job_file, layout):
+    still(layout, "000002-draft-192x128.png", (192, 128))
+    best = still(layout, "000002-preview-192x128.png", (192, 128))
+    still(layout, "000002-final-384x256-0a1b2c.png", (384, 256))  # with other keys
+    still(layout, "000001-final-384x256.png", (384, 256))  # of another frame
+    assert shot_of(job_file, layout)[0].hero.picture == best
+    expected = "Large: frame 2, 192x128, preview quality. Below: 96x64, draft quality; 3 of 4 frames drawn"
+    assert expected in told(job_file, layout)
+
+
+def test_a_still_of_a_job_as_it_was_before_it_was_submitted_again_is_not_shown(job_file, layout):
+    picture = still(layout, "000002-final-192x128.png", (192, 128))
+    before = layout.job_file.stat().st_mtime - 60.0
+    os.utime(picture, (before, before))
+    assert shot_of(job_file, layout)[0].hero.picture == layout.path(layout.picture(2))
+
+
+def test_jobs_that_are_not_drawn_keep_their_sections_and_pictures(job_file, layout, monkeypatch, tmp_path):
+    for name in ("apple", "zebra", "lemon"):
+        job_file.with_name(f"{name}.toml").write_text(TODAY.replace('"ball"', f'"{name}"'))
+    docs = tmp_path / "docs"
+    docs.mkdir()
+    kept = {name: f"## {name}\nDrawn on a slide rule.\n" for name in ("zebra", "apple")}
+    gone = {name: f"## {name}\nDrawn on sand.\n" for name in ("ball", "of a job that is no more")}
+    (docs / "gallery.md").write_text("\n".join(["# Gallery\n", *kept.values(), *gone.values()]))
+    monkeypatch.setattr(gallery, "JOBS", tmp_path)
+    arguments = ["gallery", str(tmp_path / "renders"), "--machine", "an abacus", "-o", str(docs)]
+    monkeypatch.setattr("sys.argv", arguments)
+    main()
+    sections = sections_of(docs / "gallery.md")
+    assert list(sections) == ["apple", "ball", "zebra"]
+    assert {name: sections[name] for name in kept} == kept
+    assert sections["ball"] == told(job_file, layout)
+    drawn = sorted(path.name for path in (docs / "images").iterdir())
+    assert drawn == ["gallery-ball-sheet.webp", "gallery-ball.webp"]
+    once = (docs / "gallery.md").read_text()
+    main()
+    assert (docs / "gallery.md").read_text() == once
