@@ -28,7 +28,7 @@ from render.sheet import contact_sheet
 JOBS = Path(__file__).resolve().parent.parent / "jobs"
 HEROES = {
     "ball_into_cloth": 53,
-    "cloth_over_bunny": 33,
+    "cloth_over_bunny": 22,
     "drop_on_bunny_dfsph": 186,
     "drop_on_bunny_wcsph": 186,
     "duck_in_pool_pcisph": 51,
@@ -125,7 +125,9 @@ def nearest(frames: list[Path], wanted: int) -> Path:
 
 
 def spread_in_time(frames: list[Path], count: int) -> list[Path]:
-    """At most so many frames, as evenly spread over the film as those that are there allow."""
+    """At most so many frames, as evenly spread over the film as those that are there allow; all if few are there."""
+    if len(frames) <= count:
+        return frames
     last = int(frames[-1].stem)
     chosen = {nearest(frames, round(index * last / (count - 1))) for index in range(count)}
     return sorted(chosen)

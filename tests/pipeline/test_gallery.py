@@ -12,7 +12,7 @@ from drawn_films import draw_film
 from PIL import Image
 
 from benchmarks import gallery
-from benchmarks.gallery import main, section, sections_of, shot_of
+from benchmarks.gallery import main, section, sections_of, shot_of, spread_in_time
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.receipts import read_receipt
@@ -119,3 +119,12 @@ def test_jobs_that_are_not_drawn_keep_their_sections_and_pictures(job_file, layo
     once = (docs / "gallery.md").read_text()
     main()
     assert (docs / "gallery.md").read_text() == once
+
+
+def test_a_sheet_has_all_frames_that_are_there_if_they_are_few_and_else_those_next_to_even_steps():
+    def pictures(frames: list[int]) -> list[Path]:
+        return [Path(f"{frame:06d}.png") for frame in frames]
+
+    few = pictures([0, 30, 44, 45, 46, 90])
+    assert spread_in_time(few, 6) == few
+    assert spread_in_time(pictures([0, 10, 29, 31, 44, 46, 61, 90]), 4) == pictures([0, 29, 61, 90])
