@@ -27,7 +27,7 @@ from render.sheet import contact_sheet
 
 JOBS = Path(__file__).resolve().parent.parent / "jobs"
 HEROES = {
-    "ball_into_cloth": 53,
+    "ball_into_cloth": 34,
     "cloth_over_bunny": 22,
     "drop_on_bunny_dfsph": 186,
     "drop_on_bunny_wcsph": 186,
