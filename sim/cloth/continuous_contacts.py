@@ -113,6 +113,9 @@ class ContinuousContacts:
         self._counter = ti.ndarray(ti.i32, 3)
         self._uses = ti.ndarray(ti.i32, 2 * n)
         self._predicted, self._start, self._reached = (ti.Vector.ndarray(3, ti.f32, n) for _ in range(3))
+        self._brace, self._held_sums = ti.Vector.ndarray(3, ti.f32, n), ti.ndarray(ti.i32, 6 * n)
+        self._lever, self._presser = ti.ndarray(ti.f32, n), ti.ndarray(ti.i32, n)
+        self._brace.fill(0.0)
         self._crossing, self._crossing_count = ti.ndarray(ti.i32, 4 * n), ti.ndarray(ti.i32, 1)
         self._missing, self._ends = LaneReduction(maxima=1, sums=0), LaneReduction(maxima=6, sums=0)
         self._state = state
@@ -206,8 +209,9 @@ class ContinuousContacts:
             contacts.kind, contacts.arm, contacts.friction, contacts.mobility, contacts.impulse,
             contacts.impulse_before, contacts.impulse_given, contacts.pushing, contacts.push, self._counter, n,
             state.displacement, self._predicted, self._start, self._reached, state.inverse_mass, state.thickness,
-            self._shares, self._touched, *self._uses_of(contacts), bodies.count, bodies.motion, bodies.motion_start,
-            bodies.motion_reached, bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, bodies.impulse,
+            self._shares, self._touched, *self._uses_of(contacts), self._held_sums, self._lever, self._presser,
+            int(bodies.may_move), bodies.count, bodies.motion, bodies.motion_start, bodies.motion_reached,
+            bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, bodies.impulse,
             bodies.load, bodies.load_unit, self._impulse_unit, *self._missing.tree, is_first, short,
         )  # fmt: skip
         if not pushing:
@@ -231,8 +235,8 @@ class ContinuousContacts:
         )  # fmt: skip
 
     def _uses_of(self, contacts: ContactList) -> tuple[ti.Ndarray, ...]:
-        """Which contacts push each vertex."""
-        return self._uses, contacts.used_by, contacts.use_weight
+        """Which contacts push each vertex, and its brace."""
+        return self._uses, contacts.used_by, contacts.use_weight, self._brace
 
     def _keep_apart(self, state: ClothState, count: int) -> int:
         """Push, and at last tie together, until no pair can have crossed; how many pairs still may have."""

@@ -10,6 +10,13 @@ D_c = sum_i |c_ic| S_i / m_i, and steps of the residual over D_c converge (mass 
 weights). Where all contacts push alike, as between two layers, D_c is exact and one step does; momentum (Nesterov 1983,
 of contacts Mazhar et al. 2015) brings the others.
 
+A node under a heavy body on a floor passes on what neither its mass nor twenty steps could: D_c of it is ten thousand
+times too large for the body, which would fall through. So nodes between what stands and a body that moves have a
+`brace` e: they answer to contacts by (1 - e²)/m, about as heavily as the body. What the answer keeps from them is the
+floor's, so that the momentum of cloth and bodies changes by what stands alone. Nodes that are pressed from both sides
+do not leave or enter either whatever their mass. But the cloth's own springs pull them from under the body more easily
+than its friction would let them.
+
 Sums over contacts are sums of integers, in units far below anything that matters: the same for any order of contacts
 and threads. Loops over bodies are serial on a CPU: a few bodies are done sooner than other threads wake.
 """
@@ -17,7 +24,8 @@ and threads. Loops over bodies are serial on a CPU: a few bodies are done sooner
 import taichi as ti
 
 from sim.arrays import Floats, Integers, LongIntegers, Matrices, Vectors
-from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, Quadruples, Weights
+from sim.cloth.proximity import unit_or
+from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, WALL, Quadruples, Weights
 from sim.launch import fast_launch
 from sim.reductions import reduced, runs_on_gpu
 
@@ -39,18 +47,27 @@ STEPS = 8
 
 Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
+MOST_ALIKE = -0.5
+"""A vertex is between two sides, and gets a brace, if the cosine of the angle of their normals is below this."""
+
+LEAST_COSINE = 0.86
+"""Of the angle between a brace and a normal that belongs to it: half of that between the two sides."""
+
+LEAST_ANSWER = 1.0e-6
+"""Of a vertex that has a brace: float32 tells no less from none."""
+
 ROUNDING = 1.0e-6
 """Relative rounding of a separation in float32, in lengths of the elements."""
 
 
 @ti.func
 def weigh_contacts(
-    count: ti.i32, vertices: Quadruples, weights: Weights, floor: Floats, kind: Integers, arm: Vectors,
-    mobility: Floats, impulse: Vectors, pushing: Integers, counter: Integers,
+    count: ti.i32, vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers,
+    arm: Vectors, friction: Floats, mobility: Floats, impulse: Vectors, pushing: Integers, counter: Integers,
     vertex_count: ti.i32, displacement: Vectors, predicted: Vectors, inverse_mass: Floats, shares: Integers,
-    touched: Integers, uses: Integers, used_by: Integers, use_weight: Floats,
-    body_count: ti.i32, body_inverse_mass: Floats, body_inverse_inertia: Matrices, body_load: LongIntegers,
-    load_unit: ti.f32, is_first: ti.template(), is_short: ti.template(),
+    touched: Integers, uses: Integers, used_by: Integers, use_weight: Floats, held_sums: Integers, lever: Floats,
+    presser: Integers, brace: Vectors, body_count: ti.i32, body_inverse_mass: Floats, body_inverse_inertia: Matrices,
+    body_load: LongIntegers, load_unit: ti.f32, braces: ti.i32, is_first: ti.template(), is_short: ti.template(),
 ):  # fmt: skip
     """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses, and
     keep what displacements were `predicted` without contacts.
@@ -61,9 +78,12 @@ def weigh_contacts(
     Which of them push a vertex, by their places in `pushing`, and with what weights, is listed in `used_by` and
     `use_weight`, between `uses[2 i]` and `uses[2 i + 1]` of vertex i: then a step sums over the contacts of a vertex,
     without the twelve atomic sums that each contact would otherwise take.
+
+    If `braces`, each vertex between what stands and a body that moves gets its `brace`, and its contacts a normal along
+    that; `held_sums`, `lever` and `presser` are what is summed up for it.
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, vertices_end, bodies_end = count, vertex_count, body_count
+    contacts_end, vertices_end, bodies_end, braced_end = count, vertex_count, body_count, braces * vertex_count
     counter[0], counter[1], counter[2] = 0, 0, 0
     if ti.static(is_short):
         ti.loop_config(serialize=True)
@@ -71,6 +91,12 @@ def weigh_contacts(
         shares[i], uses[2 * i], uses[2 * i + 1] = 0, 0, 0
         if ti.static(is_first):
             predicted[i] = displacement[i]
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
+    for i in range(braced_end):
+        lever[i], presser[i] = 0.0, -1
+        for k in ti.static(range(6)):
+            held_sums[6 * i + k] = 0
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for b in range(bodies_end):
@@ -88,11 +114,14 @@ def weigh_contacts(
                     if inverse_mass[vertices[c][k]] > 0.0:
                         free += ti.abs(weights[c][k])
             b = kind[c]
+            most = 0.0
             if b >= 0:
                 most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
                 if most > 0.0:
                     ti.atomic_add(body_load[b], ti.cast(ti.ceil(ti.sqrt(most) / load_unit), ti.i64))
                     free = 1.0
+            if braces == 1 and (b >= 0 or b == WALL):
+                hold(c, vertices, weights, normal, kind, most, held_sums, lever, presser)
             if free >= LEAST_FREE_WEIGHT:
                 pushing[ti.atomic_add(counter[0], 1)] = c
     if ti.static(is_short):
@@ -104,16 +133,28 @@ def weigh_contacts(
             uses[2 * i], uses[2 * i + 1] = first, first
     if ti.static(is_short):
         ti.loop_config(serialize=True)
+    for i in range(braced_end):
+        b = presser[i]
+        brace[i] = ti.math.vec3(0.0)
+        if b >= 0 and inverse_mass[i] > 0.0:
+            of_body = lever[i] * ti.cast(body_load[b], ti.f32) * load_unit
+            own = inverse_mass[i] * ti.cast(shares[i], ti.f32) / SHARES_PER_UNIT
+            brace[i] = brace_between(i, held_sums, of_body / own)
+    if ti.static(is_short):
+        ti.loop_config(serialize=True)
     for place in range(counter[0]):
         c = pushing[place]
         if ti.static(is_first):
             impulse[c] = ti.math.vec3(0.0)
+        if braces == 1 and (kind[c] >= 0 or kind[c] == WALL):
+            normal[c] = turned_to_brace(c, vertices, weights, normal, friction, brace)
         total = 0.0
         for k in ti.static(range(4)):
             weight = ti.abs(weights[c][k])
             if weight > 0.0:
                 v = vertices[c][k]
-                total += weight * inverse_mass[v] * (ti.cast(shares[v], ti.f32) / SHARES_PER_UNIT)
+                own = weight * inverse_mass[v] * (ti.cast(shares[v], ti.f32) / SHARES_PER_UNIT)
+                total += answer_of(brace[v]) * own
                 use = ti.atomic_add(uses[2 * v + 1], 1)
                 used_by[use], use_weight[use] = place, weights[c][k]
         b = kind[c]
@@ -121,6 +162,72 @@ def weigh_contacts(
             most = body_mobility(arm[c], body_inverse_mass[b], body_inverse_inertia[b])
             total += ti.sqrt(most) * ti.cast(body_load[b], ti.f32) * load_unit
         mobility[c] = total
+
+
+@ti.func
+def hold(
+    c: ti.i32, vertices: Quadruples, weights: Weights, normal: Vectors, kind: Integers, most: ti.f32,
+    held_sums: Integers, lever: Floats, presser: Integers,
+):  # fmt: skip
+    """Sum up which way the vertices of a contact are held by what stands, and pressed by a body that moves."""
+    side = ti.select(most > 0.0, 3, 0)
+    for k in ti.static(range(4)):
+        if weights[c][k] != 0.0:
+            v = vertices[c][k]
+            part = (ti.abs(weights[c][k]) * SHARES_PER_UNIT) * normal[c]
+            for axis in ti.static(range(3)):
+                ti.atomic_add(held_sums[6 * v + side + axis], ti.round(part[axis], ti.i32))
+            if most > 0.0:
+                ti.atomic_max(lever[v], ti.sqrt(most))
+                ti.atomic_max(presser[v], kind[c])
+
+
+@ti.func
+def brace_between(i: ti.i32, held_sums: Integers, lighter: ti.f32) -> ti.math.vec3:
+    """Brace of a vertex of which a body's share of a contact's mobility is `lighter` times its own; 0 if free."""
+    stands, presses = ti.math.vec3(0.0), ti.math.vec3(0.0)
+    for axis in ti.static(range(3)):
+        stands[axis] = ti.cast(held_sums[6 * i + axis], ti.f32)
+        presses[axis] = ti.cast(held_sums[6 * i + 3 + axis], ti.f32)
+    brace = ti.math.vec3(0.0)
+    if lighter < 1.0 and stands.norm_sqr() > 0.0 and presses.norm_sqr() > 0.0:
+        stands, presses = stands.normalized(), presses.normalized()
+        if stands.dot(presses) < MOST_ALIKE:
+            brace = ti.sqrt(1.0 - ti.max(lighter, LEAST_ANSWER)) * stands
+    return brace
+
+
+@ti.func
+def turned_to_brace(
+    c: ti.i32, vertices: Quadruples, weights: Weights, normal: Vectors, friction: Floats, brace: Vectors
+) -> ti.math.vec3:  # fmt: skip
+    """Normal of a contact of vertices that have a brace: along that, as far as friction holds the wedge.
+
+    Where a ball rests on cloth on a floor, their forces are opposite, along the normal of the floor, and friction is
+    what turns that of the ball. To find it by iteration takes too many steps: what is left drives cloth out of the
+    wedge.
+    """
+    n = normal[c]
+    axis, is_braced = ti.math.vec3(0.0), True
+    for k in ti.static(range(4)):
+        if weights[c][k] != 0.0:
+            own = brace[vertices[c][k]]
+            is_braced = is_braced and own.norm_sqr() > 0.0
+            axis += ti.abs(weights[c][k]) * unit_or(own, n)
+    if is_braced:
+        axis = unit_or(axis, n)
+        along = axis.dot(n)
+        across = n - along * axis
+        if ti.abs(along) > LEAST_COSINE:
+            steepness, held = across.norm(), friction[c] * ti.abs(along)
+            n = (along * axis + ti.max(1.0 - held / ti.max(steepness, 1.0e-9), 0.0) * across).normalized()
+    return n
+
+
+@ti.func
+def answer_of(brace: ti.math.vec3) -> ti.f32:
+    """By how much of what its mass says a vertex answers to contacts."""
+    return 1.0 - brace.norm_sqr()
 
 
 @ti.func
@@ -186,7 +293,7 @@ def push_apart(
     normal: Vectors, floor: Floats, kind: Integers, arm: Vectors, friction: Floats, mobility: Floats,
     impulse: Vectors, impulse_before: Vectors, impulse_given: Vectors, push: Vectors,
     touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, reached: Vectors,
-    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats,
+    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats, brace: Vectors,
     body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
     body_inverse_inertia: Matrices, body_gathered: LongIntegers, unit: ti.f32, is_short: ti.template(),
 ):  # fmt: skip
@@ -245,7 +352,8 @@ def push_apart(
             ti.loop_config(serialize=True)
         for place in range(touched_end):
             i = touched[place]
-            u = displacement[i] + (inverse_mass[i] * unit) * given_to(i, uses, used_by, use_weight, push)
+            given = answer_of(brace[i]) * given_to(i, uses, used_by, use_weight, push)
+            u = displacement[i] + (inverse_mass[i] * unit) * given
             displacement[i] = u + momenta[step + 1] * (u - reached[i])
             reached[i] = u
         if ti.static(not runs_on_gpu()):
@@ -263,7 +371,7 @@ def push_apart(
 def finish_push(
     count: ti.i32, pushing: Integers, kind: Integers, arm: Vectors, impulse: Vectors, impulse_given: Vectors,
     push: Vectors, touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors,
-    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats,
+    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats, brace: Vectors,
     body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_inverse_mass: Floats,
     body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, unit: ti.f32,
     is_short: ti.template(),
@@ -282,7 +390,8 @@ def finish_push(
         ti.loop_config(serialize=True)
     for place in range(touched_end):
         i = touched[place]
-        displacement[i] = start[i] + (inverse_mass[i] * unit) * given_to(i, uses, used_by, use_weight, push)
+        given = answer_of(brace[i]) * given_to(i, uses, used_by, use_weight, push)
+        displacement[i] = start[i] + (inverse_mass[i] * unit) * given
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for b in range(bodies_end):
@@ -329,6 +438,7 @@ def begin_push(
     impulse_given: Vectors, pushing: Integers, push: Vectors, counter: Integers, vertex_count: ti.i32,
     displacement: Vectors, predicted: Vectors, start: Vectors, reached: Vectors, inverse_mass: Floats,
     thickness: Floats, shares: Integers, touched: Integers, uses: Integers, used_by: Integers, use_weight: Floats,
+    brace: Vectors, held_sums: Integers, lever: Floats, presser: Integers, braces: ti.i32,
     body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
     body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, body_load: LongIntegers,
     load_unit: ti.f32, unit: ti.f32, partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32,
@@ -339,20 +449,21 @@ def begin_push(
     Returns how many contacts push, how many vertices they push, and the bits of what `most_missing` is.
     """
     weigh_contacts(
-        count, vertices, weights, floor, kind, arm, mobility, impulse, pushing, counter, vertex_count, displacement,
-        predicted, inverse_mass, shares, touched, uses, used_by, use_weight, body_count, body_inverse_mass,
-        body_inverse_inertia, body_load, load_unit, is_first, is_short,
+        count, vertices, weights, normal, floor, kind, arm, friction, mobility, impulse, pushing, counter,
+        vertex_count, displacement, predicted, inverse_mass, shares, touched, uses, used_by, use_weight, held_sums,
+        lever, presser, brace, body_count, body_inverse_mass, body_inverse_inertia, body_load, load_unit, braces,
+        is_first, is_short,
     )  # fmt: skip
     pushing_count, touched_count = counter[0], counter[1]
     push_apart(
         momenta, 1, pushing_count, pushing, vertices, weights, normal, floor, kind, arm, friction, mobility, impulse,
         impulse_before, impulse_given, push, touched_count, touched, displacement, start, reached, inverse_mass, uses,
-        used_by, use_weight, body_count, body_motion, body_start, body_reached, body_inverse_mass,
+        used_by, use_weight, brace, body_count, body_motion, body_start, body_reached, body_inverse_mass,
         body_inverse_inertia, body_gathered, unit, is_short,
     )  # fmt: skip
     finish_push(
         pushing_count, pushing, kind, arm, impulse, impulse_given, push, touched_count, touched, displacement, start,
-        inverse_mass, uses, used_by, use_weight, body_count, body_motion, body_start, body_inverse_mass,
+        inverse_mass, uses, used_by, use_weight, brace, body_count, body_motion, body_start, body_inverse_mass,
         body_inverse_inertia, body_gathered, body_impulse, unit, is_short,
     )  # fmt: skip
     missing = most_missing(
@@ -369,7 +480,7 @@ def push_on(
     weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors, friction: Floats,
     mobility: Floats, impulse: Vectors, impulse_before: Vectors, impulse_given: Vectors, push: Vectors,
     touched_count: ti.i32, touched: Integers, displacement: Vectors, start: Vectors, reached: Vectors,
-    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats,
+    inverse_mass: Floats, uses: Integers, used_by: Integers, use_weight: Floats, brace: Vectors,
     body_count: ti.i32, body_motion: Vectors, body_start: Vectors, body_reached: Vectors, body_inverse_mass: Floats,
     body_inverse_inertia: Matrices, body_gathered: LongIntegers, body_impulse: LongIntegers, unit: ti.f32,
     is_short: ti.template(),
@@ -378,13 +489,13 @@ def push_on(
     push_apart(
         momenta, starts, count, pushing, vertices, weights, normal, floor, kind, arm, friction, mobility, impulse,
         impulse_before, impulse_given, push, touched_count, touched, displacement, start, reached, inverse_mass, uses,
-        used_by, use_weight, body_count, body_motion, body_start, body_reached, body_inverse_mass,
+        used_by, use_weight, brace, body_count, body_motion, body_start, body_reached, body_inverse_mass,
         body_inverse_inertia, body_gathered, unit, is_short,
     )  # fmt: skip
     if ti.static(finishes):
         finish_push(
             count, pushing, kind, arm, impulse, impulse_given, push, touched_count, touched, displacement, start,
-            inverse_mass, uses, used_by, use_weight, body_count, body_motion, body_start, body_inverse_mass,
+            inverse_mass, uses, used_by, use_weight, brace, body_count, body_motion, body_start, body_inverse_mass,
             body_inverse_inertia, body_gathered, body_impulse, unit, is_short,
         )  # fmt: skip
 

@@ -37,6 +37,7 @@ class CollisionBodies(DeviceShapes):
         inverse_inertia: in world axes [1/(kg m²)], (b,) mat3.
         gathered, impulse: integers, of linear and angular impulse times the step, (6 b,).
         load: integers, sums over the contacts of a body, in `load_unit`s, (b,).
+        may_move: whether forces move any of them, or ever did.
         shortest_edge: of the smallest body [m].
 
     Args:
@@ -57,6 +58,7 @@ class CollisionBodies(DeviceShapes):
         for array in (self.gathered, self.impulse, self.load, self.motion):
             array.fill(0)
         self.load_unit = 1.0
+        self.may_move = False
         self.shortest_edge = min((geometry.shortest_edge for geometry in geometries), default=np.inf)
         if self.count:
             self.set_friction(np.asarray(friction, dtype=np.float64))
@@ -81,6 +83,7 @@ class CollisionBodies(DeviceShapes):
         put(self.position, poses.position[:b])
         put(self.rotation, poses.rotation[:b])
         put(self.inverse_mass, inverse_mass)
+        self.may_move = self.may_move or bool(inverse_mass.any())
         put(self.inverse_inertia, inverse_inertia)
         reach = np.array([geometry.radius for geometry in self.geometries])
         mobility = inverse_mass + reach**2 * np.linalg.norm(inverse_inertia, axis=(1, 2))

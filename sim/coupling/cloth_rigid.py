@@ -35,7 +35,8 @@ class ClothRigidCoupling:
     on both sides at the same point: linear and angular momentum are kept to rounding. Contacts are inelastic, and
     friction opposes sliding, so that they take energy away. Kinematic bodies push and feel nothing.
 
-    Approximate: contacts among bodies in the same step are not foreseen; cloth between two bodies gives way for it.
+    Approximate: contacts among bodies in the same step are not foreseen. Cloth carries a heavy body over what stands
+    (`sim.cloth.continuous_response`), but gives way between two bodies that both move, or in several layers.
 
     Attributes:
         bodies: names of the cloth's and of the rigid solver.

@@ -67,6 +67,36 @@ def test_device_has_the_distances_of_the_solids(shape, tolerance):
     assert tolerance > 1e-4 or error.max() < tolerance
 
 
+# --- between bodies and what stands ---------------------------------------------------------------------------------
+
+STEEL_BOX = {"type": "box", "size": (0.1, 0.1, 0.1)}
+STEEL_BALL = {"type": "sphere", "radius": 0.1}
+TABLE = {"shape": {"type": "box", "size": (0.6, 0.6, 0.1)}, "position": (0.0, 0.0, 0.3)}
+
+
+@pytest.mark.parametrize(
+    ("shape", "lowest", "table"),
+    [(STEEL_BOX, 0.05, None), (STEEL_BALL, 0.1, None), pytest.param(STEEL_BOX, 0.05, TABLE, marks=pytest.mark.slow)],
+)
+def test_a_heavy_body_rests_on_cloth_and_not_on_what_is_below(shape, lowest, table):
+    """8 and 33 kg on nodes of 0.25 g each: the body stands a thickness over the floor, and squeezes nothing out."""
+    thickness, top = 3e-3, 0.35 if table else 0.0
+    sheet = {"shape": rectangle((0.4, 0.4), (17, 17)), "position": (0.0, 0.0, top + 2e-3), "thickness": thickness,
+             "mass_per_area": 0.4, "stretch_stiffness": 4000.0, "shear_stiffness": 400.0}  # fmt: skip
+    body = {"kind": "dynamic", "density": 7800.0, "shape": shape, "position": (0.0, 0.0, top + lowest + 0.02)}
+    world = world_of(sheet, bodies=[body, *([table] if table else [])])
+    strains = []
+    for _ in range(30):
+        world.advance_frame()
+        strains.append(cloth_of(world).diagnostics()["max_strain"])
+    height = rigid_of(world).bodies.position[0, 2] - top - lowest
+    assert 0.9 * thickness < height < 1.1 * thickness
+    assert distances_to_body(world, 0).min() > 0.4 * thickness
+    assert cloth_of(world).state.positions()[:, 2].min() - top > 0.4 * thickness
+    assert max(strains[10:]) < 0.02
+    assert strains[-1] < strains[15] + 0.005
+
+
 # --- momentum and energy --------------------------------------------------------------------------------------------
 
 
