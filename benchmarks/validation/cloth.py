@@ -1,4 +1,4 @@
-"""Cloth that hangs, swings, falls and is hit: stretch, sag, period, energy, terminal speed, momentum with a ball."""
+"""Cloth that hangs, swings, falls, folds and is hit: stretch, sag, period, energy, speed, crossings, momentum."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.validation.checks import CaseResult, Check, fitted_order
+from benchmarks.validation.crossing_triangles import crossings
 from sim.cloth.parameters import ClothParameters
 from sim.domain import DomainParameters
 from sim.scene import SceneParameters
@@ -43,14 +44,19 @@ MESH_ROWS, MESH_COLUMNS = 28, 24
 BALL_DENSITIES = (1000.0, 30.0)
 """Of the ball that hits a free sheet of 18 g [kg/m³]: 524 g and 16 g."""
 
+FOLDED, FOLDED_THICKNESS = 0.5, 3e-3
+"""Side and thickness of the sheet that falls on its edge [m]."""
+
 
 def run(solver: str, *, quick: bool = False) -> CaseResult:
-    """Column, mesh, band, pendulum, swinging and falling sheet, sheet and ball."""
+    """Column, mesh, band, pendulum, swinging, falling and folding sheet, sheet and ball."""
     columns = {name: _column(name, stiffness) for name, stiffness in (("xpbd", COTTON), ("explicit", 60.0))}
     cells = (4, 8) if quick else (4, 8, 16)
     exact_sag = _catenary_sag()
     errors = [abs(_band_sag(count) - exact_sag) for count in cells]
     energy = _swinging_sheet(0.5 if quick else DURATION)
+    nodes = 41 if quick else 81
+    folded = _folded_drop(nodes=nodes, frames=20 if quick else 60)
     periods = {name: _pendulum(name) for name in ("xpbd", "explicit")}
     integrators = ("xpbd",) if quick else ("xpbd", "explicit")
     drifts = {
@@ -79,6 +85,9 @@ def run(solver: str, *, quick: bool = False) -> CaseResult:
               "required over 10 s; without damping, of m g L/2, explicit at its own step"),
         Check("terminal speed of a falling sheet over theory", _terminal_speed(), 1.0, 1e-3,
               "implicit drag is exact there; the sheet sways by 1e-4"),
+        Check("edges through triangles of a sheet folded by its fall, sum over frames", float(sum(folded["crossings"])),
+              0.0, 0.0, "required; counted by exact arithmetic that shares no code with the solver"),
+        Check("crossings that the solver had to leave", float(sum(folded["left"])), 0.0, 0.0, "a count"),
         *[
             Check(f"drift of {quantity} momentum, ball of {density:g} kg/m³ and free sheet, {name}", drift, 0.0, 1e-4,
                   "required; springs, contacts and friction keep it to rounding")
@@ -92,12 +101,14 @@ def run(solver: str, *, quick: bool = False) -> CaseResult:
         "times": energy["times"],
         "energies": energy["energies"],
         "kinetic": energy["kinetic"],
+        **{f"folded_{name}": values for name, values in folded.items()},
     }
     for name, column in columns.items():
         series |= {f"rows_{name}": list(range(1, COLUMN_ROWS)), f"ratio_{name}": column["ratio"]}
         series |= {f"stretch_{name}": column["stretch"], f"theory_{name}": column["theory"]}
     settings = {"column_rows": COLUMN_ROWS, "cotton_n_per_m": COTTON, "soft": SOFT, "duration_s": DURATION,
-                "xpbd_substeps_per_frame": 20}  # fmt: skip
+                "xpbd_substeps_per_frame": 20, "folded_nodes_along": nodes,
+                "folded_thickness_m": FOLDED_THICKNESS}  # fmt: skip
     return CaseResult("cloth", solver, settings, checks, series)
 
 
@@ -245,6 +256,33 @@ def _terminal_speed() -> float:
         solver.substep(solver.stable_dt())
     speed = -float(solver.state.velocity.to_numpy()[:, 2].mean())
     return speed / math.sqrt(2.0 * 0.05 * GRAVITY / (1.2 * 1.3))
+
+
+def _folded_drop(*, nodes: int, frames: int) -> dict[str, list[float]]:
+    """A square sheet that falls on its edge and folds, frame by frame: edges through triangles, and contacts."""
+    from sim.build import build_world
+    from sim.cloth.solver import ClothSolver
+
+    sheet = {
+        "name": "sheet", "shape": _rectangle((FOLDED, FOLDED), (nodes, nodes)), "thickness": FOLDED_THICKNESS,
+        "position": (0.0, 0.0, 0.55 * FOLDED), "rotation_deg": (85.0, 7.0, 0.0), "air_density": 0.0,
+    }  # fmt: skip
+    room = {"min": (-1.0, -1.0, 0.0), "max": (1.0, 1.0, 2.0)}
+    scene = SceneParameters.model_validate({"gravity": (0, 0, -GRAVITY), "domain": room, "cloth": [sheet]})
+    world = build_world(scene, frames_per_second=60.0)
+    cloth = world.solvers["cloth"]
+    if not isinstance(cloth, ClothSolver):
+        raise TypeError(f"the solver of a sheet is a {type(cloth).__name__}")
+    series: dict[str, list[float]] = {name: [] for name in ("times", "crossings", "contacts", "left", "height")}
+    for frame in range(frames):
+        numbers = world.advance_frame().diagnostics["cloth"]
+        positions = cloth.state.positions()
+        series["times"].append((frame + 1) / 60.0)
+        series["crossings"].append(len(crossings(positions, cloth.state.host.triangles)))
+        series["contacts"].append(numbers["contacts"])
+        series["left"].append(numbers["crossings_left"])
+        series["height"].append(float(positions[:, 2].max()))
+    return series
 
 
 def _ball_and_sheet(integrator: str, density: float, *, frames: int) -> tuple[float, float]:

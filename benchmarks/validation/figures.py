@@ -253,8 +253,8 @@ def draw_bunny_energy(results: Sequence[CaseResult]) -> Figure:
 
 
 def draw_cloth(results: Sequence[CaseResult]) -> Figure:
-    """Stretch of a column by rows, refinement of a band's sag, energy of a swinging sheet."""
-    figure, (column, order, energy) = make_panels(3)
+    """Stretch of a column by rows, refinement of a band's sag, energy of a swinging sheet, crossings of a folded."""
+    figure, (column, order, energy, folded) = make_panels(4)
     series = results[0].series
     for name, label, shade in (("xpbd", "XPBD, cotton", SHADES[0]), ("explicit", "explicit, 60 N/m", SHADES[1])):
         relative = [100.0 * (ratio - 1.0) for ratio in series[f"ratio_{name}"]]
@@ -271,6 +271,11 @@ def draw_cloth(results: Sequence[CaseResult]) -> Figure:
     energy.plot(series["times"], [100.0 * each for each in series["energies"]], color=SHADES[0], linewidth=0.8)
     energy.set_ylim(-1.0, 1.0)
     label_axes(energy, "time [s]", "energy - start / (m g L/2)  [%]", "undamped sheet, explicit", legend=False)
+    times, nodes = series["folded_times"], results[0].settings["folded_nodes_along"]
+    folded.plot(times, series["folded_contacts"], color=SHADES[1], label="contacts a substep")
+    folded.plot(times, series["folded_crossings"], color=SHADES[0], label="edges through triangles")
+    folded.set_ylim(bottom=-0.05 * max(series["folded_contacts"]))
+    label_axes(folded, "time [s]", "number", f"sheet of {nodes} x {nodes} nodes folded by its fall")
     return figure
 
 

@@ -5,9 +5,9 @@ import pytest
 import taichi as ti
 from cloth_scenes import EARTH, GRAVITY, SOFT, WEIGHTLESS, cloth, rectangle, solver_of, spring_energy
 from contact_scenes import SPACE, cloth_of, contacts_of, displace, distances_to_body, momenta, rigid_of, world_of
-from crossing_triangles import crossings
 from device_distances import measure_distances
 
+from benchmarks.validation.crossing_triangles import crossings
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.rigid_contact_bodies import CollisionBodies

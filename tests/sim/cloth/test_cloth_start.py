@@ -4,8 +4,8 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from crossing_triangles import crossings
 
+from benchmarks.validation.crossing_triangles import crossings
 from sim.build import build_world
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import build_sheet

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from cloth_scenes import cloth, rectangle, solver_of
 from contact_scenes import ROOM, cloth_of, contacts_of, rigid_of, world_of
-from crossing_triangles import crossings
 
+from benchmarks.validation.crossing_triangles import crossings
 from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.patches import Patches
 

@@ -13,9 +13,9 @@ from contact_scenes import (
     segment_distances,
     world_of,
 )
-from crossing_triangles import crossings, edges_of_triangles
 from thread_counts import outputs_by_threads
 
+from benchmarks.validation.crossing_triangles import crossings, edges_of_triangles
 from sim import short_loops
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.self_collision import SelfCollision
