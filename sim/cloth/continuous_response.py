@@ -47,11 +47,12 @@ STEPS = 8
 
 Momenta = ti.types.vector(STEPS + 1, ti.f32)
 
-MOST_ALIKE = -0.5
-"""A vertex is between two sides, and gets a brace, if the cosine of the angle of their normals is below this."""
+MOST_ALIKE = -0.95
+"""A vertex is between two sides, and gets a brace, if the cosine of the angle of their normals is below this: a heavy
+node that meets the edge of a body obliquely would kick it."""
 
 LEAST_COSINE = 0.86
-"""Of the angle between a brace and a normal that belongs to it: half of that between the two sides."""
+"""Contacts are turned to a brace if the cosine of the angle between it and their normal, either way, is above this."""
 
 LEAST_ANSWER = 1.0e-6
 """Of a vertex that has a brace: float32 tells no less from none."""
