@@ -274,8 +274,9 @@ def draw_cloth(results: Sequence[CaseResult]) -> Figure:
     times, nodes = series["folded_times"], results[0].settings["folded_nodes_along"]
     folded.plot(times, series["folded_contacts"], color=SHADES[1], label="contacts a substep")
     folded.plot(times, series["folded_crossings"], color=SHADES[0], label="edges through triangles")
-    folded.set_ylim(bottom=-0.05 * max(series["folded_contacts"]))
-    label_axes(folded, "time [s]", "number", f"sheet of {nodes} x {nodes} nodes folded by its fall")
+    most = max(series["folded_contacts"])
+    folded.set_ylim(-0.05 * most, 1.4 * most)
+    label_axes(folded, "time [s]", "number", f"folded drop, {nodes} x {nodes} nodes", legend="upper right")
     return figure
 
 
