@@ -51,6 +51,8 @@ def read_texture_coordinates(shape: MeshShape) -> tuple[NDArray[np.float64], NDA
     Raises:
         ShapeError: as of `read_triangles`.
     """
+    from trimesh import Trimesh
+
     path = Path(shape.file)
     vertices, faces = read_triangles(path)
     if not len(faces):
@@ -60,7 +62,8 @@ def read_texture_coordinates(shape: MeshShape) -> tuple[NDArray[np.float64], NDA
         uv = read_obj(_obj_text(content))[2]
         corners = _upright(vertices, faces, shape)[faces]
         return None if uv is None else (corners, uv)
-    pieces = _load(content, path.suffix.lower().removeprefix(".")).dump()
+    scene = _load(content, path.suffix.lower().removeprefix("."))
+    pieces = [piece for piece in scene.dump() if isinstance(piece, Trimesh)]  # points and lines have no triangles
     uvs = [_uv_of(piece) for piece in pieces]
     if all(uv is None for uv in uvs):
         return None

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from trimesh.visual import TextureVisuals
 
-from sim.shapes.mesh_file import read_upright_triangles
+from sim.shapes.mesh_file import read_texture_coordinates, read_upright_triangles
 from sim.shapes.mesh_repair import boundary_loops, cap_holes, merge_vertices
 from sim.shapes.parameters import MeshShape, Placement
 from sim.shapes.placement import build_solid
@@ -76,6 +76,16 @@ def test_vertices_that_were_split_at_seams_bring_theirs(tmp_path, kind):
     mesh, uv = carried(path)
     assert len(mesh.vertices) == 8
     np.testing.assert_allclose(uv, expected(mesh), atol=1e-6)
+
+
+def test_points_and_lines_beside_a_mesh_have_none(tmp_path):
+    strewn = [trimesh.PointCloud(np.eye(3)), trimesh.load_path(np.eye(3)[:2])]
+    scene = trimesh.Scene([strewn[0], unfolded_box(), strewn[1]])
+    (tmp_path / "box.glb").write_bytes(scene.export(file_type="glb"))
+    mesh, uv = carried(tmp_path / "box.glb")
+    np.testing.assert_allclose(uv, expected(mesh), atol=1e-6)
+    (tmp_path / "strewn.glb").write_bytes(trimesh.Scene(strewn).export(file_type="glb"))
+    assert read_texture_coordinates(MeshShape(type="mesh", file=str(tmp_path / "strewn.glb"))) is None
 
 
 def test_a_cap_goes_on_with_what_its_rim_has(tmp_path):
