@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.shapes.mesh_solid import MeshSolid, solid_from_triangles
-from sim.shapes.obj_file import read_obj
+from sim.shapes.obj_file import LARGEST_TEXTURE, read_obj
 from sim.shapes.parameters import MeshShape
 from sim.shapes.solid import Points, ShapeError
 
@@ -77,9 +77,9 @@ def read_texture_coordinates(shape: MeshShape) -> tuple[NDArray[np.float64], NDA
 
 
 def _uv_of(piece: Any) -> NDArray[np.float64] | None:
-    """Texture coordinates of a mesh's vertices (n, 2), or None."""
+    """Texture coordinates of a mesh's vertices (n, 2), or None if one of them is not finite in float32."""
     uv = getattr(piece.visual, "uv", None)
-    fits = uv is not None and np.shape(uv) == (len(piece.vertices), 2) and np.isfinite(uv).all()
+    fits = uv is not None and np.shape(uv) == (len(piece.vertices), 2) and (np.abs(uv) <= LARGEST_TEXTURE).all()
     return np.asarray(uv, dtype=np.float64) if fits else None
 
 

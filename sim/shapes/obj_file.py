@@ -17,16 +17,20 @@ from sim.shapes.solid import Points
 ROUND_OFF = 1.0e-2
 """Part of a polygon's area by which a triangle may lie over others: corners on a line, in files of few digits."""
 
+LARGEST_TEXTURE = float(np.finfo(np.float32).max)
+"""Texture coordinates beyond this are infinite in meshes, which hold float32."""
+
 
 def read_obj(text: str) -> tuple[Points, NDArray[np.int64], NDArray[np.float64] | None]:
     """Vertices and triangles of a file; polygons become fans about their first corner.
 
     Returns:
         Vertices (n, 3) in the order of the file, triangles (m, 3), and texture coordinates of their corners (m, 3, 2),
-        0 where a corner names none that is there; None for a file without any.
+        0 where a corner names none that is there and can be used; None for a file without any.
 
     Raises:
-        ValueError: a line cannot be read, or has a polygon that such a fan does not fill; the message names it.
+        ValueError: a `v` or `f` line cannot be read, or has a polygon that such a fan does not fill; the message names
+            it.
     """
     vertices: list[tuple[float, float, float]] = []
     triangles: list[tuple[int, int, int]] = []
@@ -46,8 +50,7 @@ def read_obj(text: str) -> tuple[Points, NDArray[np.int64], NDArray[np.float64] 
                 x, y, z = (float(value) for value in values[:3])
                 vertices.append((x, y, z))
             elif key == "vt":
-                u, v, *_ = (*(float(value) for value in values[:2]), 0.0)  # one alone is a place on a strip
-                texture.append((u, v))
+                texture.append(_texture_place(values))
             elif key == "f":
                 corners = [_vertex_number(value, len(vertices)) for value in values]
                 if len(corners) < 3:
@@ -95,6 +98,18 @@ def _vertex_number(corner: str, count: int) -> int:
     if number == 0 or number < -count:
         raise ValueError(f"a face names vertex {number}; {count} are there, numbered from 1")
     return number - 1 if number > 0 else count + number
+
+
+def _texture_place(values: list[str]) -> tuple[float, float]:
+    """Texture coordinates in a `vt` line; 0 if they cannot be read or are not finite in the float32 of meshes.
+
+    The shape does not depend on them, so they are no reason to refuse its file; those after them keep their numbers.
+    """
+    try:
+        u, v, *_ = (*(float(value) for value in values[:2]), 0.0)  # one alone is a place on a strip
+    except ValueError:
+        return 0.0, 0.0
+    return (u, v) if abs(u) <= LARGEST_TEXTURE and abs(v) <= LARGEST_TEXTURE else (0.0, 0.0)
 
 
 def _texture_number(corner: str, count: int) -> int:

@@ -117,3 +117,31 @@ def test_corners_without_any_lie_at_the_lower_left(tmp_path):
     assert uv is not None
     assert (np.abs(uv - expected(mesh)).max(axis=(1, 2)) > 1e-6).sum() == 1
     assert not uv[np.abs(uv - expected(mesh)).max(axis=(1, 2)) > 1e-6].any()
+
+
+@pytest.mark.parametrize("bad", ["-nan(ind) 0", "", "nan nan", "1e39 0", "0 -inf", "a b"])
+def test_what_cannot_be_read_or_held_lies_at_the_lower_left_and_keeps_its_number(tmp_path, bad):
+    write_obj(tmp_path / "box.obj", unfolded_box())
+    sound, uv = carried(tmp_path / "box.obj")
+    lines = (tmp_path / "box.obj").read_text().splitlines()
+    first = next(number for number, line in enumerate(lines) if line.startswith("vt"))
+    place = np.float32([float(word) for word in lines[first].split()[1:]])
+    lines[first] = f"vt {bad}"
+    (tmp_path / "box.obj").write_text("\n".join(lines))
+    mesh, told = carried(tmp_path / "box.obj")
+    np.testing.assert_array_equal(mesh.vertices, sound.vertices)
+    changed = (told != uv).any(axis=2)
+    assert changed.sum() == 1
+    np.testing.assert_array_equal(uv[changed], [place])
+    np.testing.assert_array_equal(told[changed], [[0.0, 0.0]])
+
+
+@pytest.mark.parametrize("bad", ["nan", "inf", "1e39"])
+def test_vertices_whose_coordinates_no_mesh_can_hold_count_as_without_any(tmp_path, bad):
+    unfolded_box().export(tmp_path / "box.ply", encoding="ascii")
+    assert carried(tmp_path / "box.ply")[1] is not None
+    header, end, body = (tmp_path / "box.ply").read_text().partition("end_header\n")
+    assert "property double t\nelement face" in header
+    first, _, rest = body.partition("\n")
+    (tmp_path / "box.ply").write_text(f"{header}{end}{first.rpartition(' ')[0]} {bad}\n{rest}")
+    assert carried(tmp_path / "box.ply")[1] is None
