@@ -21,7 +21,7 @@ from pipeline.stages.bodies import BodiesStage
 from pipeline.stages.flat_pictures import warn_of_flat_pictures
 from pipeline.stages.render import RenderStage
 from render.blend_file import read_material_names
-from render.blender import script_argv
+from render.blender import BlenderHungError, BlenderUnavailableError, script_argv
 from render.errors import InvalidFileError
 from render.meshes import write_ply
 from render.parameters import MaterialParameters
@@ -138,21 +138,58 @@ def test_a_picture_lies_where_the_bodys_texture_coordinates_say(materials, tmp_p
         assert all(side[:2].max() > 1.5 * side[:2].min() for side in sides)
 
 
-@pytest.mark.parametrize(("name", "flat"), [("Halves", True), ("Named", True), ("Green: bright", False)])
-def test_a_picture_on_a_body_without_texture_coordinates_is_told_once(materials, tmp_path, name, flat):
-    layout = JobLayout(tmp_path)
-    layout.job_file.write_text(JOB.format(blend=f"{materials}:{name}"))
+def told_of(folder: Path, blend: str, *more: str) -> list[tuple[int, str]]:
+    """The frames and texts of warnings about pictures in a film of the ball, and of more of that material."""
+    layout = JobLayout(folder)
+    text = JOB.format(blend=blend)
+    for name in more:
+        text += f'[[rigid]]\nname = "{name}"\nshape = {{ type = "sphere", radius = 0.1 }}\n'
+        text += f"[material.{name}]\nblend = '{blend}'\n"
+    layout.job_file.write_text(text)
     film = load_job(layout.job_file)
-    (body,) = BodiesStage().plan(film, layout)
-    assert isinstance(run_task(body, layout), Finished)
+    for body in BodiesStage().plan(film, layout):
+        assert isinstance(run_task(body, layout), Finished)
     told = []
     for frame, task in enumerate(RenderStage().plan(film, layout)[:2]):
         events: list[TaskEvent] = []
         assignment = Assignment(task, 1, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES")
         warn_of_flat_pictures(AttemptContext(assignment, events.append, lambda: False))
         told += [(frame, event.message) for event in events if isinstance(event, Warned)]
+    return told
+
+
+@pytest.mark.parametrize(("name", "flat"), [("Halves", True), ("Named", True), ("Green: bright", False)])
+def test_a_picture_on_a_body_without_texture_coordinates_is_told_once(materials, tmp_path, name, flat):
+    told = told_of(tmp_path, f"{materials}:{name}")
     assert [frame for frame, _ in told] == ([0] if flat else [])
     assert all(f'"ball" has no texture coordinates, so pictures in its material "{name}"' in line for _, line in told)
+
+
+def test_blender_is_asked_once_of_a_material_that_several_bodies_have(materials, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("render.blend_file.has_pictures_by_uv", lambda *wanted: not asked.append(wanted))
+    told = told_of(tmp_path, f"{materials}:Halves", "second", "third")
+    assert asked == [(materials, "Halves", None)]
+    assert [line.partition(" has no")[0] for _, line in told] == ['"ball"', '"second"', '"third"']
+
+
+@pytest.mark.parametrize(
+    "trouble",
+    [
+        BlenderHungError("Blender took more than 120 s to read it"),
+        BlenderUnavailableError("cannot start"),
+        InvalidFileError(Path("own.blend"), "Blender ended with exit code -11 while it read it"),
+    ],
+    ids=lambda trouble: type(trouble).__name__,
+)
+def test_a_material_that_cannot_be_looked_at_is_told_and_fails_no_frame(materials, tmp_path, monkeypatch, trouble):
+    def ask(*wanted: object) -> bool:
+        raise trouble
+
+    monkeypatch.setattr("render.blend_file.has_pictures_by_uv", ask)
+    ((frame, line),) = told_of(tmp_path, f"{materials}:Halves", "second")
+    assert frame == 0
+    assert line.startswith(f'the material "Halves" of "ball", "second" could not be looked at ({trouble}); ')
 
 
 def test_no_program_of_the_file_is_run(materials, tmp_path):
