@@ -147,7 +147,7 @@ def _kind(node: schema.Node) -> str:
         prefix = node.get("prefixItems")
         return f"{len(prefix)} of: {_kind(prefix[0])}" if prefix else f"list of {_kind(node['items'])}"
     word = {"number": "number", "integer": "whole number", "boolean": "true or false", "string": "text"}[node["type"]]
-    bounds = " and ".join(f"{sign} {node[key]:g}" for key, sign in _SIGNS.items() if key in node)
+    bounds = " and ".join(f"{sign} {node[key]:.10g}" for key, sign in _SIGNS.items() if key in node)
     return f"{word} {bounds}".strip()
 
 

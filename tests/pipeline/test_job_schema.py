@@ -87,6 +87,11 @@ def test_reference_in_the_documentation_is_current():
     assert with_reference(document) == document, "run: python -m pipeline.job.reference docs/job-file.md"
 
 
+def test_the_reference_has_all_digits_of_bounds_as_messages_do():
+    assert "| `seed` | whole number ≥ 0 and < 2147483648 |" in reference()
+    assert "| `max_particles` | whole number ≥ 1 and ≤ 2147483647 |" in reference()
+
+
 def test_the_reference_has_what_each_material_of_cloth_gives():
     lines = reference().splitlines()
     rows = {line.split('"')[1]: line.split(" | ")[1:] for line in lines if line.startswith('| "')}
