@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from math import prod
 from pathlib import Path
@@ -52,6 +52,8 @@ _LOOK_REVISIONS = {"honey": 2, "cotton": 2, "silk": 2, "denim": 2}
 """Looks that are drawn otherwise than in earlier versions: nothing else of a job says so."""
 _TANK_REVISION = 2
 """The same of the glass tank."""
+_BLEND_ON_CLOTH_REVISION = 2
+"""The same of .blend materials on cloth: UV maps that they name were not found, and are the cloth's own now."""
 
 _FORMER_COLOR = [0.22, 0.25, 0.29]
 """What stood for a stage's colour where the job gives none, in those versions."""
@@ -66,7 +68,7 @@ class RenderStage:
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
         drawn = render_spec(job, layout)
-        spec = _decisive(drawn)
+        spec = _decisive(drawn, {cloth.name for cloth in job.cloth})
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
             spec["camera"] = {"framing": job.placed_camera.model_dump(mode="json")}
@@ -206,8 +208,12 @@ def _missing_materials(job: Job) -> Iterator[str]:
                 yield f'material.{body}.blend: {file} has no material "{name}"{hint}; {known}'
 
 
-def _decisive(spec: RenderSpec) -> dict[str, Any]:
+def _decisive(spec: RenderSpec, cloths: Collection[str]) -> dict[str, Any]:
     """What of a specification decides pixels: files by their content, and keys of later versions only where used.
+
+    Args:
+        spec: the whole.
+        cloths: names of its objects that are cloth.
 
     Raises:
         MissingInputError: a file cannot be read.
@@ -231,11 +237,11 @@ def _decisive(spec: RenderSpec) -> dict[str, Any]:
     if stage["tank"]:
         stage["tank_revision"] = _TANK_REVISION
     for drawn in document["objects"]:
-        _keep_decisive(drawn)
+        _keep_decisive(drawn, is_cloth=drawn["name"] in cloths)
     return document
 
 
-def _keep_decisive(drawn: dict[str, Any]) -> None:
+def _keep_decisive(drawn: dict[str, Any], *, is_cloth: bool) -> None:
     """Take out of an object what decides no pixel, as `_decisive` does."""
     # Where fluids are wet has no revision yet: nothing was released since this key came.
     if drawn.get("wets_within", ...) is None:
@@ -249,6 +255,8 @@ def _keep_decisive(drawn: dict[str, Any]) -> None:
     if "blend" in material:
         file, name = split_blend(material["blend"])
         drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
+        if is_cloth:
+            drawn["material"]["blend_revision"] = _BLEND_ON_CLOTH_REVISION
 
 
 def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:

@@ -232,6 +232,22 @@ def test_frames_with_a_tank_are_drawn_again_and_others_are_not(is_seen):
     assert ("tank_revision" in json.loads(task.parameters.canonical)["stage"]) == is_seen
 
 
+def test_frames_with_a_material_of_a_blend_file_on_cloth_are_drawn_again_and_others_are_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("pipeline.stages.render.own_picture_bytes", lambda _: 0)
+    (tmp_path / "own.blend").write_bytes(b"BLENDER")
+    shape = {"type": "rectangle", "size": [0.2, 0.2], "counts": [5, 5]}
+    cloth = [
+        {"name": name, "material": "cotton", "shape": shape, "position": [0.0, y, 0.8]}
+        for name, y in (("flag", 0.0), ("sail", 0.5))
+    ]
+    material = {name: {"blend": f"{tmp_path}/own.blend:Linen"} for name in ("ball", "water", "flag")}
+    tank = job(cloth=cloth, material=material)
+    task = next(task for task in plan_job(tank, LAYOUT, STAGES) if task.stage == "render")
+    objects = {each["name"]: each["material"] for each in json.loads(task.parameters.canonical)["objects"]}
+    assert {name for name, each in objects.items() if "blend" in each} == {"ball", "water", "flag"}
+    assert {name for name, each in objects.items() if "blend_revision" in each} == {"flag"}
+
+
 @pytest.mark.parametrize("angles", [(0, 0, 0), (90, 0, 0), (10, 20, 30), (-35, 120, 200)])
 def test_blender_turns_a_body_as_the_simulation_does(angles):
     spec = render_spec(job(rigid=[{**TANK["rigid"][0], "rotation_deg": angles}]), LAYOUT)
