@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import statistics
 import sys
@@ -64,7 +65,7 @@ def main() -> None:
     device = initialize("cpu", threads=arguments.cores)
     loaded, findings = load_checked_job(arguments.job, arguments.set, preview=arguments.preview)
     job = live_job(loaded.job)
-    session = Session(job)
+    session = Session(job, patience_s=math.inf)
     for _ in range(3):
         session.advance()  # kernels
     parts = []

@@ -29,9 +29,14 @@ class FrameWatch:
         """A frame begins now."""
         self._spent_s, self._seen_s = 0.0, self._clock()
 
+    @property
+    def is_too_slow(self) -> bool:
+        """Whether the frame has taken too long."""
+        return self._spent_s > self.patience_s
+
     def after_substep(self) -> str | None:
         """What is wrong with the frame, if it has taken too long."""
         now = self._clock()
         self._spent_s += min(now - self._seen_s, MOST_OF_A_SUBSTEP_S)
         self._seen_s = now
-        return f"a frame takes longer than {self.patience_s:g} s" if self._spent_s > self.patience_s else None
+        return f"a frame takes longer than {self.patience_s:g} s" if self.is_too_slow else None

@@ -42,6 +42,10 @@ FRAMES_TO_TRUST = 60
 
 FIRST = "The first frame compiles kernels: up to a minute, once on a machine."
 
+MORE_SUBSTEPS = " The job may need more substeps."
+FASTER = " --anyway lets frames take as long as they do; fewer substeps or --preview makes them faster."
+"""What may help where nobody turned or held anything: against steps that are too long, and against slow frames."""
+
 GRABBED_SPACINGS = 1.5
 """A hand takes cloth by the nodes within so many spacings: a single node would be drawn into a spike."""
 
@@ -221,10 +225,13 @@ class Session:
         except _FrameLeftError:
             return
         except SimulationDivergedError as error:
-            self._go_back(f"It blew up: {error.finding}")  # its hint is about keys of a job that no knob turns
+            # Its hint is about keys of a job that no knob turns.
+            remedy = FASTER if self._watch.is_too_slow else MORE_SUBSTEPS
+            self._go_back(f"It blew up: {error.finding}", remedy=remedy)
             return
         except (ArithmeticError, np.linalg.LinAlgError) as error:
-            self._go_back(f"It blew up: {error}")
+            # Too many contacts or neighbours say themselves what leaves fewer.
+            self._go_back(f"It blew up: {error}", remedy="" if isinstance(error, OverflowError) else MORE_SUBSTEPS)
             return
         except (MemoryError, RuntimeError) as error:
             if classify(error) is not FailureKind.OUT_OF_MEMORY:
@@ -486,12 +493,13 @@ class Session:
                     refused[name] = f"{name} = {value} ({error})"
         return list(refused.values())
 
-    def _go_back(self, what: str, *, remedy: str = " The job may need more substeps.") -> None:
+    def _go_back(self, what: str, *, remedy: str) -> None:
         """Go back to the newest moment that can be trusted; else to the start with the values of then, and stop.
 
         Args:
             what: happened, a sentence without its stop.
-            remedy: a sentence that follows a space: what may help if nobody turned or held anything.
+            remedy: a sentence that follows a space: what may help if nobody turned or held anything; beside `FASTER`,
+                what live gave up is not told, as to have it back makes no frame faster.
         """
         now = self.world.frame
         moment = next((each for each in reversed(self._moments) if now - each.frame >= FRAMES_TO_TRUST), None)
@@ -513,7 +521,7 @@ class Session:
             self.world.restore(moment.frame, moment.arrays)
             self._moments.append(moment)
         began_with = {name: value for name, value in self.values.items() if value == self.knobs[name].start}
-        if pace := told_pace(self._written, began_with):
+        if remedy != FASTER and (pace := told_pace(self._written, began_with)):
             cause += f" {pace} Knobs bring that back{', and so does --as-written' if self._gave_up else ''}."
         elif not (turned or held):
             cause += remedy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -74,7 +75,9 @@ def play(address: str, session: Session, folder: Path) -> None:
             for share in np.linspace(0.0, 1.0, 8):
                 page.mouse.move(x, y - 60.0 * share)
                 time.sleep(0.05)
-            until(lambda: [held[:2] for held in session._hands] == [(kind, name)], f"{kind} {name} is not in hand")
+            until(
+                lambda: [held[:2] for held in list(session._hands)] == [(kind, name)], f"{kind} {name} is not in hand"
+            )
 
         for place, kind, name in ((SHEET, "cloth", "sheet"), (PIN, "pin", "0")):
             drag_up(place, kind=kind, name=name)
@@ -111,7 +114,7 @@ def play(address: str, session: Session, folder: Path) -> None:
 @pytest.mark.usefixtures("taichi")
 def test_a_page_draws_and_takes_drags_buttons_and_sliders_to_the_scene(tmp_path):
     read = loaded(tmp_path, LOOKED_AT)
-    session = Session(live_job(read.job))
+    session = Session(live_job(read.job), patience_s=math.inf)
     session.advance()  # kernels
     session.reset()
     session.is_paused = True
