@@ -91,8 +91,10 @@ class Recorder:
             take.end()
         except _TROUBLES as error:
             trouble = f"the take ends early: {error}; "
-        if take.frames:
-            frames = "1 frame" if take.frames == 1 else f"{take.frames} frames"
+        frames = "1 frame" if take.frames == 1 else f"{take.frames} frames"
+        if take.frames and take.frames != take.frames_in_job:
+            became = f"{take.layout.job_file} has 1 frame; {frames} are in {take.layout.checkpoints.parent}"
+        elif take.frames:
             became = f"{frames}: pipeline submit {shlex.quote(str(take.layout.job_file))}"
         else:
             became = f"none of its frames is in {take.layout.root}"
@@ -113,6 +115,7 @@ class _Take:
     Attributes:
         layout: its folder.
         frames: how many are committed; the writer's thread counts them.
+        frames_in_job: how many its job file has: 1 until the end, and where nothing could be written then.
     """
 
     def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:
@@ -147,6 +150,8 @@ class _Take:
     def end(self) -> None:
         """Wait for all frames, and write what the take is: of those that were committed, also if one could not be.
 
+        A lease that did not answer for long may be ours still: the frames are named then, and the loss is told.
+
         Raises:
             OSError, PipelineError, RuntimeError, sqlite3.Error: something of it could not be written.
         """
@@ -155,9 +160,10 @@ class _Take:
                 self._writer.__exit__(None, None, None)
             finally:
                 self._write_what_it_is()
+            self._lease.check()
 
     def _write_what_it_is(self) -> None:
-        self._lease.check()
+        self._lease.heartbeat()  # raises if the folder is not ours any more
         self._write_job(frames=max(1, self.frames))  # no job has none
         story = {
             "take": self._name,
@@ -194,6 +200,7 @@ class _Take:
 
     def _write_job(self, *, frames: int) -> None:
         replace_durably(self.layout.job_file, self._text(frames=frames))
+        self.frames_in_job = frames
 
     def _text(self, *, frames: int) -> str:
         """The job with the present values, and bodies as they could be moved: the renderer asks the frames for them."""

@@ -165,12 +165,31 @@ def test_a_take_whose_folder_another_process_has_taken_over_writes_nothing_more(
         raise LeaseLostError("drape-take was taken over")
 
     monkeypatch.setattr(Lease, "check", lost)
+    monkeypatch.setattr(Lease, "heartbeat", lost)
     session.advance()
     assert not recorder.is_recording
-    assert "the take ends early: drape-take was taken over" in session.message
     folder = tmp_path / "drape-take"
+    became = f"{folder / 'job.toml'} has 1 frame; 2 frames are in {folder / 'cache'}"
+    assert session.message == f"the take ends early: drape-take was taken over; {became}"
     assert load_job(folder / "job.toml").frame_count == 1
     assert not (folder / "take.json").exists()
+
+
+def test_a_take_whose_lease_did_not_answer_but_is_its_own_still_becomes_a_film_of_all_its_frames(tmp_path):
+    read = loaded(tmp_path)
+    session = Session(live_job(read.job))
+    recorder = Recorder(read, session, tmp_path, device="cpu")
+    recorder.toggle()
+    session.advance()
+    assert recorder._take is not None
+    recorder._take._lease._loss = LeaseLostError("runner.lease could not be renewed for 60 s")
+    session.advance()
+    assert not recorder.is_recording
+    folder = tmp_path / "drape-take"
+    told = f"runner.lease could not be renewed for 60 s; 2 frames: pipeline submit {folder / 'job.toml'}"
+    assert session.message == f"the take ends early: {told}"
+    assert load_job(folder / "job.toml").frame_count == 2
+    assert json.loads((folder / "take.json").read_text())["frames"] == 2
 
 
 def test_a_take_that_cannot_be_written_on_keeps_the_frames_that_were(tmp_path, monkeypatch):
