@@ -269,11 +269,17 @@ class FarmView:
         return JobCard(name, state, entry, holder, record, flaw, changed)
 
     def _state_without_run(self, name: str, layout: JobLayout, record: Record) -> JobState:
-        """Where a job stands whose record tells of no run: one that a lost record was made anew of had some."""
+        """Where a job stands whose record tells of no run: one that a lost record was made anew of had some.
+
+        Raises:
+            OSError: its folder cannot be read.
+        """
         with suppress(NotThereError):
             self.places.file(name, layout.take_story.name)
             return JobState.RECORDED
-        return JobState.NOT_STARTED if record.is_empty else JobState.INTERRUPTED
+        # A record may be lost; and of a take that crashed it is empty, as it is filled at the end.
+        is_new = record.is_empty and not _holds_frames(layout)
+        return JobState.NOT_STARTED if is_new else JobState.INTERRUPTED
 
     def _record(self, name: str, layout: JobLayout, *, runs: bool) -> _Remembered:
         now = time.time()
@@ -354,6 +360,15 @@ def _holds_job(layout: JobLayout) -> bool:
         return layout.job_file.is_file() or layout.manifest.is_file()
     except PermissionError:
         return True
+
+
+def _holds_frames(layout: JobLayout) -> bool:
+    """Whether anything lies where a job's simulated frames and its pictures go. Raises OSError."""
+    for frame in (layout.frame_cache(0), layout.picture(0)):
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(layout.path(frame).parent) as entries:
+            if any(entries):
+                return True
+    return False
 
 
 def _state_of_outcome(outcome: str | None) -> JobState:

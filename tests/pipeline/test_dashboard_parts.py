@@ -193,6 +193,23 @@ def test_a_job_that_never_ran_has_not_started_and_one_with_a_lost_record_was_int
     assert [action.label for action in actions_of(view.job("new"), has_runner=False)] == ["Start"]
 
 
+def test_a_job_without_record_that_has_frames_was_interrupted_and_so_was_a_take_that_crashed(tmp_path: Path) -> None:
+    for name in ("film", "take", "new"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "job.toml").touch()
+    film, take = JobLayout(tmp_path / "film"), JobLayout(tmp_path / "take")
+    Manifest(take.manifest).close()
+    for made in (film.path(film.picture(0)), film.path(film.movie()), take.path(take.frame_cache(0))):
+        made.parent.mkdir(exist_ok=True)
+        made.touch()
+    view = FarmView(Places(tmp_path), Spool(tmp_path))
+    assert {card.name: card.state for card in view.glance().jobs} == {
+        "film": JobState.INTERRUPTED,
+        "take": JobState.INTERRUPTED,
+        "new": JobState.NOT_STARTED,
+    }
+
+
 # --- estimates ---
 def test_what_is_left_is_shared_by_those_that_work_beside_each_other() -> None:
     summaries = [StageSummary("render", {TaskState.SUCCEEDED: 10, TaskState.RUNNING: 2, TaskState.PENDING: 8})]
