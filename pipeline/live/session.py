@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -101,6 +103,10 @@ class _JobPin(NamedTuple):
     release_s: float
 
 
+class CannotGoOnError(PipelineError):
+    """A scene is gone, and cannot be built again: there is no memory for it, say."""
+
+
 class _FrameLeftError(Exception):
     """Nobody wants the frame any more that is being computed."""
 
@@ -192,13 +198,19 @@ class Session:
     # --- the owner's: the loop --------------------------------------------------------------------------------------
 
     def meet_requests(self, wait_s: float = 0.0) -> None:
-        """Do all that was asked for; wait for the first request for so long at most [s]."""
+        """Do all that was asked for; wait for the first request for so long at most [s].
+
+        Raises:
+            CannotGoOnError: a scene that had to begin anew has no memory.
+        """
         try:
             asked = self._requests.get(timeout=wait_s) if wait_s > 0.0 else self._requests.get_nowait()
             while True:
                 request, arguments = asked
                 try:
                     request(*arguments)
+                except CannotGoOnError:
+                    raise
                 except (ValueError, PipelineError, OSError) as error:
                     self._refusal = str(error)
                     self.revision += 1
@@ -211,14 +223,16 @@ class Session:
             return
 
     def advance(self) -> None:
-        """Compute a frame; after a blow-up, go back to where the scene was sound."""
+        """Compute a frame; after a blow-up, go back to where the scene was sound.
+
+        Raises:
+            CannotGoOnError: there is no memory for that either.
+        """
         began = self._clock()
         self._begins.append(began)
+        what = remedy = ""
         try:
-            for hand in self._hands.values():
-                hand.move(self.dt)
-            if self._hands:
-                self.world.tell_couplings()
+            self._move_hands()
             self._watch.begin_frame()
             report = self.world.advance_frame()
             _require_sound(report)
@@ -227,16 +241,17 @@ class Session:
         except SimulationDivergedError as error:
             # Its hint is about keys of a job that no knob turns.
             remedy = FASTER if self._watch.is_too_slow else MORE_SUBSTEPS
-            self._go_back(f"It blew up: {error.finding}", remedy=remedy)
-            return
+            what = f"It blew up: {error.finding}"
         except (ArithmeticError, np.linalg.LinAlgError) as error:
             # Too many contacts or neighbours say themselves what leaves fewer.
-            self._go_back(f"It blew up: {error}", remedy="" if isinstance(error, OverflowError) else MORE_SUBSTEPS)
-            return
+            remedy = "" if isinstance(error, OverflowError) else MORE_SUBSTEPS
+            what = f"It blew up: {error}"
         except (MemoryError, RuntimeError) as error:
             if classify(error) is not FailureKind.OUT_OF_MEMORY:
                 raise
-            self._go_back(f"No memory was left: {describe(error)}", remedy="")
+            what = f"No memory was left: {describe(error)}"
+        if what:  # not within the handlers: an error's traceback would keep the old world
+            self._go_back(what, remedy=remedy)
             return
         self.report = report
         if self._result == FIRST:
@@ -281,10 +296,24 @@ class Session:
         self.speed = speed
 
     def reset(self) -> None:
-        """Begin anew, with the knobs where they are."""
+        """Begin anew, with the knobs where they are.
+
+        Raises:
+            CannotGoOnError: there is no memory for it.
+        """
         self._is_reset_asked.clear()
         self.message = ""
-        self._begin_anew(dict(self.values))
+        values, has_room = dict(self.values), True
+        try:
+            self._begin_anew(values)  # the old world goes on if the new one is refused, as where a mesh is gone
+        except (MemoryError, RuntimeError) as error:
+            if classify(error) is not FailureKind.OUT_OF_MEMORY:
+                raise
+            has_room = False
+        if not has_room:  # for both
+            self._drop()
+            with self._or_ended():
+                self._begin_anew(values)
 
     def turn(self, name: str, value: object) -> None:
         """Turn a knob.
@@ -438,6 +467,12 @@ class Session:
         self._release(key)
         return key
 
+    def _move_hands(self) -> None:
+        for hand in self._hands.values():
+            hand.move(self.dt)
+        if self._hands:
+            self.world.tell_couplings()
+
     def _release(self, key: _Held) -> None:
         if (hand := self._hands.pop(key, None)) is not None:
             hand.release()
@@ -476,6 +511,24 @@ class Session:
             self.message = f"{self.message} Not taken over: {'; '.join(refused)}.".lstrip()
         self._begins.clear()
 
+    def _drop(self) -> None:
+        """Let the world and all that is of it go, before another is built where there may be no memory for two."""
+        del self.world
+        self._solvers = {}
+        self._hands.clear()
+        self._moments.clear()
+        gc.collect()
+
+    @contextmanager
+    def _or_ended(self) -> Iterator[None]:
+        """What is done after `_drop`: there is no scene if it fails. Raises CannotGoOnError then."""
+        try:
+            yield
+        except (MemoryError, RuntimeError, ValueError, OSError, PipelineError) as error:
+            if isinstance(error, RuntimeError) and classify(error) is not FailureKind.OUT_OF_MEMORY:
+                raise
+            raise CannotGoOnError(f"{self.job.name} cannot begin anew: {describe(error)}") from error
+
     def _turn_all(self, values: Mapping[str, Value]) -> list[str]:
         """Turn knobs; returns what was refused, and why.
 
@@ -512,14 +565,15 @@ class Session:
         else:
             cause = "Nothing had been turned."
         self.message = ""
-        self._begin_anew({} if moment is None else moment.values)
-        if moment is None:
-            self.is_paused = True
-        else:
-            if "rigid" in self._solvers:
-                self._solvers["rigid"].paths.update(moment.paths)
-            self.world.restore(moment.frame, moment.arrays)
-            self._moments.append(moment)
+        self._drop()
+        with self._or_ended():
+            self._begin_anew({} if moment is None else moment.values)
+            if moment is not None:
+                if "rigid" in self._solvers:
+                    self._solvers["rigid"].paths.update(moment.paths)
+                self.world.restore(moment.frame, moment.arrays)
+                self._moments.append(moment)
+        self.is_paused = self.is_paused or moment is None
         began_with = {name: value for name, value in self.values.items() if value == self.knobs[name].start}
         if remedy != FASTER and (pace := told_pace(self._written, began_with)):
             cause += f" {pace} Knobs bring that back{', and so does --as-written' if self._gave_up else ''}."

@@ -1,6 +1,7 @@
 """A scene that is played with, without a page: knobs and hands change what happens, and a blow-up is no end."""
 
 import threading
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,8 +10,12 @@ import numpy as np
 import pytest
 from live_jobs import BALL_OVER_SHEET, loaded
 
+import sim.build
+from pipeline.executors.failures import describe
+from pipeline.job.models import Job
 from pipeline.live.scene import live_job
-from pipeline.live.session import FASTER, FIRST, FRAMES_TO_TRUST, Session
+from pipeline.live.session import FASTER, FIRST, FRAMES_TO_TRUST, CannotGoOnError, Session
+from sim.world import World
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -354,6 +359,65 @@ def test_too_many_pairs_and_too_little_memory_go_back_too(tmp_path, error, told)
     assert ("substeps" in session.message) == isinstance(error, ZeroDivisionError)
     run(session, 2)
     assert session.world.frame == 2
+
+
+def built(monkeypatch: pytest.MonkeyPatch, session: Session, *errors: BaseException | None) -> list[bool]:
+    """Whether the cloth of before is still in memory, of each time that a scene is built; each fails as is said."""
+    cloth, kept = weakref.ref(session.world.solvers["cloth"]), []
+    outcomes = iter(errors)
+
+    def build(job: Job, *, frames_per_second: float) -> World:
+        kept.append(cloth() is not None)
+        if (error := next(outcomes)) is not None:
+            raise error
+        return build_world(job, frames_per_second=frames_per_second)
+
+    build_world = sim.build.build_world
+    monkeypatch.setattr(sim.build, "build_world", build)
+    return kept
+
+
+def out_of_memory() -> str | None:
+    raise MemoryError("Unable to allocate 9 GiB")
+
+
+def test_the_old_scene_is_gone_before_one_is_built_after_too_little_memory(tmp_path, monkeypatch):
+    session = session_of(tmp_path)
+    run(session, 30)
+    session.grab_cloth("sheet", (0.0, 0.0, 0.5))
+    session.world.watch = out_of_memory
+    kept = built(monkeypatch, session, None)
+    session.advance()
+    assert kept == [False]
+    assert session.message.startswith("No memory was left: MemoryError: Unable to allocate 9 GiB. In hand: ")
+    run(session, 1)
+    assert session.world.frame == 1
+
+
+@pytest.mark.parametrize("error", [MemoryError("no 9 GiB"), RuntimeError("CUDA: out of memory"), ValueError("no mesh")])
+def test_a_scene_that_cannot_be_built_again_ends_live_with_a_line(tmp_path, monkeypatch, error):
+    session = session_of(tmp_path)
+    run(session, 1)
+    session.world.watch = out_of_memory
+    built(monkeypatch, session, error)
+    session.ask(session.step)
+    with pytest.raises(CannotGoOnError, match=f"^drape cannot begin anew: {describe(error)}$"):
+        session.meet_requests()
+
+
+def test_a_reset_with_memory_for_one_scene_only_lets_the_old_one_go_and_a_refused_one_does_not(tmp_path, monkeypatch):
+    session = session_of(tmp_path)
+    session.turn("cloth.sheet.friction", 1.5)
+    run(session, 2)
+    kept = built(monkeypatch, session, ValueError("no mesh"), MemoryError("no 9 GiB"), None)
+    session.ask(session.reset)
+    session.meet_requests()
+    assert (session.message, session.world.frame) == ("no mesh", 2)
+    session.turn("cloth.sheet.friction", 1.4)
+    session.ask(session.reset)
+    session.meet_requests()
+    assert kept == [True, True, False]
+    assert (session.message, session.world.frame, session.values["cloth.sheet.friction"]) == ("", 0, 1.4)
 
 
 @pytest.mark.parametrize("error", [TypeError("no"), RuntimeError("generator raised StopIteration"), KeyError("no")])
