@@ -15,6 +15,7 @@ from pipeline.view.colors import BODY as BODY_COLOR
 from pipeline.view.colors import CLOTH, PIN, SURFACE
 from pipeline.view.drawing import Drawing, Rgb
 from pipeline.view.scene import color_of
+from render.parameters import CameraParameters
 from sim.rigid.static import StaticBody
 from sim.snapshots import Snapshot
 
@@ -33,10 +34,11 @@ class SceneDrawing:
     Args:
         server: what pages connect to.
         job: as it is simulated.
+        of_film: the placed camera of the job as it was read: bodies that rest there stand still no more in `job`.
         on_drag: is called when bodies that move, cloths and pins are dragged.
     """
 
-    def __init__(self, server: viser.ViserServer, job: Job, on_drag: Drag) -> None:
+    def __init__(self, server: viser.ViserServer, job: Job, of_film: CameraParameters, on_drag: Drag) -> None:
         from trimesh.creation import icosphere
 
         self._job, self._on_drag = job, on_drag
@@ -50,7 +52,7 @@ class SceneDrawing:
                 "/floor", width=width, height=depth, plane="xy", cell_size=0.1, section_size=0.5, position=place,
                     cell_color=FLOOR_COLOR, section_color=FLOOR_COLOR,
             )  # fmt: skip
-        camera, of_film = server.initial_camera, job.placed_camera
+        camera = server.initial_camera
         if of_film.position is not None and not isinstance(of_film.look_at, str):
             camera.position = np.asarray(of_film.position)
             camera.look_at = middle if of_film.look_at is None else np.asarray(of_film.look_at)

@@ -30,7 +30,7 @@ class LivePage:
         session: the scene.
         save: writes the job with the present values.
         recorder: makes takes.
-        written: the job as it was read: what differs from it for the sake of speed is told.
+        written: the job as it was read: it has the camera, and what differs from it for the sake of speed is told.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class LivePage:
             with gui.add_folder(label):
                 for knob in knobs:
                     self._add_knob(gui, knob)
-        self._drawing = SceneDrawing(server, session.job, self._dragged)
+        self._drawing = SceneDrawing(server, session.job, written.placed_camera, self._dragged)
 
         @server.on_client_disconnect
         async def _(client: Any) -> None:

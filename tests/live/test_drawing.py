@@ -31,7 +31,7 @@ def test_a_moved_sheet_costs_its_positions_and_no_triangles(tmp_path):
     first = np.arange(NODES).reshape(100, 100)[:-1, :-1].ravel()
     triangles = np.concatenate([first[:, None] + [0, 1, 100], first[:, None] + [1, 101, 100]]).astype(np.int32)
     with page_server(port=0, label="drape") as server:
-        drawing, end = SceneDrawing(server, job, lambda *_: None), server.gui.add_markdown("")
+        drawing, end = SceneDrawing(server, job, job.placed_camera, lambda *_: None), server.gui.add_markdown("")
         address = f"ws://127.0.0.1:{server.get_port()}"
         versions = [f"viser-v{viser.__version__}"]
         with connect(address, subprotocols=versions, max_size=None, compression=None, max_queue=None) as browser:

@@ -129,7 +129,7 @@ def test_a_scene_has_the_colours_of_the_viewer(tmp_path):
     read = loaded(tmp_path, BALL_OVER_SHEET + '\n[material.post]\nlook = "metal"\ncolor = [0.5, 0.1, 0.0]\n')
     session = Session(live_job(read.job))
     with page_server(port=0, label="drape") as server:
-        drawn = SceneDrawing(server, session.job, lambda *_: None)
+        drawn = SceneDrawing(server, session.job, read.job.placed_camera, lambda *_: None)
         drawn.show(session.bodies(), session.pins)
         nodes = server.scene._handle_from_node_name
         expected = {
@@ -146,10 +146,22 @@ def test_the_ball_of_a_pin_goes_when_the_pin_lets_go(tmp_path):
     read = loaded(tmp_path, BALL_OVER_SHEET.replace('edge = "y-"', 'edge = "y-"\nrelease_s = 0.02'))
     session = Session(live_job(read.job))
     with page_server(port=0, label="drape") as server:
-        drawn = SceneDrawing(server, session.job, lambda *_: None)
+        drawn = SceneDrawing(server, session.job, read.job.placed_camera, lambda *_: None)
         balls = []
         for _ in range(3):
             drawn.show(session.bodies(), session.pins)
             balls.append([name for name in server.scene._handle_from_node_name if name.startswith("/pin/")])
             session.advance()
         assert balls == [["/pin/0", "/pin/1"], ["/pin/0", "/pin/1"], ["/pin/1"]]
+
+
+@pytest.mark.usefixtures("taichi")
+def test_the_page_begins_with_the_camera_of_the_film_that_looks_at_a_body_at_rest(tmp_path):
+    camera = '\n[camera]\nposition = [0.0, -1.2, 1.3]\nlook_at = "post"\n'
+    read = loaded(tmp_path, BALL_OVER_SHEET + camera)
+    session = Session(live_job(read.job))
+    with page_server(port=0, label="drape") as server:
+        recorder = Recorder(read, session, tmp_path, device="cpu")
+        LivePage(server, session, save=lambda: save_job(read, {}, tmp_path), recorder=recorder, written=read.job)
+        view = server.initial_camera
+        assert (tuple(view.position), tuple(view.look_at)) == ((0.0, -1.2, 1.3), (0.4, 0.0, 0.05))
