@@ -22,6 +22,9 @@ BLACK_LUMINANCE = 1.0e-4
 FLAT_LEVELS = 1
 """Range of each channel in grey levels of 255 up to which a picture has one colour only: rounding, or little noise."""
 
+WHITE_LEVEL = 245.0 / 255.0
+"""Display value [-] from which a channel counts as burnt: the view's curve comes to 1 slowly."""
+
 VISIBLE_LEVELS = 6
 """Grey levels of 255 by which a part of a picture differs from the empty stage if something is to be seen there; noise
 of a denoised draft, in the mean of a cell of four pixels, reaches 5."""
@@ -47,6 +50,7 @@ class PictureStatistics:
         luminance_deviation: standard deviation of the luminance [-].
         darkest: smallest luminance [-].
         brightest: largest luminance [-].
+        white_share: of the pixels whose least channel is at `WHITE_LEVEL` or above [-].
     """
 
     width: int
@@ -56,6 +60,7 @@ class PictureStatistics:
     luminance_deviation: float
     darkest: float
     brightest: float
+    white_share: float
 
 
 def read_picture(path: Path) -> Pixels:
@@ -141,6 +146,7 @@ def validate_picture(path: Path, resolution: tuple[int, int], *, may_be_empty: b
         raise InvalidFileError(path, f"is {width}x{height} pixels, but {resolution[0]}x{resolution[1]} were asked for")
     scale = float(np.iinfo(pixels.dtype).max)
     luminance = pixels[..., :3] @ _BT709_WEIGHTS / scale if channels >= 3 else pixels[..., 0] / scale
+    color = pixels[..., :3] if channels >= 3 else pixels[..., :1]
     statistics = PictureStatistics(
         width=width,
         height=height,
@@ -149,12 +155,12 @@ def validate_picture(path: Path, resolution: tuple[int, int], *, may_be_empty: b
         luminance_deviation=float(luminance.std()),
         darkest=float(luminance.min()),
         brightest=float(luminance.max()),
+        white_share=float((color.min(axis=2) >= WHITE_LEVEL * scale).mean()),
     )
     if may_be_empty:
         return statistics
     if statistics.mean_luminance < BLACK_LUMINANCE:
         raise InvalidFileError(path, f"is black (mean luminance {statistics.mean_luminance:.2g})")
-    color = pixels[..., :3] if channels >= 3 else pixels[..., :1]
     spread = np.ptp(color.reshape(-1, color.shape[2]).astype(np.int64), axis=0).max()
     if spread <= FLAT_LEVELS * scale / 255.0:
         raise InvalidFileError(path, f"has one colour only: {color[0, 0].tolist()}")

@@ -24,11 +24,16 @@ from render.camera_path import View
 
 if TYPE_CHECKING:
     from render.blender import Renderer
+    from render.pictures import PictureStatistics
 
 STAGE_PIXELS = 96
 """Along the longer side of the empty stage that pictures are held against: half a percent of it is 25 pixels."""
 
+WHITE_SHARE = 0.8
+"""Of a picture that is white, from which it is warned of: 0.4 of a white studio in twice its light is."""
+
 BAD_PICTURE = "bad picture"
+NEARLY_WHITE = "nearly white"
 NO_GPU = "no GPU"
 CPU = "CPU"
 """What a renderer calls its device when it draws on none of the GPUs."""
@@ -53,7 +58,7 @@ def draw_until_good(context: TaskContext, paths: list[Path], view: View, bodies:
     for once_more in (True, False):
         try:
             _draw(context, frame, paths)
-            _check_picture(context, frame, paths[0], view, bodies)
+            statistics = _check_picture(context, frame, paths[0], view, bodies)
         except InvalidFileError as error:
             if once_more:
                 close_renderers()  # what went wrong in it may stay so
@@ -65,6 +70,13 @@ def draw_until_good(context: TaskContext, paths: list[Path], view: View, bodies:
             raise InvalidArtifactError(
                 f"frame {frame}: the picture {error.reason}; twice; it is kept as {rejected}"
             ) from error
+        # What stands before white on purpose is no mistake, and light that was asked for is no failure of Blender's.
+        if statistics.white_share > WHITE_SHARE and not may_be_empty(context.job):
+            context.warn(
+                NEARLY_WHITE,
+                f"frame {frame}: {100 * statistics.white_share:.0f} % of the picture is white; see stage.strength, "
+                "the power of [[light]] and render.exposure",
+            )
         return
 
 
@@ -86,18 +98,24 @@ def _draw(context: TaskContext, frame: int, paths: list[Path]) -> None:
     context.progress(0, 1)
 
 
-def _check_picture(context: TaskContext, frame: int, path: Path, view: View, bodies: Sequence[BodyAtFrame]) -> None:
-    """Raise InvalidFileError if a picture is damaged, black, of one colour, or shows the stage without its bodies."""
+def _check_picture(
+    context: TaskContext, frame: int, path: Path, view: View, bodies: Sequence[BodyAtFrame]
+) -> PictureStatistics:
+    """What a picture looks like in numbers.
+
+    Raises:
+        InvalidFileError: it is damaged, black, of one colour, or shows the stage without its bodies.
+    """
     from render.pictures import read_shown, require_more_than_stage, validate_picture
 
     job = context.job
-    validate_picture(path, job.render.resolution, may_be_empty=may_be_empty(job))
+    statistics = validate_picture(path, job.render.resolution, may_be_empty=may_be_empty(job))
     width, height = job.render.resolution
     scale = min(1.0, STAGE_PIXELS / max(width, height))
     columns, rows = max(4, round(scale * width)), max(4, round(scale * height))
     cells = expected_cells(job, view, bodies, (rows, columns))
     if cells is None:
-        return
+        return statistics
     if job.placed_camera.moves or "still" not in _EMPTY_STAGE:
         with tempfile.TemporaryDirectory(prefix="stage-") as folder:
             picture = Path(folder) / "stage.png"
@@ -108,6 +126,7 @@ def _check_picture(context: TaskContext, frame: int, path: Path, view: View, bod
     else:
         stage = _EMPTY_STAGE["still"]
     require_more_than_stage(path, stage, cells)
+    return statistics
 
 
 def may_be_empty(job: Job) -> bool:

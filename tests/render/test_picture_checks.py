@@ -189,3 +189,19 @@ def test_a_frame_that_the_ball_is_not_in_is_no_fault_without_a_background(tmp_pa
     ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
     render_drawing.close_renderers()
     assert isinstance(ended, Finished), ended
+
+
+@needs_bpy
+@pytest.mark.parametrize(("power", "is_white"), [(100.0, True), (5.0, False)])
+def test_a_frame_that_is_nearly_white_is_warned_of(tmp_path, power, is_white):
+    sun = f'[[light]]\ntype = "sun"\nposition = [0.5, -1.0, 2.0]\npower = {power}\n'
+    _, layout = job_of_the_ball(tmp_path, "noon", sun)
+    cache = layout.path(layout.frame_cache(1))
+    cache.parent.mkdir()
+    write_frame(
+        cache, {"ball": Snapshot("rigid", pose()["ball"], {})}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu"
+    )
+    ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
+    render_drawing.close_renderers()
+    assert isinstance(ended, Finished), ended
+    assert ("of the picture is white" in layout.log(ended.task_id, 1).read_text()) == is_white

@@ -48,6 +48,7 @@ def test_statistics_are_those_of_the_pixels(tmp_path, pixels):
     assert statistics.mean_luminance == pytest.approx(luminance.mean())
     assert statistics.luminance_deviation == pytest.approx(luminance.std())
     assert (statistics.darkest, statistics.brightest) == pytest.approx((luminance.min(), luminance.max()))
+    assert statistics.white_share == pytest.approx((pixels.min(axis=2) >= 245).mean())
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
