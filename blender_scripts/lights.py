@@ -32,6 +32,12 @@ GREY: Color = (0.22, 0.25, 0.29)
 _CATCHER_REACH = 2.1
 """How far shadows are caught where there is no background, in diagonals of the domain."""
 
+_SUNLIGHT: Color = (1.0, 0.94, 0.86)
+"""Of the sun outdoors at its usual height, linear RGB."""
+_USUAL_ELEVATION_DEG = 38.0
+_OPTICAL_DEPTH: Color = (0.04, 0.10, 0.24)
+"""Of clean air overhead, by Rayleigh scattering, at 680, 550 and 440 nm (Bucholtz 1995)."""
+
 _WINDOW_DISTANCE = 1.7
 """Of the window of a room, from the domain's middle, in diagonals of the domain."""
 
@@ -134,16 +140,20 @@ def _build_studio(parameters: dict[str, Any], geometry: StageGeometry) -> None:
 
 
 def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
-    """Ground to the horizon, a physical sky and a sun from behind the camera's left."""
+    """Ground to the horizon, a physical sky and a sun: at the left and behind the scene where the job does not say."""
     _add_ground(_plain(geometry), "ground", parameters, geometry)
 
-    elevation = math.radians(38.0)
-    from_sun = geometry.place(right=-1.0, towards_camera=-0.45, above_floor=0.0) - geometry.place(
-        right=0.0, towards_camera=0.0, above_floor=0.0
-    )
-    horizontal = from_sun.normalized()
+    elevation_deg, azimuth_deg = parameters["sun_elevation_deg"], parameters["sun_azimuth_deg"]
+    elevation = math.radians(elevation_deg)
+    if azimuth_deg is None:
+        from_sun = geometry.place(right=-1.0, towards_camera=-0.45, above_floor=0.0) - geometry.place(
+            right=0.0, towards_camera=0.0, above_floor=0.0
+        )
+        horizontal = from_sun.normalized()
+    else:
+        horizontal = Vector((math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg)), 0.0))
     towards_sun = Vector((horizontal.x * math.cos(elevation), horizontal.y * math.cos(elevation), math.sin(elevation)))
-    sun = _new_light("sun", "SUN", 5.5 * parameters["strength"], (1.0, 0.94, 0.86))
+    sun = _new_light("sun", "SUN", 5.5 * parameters["strength"], _sunlight(elevation_deg))
     sun.angle = math.radians(0.7)
     _add_light_object("sun", sun, geometry.centre + 3 * geometry.size * towards_sun, geometry.centre)
 
@@ -156,6 +166,26 @@ def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     # that it takes a third of a draft's time.
     settings = bpy.context.scene.world.cycles
     settings.sampling_method, settings.sample_map_resolution = "MANUAL", _SKY_MAP_PIXELS
+
+
+def _sunlight(elevation_deg: float) -> Color:
+    """Colour of the sun's light after its way through the air: a low sun is dim and red.
+
+    I = I_0 exp(-tau m) for each channel; the air mass m is that of Kasten & Young 1989, eq. 3.
+
+    Args:
+        elevation_deg: above the horizon [degrees].
+    """
+    longer = _air_mass(elevation_deg) - _air_mass(_USUAL_ELEVATION_DEG)
+    red, green, blue = (
+        channel * math.exp(-depth * longer) for channel, depth in zip(_SUNLIGHT, _OPTICAL_DEPTH, strict=True)
+    )
+    return red, green, blue
+
+
+def _air_mass(elevation_deg: float) -> float:
+    """Air on the way of the sun's light, in thicknesses of the atmosphere overhead [-]."""
+    return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
 
 
 def _build_night(parameters: dict[str, Any], geometry: StageGeometry) -> None:
@@ -448,4 +478,6 @@ def _add_extra_light(name: str, parameters: dict[str, Any]) -> None:
         light.size = parameters["size"]
     elif parameters["type"] == "point":
         light.shadow_soft_size = parameters["size"]
+    else:
+        light.angle = math.radians(parameters["size"])
     _add_light_object(name, light, Vector(parameters["position"]), Vector(parameters["look_at"]))

@@ -1,4 +1,4 @@
-"""The domain's walls as a glass tank, open at the top."""
+"""The domain's walls as a glass tank, open at the top and where the domain is open at a side."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _GAP = 0.002
 """Between water and glass, in domain diagonals: coinciding surfaces would shade each other at random."""
 
 
-def add_tank(spec: dict[str, Any]) -> Any:
-    """Put four panes around the domain; their rims and corners are solid, so that the tank can be seen.
+def add_tank(spec: dict[str, Any]) -> Any | None:
+    """Put a pane on each closed side of the domain; their rims and corners are solid, so that the tank can be seen.
 
     Returns:
-        The object of the panes.
+        The object of the panes; None where all sides are open.
     """
     low, high = np.array(spec["domain_min"], dtype=np.float64), np.array(spec["domain_max"], dtype=np.float64)
     size = float(np.linalg.norm(high - low))
@@ -32,18 +32,23 @@ def add_tank(spec: dict[str, Any]) -> Any:
     sideways = np.array((thickness, thickness, 0.0))
     outer_low, outer_high = inner_low - sideways, inner_high + sideways
 
+    closed = {side for side in ("x-", "x+", "y-", "y+") if side not in spec["open_faces"]}
+    if not closed:
+        return None
     panes, edges = [], []
-    for x_low, x_high, y_low, y_high in (
-        (inner_low[0], inner_high[0], outer_low[1], inner_low[1]),
-        (inner_low[0], inner_high[0], inner_high[1], outer_high[1]),
-        (outer_low[0], inner_low[0], inner_low[1], inner_high[1]),
-        (inner_high[0], outer_high[0], inner_low[1], inner_high[1]),
+    for side, x_low, x_high, y_low, y_high in (
+        ("y-", inner_low[0], inner_high[0], outer_low[1], inner_low[1]),
+        ("y+", inner_low[0], inner_high[0], inner_high[1], outer_high[1]),
+        ("x-", outer_low[0], inner_low[0], inner_low[1], inner_high[1]),
+        ("x+", inner_high[0], outer_high[0], inner_low[1], inner_high[1]),
     ):
-        panes.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2] - thickness / 2)))
-        edges.append(((x_low, y_low, inner_high[2] - thickness / 2), (x_high, y_high, inner_high[2])))
-    for x_low, x_high in ((outer_low[0], inner_low[0]), (inner_high[0], outer_high[0])):
-        for y_low, y_high in ((outer_low[1], inner_low[1]), (inner_high[1], outer_high[1])):
-            edges.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2])))
+        if side in closed:
+            panes.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2] - thickness / 2)))
+            edges.append(((x_low, y_low, inner_high[2] - thickness / 2), (x_high, y_high, inner_high[2])))
+    for x_side, x_low, x_high in (("x-", outer_low[0], inner_low[0]), ("x+", inner_high[0], outer_high[0])):
+        for y_side, y_low, y_high in (("y-", outer_low[1], inner_low[1]), ("y+", inner_high[1], outer_high[1])):
+            if {x_side, y_side} & closed:  # the end of a single pane, too
+                edges.append(((x_low, y_low, inner_low[2]), (x_high, y_high, inner_high[2])))
     made = []
     # What panes stand on shows through them. A lower side would be seen from inside of the glass: a mirror.
     for name, boxes in (("tank_glass", _boxes(panes, open_below=True)), ("tank_edge", _boxes(edges))):

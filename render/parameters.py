@@ -138,15 +138,41 @@ class CameraParameters(Parameters):
         return self
 
 
+LightType = Literal["area", "point", "sun"]
+
+MOST_SUN_DEG = 180.0
+USUAL_POWER: dict[LightType, float] = {"area": 100.0, "point": 100.0, "sun": 5.0}
+"""Of a light that the job gives none [W], of a sun [W/m²]: that of the stage `outdoor` has 5.5."""
+
+
 class LightParameters(Parameters):
     """An extra light."""
 
-    type: Literal["area", "point", "sun"] = Field(default="area", description="Kind of light.")
-    position: Vector3 = Field(description="Where it stands [m].")
+    type: LightType = Field(default="area", description="Kind of light.")
+    position: Vector3 = Field(description="Where it stands [m]; of a sun only the direction counts.")
     look_at: Vector3 = Field(default=(0.0, 0.0, 0.0), description="What it shines at [m].")
-    power: Positive = Field(default=100.0, description="Power [W]; for a sun, irradiance [W/m²].")
-    size: Positive = Field(default=0.5, description="Edge of an area light, radius of a point light [m].")
+    power: Positive | None = Field(
+        default=None, description="Power [W]; for a sun, irradiance [W/m²]. 100 W if omitted, 5 W/m² for a sun."
+    )
+    size: Positive = Field(
+        default=0.5, description="Edge of an area light, radius of a point light [m]; angle across a sun [degrees]."
+    )
     color: Color = Field(default=(1.0, 1.0, 1.0), description="Linear RGB.")
+
+    @property
+    def power_that_counts(self) -> float:
+        """Power, or what is usual for its type [W]; for a sun [W/m²]."""
+        return USUAL_POWER[self.type] if self.power is None else self.power
+
+    def with_power(self) -> Self:
+        """The same light with a power that is said."""
+        return self.model_copy(update={"power": self.power_that_counts})
+
+    @model_validator(mode="after")
+    def _is_no_larger_than_the_sky(self) -> Self:
+        if self.type == "sun" and self.size > MOST_SUN_DEG:
+            raise ValueError(f"size of a sun is an angle of at most {MOST_SUN_DEG:g} degrees, got {self.size:g}")
+        return self
 
 
 class StageParameters(Parameters):
@@ -158,6 +184,14 @@ class StageParameters(Parameters):
         "a dark sky and a moon behind the domain; window: a room with soft light from a large window at the left.",
     )
     strength: Positive = Field(default=1.0, description="Factor on all of its lights [-].")
+    sun_elevation_deg: Annotated[float, Field(gt=0.0, le=90.0)] = Field(
+        default=38.0, description="Outdoor: how high the sun stands above the horizon [degrees]."
+    )
+    sun_azimuth_deg: float | None = Field(
+        default=None,
+        description="Outdoor: where the sun stands, counter-clockwise from above [degrees]: 0 towards +x, 90 towards "
+        "+y; at the left and behind the scene, as the camera sees it at first, if omitted.",
+    )
     color: Color | None = Field(
         default=None,
         description="Colour of the ground and backdrop, linear RGB; the stage's own if omitted, or that of the look in "
@@ -180,7 +214,9 @@ class StageParameters(Parameters):
     rotation_deg: float = Field(
         default=0.0, description="How far the hdri is turned, counter-clockwise from above [degrees]."
     )
-    tank: bool = Field(default=False, description="Show the domain's walls as a glass tank.")
+    tank: bool = Field(
+        default=False, description="Show the domain's walls as a glass tank; its open_faces have no pane."
+    )
 
 
 Look = Literal[

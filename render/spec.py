@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, field_validator
 
 from render.camera_path import CameraPath
 from render.parameters import (
@@ -148,6 +148,10 @@ class RenderSpec(Parameters):
     fps: float = Field(gt=0.0)
     domain_min: Vector3
     domain_max: Vector3
+    open_faces: tuple[str, ...] = Field(
+        default=(),
+        description="Sides of the domain without a wall: x-, x+, y-, y+, z-, z+; the tank has no pane there.",
+    )
     camera: Camera
     stage: StageParameters
     lights: tuple[LightParameters, ...] = ()
@@ -156,6 +160,11 @@ class RenderSpec(Parameters):
     engine: Literal["cycles", "workbench"] = Field(
         default="cycles", description="workbench: plain pictures at once, for animatics."
     )
+
+    @field_validator("lights")
+    @classmethod
+    def _say_their_power(cls, lights: tuple[LightParameters, ...]) -> tuple[LightParameters, ...]:
+        return tuple(light.with_power() for light in lights)
 
     def write(self, path: Path) -> None:
         """Write the document; the same specification gives the same bytes."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from math import log2
 from pathlib import Path
 
 from pipeline.errors import JobFileError
@@ -12,6 +13,7 @@ from pipeline.job.looks import (
     BODY,
     GLOWING_K,
     REFRACTING_LOOKS,
+    ROUGH_LOOKS,
     TEXTURED_LOOKS,
     VOLUME_LOOKS,
     WHITEWATER,
@@ -29,6 +31,8 @@ from pipeline.stages.movie import MovieStage
 from render.parameters import HIGHEST_FPS, MaterialParameters
 
 MANY_FRAMES = 100_000
+BURNING_SUN = 20.0
+"""Irradiance, times that of the exposure, from which a grey ground is nearly white in a picture [W/m²]."""
 
 
 def check_job(job: Job, *, memory_bytes: int | None = None) -> Findings:
@@ -143,6 +147,7 @@ def _check_keys(material: MaterialParameters, path: KeyPath, findings: Findings)
     if material.caustics and material.look not in REFRACTING_LOOKS:
         findings.warn((*path, "caustics"), f'has no effect on the look "{material.look}"')
     for key, looks in (
+        ("roughness", ROUGH_LOOKS),
         ("density", (*VOLUME_LOOKS, "water", "honey", "milk")),
         ("anisotropy", VOLUME_LOOKS),
         ("edge_fade", VOLUME_LOOKS),
@@ -223,6 +228,12 @@ def _check_pictures(job: Job, findings: Findings) -> None:
     for index, light in enumerate(job.light):
         if light.position == light.look_at and light.type != "point":
             findings.error(("light", index, "look_at"), "is where the light stands; it must be somewhere else")
+        if light.type == "sun" and log2(light.power_that_counts) + job.render.exposure > log2(BURNING_SUN):
+            findings.warn(
+                ("light", index, "power"),
+                f"is {light.power_that_counts:g} W/m² for a sun, which burns the picture white at exposure "
+                f"{job.render.exposure:g}; the sun of the stage outdoor has 5.5",
+            )
 
 
 def _check_limits(job: Job, findings: Findings) -> None:

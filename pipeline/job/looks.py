@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from render.parameters import MaterialParameters
+from typing import get_args
+
+from render.parameters import Look, MaterialParameters
 from sim.cloth.materials import Material
 
 BODY = "body"
@@ -50,6 +52,9 @@ TEXTURED_LOOKS = {"stone": ("rigid",), "wood": ("rigid", "cloth")}
 
 VOLUME_LOOKS = ("smoke", "fire")
 """What a volume can look like, and nothing else."""
+
+ROUGH_LOOKS = tuple(look for look in get_args(Look) if look not in (*VOLUME_LOOKS, "foam"))
+"""What has a surface that mirrors more or less sharply; foam is matt."""
 
 GLOWING_K = 900.0
 """From here on the glow of smoke shows beside other light; by day it takes 1200 K and more [K]."""

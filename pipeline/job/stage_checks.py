@@ -24,6 +24,15 @@ def check_stage(job: Job, findings: Findings) -> None:
             findings.warn(("stage", "name"), "has no effect beside hdri, which light and sky come from; remove one")
     elif "rotation_deg" in given:
         findings.warn(("stage", "rotation_deg"), "has no effect without hdri, which it turns")
+    for key in sorted({"sun_elevation_deg", "sun_azimuth_deg"} & given):
+        if stage.hdri is not None:
+            findings.error(("stage", key), "has no effect beside hdri, which all light comes from; remove one")
+        elif stage.name != "outdoor":
+            findings.error(
+                ("stage", key), f'has no effect on the stage "{stage.name}", which has no sun; set name = "outdoor"'
+            )
+    if stage.tank and {"x-", "x+", "y-", "y+"} <= set(job.domain.open_faces):
+        findings.warn(("stage", "tank"), "has no effect, as all sides of the domain are open: there is no pane")
     if stage.background != "stage" and stage.ground is not None:
         findings.warn(
             ("stage", "ground"), f'is seen in reflections only, as background = "{stage.background}" leaves it out'

@@ -45,7 +45,10 @@ _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "r
 differently."""
 
 _LATER_KEYS: dict[str, Any] = {"format": "png", "passes": []}
-_LATER_STAGE_KEYS: dict[str, Any] = {"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0}
+_LATER_STAGE_KEYS: dict[str, Any] = {
+    **{"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0},
+    **{"sun_elevation_deg": 38.0, "sun_azimuth_deg": None},
+}
 _LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None, "caustics": False}
 """Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
 _LOOK_REVISIONS = {"honey": 2, "cotton": 2, "silk": 2, "denim": 2}
@@ -54,6 +57,8 @@ _TANK_REVISION = 2
 """The same of the glass tank."""
 _BLEND_ON_CLOTH_REVISION = 2
 """The same of .blend materials on cloth: UV maps that they name were not found, and are the cloth's own now."""
+_SUN_REVISION = 2
+"""The same of extra lights that are suns, whose size counted for nothing."""
 
 _FORMER_COLOR = [0.22, 0.25, 0.29]
 """What stood for a stage's colour where the job gives none, in those versions."""
@@ -236,6 +241,13 @@ def _decisive(spec: RenderSpec, cloths: Collection[str]) -> dict[str, Any]:
         stage["color"] = _FORMER_COLOR
     if stage["tank"]:
         stage["tank_revision"] = _TANK_REVISION
+    # Where a pane is left out; the tank has none above or below.
+    document["open_faces"] = sorted({face for face in spec.open_faces if face[0] in "xy"}) if stage["tank"] else []
+    if not document["open_faces"]:
+        del document["open_faces"]
+    for light in document["lights"]:
+        if light["type"] == "sun":
+            light["sun_revision"] = _SUN_REVISION
     for drawn in document["objects"]:
         _keep_decisive(drawn, is_cloth=drawn["name"] in cloths)
     return document

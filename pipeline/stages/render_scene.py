@@ -86,6 +86,7 @@ def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None 
         fps=job.fps,
         domain_min=job.domain.min,
         domain_max=job.domain.max,
+        open_faces=job.domain.open_faces,
         camera=Camera.on(camera_path(job, framed), f_stop=job.camera.f_stop, views=layout.views),
         stage=job.stage,
         lights=job.light,

@@ -178,6 +178,10 @@ def test_job_that_cannot_be_meant_is_refused_with_this_line(text, expected, tmp_
             HEAD + WATER + BALL + '[material.ball]\nlook = "metal"\ndensity = 2.0',
             'dam.toml:17 material.ball.density: has no effect on the look "metal"',
         ),
+        (
+            HEAD + PLUME + '[material.plume]\nlook = "smoke"\nroughness = 0.5',
+            'dam.toml:12 material.plume.roughness: has no effect on the look "smoke"',
+        ),
     ],
 )
 def test_job_that_may_be_unintended_is_allowed_with_this_warning(text, expected, tmp_path):

@@ -145,6 +145,53 @@ def test_keys_beside_a_material_of_a_file_are_warned_of(tmp_path):
     ]
 
 
+@pytest.mark.parametrize(
+    ("stage", "expected"),
+    [
+        (
+            'name = "night"\nsun_elevation_deg = 20',
+            '11 stage.sun_elevation_deg: has no effect on the stage "night", which has no sun; set name = "outdoor"',
+        ),
+        ("sun_azimuth_deg = 20", '10 stage.sun_azimuth_deg: has no effect on the stage "studio", which has no sun'),
+        ('hdri = "noon.hdr"\nsun_azimuth_deg = 20', "11 stage.sun_azimuth_deg: has no effect beside hdri"),
+    ],
+)
+def test_a_sun_is_placed_only_where_there_is_one(tmp_path, stage, expected):
+    write_hdr(tmp_path / "noon.hdr", np.ones((8, 16, 3)))
+    (error,), _ = problems(tmp_path, stage)
+    assert error.startswith(f"film.toml:{expected}")
+    assert problems(tmp_path, 'name = "outdoor"\nsun_elevation_deg = 20\nsun_azimuth_deg = -90') == ([], [])
+
+
+def test_a_tank_without_a_closed_side_is_warned_of(tmp_path):
+    sides = 'tank = true\n[domain]\nmin = [-1, -1, 0]\nmax = [1, 1, 1]\nopen_faces = ["x-", "x+", "y-"{last}]'
+    assert problems(tmp_path, sides.format(last="")) == ([], [])
+    _, (warning,) = problems(tmp_path, sides.format(last=', "y+"'))
+    assert warning == "film.toml:10 stage.tank: has no effect, as all sides of the domain are open: there is no pane"
+
+
+@pytest.mark.parametrize(
+    ("light", "exposure", "has_warning"),
+    [
+        ('type = "sun"', 0.0, False),
+        ('type = "sun"\npower = 100', 0.0, True),
+        ('type = "sun"\npower = 100', -4.0, False),
+        ('type = "sun"', 3.0, True),
+        ("power = 100", 0.0, False),
+    ],
+)
+def test_a_sun_that_burns_the_picture_is_warned_of(tmp_path, light, exposure, has_warning):
+    text = f'name = "outdoor"\n[render]\nexposure = {exposure}\n[[light]]\nposition = [1, 0, 1]\n{light}'
+    errors, warnings = problems(tmp_path, text)
+    assert errors == []
+    assert [("which burns the picture white" in warning) for warning in warnings] == [True] * has_warning
+
+
+def test_the_size_of_a_sun_is_an_angle(tmp_path):
+    with pytest.raises(JobFileError, match="size of a sun is an angle of at most 180 degrees, got 200"):
+        problems(tmp_path, '[[light]]\nposition = [1, 0, 1]\ntype = "sun"\nsize = 200')
+
+
 def test_a_plain_background_is_refused_in_16_bits_which_it_is_not_laid_over_in(tmp_path):
     errors, _ = problems(tmp_path, 'background = "plain"\n[render]\nformat = "png16"')
     assert len(errors) == 1 and 'is "plain", which pictures are laid over in 8 bits' in errors[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -178,6 +179,9 @@ def test_keys_that_a_codec_has_not_are_refused(table, sentence):
         ({"fps": 30}, {"simulate", "volume", "render", "movie"}),
         ({"stage": {"color": [0.22, 0.25, 0.29], "background": "stage", "rotation_deg": 0.0}}, set()),
         ({"stage": {"name": "window"}}, {"render"}),
+        ({"stage": {"sun_elevation_deg": 38.0}}, set()),
+        ({"stage": {"sun_elevation_deg": 20.0}}, {"render"}),
+        ({"stage": {"sun_azimuth_deg": 0.0}}, {"render"}),
         ({"material": {"water": {"look": "water", "caustics": True}}}, {"render"}),
         ({"material": {"water": {"look": "water", "caustics": False}}}, set()),
         ({"stage": {"ground": "wood"}}, {"render"}),
@@ -246,6 +250,34 @@ def test_frames_with_a_material_of_a_blend_file_on_cloth_are_drawn_again_and_oth
     objects = {each["name"]: each["material"] for each in json.loads(task.parameters.canonical)["objects"]}
     assert {name for name, each in objects.items() if "blend" in each} == {"ball", "water", "flag"}
     assert {name for name, each in objects.items() if "blend_revision" in each} == {"flag"}
+
+
+def rendered_parameters(of: Job) -> dict[str, Any]:
+    task = next(task for task in plan_job(of, LAYOUT, STAGES) if task.stage == "render")
+    parameters: dict[str, Any] = json.loads(task.parameters.canonical)
+    return parameters
+
+
+@pytest.mark.parametrize(
+    ("faces", "is_seen", "kept"),
+    [
+        (["z+"], True, None),
+        (["z+", "z-"], True, None),
+        (["x+", "z+"], False, None),
+        (["y-", "x+", "z+"], True, ["x+", "y-"]),
+    ],
+)
+def test_open_faces_count_for_pictures_only_where_a_pane_is_left_out(faces, is_seen, kept):
+    tank = job(domain={"open_faces": faces}, stage={"tank": is_seen})
+    assert render_spec(tank, LAYOUT).open_faces == tuple(faces)
+    assert rendered_parameters(tank).get("open_faces") == kept
+
+
+def test_lights_have_the_power_that_is_usual_for_their_type_and_only_suns_are_drawn_again():
+    place = {"position": [1, 0, 1]}
+    lights = rendered_parameters(job(light=[place, place | {"type": "point"}, place | {"type": "sun"}]))["lights"]
+    assert [light["power"] for light in lights] == [100.0, 100.0, 5.0]
+    assert ["sun_revision" in light for light in lights] == [False, False, True]
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (90, 0, 0), (10, 20, 30), (-35, 120, 200)])

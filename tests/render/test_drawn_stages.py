@@ -11,7 +11,7 @@ from fresh_python import run_python
 from needed_blender import needs_bpy
 from radiance_pictures import write_hdr
 
-from render.parameters import CameraParameters, MaterialParameters, StageParameters
+from render.parameters import CameraParameters, LightParameters, MaterialParameters, StageParameters
 from render.pictures import read_picture
 from render.spec import MeshObject
 
@@ -25,7 +25,13 @@ RADIUS_PIXELS = 10
 
 
 def draw(
-    folder: Path, *, ball: MaterialParameters | None = WHITE, camera: CameraParameters | None = None, **stage: object
+    folder: Path,
+    *,
+    ball: MaterialParameters | None = WHITE,
+    camera: CameraParameters | None = None,
+    lights: tuple[LightParameters, ...] = (),
+    open_faces: tuple[str, ...] = (),
+    **stage: object,
 ):
     """Pixels of a ball of 0.3 m that lies on the ground of a stage, as they are in the file."""
     write_mesh(folder / "ball.ply", *sphere((0.0, 0.0, 0.3), 0.3))
@@ -34,6 +40,7 @@ def draw(
         "stage": StageParameters.model_validate(stage),
         "camera": still_camera(camera or CameraParameters(position=(0.0, -2.5, 0.3), look_at=(0.0, 0.0, 0.3))),
     }
+    changes |= {"lights": lights, "open_faces": open_faces}
     spec_of(*objects, samples=16, motion_blur=False).model_copy(update=changes).write(folder / "spec.json")
     run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
     return read_picture(folder / "0.png").astype(float)
@@ -45,6 +52,69 @@ def sides(picture: np.ndarray) -> tuple[float, float]:
     luminance = picture[..., :3] @ LUMINANCE
     left = luminance[half, MIDDLE_COLUMN - RADIUS_PIXELS : MIDDLE_COLUMN - 3]
     return float(left.mean()), float(luminance[half, MIDDLE_COLUMN + 3 : MIDDLE_COLUMN + RADIUS_PIXELS].mean())
+
+
+FROM_ABOVE = CameraParameters(position=(0.0, 0.0, 5.0), look_at=(0.0, 0.0, 0.0))
+PIXELS_PER_METRE_OF_GROUND = 64 * 50.0 / 36.0 / 5.0
+
+
+def darkness_towards(picture: np.ndarray, *, x: float, y: float) -> np.ndarray:
+    """How dark the ground is along a way from the middle, relative to the picture's corners: one value every 0.1 m.
+
+    Args:
+        picture: of `FROM_ABOVE`, where +x is to the right and +y upwards.
+        x: unit vector of the way.
+        y: the same.
+    """
+    luminance = picture[..., :3] @ LUMINANCE
+    way = PIXELS_PER_METRE_OF_GROUND * np.arange(0.05, 1.0, 0.1)
+    rows, columns = (18 - y * way).astype(int), (32 + x * way).astype(int)
+    return 1.0 - luminance[rows, columns] / luminance[::35, ::63].mean()
+
+
+@pytest.mark.parametrize(("azimuth", "shadow"), [(0.0, (-1, 0)), (90.0, (0, -1)), (180.0, (1, 0)), (-90.0, (0, 1))])
+def test_the_shadow_falls_away_from_where_the_sun_is_put(azimuth, shadow, tmp_path):
+    picture = draw(tmp_path, camera=FROM_ABOVE, name="outdoor", sun_elevation_deg=45.0, sun_azimuth_deg=azimuth)
+    # The shadow of a ball of radius r reaches r / tan(e / 2) = 0.72 m; from above the ball itself hides 0.3 m.
+    away = darkness_towards(picture, x=shadow[0], y=shadow[1])
+    assert (away[4:6] > 0.2).all()
+    assert (away[8:] < 0.1).all()
+    towards = darkness_towards(picture, x=-shadow[0], y=-shadow[1])
+    assert (towards[4:] < 0.1).all()
+
+
+def test_a_low_sun_throws_a_longer_shadow(tmp_path):
+    high, low = (
+        draw(tmp_path, camera=FROM_ABOVE, name="outdoor", sun_elevation_deg=e, sun_azimuth_deg=0.0)
+        for e in (60.0, 20.0)
+    )
+    # 0.52 m and 1.7 m.
+    assert (darkness_towards(high, x=-1, y=0)[6:] < 0.1).all()
+    assert (darkness_towards(low, x=-1, y=0)[4:] > 0.2).all()
+
+
+def test_what_a_low_sun_lights_is_redder(tmp_path):
+    usual, low = (
+        draw(tmp_path, name="outdoor", sun_elevation_deg=e, sun_azimuth_deg=-90.0)[
+            MIDDLE_ROW - 5 : MIDDLE_ROW + 5, MIDDLE_COLUMN - 5 : MIDDLE_COLUMN + 5
+        ].mean(axis=(0, 1))
+        for e in (38.0, 8.0)
+    )
+    assert low[0] / low[2] > 1.1 * usual[0] / usual[2]
+
+
+def test_the_size_of_a_sun_is_its_angle_and_softens_shadows(tmp_path):
+    sharp, soft = (
+        draw(
+            tmp_path,
+            camera=FROM_ABOVE,
+            lights=(LightParameters(type="sun", position=(1.0, 0.0, 1.0), power=3.0, size=size),),
+            strength=0.05,
+        )
+        for size in (0.5, 60.0)
+    )
+    # At the shadow's tip a sun that stands from 15 to 75 degrees is hidden in part only.
+    assert darkness_towards(soft, x=-1, y=0)[6] < 0.5 * darkness_towards(sharp, x=-1, y=0)[6]
 
 
 def srgb(linear: float) -> int:
@@ -149,3 +219,17 @@ def test_the_panes_of_a_tank_mirror_nothing_where_they_stand_on_the_ground(tmp_p
     front = draw(tmp_path, ball=None, camera=camera, tank=True)[..., :3] @ LUMINANCE
     # 193 everywhere, less what the pane's surfaces keep back. The mirror of the dark room had 42.
     assert front.mean(axis=1) == pytest.approx(np.median(front), rel=0.05)
+
+
+def test_a_tank_has_no_pane_where_the_domain_is_open(tmp_path):
+    """Seen from above, the rim of each pane is a bright line around the floor."""
+    above = CameraParameters(position=(0.0, 0.0, 5.0), look_at=(0.0, 0.0, 0.0), focal_length_mm=110.0)
+    without = draw(tmp_path, ball=None, camera=above)
+    all_open = draw(tmp_path, ball=None, camera=above, tank=True, open_faces=("x-", "x+", "y-", "y+", "z+"))
+    assert (all_open == without).all()
+    tank = draw(tmp_path, ball=None, camera=above, tank=True, open_faces=("x+", "y-", "z+"))
+    changed = np.abs(tank - without)[..., :3].mean(axis=2)
+    # Half a metre is 24 pixels at the height of the rims; strips without the corners, whose posts end single panes.
+    rows = slice(8, 28)
+    left, right = changed[rows, 6:10].max(axis=1), changed[rows, 54:58].max(axis=1)
+    assert np.median(left) > 3 * max(np.median(right), 1.0)
