@@ -205,7 +205,7 @@ def test_all_problems_come_at_once_in_the_order_of_the_file(tmp_path):
         "dam.toml:2 fps: must be >= 1, got 0",
         'dam.toml:4 render.sampels: unknown key "sampels"; did you mean "samples"?',
         "dam.toml:6 camera.f_stop: must be > 0, got -1",
-        'dam.toml:7 light[0]: missing key "position" (Where it stands [m])',
+        'dam.toml:7 light[0]: missing key "position" (Where it stands [m]; of a sun only the direction counts)',
     ]
 
 
