@@ -10,7 +10,7 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from math import ceil
+from math import ceil, prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from pipeline.receipts import read_receipt
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import (
     bodies_by_content,
-    domain_volume,
     estimated_cloth_nodes,
     most_particles,
     tool_version,
@@ -269,7 +268,7 @@ def _resources(job: Job) -> Resources:
 
 def _snapshot_bytes(job: Job) -> int:
     """What a snapshot or a checkpoint takes: an upper bound for fluids and smoke, an estimate for cloths of meshes."""
-    cells = sum(domain_volume(job) / smoke.cell_size**3 for smoke in job.smoke)
+    cells = sum(prod(smoke.cell_counts(job.domain)) for smoke in job.smoke)
     nodes = estimated_cloth_nodes(job)
     return ceil(most_particles(job) * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL + nodes * BYTES_PER_CLOTH_NODE)
 

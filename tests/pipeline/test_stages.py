@@ -324,6 +324,21 @@ def test_frames_on_their_way_to_the_disk_are_counted_in_memory():
     assert need(0.005) - need(0.05) > 3 * 32 * 0.99 * particles  # three frames of 32 bytes a particle
 
 
+@pytest.mark.parametrize(
+    "domain", [{"min": (-5, -5, 0), "max": (5, 5, 5)}, {"min": (-0.1, -0.1, 0), "max": (0.1, 0.1, 0.2)}]
+)
+def test_smoke_is_counted_in_memory_by_its_own_box(domain):
+    fog = {"name": "fog", "cell_size": 0.01, "min": (-0.5, -0.5, 0.0), "max": (0.5, 0.5, 1.0),
+           "source": [{"shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.2)}]}  # fmt: skip
+
+    def need(smoke: list[dict]) -> int:
+        tasks = plan_job(job(device="cuda", fluid=[], domain=domain, smoke=smoke), LAYOUT, STAGES)
+        return next(task.resources.memory_bytes for task in tasks if task.stage == "simulate")
+
+    # Of 100³ cells: five frames of five arrays, and less than ten of six.
+    assert 5 * 5 * 4 * 100**3 < need([fog]) - need([]) < 10 * 6 * 4 * 100**3
+
+
 def test_a_job_simulated_on_a_gpu_elsewhere_is_rendered_on_a_machine_without_one():
     tasks = plan_job(job(device="cuda"), LAYOUT, STAGES)
     done = {task.id for task in tasks if task.stage != "render"}
