@@ -33,7 +33,7 @@ class Forces:
         velocity: the three face velocities [m/s], flat fields.
         cell_fields: density and temperature excess, flat fields.
         work: four flat fields to work in.
-        gravity: [m/s²]; only its direction matters.
+        gravity: [m/s²]; only its direction matters, as alpha and beta are accelerations.
         buoyancy_density: alpha [m/s²].
         buoyancy_temperature: beta [m/(s² K)].
         confinement: epsilon [1/s]: with h [m] and omega [1/s] its force is an acceleration.

@@ -157,9 +157,10 @@ class SmokeParameters(Parameters):
     buoyancy_density: NonNegative = Field(
         default=0.1, description="Weight alpha of the smoke: downward acceleration per density [m/s²]."
     )
-    buoyancy_temperature: NonNegative = Field(
-        default=9.81 / 293.0,
-        description="Lift beta of heat: upward acceleration per kelvin [m/(s² K)]; g/T of an ideal gas by default.",
+    buoyancy_temperature: NonNegative | None = Field(
+        default=None,
+        description="Lift beta of heat: upward acceleration per kelvin [m/(s² K)]; if omitted that of an ideal gas, "
+        "strength of gravity / ambient_temperature.",
     )
     vorticity_confinement: NonNegative = Field(
         default=0.3, description="Strength epsilon of the vorticity confinement [1/s]; 0 switches it off."
@@ -191,6 +192,12 @@ class SmokeParameters(Parameters):
     def hottest_excess(self) -> float:
         """Of the hottest source, over the air's temperature [K]; 0 if none is hotter than that."""
         return max(0.0, *(source.temperature - self.ambient_temperature for source in self.source))
+
+    def lift_per_kelvin(self, gravity: Vector3) -> float:
+        """Upward acceleration beta for each kelvin of excess [m/(s² K)], under a gravity [m/s²]."""
+        if self.buoyancy_temperature is not None:
+            return self.buoyancy_temperature
+        return math.hypot(*gravity) / self.ambient_temperature
 
     @property
     def windward_faces(self) -> tuple[Face, ...]:

@@ -66,7 +66,7 @@ class SmokeSolver:
     Args:
         parameters: the smoke of a job.
         domain: the box that is used where the smoke names none.
-        gravity: [m/s²]; its direction is down.
+        gravity: [m/s²]; its direction is down, and heat rises by its strength unless the parameters say how fast.
         solids: static obstacles, voxelized on the grid.
         moving: whether there will be obstacles that move.
 
@@ -122,6 +122,7 @@ class SmokeSolver:
             wind=parameters.wind,
             balance=self._balance,
         )
+        self._lift = parameters.lift_per_kelvin(gravity)
         self._forces = Forces(
             self.obstacles,
             openness=self.openness,
@@ -130,7 +131,7 @@ class SmokeSolver:
             work=work[:4],
             gravity=gravity,
             buoyancy_density=parameters.buoyancy_density,
-            buoyancy_temperature=parameters.buoyancy_temperature,
+            buoyancy_temperature=self._lift,
             confinement=parameters.vorticity_confinement,
         )
         self._extrapolation = Extrapolation(
@@ -352,7 +353,7 @@ class SmokeSolver:
     def _buoyancy_bound(self, excess: float, density: float) -> float:
         if not self._has_gravity:
             return 0.0
-        return self.parameters.buoyancy_temperature * abs(excess) + self.parameters.buoyancy_density * density
+        return self._lift * abs(excess) + self.parameters.buoyancy_density * density
 
     def _build_turbulence(self, velocity: tuple) -> Turbulence | None:
         parameters = self.parameters.turbulence
@@ -372,7 +373,7 @@ class SmokeSolver:
     def _find_speed_and_acceleration(self) -> Pair:
         """Largest face velocity [m/s] and a bound of the largest buoyant acceleration [m/s²]."""
         alpha = ti.static(self.parameters.buoyancy_density if self._has_gravity else 0.0)
-        beta = ti.static(self.parameters.buoyancy_temperature if self._has_gravity else 0.0)
+        beta = ti.static(self._lift if self._has_gravity else 0.0)
         for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
             row = i * self._step_x + j * self._step_y
             speed = 0.0

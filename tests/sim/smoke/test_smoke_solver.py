@@ -198,9 +198,36 @@ def test_a_checkpoint_of_another_grid_is_refused(solver):
 def test_first_step_from_rest_is_bounded_by_the_lift_of_the_source(solver):
     dt = solver.stable_dt()
     parameters = solver.parameters
-    acceleration = parameters.buoyancy_temperature * (450.0 - 293.0) + parameters.buoyancy_density
+    acceleration = 9.81 / 293.0 * (450.0 - 293.0) + parameters.buoyancy_density
     # The lift of the source is all that moves: a dt^2 = cfl h.
     assert acceleration * dt**2 == pytest.approx(parameters.cfl * parameters.cell_size, rel=1.0e-6)
+
+
+@pytest.mark.parametrize(
+    ("gravity", "changes", "expected"),
+    [
+        (GRAVITY, {}, 9.81 / 293.0),
+        ((0.0, 0.0, -1.62), {"ambient_temperature": 220.0}, 1.62 / 220.0),
+        ((3.0, 0.0, -4.0), {}, 5.0 / 293.0),
+        ((0.0, 0.0, 0.0), {}, 0.0),
+        ((0.0, 0.0, -1.62), {"buoyancy_temperature": 0.02}, 0.02),
+    ],
+)
+def test_heat_lifts_as_an_ideal_gas_does_unless_it_is_said(gravity, changes, expected):
+    # Equal to the bit: what a scene of the earth gives does not change.
+    assert plume(**changes).lift_per_kelvin(gravity) == expected
+
+
+def test_a_plume_on_the_moon_is_slower():
+    """From rest and without drag speeds grow with gravity: a sixth of it, a sixth of the speed of the first moment."""
+    speeds = []
+    for gravity in (GRAVITY, (0.0, 0.0, -1.62)):
+        solver = SmokeSolver(plume(buoyancy_density=0.0), domain=DOMAIN, gravity=gravity)
+        for _ in range(2):
+            solver.substep(0.01)
+        speeds.append(solver.diagnostics()["max_speed"])
+    # Advection and confinement, which are of second order, are all that is not proportional.
+    assert speeds[1] / speeds[0] == pytest.approx(1.62 / 9.81, rel=0.05)
 
 
 def test_a_source_without_a_cell_is_refused_with_a_remedy():
