@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.domain import DomainParameters
+from sim.smoke.parameters import SmokeParameters
 
 Box = NDArray[np.float64]
 """Lower and upper corner [m], (2, 3)."""
@@ -14,6 +15,11 @@ Box = NDArray[np.float64]
 def domain_box(domain: DomainParameters) -> Box:
     """The box of a domain."""
     return np.array([domain.min, domain.max])
+
+
+def smoke_box(smoke: SmokeParameters, domain: DomainParameters) -> Box:
+    """The box of a smoke as the job gives it, empty or not."""
+    return np.array([smoke.min or domain.min, smoke.max or domain.max])
 
 
 def overlap(a: Box, b: Box) -> float:

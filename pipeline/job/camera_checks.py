@@ -11,11 +11,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.job.boxes import Box, domain_box, touch
+from pipeline.job.boxes import Box, domain_box, smoke_box, touch
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
-from pipeline.job.smoke_checks import smoke_box
 from render.camera_path import CameraPath, View
 from render.parameters import Vector3
 from render.visibility import clip_range, in_picture, points_of_box

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.job.amounts import count, gigabytes, rounded_up
-from pipeline.job.boxes import Box, domain_box, overlap, span, touch
+from pipeline.job.boxes import Box, domain_box, overlap, smoke_box, span, touch
 from pipeline.job.camera_checks import check_camera
 from pipeline.job.cloth_checks import check_cloths
 from pipeline.job.fluid_checks import check_fluids, check_search_cells, emitted_particles, particle_room
@@ -21,7 +21,7 @@ from pipeline.job.placements import placements
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
 from pipeline.job.rigid_checks import check_ballast, check_rigid_start
-from pipeline.job.smoke_checks import check_smokes, smoke_box
+from pipeline.job.smoke_checks import check_smokes
 from pipeline.job.step_checks import check_time_steps
 from sim.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.job.amounts import count, gigabytes, rounded_down, rounded_up
-from pipeline.job.boxes import Box, overlap, span, touch
+from pipeline.job.boxes import Box, overlap, smoke_box, span, touch
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
-from sim.domain import DomainParameters
+from pipeline.job.smoke_body_checks import check_bodies_in_smoke
 from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, SmokeSourceParameters
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
-    from sim.shapes import Solid
+    from sim.shapes import PlacedSolid, Solid
 
 BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 320, 250
 """Upper bounds of what a smoke takes: 171 for the solver and all that it may be coupled to (101 for itself and what
@@ -46,7 +46,7 @@ SMALLEST_TOLERANCE = 2.0e-7
 came to 1.4e-7 to 0.7e-7 in 60 iterations a step."""
 
 
-def check_smokes(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget, findings: Findings) -> int:
+def check_smokes(job: Job, solids: Mapping[KeyPath, PlacedSolid], budget: MemoryBudget, findings: Findings) -> int:
     """Note what is wrong with the smokes, their sources and what moves in them.
 
     Args:
@@ -60,6 +60,8 @@ def check_smokes(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
     """
     names = {body.name for body in job.rigid}
     cells, size_bytes = 0, 0.0
+    refused = check_bodies_in_smoke(job, solids, findings)
+    solids = {path: solid for path, solid in solids.items() if path[0] != "rigid" or path[1] not in refused}
     for index, smoke in enumerate(job.smoke):
         more_cells, more_bytes = _check_size(job, index, budget, (cells, size_bytes), findings)
         cells, size_bytes = cells + more_cells, size_bytes + more_bytes
@@ -71,13 +73,7 @@ def check_smokes(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget
             # Where one is whose body is not known nobody can tell.
             if path in solids and (source.follow is None or source.follow in names):
                 _check_place(job, index, number, solids, findings)
-    _check_bodies_in_smoke(job, solids, findings)
     return cells
-
-
-def smoke_box(smoke: SmokeParameters, domain: DomainParameters) -> Box:
-    """The box of a smoke as the job gives it, empty or not."""
-    return np.array([smoke.min or domain.min, smoke.max or domain.max])
 
 
 # --- the grid ------------------------------------------------------------------------------------------------------
@@ -344,28 +340,3 @@ def _check_what_fills_source(
                 path,
                 f"lies wholly inside {format_path(other)} at the start, and emits nothing until that has moved off",
             )
-
-
-# --- what moves in it ----------------------------------------------------------------------------------------------
-
-
-def _check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    """Note bodies that move and are too thin for the cells of a smoke into whose box they can come."""
-    from sim.coupling.smoke_reach import too_thin_bodies
-    from sim.rigid.geometry import BodyGeometry
-    from sim.shapes import ShapeError
-
-    moving = [index for index, body in enumerate(job.rigid) if body.kind != "static" and ("rigid", index) in solids]
-    if not (moving and job.smoke):
-        return
-    bodies = [job.rigid[index] for index in moving]
-    geometries = []
-    for index, body in zip(moving, bodies, strict=True):
-        try:
-            geometries.append(BodyGeometry(body))
-        except ShapeError as error:
-            findings.error(("rigid", index, "shape"), f"is too thin for a body that moves in smoke: {error}")
-            return
-    for smoke in job.smoke:
-        for number, reason in too_thin_bodies(smoke, bodies, geometries, job.domain):
-            findings.error(("rigid", moving[number]), reason)

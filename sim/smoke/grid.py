@@ -82,22 +82,13 @@ class SmokeGrid:
                 )
         if problem := parameters.wind_problem():
             raise ValueError(f'smoke "{parameters.name}": wind {problem}')
-        nx, ny, nz = parameters.cell_counts(domain)
-        inflow = frozenset(parameters.windward_faces)
-        empty = cls(
-            lower,
-            parameters.cell_size,
-            (nx, ny, nz),
-            frozenset(parameters.open_faces) - inflow,
-            np.zeros((nx, ny, nz), bool),
-            inflow,
-        )
+        empty = cls.of_box(parameters, domain)
         if not solids:
             return empty
         masks = [empty.cells_inside(region) for region in solids]
         for region, mask in zip(solids, masks, strict=True):
-            thinnest = float(np.ptp(region.bounds, axis=0).min())
-            if thinnest < parameters.cell_size and not mask.any() and empty.touches(region):
+            if not mask.any() and empty.misses(region):
+                thinnest = float(np.ptp(region.bounds, axis=0).min())
                 raise ValueError(
                     f'smoke "{parameters.name}": an obstacle {thinnest:.3g} m thin falls between its cells of '
                     f"{parameters.cell_size:g} m, and would not be there; use a smaller cell_size or a thicker body"
@@ -107,10 +98,21 @@ class SmokeGrid:
             raise ValueError(f'smoke "{parameters.name}": solids fill its whole box; there is no air to move')
         return replace(empty, solid=solid)
 
-    def touches(self, region: SolidRegion) -> bool:
-        """Whether the bounds of a region overlap the box."""
+    @classmethod
+    def of_box(cls, parameters: SmokeParameters, domain: DomainParameters) -> SmokeGrid:
+        """The cells of a smoke's box, of which none is solid; the box must not be empty."""
+        nx, ny, nz = parameters.cell_counts(domain)
+        inflow = frozenset(parameters.windward_faces)
+        lower = parameters.min if parameters.min is not None else domain.min
+        is_open = frozenset(parameters.open_faces) - inflow
+        return cls(lower, parameters.cell_size, (nx, ny, nz), is_open, np.zeros((nx, ny, nz), bool), inflow)
+
+    def misses(self, region: SolidRegion) -> bool:
+        """Whether a region that reaches into the box is thinner than a cell, and holds no centre of one."""
         lower, upper = region.bounds
-        return bool(np.all((lower < self.upper) & (upper > self.origin)))
+        touches = np.all((lower < self.upper) & (upper > self.origin))
+        is_thin = np.min(upper - lower) < self.cell_size
+        return bool(touches and is_thin and not self._near(region, self.cells, CENTRE)[1].any())
 
     @property
     def padded(self) -> Index3:
@@ -196,19 +198,28 @@ class SmokeGrid:
         ]
 
     def _inside(self, region: SolidRegion, shape: Index3, offset: Sequence[float]) -> NDArray[np.bool_]:
-        """Which places lie inside a region; distances, which are dear for meshes, are asked for near it only."""
+        """Which places lie inside a region."""
+        inside = np.zeros(shape, bool)
+        spans, near = self._near(region, shape, offset)
+        inside[spans] = near
+        return inside
+
+    def _near(
+        self, region: SolidRegion, shape: Index3, offset: Sequence[float]
+    ) -> tuple[tuple[slice, ...], NDArray[np.bool_]]:
+        """The places within a region's bounds, and which of them lie inside: distances are dear for meshes."""
         axes = self._axes(shape, offset)
         lower, upper = region.bounds
         spans = tuple(
             slice(int(np.searchsorted(axis, low)), int(np.searchsorted(axis, high, "right")))
             for axis, low, high in zip(axes, lower, upper, strict=True)
         )
-        inside = np.zeros(shape, bool)
-        near = inside[spans]
-        if near.size:
-            points = _points([axis[span] for axis, span in zip(axes, spans, strict=True)])
-            near[...] = (region.signed_distance(points) < 0.0).reshape(near.shape)
-        return inside
+        near = [axis[span] for axis, span in zip(axes, spans, strict=True)]
+        counts = tuple(map(len, near))
+        if 0 in counts:
+            return spans, np.zeros(counts, bool)
+        inside: NDArray[np.bool_] = region.signed_distance(_points(near)) < 0.0
+        return spans, inside.reshape(counts)
 
     def _open_area(self, axis: int) -> NDArray[np.bool_]:
         air = np.moveaxis(~self.solid, axis, 0)

@@ -149,7 +149,10 @@ class SmokeParameters(Parameters):
     source: tuple[SmokeSourceParameters, ...] = Field(min_length=1, description="Where the smoke comes from.")
     min: Vector3 | None = Field(default=None, description="Lower corner of its grid [m]; the domain's if omitted.")
     max: Vector3 | None = Field(default=None, description="Upper corner of its grid [m]; the domain's if omitted.")
-    cell_size: Positive = Field(default=0.02, description="Edge of a cubic cell [m].")
+    cell_size: Positive = Field(
+        default=0.02,
+        description="Edge of a cubic cell [m]; air passes through walls of bodies that are thinner than one.",
+    )
     open_faces: tuple[Face, ...] = Field(
         default=("x-", "x+", "y-", "y+", "z+"), description="Sides through which air and smoke may pass."
     )

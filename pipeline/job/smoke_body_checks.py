@@ -1,0 +1,101 @@
+"""Whether the cells of a smoke are fine enough for the bodies in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.job.amounts import rounded_down
+from pipeline.job.boxes import smoke_box, touch
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings
+from sim.smoke.parameters import MOST_CELLS, SmokeParameters
+
+if TYPE_CHECKING:
+    from pipeline.job.models import Job
+    from sim.shapes import PlacedSolid
+    from sim.smoke.thin_walls import ThinWalls
+
+MISSED = 0.05
+"""Share of a body's surface that cells may miss without a word: what is beside sharp edges they always do."""
+
+
+def check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, PlacedSolid], findings: Findings) -> set[int]:
+    """Note bodies that are too thin for the cells of a smoke.
+
+    Returns:
+        The static bodies that no smoke can be simulated with, by number.
+    """
+    refused = set()
+    _check_moving_bodies(job, solids, findings)
+    for smoke in job.smoke:
+        box = smoke_box(smoke, job.domain)
+        # An empty box and too many cells are told where its size is looked at.
+        if np.any(box[1] <= box[0]) or np.prod((box[1] - box[0]) / smoke.cell_size) > MOST_CELLS:
+            continue
+        for index, body in enumerate(job.rigid):
+            solid = solids.get(("rigid", index))
+            if body.kind != "static" or solid is None or not touch(solid.bounds, box, margin=0.0):
+                continue
+            if not _check_static_body(job, smoke, index, solid, findings):
+                refused.add(index)
+    return refused
+
+
+def _check_static_body(job: Job, smoke: SmokeParameters, index: int, solid: PlacedSolid, findings: Findings) -> bool:
+    """Note a static body that has no cell, or too few; whether the smoke can be simulated with it."""
+    from sim.smoke.grid import SmokeGrid
+    from sim.smoke.thin_walls import thin_walls
+
+    thinnest = float(np.ptp(solid.bounds, axis=0).min())
+    if SmokeGrid.of_box(smoke, job.domain).misses(solid):
+        findings.error(
+            ("rigid", index),
+            f'is {thinnest:.3g} m thin and falls between the cells of smoke "{smoke.name}", {smoke.cell_size:g} m: '
+            "the air would not notice it; use a smaller cell_size or a thicker body",
+        )
+        return False
+    walls = thin_walls(solid, smoke, job.domain)
+    if walls.share > MISSED:
+        findings.warn(("rigid", index), _of_thin_walls(walls, smoke))
+    return True
+
+
+def _check_moving_bodies(job: Job, solids: Mapping[KeyPath, PlacedSolid], findings: Findings) -> None:
+    """Note bodies that move, can come into the box of a smoke, and are too thin for its cells."""
+    from sim.coupling.smoke_reach import can_come, too_thin_bodies
+    from sim.rigid.geometry import BodyGeometry
+    from sim.shapes import ShapeError
+    from sim.smoke.thin_walls import thin_walls_on_the_way
+
+    moving = [index for index, body in enumerate(job.rigid) if body.kind != "static" and ("rigid", index) in solids]
+    if not (moving and job.smoke):
+        return
+    bodies = [job.rigid[index] for index in moving]
+    geometries = []
+    for index, body in zip(moving, bodies, strict=True):
+        try:
+            geometries.append(BodyGeometry(body))
+        except ShapeError as error:
+            findings.error(("rigid", index, "shape"), f"is too thin for a body that moves in smoke: {error}")
+            return
+    for smoke in job.smoke:
+        refused = dict(too_thin_bodies(smoke, bodies, geometries, job.domain))
+        for number, reason in refused.items():
+            findings.error(("rigid", moving[number]), reason)
+        for number, (body, geometry) in enumerate(zip(bodies, geometries, strict=True)):
+            if number in refused or not can_come(body, geometry, smoke, job.domain):
+                continue
+            walls = thin_walls_on_the_way(solids["rigid", moving[number]], smoke)
+            if walls.share > MISSED:
+                findings.warn(("rigid", moving[number]), _of_thin_walls(walls, smoke))
+
+
+def _of_thin_walls(walls: ThinWalls, smoke: SmokeParameters) -> str:
+    return (
+        f'has walls thinner than the cells of smoke "{smoke.name}", {smoke.cell_size:g} m, which miss '
+        f"{100.0 * walls.share:.0f} % of its surface: air passes through there; use a cell_size of "
+        f"{rounded_down(walls.thickness):g} m or less, or thicker walls"
+    )

@@ -1,0 +1,152 @@
+"""Whether the cells of a smoke are fine enough for the walls of a body: air passes through where none is solid.
+
+A cell is solid if its centre lies in the body. A wall of normal n and thickness d has in every column of cells along
+the axis of its largest |n_i| a solid one, and thus lets no air through, if d is at least cell_size * max |n_i|; of a
+thinner one a part of these columns has none, unless it happens to lie along a layer of centres. That part is what is
+measured here, at points of the surface. Beside an edge that is sharper than 45 degrees off a plate's two sides, such as
+the rim of a cone, a body is thin as well; cells only blunt it, and what they miss there does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.domain import DomainParameters
+from sim.shapes import Solid
+from sim.shapes.sampling import stratified_points
+from sim.smoke.parameters import SmokeParameters
+
+Points = NDArray[np.float64]
+
+PROBES = 1000
+"""Points of the surface within the box below which a body's thickness is looked at: shares are right to 0.03."""
+
+POINTS_DRAWN = 64 * PROBES
+"""Of the whole surface: of one of which less than a 64th lies in the box fewer are looked at."""
+
+DEPTHS = 8
+"""Along the ray inwards, up to the edge of a cell, where it is seen whether it is still in the body."""
+
+HALVINGS = 5
+"""Of the interval in which a ray leaves the body."""
+
+OPPOSITE = np.cos(np.deg2rad(45.0))
+"""Cosine of the angle between a ray and the surface's normal where it leaves a wall, at least."""
+
+COLUMN = (-2, -1, 0, 1, 2)
+"""Cells of a column that may be solid below a point: its wall crosses the column's middle less than two cells off."""
+
+LUCK = (0.0, 1.0 / 3.0, 2.0 / 3.0)
+"""Where in a cell a body that moves may be, for an average [cells]."""
+
+
+@dataclass(frozen=True)
+class ThinWalls:
+    """What the cells miss of a body.
+
+    Attributes:
+        share: of its surface in the box [-], as far as it is thinner than a cell below.
+        thickness: its median there [m]; 0 where nothing is missed.
+    """
+
+    share: float
+    thickness: float
+
+
+def thin_walls(solid: Solid, smoke: SmokeParameters, domain: DomainParameters) -> ThinWalls:
+    """What a smoke's cells miss of a body that stands still in its box; what lies on a closed side counts as seen."""
+    points, inwards = _probes(solid, smoke.corners(domain))
+    depth = _thickness(solid, points, inwards, smoke.cell_size)
+    thin = np.flatnonzero(np.isfinite(depth))
+    missed = thin[~_has_solid_cell(solid, points[thin], inwards[thin], smoke, domain)]
+    return _walls(depth, missed, len(points))
+
+
+def thin_walls_on_the_way(solid: Solid, smoke: SmokeParameters) -> ThinWalls:
+    """What cells of this size miss on average of a body that moves, if it is turned as it is now."""
+    points, inwards = _probes(solid, None)
+    depth = _thickness(solid, points, inwards, smoke.cell_size)
+    thin = np.flatnonzero(np.isfinite(depth))
+    missed = [
+        thin[~_column(solid, points[thin], inwards[thin], np.full(3, part * smoke.cell_size), smoke.cell_size)]
+        for part in LUCK
+    ]
+    return _walls(depth, np.concatenate(missed), len(LUCK) * len(points))
+
+
+def _walls(depth: NDArray[np.float64], missed: NDArray[np.int64], looked_at: int) -> ThinWalls:
+    if len(missed) == 0:
+        return ThinWalls(0.0, 0.0)
+    return ThinWalls(len(missed) / looked_at, float(np.median(depth[missed])))
+
+
+def _probes(solid: Solid, box: tuple[Iterable[float], Iterable[float]] | None) -> tuple[Points, Points]:
+    """Points of the surface within a box [m], evenly by area, and unit vectors into the body, (n, 3) each."""
+    mesh = solid.surface_mesh()
+    points, face = stratified_points(mesh, POINTS_DRAWN)
+    kept = np.arange(len(points))
+    if box is not None:
+        low, high = (np.asarray(tuple(corner)) for corner in box)
+        kept = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
+    kept = kept[:: max(1, len(kept) // PROBES)]
+    inwards = -mesh.area_vectors[face[kept]]
+    return points[kept], inwards / np.linalg.norm(inwards, axis=1, keepdims=True)
+
+
+def _thickness(solid: Solid, points: Points, inwards: Points, longest: float) -> NDArray[np.float64]:
+    """How far rays inwards stay in a wall [m], (n,); infinite where that is farther than `longest` [m], or no wall."""
+    step = longest / DEPTHS
+    left = np.full(len(points), np.inf)
+    for number in range(DEPTHS):
+        ahead = np.flatnonzero(np.isinf(left))
+        depth = (number + 0.5) * step
+        outside = solid.signed_distance(points[ahead] + depth * inwards[ahead]) > 0.0
+        left[ahead[outside]] = depth
+    thin = np.flatnonzero(np.isfinite(left))
+    low, high = np.maximum(left[thin] - step, 0.0), left[thin]
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        outside = solid.signed_distance(points[thin] + middle[:, None] * inwards[thin]) > 0.0
+        low, high = np.where(outside, low, middle), np.where(outside, middle, high)
+    left[thin] = high
+    ends = points[thin] + high[:, None] * inwards[thin]
+    left[thin[np.sum(_normals(solid, ends, 0.01 * step) * inwards[thin], axis=1) < OPPOSITE]] = np.inf
+    return left
+
+
+def _normals(solid: Solid, points: Points, step: float) -> Points:
+    """Unit vectors out of the body at points of its surface, (n, 3), by central differences over a step [m]."""
+    offsets = step * np.concatenate([np.eye(3), -np.eye(3)])
+    values = solid.signed_distance((points[:, None] + offsets).reshape(-1, 3)).reshape(-1, 6)
+    gradient: Points = values[:, :3] - values[:, 3:]
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    return gradient / np.maximum(length, np.finfo(np.float64).tiny)
+
+
+def _has_solid_cell(
+    solid: Solid, points: Points, inwards: Points, smoke: SmokeParameters, domain: DomainParameters
+) -> NDArray[np.bool_]:
+    """Whether the column of cells at each point has a solid one, or ends right there at a closed side, (n,)."""
+    low, high = (np.asarray(corner) for corner in smoke.corners(domain))
+    found = _column(solid, points, inwards, low, smoke.cell_size)
+    axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))
+    for side, beside in (("-", points - low < smoke.cell_size), ("+", high - points < smoke.cell_size)):
+        closed = np.array([f"{name}{side}" not in smoke.open_faces for name in "xyz"])
+        found |= closed[axis] & beside[every, axis]
+    return found
+
+
+def _column(solid: Solid, points: Points, inwards: Points, low: Points, cell_size: float) -> NDArray[np.bool_]:
+    """Whether a cell of the column at each point is solid, (n,); `low` is a corner of cells [m], (3,)."""
+    found = np.zeros(len(points), bool)
+    axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))
+    cell = np.floor((points - low) / cell_size)
+    for offset in COLUMN:
+        place = cell.copy()
+        place[every, axis] += offset
+        found |= solid.signed_distance(low + (place + 0.5) * cell_size) < 0.0
+    return found

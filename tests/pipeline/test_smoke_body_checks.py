@@ -1,0 +1,71 @@
+"""Bodies that the cells of a smoke cannot show, told with their lines."""
+
+import pytest
+import trimesh
+from checked_jobs import checked
+
+PLUME = """
+name = "air"
+frames = 24
+fps = 24
+[domain]
+min = [-0.5, -0.5, 0.0]
+max = [0.5, 0.5, 1.0]
+[[smoke]]
+name = "plume"
+cell_size = 0.02
+[[smoke.source]]
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.2]
+"""
+PLATE = """
+[[rigid]]
+name = "plate"
+shape = { type = "box", size = [0.9, 0.9, 0.01] }
+position = [0.0, 0.0, 0.5]
+"""
+TURNED = "rotation_deg = [20.0, 12.0, 0.0]\n"
+
+
+def test_a_flat_static_plate_between_the_cells_is_refused_with_its_name(tmp_path):
+    assert checked(PLUME + PLATE, tmp_path / "flat.toml").errors == [
+        'flat.toml:15 rigid[0]: is 0.01 m thin and falls between the cells of smoke "plume", 0.02 m: the air would '
+        "not notice it; use a smaller cell_size or a thicker body"
+    ]
+
+
+def test_wind_past_such_a_plate_is_one_error(tmp_path):
+    windy = PLUME.replace("cell_size = 0.02", "cell_size = 0.02\nwind = [1.0, 0.0, 0.0]")
+    assert len(checked(windy + PLATE, tmp_path / "flat.toml").errors) == 1
+
+
+def test_a_static_plate_that_leaks_is_told_with_the_cells_that_would_not(tmp_path):
+    found = checked(PLUME + PLATE + TURNED, tmp_path / "leak.toml")
+    assert found.errors == []
+    (warning,) = found.warnings
+    assert warning.startswith('leak.toml:15 rigid[0]: has walls thinner than the cells of smoke "plume", 0.02 m, which')
+    assert warning.endswith("air passes through there; use a cell_size of 0.01 m or less, or thicker walls")
+    finer = (PLUME + PLATE + TURNED).replace("cell_size = 0.02", "cell_size = 0.01")
+    assert checked(finer, tmp_path / "fine.toml").warnings == []
+
+
+@pytest.mark.parametrize(
+    "motion", ["", 'kind = "kinematic"\nvelocity = [0.1, 0.0, 0.0]\n', 'kind = "dynamic"\ndensity = 500.0\n']
+)
+def test_a_room_with_thin_walls_is_told_whether_it_moves_or_not(motion, tmp_path):
+    outer, inner = trimesh.creation.box((0.5, 0.5, 0.5)), trimesh.creation.box((0.48, 0.48, 0.48))
+    inner.invert()
+    trimesh.util.concatenate([outer, inner]).export(tmp_path / "room.obj")
+    room = f'[[rigid]]\nname = "room"\nshape = {{ type = "mesh", file = "room.obj" }}\nposition = [0, 0, 0.5]\n{motion}'
+    (warning,) = checked(PLUME + room, tmp_path / "room.toml").warnings
+    assert "rigid[0]: has walls thinner than the cells" in warning
+
+
+@pytest.mark.parametrize(
+    "changes", ["cell_size = 1e-6", "cell_size = 0.02\nmin = [0.0, 0.0, 0.495]\nmax = [0.1, 0.1, 0.3]"]
+)
+def test_of_a_grid_that_cannot_be_only_its_size_is_told(changes, tmp_path):
+    """It is not built to look for bodies in it."""
+    found = checked(PLUME.replace("cell_size = 0.02", changes) + PLATE, tmp_path / "size.toml")
+    assert any("smoke[0]" in each for each in found.errors)
+    assert not any("rigid[0]" in each for each in [*found.errors, *found.warnings])
