@@ -14,6 +14,7 @@ from pipeline.job.boxes import Box, overlap, smoke_box, span, touch
 from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
+from pipeline.job.shut_in_air_checks import check_shut_in_air
 from pipeline.job.smoke_body_checks import check_bodies_in_smoke
 from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, SmokeSourceParameters
 
@@ -66,6 +67,7 @@ def check_smokes(job: Job, solids: Mapping[KeyPath, PlacedSolid], budget: Memory
         more_cells, more_bytes = _check_size(job, index, budget, (cells, size_bytes), findings)
         cells, size_bytes = cells + more_cells, size_bytes + more_bytes
         _check_air(job, smoke, index, solids, findings)
+        check_shut_in_air(job, smoke, solids, findings)
         for number, source in enumerate(smoke.source):
             path: KeyPath = ("smoke", index, "source", number)
             _check_numbers(job, smoke, source, path, findings)

@@ -104,13 +104,13 @@ def most_particles_of(fluid: FluidParameters, scene: SceneParameters, *, until_s
     filled = sum(
         prod(block.shape.size) * block.scale**3 if isinstance(block.shape, BoxShape) else inf for block in fluid.block
     )
-    emitted = sum(_emitted_volume(emitter, until_s) for emitter in fluid.emitter)
+    emitted = sum(emitted_volume(emitter, until_s=until_s) for emitter in fluid.emitter)
     volume = min(MOST_IN_A_VOLUME * (filled + emitted), domain_volume(scene))
     return min(volume / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf)
 
 
-def _emitted_volume(emitter: EmitterParameters, until_s: float) -> float:
-    """What flows in until then [m³]."""
+def emitted_volume(emitter: EmitterParameters, *, until_s: float) -> float:
+    """What flows in until then [m³], as far as there is room."""
     opening = emitter.shape
     area = prod(opening.size) if isinstance(opening, RectangleOpening) else pi * opening.radius**2
     end_s = until_s if emitter.end_s is None else min(emitter.end_s, until_s)

@@ -1,0 +1,81 @@
+"""Air that cannot get out of its box, told with their lines."""
+
+import pytest
+from checked_jobs import checked
+
+PLUME = """
+name = "air"
+frames = 24
+fps = 24
+[domain]
+min = [-0.5, -0.5, 0.0]
+max = [0.5, 0.5, 1.0]
+[[smoke]]
+name = "plume"
+cell_size = 0.02
+[[smoke.source]]
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.2]
+"""
+CLOSED = PLUME.replace("cell_size = 0.02", "cell_size = 0.02\nopen_faces = []")
+PISTON = """
+[[rigid]]
+name = "piston"
+kind = "kinematic"
+shape = { type = "box", size = [0.5, 0.5, 0.5] }
+"""
+INFLOW = """
+[[fluid]]
+name = "water"
+particle_radius = 0.012
+[[fluid.emitter]]
+shape = { type = "disc", radius = 0.05 }
+position = [-0.3, 0.0, 0.8]
+direction = [0.0, 0.0, -1.0]
+speed = 1.5
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            CLOSED + PISTON + "position = [-0.76, 0.0, 0.5]\nvelocity = [0.5, 0.0, 0.0]\n",
+            'rigid[0]: comes into the box of smoke "plume", of which it takes about 12 %, and no side of that is open: '
+            "as much air must flow out, for air of constant density cannot be compressed; add a side to its open_faces",
+        ),
+        (
+            CLOSED + PISTON + "position = [-0.24, 0.0, 0.5]\nvelocity = [-0.52, 0.0, 0.0]\n",
+            'rigid[0]: leaves the box of smoke "plume", of which it takes about 12 %, and no side of that is open: '
+            "as much air must flow in, for air of constant density cannot be compressed; add a side to its open_faces",
+        ),
+        (
+            CLOSED + INFLOW,
+            'fluid[0].emitter[0]: fills about 1.2 % of the box of smoke "plume", and no side of that is open: '
+            "as much air must flow out, for air of constant density cannot be compressed; add a side to its open_faces",
+        ),
+    ],
+)
+def test_what_presses_on_air_that_is_shut_in_is_told_with_this_line(text, expected, tmp_path):
+    (warning,) = checked(text, tmp_path / "closed.toml").warnings
+    assert warning.endswith(expected)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        # Through an open side as much flows out.
+        PLUME + PISTON + "position = [-0.76, 0.0, 0.5]\nvelocity = [0.5, 0.0, 0.0]\n",
+        PLUME + INFLOW,
+        # It stays inside, or as far outside as it is.
+        CLOSED + PISTON + "position = [0.1, 0.0, 0.6]\nvelocity = [0.1, 0.0, 0.0]\n",
+        CLOSED + PISTON + "position = [-0.2, 0.0, 0.0]\nvelocity = [0.4, 0.0, 0.0]\n",
+        # It turns in the wall, as much of it inside as before.
+        CLOSED + PISTON + "position = [0.0, 0.0, 0.0]\nangular_velocity = [1.6, 0.0, 0.0]\n",
+        # It begins after the film.
+        CLOSED + INFLOW + "start_s = 2.0\n",
+    ],
+)
+def test_air_that_keeps_its_room_passes_without_a_word(text, tmp_path):
+    warnings = checked(text, tmp_path / "closed.toml").warnings
+    assert not [each for each in warnings if "no side of that is open" in each]
