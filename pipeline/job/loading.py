@@ -72,12 +72,14 @@ def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool =
     if changes:
         text = changed_text(text, changes)
     job = _validate(_parse(path, text), source)
+    text = _with_absolute_files(text, job, path)
+    job = _validate(_parse(path, text), source)
     if preview:
         preview_changes = preview_overrides(job)
         source.options.update({change.path: change.origin for change in preview_changes})
         text = changed_text(text, preview_changes)
-    text = _with_absolute_files(text, job, path)
-    return LoadedJob(job=_validate(_parse(path, text), source), text=text, path=path, source=source)
+        job = _validate(_parse(path, text), source)
+    return LoadedJob(job=job, text=text, path=path, source=source)
 
 
 def job_of_text(text: str, path: Path) -> Job:

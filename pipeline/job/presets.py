@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipeline.job.coarser_smoke import coarser_cell_sizes
 from pipeline.job.models import Job
 from pipeline.job.overrides import Override
 from sim.cloth.parameters import RectangleSheet
@@ -10,11 +11,16 @@ from sim.smoke.parameters import CELLS_PER_EDDY
 PREVIEW = "--preview"
 COARSENING = 2.0
 """Particle radii, cells and the cells of cloths grow by this factor: an eighth of the particles and cells, a quarter of
-the nodes, and larger steps. Gusts grow where coarser cells could not carry their eddies."""
+the nodes, and larger steps. Cells of smoke grow less where a source or a body would be lost between them; gusts grow
+where coarser cells could not carry their eddies."""
 
 
 def preview_overrides(job: Job) -> list[Override]:
-    """A fast, small version: half the picture, coarse physics, draft quality; the same scene, camera and length."""
+    """A fast, small version: half the picture, coarse physics, draft quality; the same scene, camera and length.
+
+    Args:
+        job: with absolute mesh paths.
+    """
     width, height = job.render.resolution
     changes: list[tuple[tuple[str | int, ...], object]] = [
         (("name",), f"{job.name[:92]}-preview"),
@@ -27,8 +33,8 @@ def preview_overrides(job: Job) -> list[Override]:
         changes.append((("fluid", index, "particle_radius"), fluid.particle_radius * COARSENING))
         if fluid.dt != "adaptive":
             changes.append((("fluid", index, "dt"), fluid.dt * COARSENING))
-    for index, smoke in enumerate(job.smoke):
-        cell_size = smoke.cell_size * COARSENING
+    cell_sizes = coarser_cell_sizes(job, COARSENING)
+    for index, (smoke, cell_size) in enumerate(zip(job.smoke, cell_sizes, strict=True)):
         changes.append((("smoke", index, "cell_size"), cell_size))
         gusts = smoke.turbulence
         if gusts.strength > 0.0 and gusts.size < CELLS_PER_EDDY * cell_size:

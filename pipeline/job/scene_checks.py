@@ -49,7 +49,7 @@ ALL = 1.0 - 1e-6
 
 def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -> None:
     """Note what is wrong with shapes, places and sizes, and how large it all is; `memory_bytes` as in `check_job`."""
-    solids = _build_solids(job, findings)
+    solids = build_solids(job, findings)
     _check_rigid_bodies(job, solids, findings)
     check_rigid_start(job, solids, findings)
     check_ballast(job, solids, findings)
@@ -65,7 +65,7 @@ def check_scene(job: Job, findings: Findings, memory_bytes: int | None = None) -
 # --- shapes --------------------------------------------------------------------------------------------------------
 
 
-def _build_solids(job: Job, findings: Findings) -> Mapping[KeyPath, PlacedSolid]:
+def build_solids(job: Job, findings: Findings) -> Mapping[KeyPath, PlacedSolid]:
     """Every shape that can be built, by its path."""
     from sim.shapes import ShapeError, build_solid
 

@@ -34,6 +34,8 @@ ALL = 1.0 - 1e-6
 COUNTED_CELLS = 1_000_000
 """A source whose box has more cells than this is taken to have some of its own; in a larger box of smoke nobody looks
 for air that bodies shut in."""
+LEAST_LAYERS = 4.0
+"""Cells along each edge of a smoke's box, at least."""
 HOTTEST = 10_000.0
 """Hotter gas is a plasma, which neither these equations nor a film's light describe [K]."""
 HOTTEST_FLAME = 4_000.0
@@ -92,11 +94,11 @@ def _check_size(
         corner = "max" if smoke.max is not None else "min"
         findings.error(("smoke", index, corner), f"max must be above min on every axis, got {span(box)}")
         return 0, 0.0
-    if np.any(extent < 4.0 * smoke.cell_size):
+    if np.any(extent < LEAST_LAYERS * smoke.cell_size):
         findings.error(
             ("smoke", index, "cell_size"),
-            f"{smoke.cell_size:g} m leaves fewer than 4 cells along an edge of {extent.min():.3g} m; "
-            f"use {rounded_down(extent.min() / 4.0):g} m or less",
+            f"{smoke.cell_size:g} m leaves fewer than {LEAST_LAYERS:g} cells along an edge of {extent.min():.3g} m; "
+            f"use {rounded_down(extent.min() / LEAST_LAYERS):g} m or less",
         )
     layers = np.ceil(extent / smoke.cell_size)
     cells, size_bytes = float(np.prod(layers)), _bytes_of(layers, on_gpu=budget.on_gpu)
@@ -265,7 +267,7 @@ def _check_source(job: Job, path: KeyPath, solids: Mapping[KeyPath, Solid], box:
         return
     if inside < ALL:
         findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the smoke's grid and emit nothing")
-    centres = _centres_inside(solid, box, cell_size)
+    centres = centres_inside(solid, box, cell_size)
     if centres is None:
         return
     if len(centres) == 0:
@@ -285,7 +287,7 @@ def _check_source(job: Job, path: KeyPath, solids: Mapping[KeyPath, Solid], box:
         findings.error(path, "lies wholly inside solid bodies, so it emits nothing; move it")
 
 
-def _centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float64] | None:
+def centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float64] | None:
     """Centres of cells that a solid contains [m], (n, 3); None if they are too many to look at each."""
     low = np.maximum(solid.bounds[0], box[0])
     high = np.minimum(solid.bounds[1], box[1])

@@ -1,0 +1,85 @@
+"""How much coarser the cells of a smoke may be made before something in it is lost between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.job.boxes import Box, smoke_box
+from pipeline.job.magnitudes import check_magnitudes
+from pipeline.job.models import Job
+from pipeline.job.positions import KeyPath
+from pipeline.job.problems import Findings
+from sim.smoke.parameters import MOST_CELLS, SmokeParameters
+
+if TYPE_CHECKING:
+    from sim.shapes import PlacedSolid
+
+STEPS = 4
+"""Factors that are tried between 1 and the largest."""
+
+
+def coarser_cell_sizes(job: Job, largest_factor: float) -> list[float]:
+    """Cell sizes [m] of the smokes, grown by this factor at most, that lose no source and no body.
+
+    Where the job's own cells do so they are kept: what is told of them is then told of what was written. Bodies that
+    close a gap that wind needs, and walls that are thin but there, do not count.
+
+    Args:
+        job: with absolute mesh paths; its shapes are built as far as they can be.
+        largest_factor: above 1.
+    """
+    from pipeline.job.scene_checks import build_solids
+
+    unheard = Findings()  # all of it is told when the changed job is checked
+    if not job.smoke or not check_magnitudes(job, unheard):
+        return [smoke.cell_size for smoke in job.smoke]
+    solids = build_solids(job, unheard)
+    factors = np.linspace(largest_factor, 1.0, STEPS, endpoint=False).tolist()
+    return [
+        next(
+            (smoke.cell_size * factor for factor in factors if _carries(job, index, smoke.cell_size * factor, solids)),
+            smoke.cell_size,
+        )
+        for index, smoke in enumerate(job.smoke)
+    ]
+
+
+def _carries(job: Job, index: int, cell_size: float, solids: Mapping[KeyPath, PlacedSolid]) -> bool:
+    """Whether cells of this size [m] show a smoke's box, its sources and the bodies in it."""
+    from pipeline.job.smoke_checks import LEAST_LAYERS
+
+    smoke = job.smoke[index].model_copy(update={"cell_size": cell_size})
+    box = smoke_box(smoke, job.domain)
+    extent = box[1] - box[0]
+    if np.any(extent < LEAST_LAYERS * cell_size):
+        return False
+    if np.prod(extent / cell_size) > MOST_CELLS:
+        return True  # refused for that
+    sources = {path[3]: solid for path, solid in solids.items() if path[:3] == ("smoke", index, "source")}
+    bodies = {path[1]: solid for path, solid in solids.items() if path[0] == "rigid"}
+    return all(
+        _has_cells(solid, box, cell_size, moves=smoke.source[int(number)].moves) for number, solid in sources.items()
+    ) and not any(_is_lost(job, int(number), solid, smoke) for number, solid in bodies.items())
+
+
+def _has_cells(source: PlacedSolid, box: Box, cell_size: float, *, moves: bool) -> bool:
+    from pipeline.job.smoke_checks import centres_inside
+
+    if moves:
+        return bool(np.ptp(source.bounds, axis=0).min() >= cell_size)
+    centres = centres_inside(source, box, cell_size)
+    return centres is None or len(centres) > 0
+
+
+def _is_lost(job: Job, number: int, body: PlacedSolid, smoke: SmokeParameters) -> bool:
+    """Whether a body falls between the cells of a smoke, now or, if it moves, in some place."""
+    from sim.shapes import PlacedSolid
+    from sim.smoke.grid import SmokeGrid
+
+    if job.rigid[number].kind == "static":
+        return np.ptp(body.bounds, axis=0).min() < smoke.cell_size and SmokeGrid.of_box(smoke, job.domain).misses(body)
+    at_rest = PlacedSolid(body.shape, body.scale, np.eye(3), np.zeros(3))
+    return bool(np.ptp(at_rest.bounds, axis=0).min() < smoke.cell_size)
