@@ -21,6 +21,9 @@ COSTLY_SHAPES = (DuckShape, BunnyShape, MeshShape)
 LOOKUPS_PER_CELL = 2.0
 """Nodes of such a table along the edge of a cell."""
 
+ROUND_OFF = 1.0e-9
+"""Of ways and distances, in parts of them and in cells, at most."""
+
 CELLS = 3
 """Stands for cells where the axis of faces is asked for."""
 
@@ -58,7 +61,8 @@ class SweptShape:
         self._solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
         self.reach = float(np.linalg.norm(np.abs(self._solid.bounds).max(axis=0)))
         self._distance = self._solid.signed_distance
-        if isinstance(placement.shape, COSTLY_SHAPES):
+        self._is_exact = not isinstance(placement.shape, COSTLY_SHAPES)
+        if not self._is_exact:
             spacing = grid.cell_size / LOOKUPS_PER_CELL
             self._distance = LevelSet.sample(self._solid, spacing, exact_within=2.0 * spacing).signed_distance
 
@@ -71,18 +75,35 @@ class SweptShape:
         first = np.min([low for low, _ in windows], axis=0)
         size = np.maximum(np.max([high for _, high in windows], axis=0) - first, 0)
         last = np.full(size, -1, np.int64)
-        for number, (pose, (low, high)) in enumerate(zip(poses, windows, strict=True)):
-            if (high <= low).any():
+        # Backwards, so that what a later pose covers need not be looked at again. No more need what is farther off
+        # than the shape has gone since it was looked at.
+        free_until = np.full(size, -np.inf)
+        ways = self._ways_to_the_last(poses)
+        for number in reversed(range(len(poses))):
+            pose, (low, high) = poses[number], windows[number]
+            window = tuple(map(slice, low - first, high - first))
+            asked = np.nonzero((last[window] < 0) & (free_until[window] <= ways[number]))
+            if len(asked[0]) == 0:
                 continue
-            places = self._positions(np.stack(np.meshgrid(*map(np.arange, low, high), indexing="ij"), axis=-1), offset)
-            own = rotation.rotated(rotation.conjugate(pose.orientation), places.reshape(-1, 3) - pose.position)
-            inside = (self._distance(own) < 0.0).reshape(places.shape[:3])
-            part = last[tuple(map(slice, low - first, high - first))]
-            part[inside] = number
+            places = self._positions(np.stack(asked, axis=-1) + low, offset)
+            own = rotation.rotated(rotation.conjugate(pose.orientation), places - pose.position)
+            distance = self._distance(own)
+            last[window][asked] = np.where(distance < 0.0, number, -1)
+            if self._is_exact:
+                free_until[window][asked] = ways[number] + distance
         found = np.argwhere(last >= 0) + first
         padded = grid.padded
         indices = ((found[:, 0] + 1) * padded[1] + found[:, 1] + 1) * padded[2] + found[:, 2] + 1
         return Swept(indices.astype(np.int32), self._positions(found, offset), last[last >= 0])
+
+    def _ways_to_the_last(self, poses: Sequence[Motion]) -> NDArray[np.float64]:
+        """Bound of how far points of the shape go from each pose to the last one [m], (n,)."""
+        origins = np.stack([pose.position for pose in poses])
+        turned = np.stack([rotation.matrices(pose.orientation) for pose in poses])
+        steps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
+        turns = np.linalg.norm(np.diff(turned, axis=0), axis=(1, 2))
+        ways = (1.0 + ROUND_OFF) * (steps + self.reach * turns) + ROUND_OFF * self._grid.cell_size
+        return np.append(np.cumsum(ways[::-1])[::-1], 0.0)
 
     def _window(
         self, pose: Motion, shape: Index3, offset: NDArray[np.float64]
