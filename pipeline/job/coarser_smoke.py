@@ -74,12 +74,22 @@ def _has_cells(source: PlacedSolid, box: Box, cell_size: float, *, moves: bool) 
     return centres is None or len(centres) > 0
 
 
-def _is_lost(job: Job, number: int, body: PlacedSolid, smoke: SmokeParameters) -> bool:
-    """Whether a body falls between the cells of a smoke, now or, if it moves, in some place."""
-    from sim.shapes import PlacedSolid
+def _is_lost(job: Job, number: int, solid: PlacedSolid, smoke: SmokeParameters) -> bool:
+    """Whether a body falls between the cells of a smoke, now or, if it moves, in some place that it can come to."""
+    from sim.coupling.smoke_reach import too_thin_bodies
+    from sim.rigid.geometry import BodyGeometry
+    from sim.shapes import PlacedSolid, ShapeError
     from sim.smoke.grid import SmokeGrid
 
-    if job.rigid[number].kind == "static":
-        return np.ptp(body.bounds, axis=0).min() < smoke.cell_size and SmokeGrid.of_box(smoke, job.domain).misses(body)
-    at_rest = PlacedSolid(body.shape, body.scale, np.eye(3), np.zeros(3))
-    return bool(np.ptp(at_rest.bounds, axis=0).min() < smoke.cell_size)
+    body = job.rigid[number]
+    if body.kind == "static":
+        is_thin = np.ptp(solid.bounds, axis=0).min() < smoke.cell_size
+        return bool(is_thin and SmokeGrid.of_box(smoke, job.domain).misses(solid))
+    at_rest = PlacedSolid(solid.shape, solid.scale, np.eye(3), np.zeros(3))
+    if np.ptp(at_rest.bounds, axis=0).min() >= smoke.cell_size:
+        return False
+    try:
+        geometry = BodyGeometry(body)
+    except ShapeError:
+        return False  # refused for that
+    return bool(too_thin_bodies(smoke, [body], [geometry], job.domain))

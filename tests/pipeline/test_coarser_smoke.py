@@ -48,6 +48,8 @@ def preview(text, folder):
         (PLUME + PADDLE.replace("0.505", "0.5"), 0.04),  # a centre of such cells lies in it
         (PLUME + PADDLE.replace("0.505", "0.52"), 0.035),
         (PLUME + PADDLE + MOVES, 0.03),
+        # It never comes into the smoke's box.
+        (PLUME.replace("[[smoke.source]]", "max = [0.5, 0.5, 0.28]\n[[smoke.source]]") + PADDLE + MOVES, 0.04),
         # Four cells high, at least.
         (PLUME.replace("[[smoke.source]]", "min = [-0.5, -0.5, 0.1]\nmax = [0.5, 0.5, 0.25]\n[[smoke.source]]"), 0.035),
     ],
