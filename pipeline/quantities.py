@@ -99,6 +99,7 @@ _KNOWN = {
         Quantity("repaired_crossings", "crossings repaired", "", "Cloth crossings repaired", counted=True),
         Quantity("crossings_left", "crossings left", "", "Cloth crossings left", counted=True),
         Quantity("impact_zone_vertices", "nodes moved as one", "", "Cloth nodes moved as one", counted=True),
+        Quantity("jammed", "cloth jammed", "", "Frames with jammed cloth", counted=True),
         Quantity("overlong_springs", "springs too long", "", "Cloth springs too long", counted=True),
         Quantity("max_strain", "largest strain", SHARE, "Strain"),
         Quantity("wall_contacts", "wall contacts", "", "Contacts", counted=True),
@@ -180,6 +181,13 @@ WARNINGS = (
         "crossings_left",
         "crossing of cloth could not be prevented",
         "crossings of cloth could not be prevented",
+    ),
+    CountedEvent(
+        "jammed",
+        "frame has cloth so jammed that much of it moves as one, which is slow: give weaker wind, slower pins and "
+        "bodies, or a larger thickness",
+        "frames have cloth so jammed that much of it moves as one, which is slow: give weaker wind, slower pins and "
+        "bodies, or a larger thickness",
     ),
     CountedEvent(
         "overlong_springs",

@@ -48,6 +48,11 @@ RECOVERY_TIME_S = 0.01
 LARGEST_MOTION = 0.5
 """How far vertices may get from their common motion in a step, in mean edges: farther, the lists grow too long."""
 
+JAMMED_SHARE = 0.1
+"""A cloth is jammed in a frame where impact zones move so much of its nodes as one, on average over the substeps. Falls
+and folds have some for a few substeps; cloth that wind presses into a heap has most of its nodes there in all of them,
+and no substep gets by without every round of repairs."""
+
 IMPULSE_UNIT = 1.0e-5
 """Unit of impulses over the step, in mean masses of a vertex times m/s²: a millionth of the weight, however short the
 steps are; 64 bits hold the sum of ten million vertices stopped from 100 m/s in a step of 0.1 ms."""
@@ -141,6 +146,7 @@ class ContinuousContacts:
         self._near.begin_frame(state)
         self.rigid.set_thickness(self._near.thickness)
         self._substeps = self._found = self._iterations = self._repaired = self._zone_vertices = self._left = 0
+        self._moved_as_one, self._nodes_as_one = (np.zeros(len(state.names)) for _ in range(2))
         self._mean_mass = float(copied(state.mass).mean())
 
     def diagnostics(self) -> Mapping[str, float]:
@@ -148,14 +154,19 @@ class ContinuousContacts:
 
         `repaired_crossings` counts pairs that contacts alone would have let cross, `impact_zone_vertices` the vertices
         that had to move with others, `crossings_left` pairs that even so may have crossed, as where pins are led
-        through each other; all summed over the substeps.
+        through each other; all summed over the substeps. `jammed` is 1 in a frame with a cloth of which impact zones
+        moved more than `JAMMED_SHARE`, on average over the substeps.
         """
+        body = self._state.host.body
+        nodes = np.bincount(body, minlength=len(self._moved_as_one))
+        is_jammed = self._moved_as_one > JAMMED_SHARE * max(self._substeps, 1) * nodes
         return {
             "contacts": self._found / max(self._substeps, 1),
             "contact_iterations": self._iterations / max(self._substeps, 1),
             "repaired_crossings": float(self._repaired),
             "impact_zone_vertices": float(self._zone_vertices),
             "crossings_left": float(self._left),
+            "jammed": float(is_jammed.any()),
         }
 
     def take_impulses(self, dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -172,6 +183,7 @@ class ContinuousContacts:
             return  # the solver says which quantity is not finite, or ran away
         self.rigid.begin_substep(dt)
         self._impulse_unit = IMPULSE_UNIT * self._mean_mass * dt**2
+        self._nodes_as_one.fill(0.0)
         while True:
             self._near.prepare(state)
             found = self._find(state, dt)
@@ -189,6 +201,7 @@ class ContinuousContacts:
             self._near.look(state)
         self._near.follow(state, is_changed=found > 0)
         self._substeps += 1
+        self._moved_as_one += self._nodes_as_one
         self._found += found
         self._left += left
 
@@ -254,7 +267,9 @@ class ContinuousContacts:
             while failed and zones.join(self._contacts.vertices.to_numpy()[:count][self._crossing_rows(count)]):
                 state.displacement.from_numpy(zones.apply(state.displacement.to_numpy()))
                 failed = self._crossings(state, count)
-            self._zone_vertices += zones.vertex_count
+            self._zone_vertices += len(zones.members)
+            of_cloths = np.bincount(state.host.body[zones.members], minlength=len(self._nodes_as_one))
+            np.maximum(self._nodes_as_one, of_cloths, out=self._nodes_as_one)
         return failed
 
     def _crossings(self, state: ClothState, count: int) -> int:

@@ -42,13 +42,13 @@ class ImpactZones:
         return grew
 
     @property
-    def vertex_count(self) -> int:
-        """Vertices that share their zone with others."""
-        return int(np.count_nonzero(np.bincount(self.labels)[self.labels] > 1))
+    def members(self) -> NDArray[np.int64]:
+        """Vertices that share their zone with others, in ascending order, (k,)."""
+        return np.flatnonzero(np.bincount(self.labels)[self.labels] > 1)
 
     def apply(self, displacement: NDArray[np.float32]) -> NDArray[np.float32]:
         """The displacements [m], (n, 3), with that of each zone for its free vertices."""
-        members = np.flatnonzero(np.bincount(self.labels)[self.labels] > 1)
+        members = self.members
         zone = self.labels[members]
         held = np.bincount(zone, self._pinned[members], minlength=len(self._mass))[zone] > 0.0
         weight = np.where(held, self._pinned[members].astype(np.float64), self._mass[members])
