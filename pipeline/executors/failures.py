@@ -46,6 +46,11 @@ def is_disk_full(error: BaseException) -> bool:
     return any(map(_means_disk_full, _chain(error)))
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an exception comes of too little memory, of the machine or of a GPU."""
+    return classify(error) is FailureKind.OUT_OF_MEMORY
+
+
 def _chain(error: BaseException) -> Iterator[BaseException]:
     link: BaseException | None = error
     while link is not None:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.errors import PipelineError, StageUnavailableError
+from pipeline.executors.failures import describe, is_out_of_memory
 from pipeline.live.loop import run
 from pipeline.live.saving import save_job
-from pipeline.live.session import Session
+from pipeline.live.session import CannotGoOnError, Session
 from pipeline.live.take import Recorder
 from pipeline.view.serving import address as address_of
 from pipeline.view.serving import page_server
@@ -58,12 +60,12 @@ def show_live(
         ends: whether it is over.
 
     Raises:
-        PipelineError: the port is taken, or the scene cannot be built.
+        PipelineError: the port is taken, the scene cannot be built, or there is too little memory for it and its page.
     """
     from sim.runtime import DeviceUnavailableError, initialize
     from sim.shapes.solid import ShapeError
 
-    with page_server(host=address.host, port=address.port, label=job.name) as server:
+    with _memory_told(job), page_server(host=address.host, port=address.port, label=job.name) as server:
         from pipeline.live.page import LivePage
 
         try:
@@ -90,3 +92,14 @@ def show_live(
             if recorder.is_recording:
                 recorder.stop()
                 tell(session.message)
+
+
+@contextmanager
+def _memory_told(job: Job) -> Iterator[None]:
+    """Too little memory as a line. Raises CannotGoOnError then."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise CannotGoOnError(f"{job.name} cannot go on, as no memory is left: {describe(error)}") from error

@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
-from pipeline.executors.failures import classify, describe
+from pipeline.executors.failures import describe, is_out_of_memory
 from pipeline.live.frame_watch import PATIENCE_S, FrameWatch
 from pipeline.live.hands import FreeBody, Hand, LedBody, Nodes
 from pipeline.live.knobs import Knob, Value, knobs_of, turn
 from pipeline.live.pace import told_pace
-from pipeline.task import FailureKind
 from sim.snapshots import Snapshot
 from sim.solver import SimulationDivergedError
 
@@ -43,6 +42,8 @@ FRAMES_TO_TRUST = 60
 """A moment that is younger than this at a blow-up may carry its cause."""
 
 FIRST = "The first frame compiles kernels: up to a minute, once on a machine."
+
+NO_MEMORY = "No memory was left"
 
 MORE_SUBSTEPS = " The job may need more substeps."
 FASTER = " --anyway lets frames take as long as they do; fewer substeps or --preview makes them faster."
@@ -104,7 +105,7 @@ class _JobPin(NamedTuple):
 
 
 class CannotGoOnError(PipelineError):
-    """A scene is gone, and cannot be built again: there is no memory for it, say."""
+    """A scene is gone, and cannot be built again, or cannot be shown: there is no memory for it, say."""
 
 
 class _FrameLeftError(Exception):
@@ -236,6 +237,9 @@ class Session:
             self._watch.begin_frame()
             report = self.world.advance_frame()
             _require_sound(report)
+            took_s = self._clock() - began
+            bodies = None if self.on_frame is None else self.world.snapshots()
+            moment = None if report.frame % FRAMES_BETWEEN_MOMENTS else self._moment()
         except _FrameLeftError:
             return
         except SimulationDivergedError as error:
@@ -247,21 +251,32 @@ class Session:
             remedy = "" if isinstance(error, OverflowError) else MORE_SUBSTEPS
             what = f"It blew up: {error}"
         except (MemoryError, RuntimeError) as error:
-            if classify(error) is not FailureKind.OUT_OF_MEMORY:
+            if not is_out_of_memory(error):
                 raise
-            what = f"No memory was left: {describe(error)}"
+            what = f"{NO_MEMORY}: {describe(error)}"
         if what:  # not within the handlers: an error's traceback would keep the old world
             self._go_back(what, remedy=remedy)
             return
         self.report = report
         if self._result == FIRST:
             self._result = ""
-        self._frame_ms = 1e3 * (self._clock() - began)
+        self._frame_ms = 1e3 * took_s
         self._substeps_asked = self.values.get("cloth.substeps")
-        if self.on_frame is not None:
-            self.on_frame(report, self.world.snapshots())
-        if report.frame % FRAMES_BETWEEN_MOMENTS == 0:
-            self._moments.append(self._moment())
+        if self.on_frame is not None and bodies is not None:
+            self.on_frame(report, bodies)
+        if moment is not None:
+            self._moments.append(moment)
+
+    def free_memory(self, trouble: str) -> None:
+        """Go back to where the scene was sound, as there was no memory for something else than a frame.
+
+        Args:
+            trouble: what was told of that.
+
+        Raises:
+            CannotGoOnError: there is no memory for it either.
+        """
+        self._go_back(f"{NO_MEMORY}: {trouble}", remedy="")
 
     def status(self) -> Status:
         """How it goes."""
@@ -307,7 +322,7 @@ class Session:
         try:
             self._begin_anew(values)  # the old world goes on if the new one is refused, as where a mesh is gone
         except (MemoryError, RuntimeError) as error:
-            if classify(error) is not FailureKind.OUT_OF_MEMORY:
+            if not is_out_of_memory(error):
                 raise
             has_room = False
         if not has_room:  # for both
@@ -525,7 +540,7 @@ class Session:
         try:
             yield
         except (MemoryError, RuntimeError, ValueError, OSError, PipelineError) as error:
-            if isinstance(error, RuntimeError) and classify(error) is not FailureKind.OUT_OF_MEMORY:
+            if isinstance(error, RuntimeError) and not is_out_of_memory(error):
                 raise
             raise CannotGoOnError(f"{self.job.name} cannot begin anew: {describe(error)}") from error
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from pipeline.artifacts import committing
 from pipeline.cache import validate_frame, write_frame
 from pipeline.errors import PipelineError
+from pipeline.executors.failures import describe, is_out_of_memory
 from pipeline.files import replace_durably
 from pipeline.fingerprint import task_fingerprint
 from pipeline.job.loading import job_of_text
@@ -39,8 +40,9 @@ if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
     from sim.snapshots import Snapshot
 
-_TROUBLES = (OSError, PipelineError, RuntimeError, sqlite3.Error)
-"""What writing a take may meet: the disk, a folder that somebody else uses, HDF5, a lost writer, the record."""
+_TROUBLES = (OSError, PipelineError, MemoryError, RuntimeError, sqlite3.Error)
+"""What writing a take may meet: the disk, a folder that somebody else uses, too little memory, HDF5, a lost writer, the
+record."""
 
 
 class Recorder:
@@ -82,15 +84,21 @@ class Recorder:
 
     def stop(self) -> None:
         """End the take, if one is being made, and say how to go on with it."""
+        self._stop(trouble="")
+
+    def _stop(self, *, trouble: str) -> None:
+        """As `stop`; `trouble` is why the take ends before anybody wants it, "" if it does not.
+
+        What writing meets is told instead: it is the same, or where the trouble comes from.
+        """
         take, self._take = self._take, None
         self._session.on_frame = None
         if take is None:
             return
-        trouble = ""
         try:
             take.end()
         except _TROUBLES as error:
-            trouble = f"the take ends early: {error}; "
+            trouble = _told(error)
         frames = "1 frame" if take.frames == 1 else f"{take.frames} frames"
         if take.frames and take.frames != take.frames_in_job:
             became = f"{take.layout.job_file} has 1 frame; {frames} are in {take.layout.checkpoints.parent}"
@@ -98,15 +106,15 @@ class Recorder:
             became = f"{frames}: pipeline submit {shlex.quote(str(take.layout.job_file))}"
         else:
             became = f"none of its frames is in {take.layout.root}"
-        self._session.message = f"{trouble}{became}"
+        self._session.message = f"the take ends early: {trouble}; {became}" if trouble else became
 
     def _add(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
         if self._take is None:
             return
         try:
             self._take.add(report, bodies)
-        except _TROUBLES:
-            self.stop()  # the writer tells it what it has told here
+        except _TROUBLES as error:
+            self._stop(trouble=_told(error))
 
 
 class _Take:
@@ -216,6 +224,11 @@ class _Take:
                 changes.append((("rigid", number, "kind"), lived.kind))
         overrides = [Override(path, value, "live") for path, value in changes]
         return text_with_values(self._loaded, self._session.values, overrides)
+
+
+def _told(error: BaseException) -> str:
+    """An error in a few words: what is no sentence by itself, such as a lack of memory, with its name."""
+    return describe(error) if is_out_of_memory(error) else str(error)
 
 
 def _new_folder(output: Path, stem: str) -> Path:

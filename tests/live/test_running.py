@@ -25,3 +25,28 @@ def test_a_frame_may_take_long_only_anyway_and_the_end_does_not_wait_for_it(tmp_
     arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path), *options]
     assert CliRunner().invoke(main, arguments).exit_code == 0
     assert found == [(patience_s, True)]
+
+
+@pytest.mark.parametrize("where", ["run", "Session", "Recorder"])
+@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 9 GiB"), RuntimeError("CUDA: out of memory")])
+def test_live_ends_with_a_line_where_no_memory_is_left(tmp_path, monkeypatch, where, error):
+    def fails(*_arguments: object, **_options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(running, where, fails)
+    loaded(tmp_path)
+    arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path)]
+    ended = CliRunner().invoke(main, arguments)
+    assert ended.exit_code == 1
+    told = f"error: drape cannot go on, as no memory is left: {type(error).__name__}: {error}"
+    assert told in ended.output.splitlines()
+
+
+def test_errors_of_the_program_keep_their_traceback(tmp_path, monkeypatch):
+    def fails(*_arguments: object, **_options: object) -> None:
+        raise RuntimeError("Event loop is closed")
+
+    monkeypatch.setattr(running, "run", fails)
+    loaded(tmp_path)
+    arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path)]
+    assert isinstance(CliRunner().invoke(main, arguments).exception, RuntimeError)

@@ -394,6 +394,40 @@ def test_the_old_scene_is_gone_before_one_is_built_after_too_little_memory(tmp_p
     assert session.world.frame == 1
 
 
+def raises_anew(error: BaseException) -> Callable[[], None]:
+    """As `raises`, without what the error was raised from before."""
+
+    def fails() -> None:
+        raise type(error)(*error.args)
+
+    return fails
+
+
+@pytest.mark.parametrize("error", [MemoryError("no 9 GiB"), RuntimeError("[cuda] out of memory")])
+def test_a_state_that_there_is_no_memory_to_keep_or_to_record_leads_back(tmp_path, monkeypatch, error):
+    session = session_of(tmp_path)
+    run(session, 30)
+    session.world.checkpoint = raises_anew(error)
+    run(session, 29)
+    session.advance()
+    assert (session.message.partition(":")[0], session.world.frame) == ("No memory was left", 0)
+    assert describe(error) in session.message
+    session.on_frame = lambda _report, _bodies: None
+    session.world.snapshots = raises_anew(error)
+    session.advance()
+    assert (session.message.partition(":")[0], session.world.frame) == ("No memory was left", 0)
+
+
+def test_a_scene_goes_back_where_there_is_no_memory_to_show_it(tmp_path, monkeypatch):
+    session = session_of(tmp_path)
+    run(session, 91)
+    kept = built(monkeypatch, session, None)
+    session.free_memory("MemoryError: no 9 GiB")
+    assert kept == [False]
+    assert session.message.startswith("No memory was left: MemoryError: no 9 GiB. Nothing had been turned.")
+    assert (session.world.frame, session.is_paused) == (30, False)
+
+
 @pytest.mark.parametrize("error", [MemoryError("no 9 GiB"), RuntimeError("CUDA: out of memory"), ValueError("no mesh")])
 def test_a_scene_that_cannot_be_built_again_ends_live_with_a_line(tmp_path, monkeypatch, error):
     session = session_of(tmp_path)

@@ -192,12 +192,20 @@ def test_a_take_whose_lease_did_not_answer_but_is_its_own_still_becomes_a_film_o
     assert json.loads((folder / "take.json").read_text())["frames"] == 2
 
 
-def test_a_take_that_cannot_be_written_on_keeps_the_frames_that_were(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "[Errno 28] No space left on device"),
+        (MemoryError(), "MemoryError"),
+        (RuntimeError("[cuda] out of memory"), "RuntimeError: [cuda] out of memory"),
+    ],
+)
+def test_a_take_that_cannot_be_written_on_keeps_the_frames_that_were(tmp_path, monkeypatch, error, told):
     from pipeline.live import take
 
     def write_two(path, bodies, report, *, device):
         if report.frame == 2:
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise error
         write_frame(path, bodies, report, device=device)
 
     write_frame = take.write_frame
@@ -211,11 +219,28 @@ def test_a_take_that_cannot_be_written_on_keeps_the_frames_that_were(tmp_path, m
     recorder.stop()
     assert not recorder.is_recording
     folder = tmp_path / "drape-take"
-    assert "No space left on device" in session.message
-    assert f"2 frames: pipeline submit {folder / 'job.toml'}" in session.message
+    assert session.message == f"the take ends early: {told}; 2 frames: pipeline submit {folder / 'job.toml'}"
     assert load_job(folder / "job.toml").frame_count == 2
     assert json.loads((folder / "take.json").read_text())["frames"] == 2
     assert not [thread for thread in threading.enumerate() if thread.name == "writer"]
+
+
+def test_a_frame_that_there_is_no_memory_to_hand_in_ends_the_take_and_is_told(tmp_path, monkeypatch):
+    from pipeline.live import take
+
+    read = loaded(tmp_path)
+    session = Session(live_job(read.job))
+    recorder = Recorder(read, session, tmp_path, device="cpu")
+    recorder.toggle()
+
+    def replace(*_arguments, **_changes):
+        raise MemoryError("no 9 GiB")
+
+    monkeypatch.setattr(take, "replace", replace)
+    session.advance()
+    assert not recorder.is_recording
+    became = f"1 frame: pipeline submit {tmp_path / 'drape-take' / 'job.toml'}"
+    assert session.message == f"the take ends early: MemoryError: no 9 GiB; {became}"
 
 
 def test_what_is_printed_of_a_take_works_from_anywhere(tmp_path, monkeypatch):
