@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
+from pipeline.crashed_take import complete_crashed_take
 from pipeline.errors import JobBusyError, PipelineError
 from pipeline.lease import live_holder
 from pipeline.spool import QueuedJob, Spool, Wish, new_ticket, submission
@@ -85,8 +86,10 @@ def another_try(spool: Spool, name: str, *, background: bool) -> QueuedJob:
 def continuation(spool: Spool, name: str) -> QueuedJob:
     """The entry by which a job goes on in the background as it was meant, to be queued.
 
+    Of a take whose recorder crashed, all frames that are there are taken over.
+
     Raises:
-        PipelineError: it was never submitted.
+        PipelineError: it was never submitted, or its job file is damaged.
         JobBusyError: it runs, and is not to pause.
     """
     paused = spool.find(name)
@@ -96,6 +99,7 @@ def continuation(spool: Spool, name: str) -> QueuedJob:
             raise PipelineError(f"no submitted job in {layout.root}; submit one with: pipeline submit JOB.toml")
         if live_holder(layout.lease) is not None:
             raise JobBusyError(f"{name} runs already")
+        complete_crashed_take(layout)
         return submission(name, background=True)
     if paused.wish is Wish.RUN:
         state = queue_state(spool, paused)

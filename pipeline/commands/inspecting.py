@@ -91,7 +91,7 @@ def status(job: str, output: Path, as_json: bool) -> None:
     layout = find_job(job, output)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         summary, failures, events = manifest.summary(), manifest.failures(), manifest.events(limit=5)
-        drawn_on = manifest.devices("render")
+        drawn_on, is_empty = manifest.devices("render"), manifest.is_empty()
     holder = live_holder(layout.lease)
     numbers = simulation_numbers(layout)
     so_far = layout.film_so_far if layout.film_so_far.exists() else None
@@ -112,7 +112,8 @@ def status(job: str, output: Path, as_json: bool) -> None:
             )
         )
         return
-    click.echo(f"{layout.root}: {_activity(holder.pid if holder else None, summary)}")
+    activity = _activity(holder.pid if holder else None, summary) or _activity_before_runs(layout, is_empty=is_empty)
+    click.echo(f"{layout.root}: {activity}")
     for stage in summary:
         counts = ", ".join(
             f"{count} {'interrupted' if state is TaskState.RUNNING and holder is None else state}"
@@ -243,6 +244,7 @@ def _state(manifest: ManifestReader, task: TaskId) -> TaskState | None:
 
 
 def _activity(pid: int | None, summary: Sequence[StageSummary]) -> str:
+    """What happens to a job; "" of one without tasks, which never ran."""
     if pid is not None:
         return f"running, process {pid}"
     done = sum(
@@ -252,7 +254,21 @@ def _activity(pid: int | None, summary: Sequence[StageSummary]) -> str:
         if state in (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
     )
     total = sum(stage.total for stage in summary)
+    if not total:
+        return ""
     return "done" if done == total else f"not running, {done} of {total} tasks done"
+
+
+def _activity_before_runs(layout: JobLayout, *, is_empty: bool) -> str:
+    """How a job stands whose record has no tasks: a take, a new job, or one whose record was lost."""
+    from pipeline.crashed_take import frames_of_crashed_take
+
+    if (frames := frames_of_crashed_take(layout)) is not None:
+        there = f"with {frames} frame{'' if frames == 1 else 's'}; submitting {layout.job_file} makes the film of all"
+        return f"a take that was cut short {there if frames else 'before its first frame'}"
+    if layout.take_story.exists():
+        return f"a take; submitting {layout.job_file} makes the film"
+    return "not started" if is_empty else "not running; its record does not tell of tasks"
 
 
 def _attempts_with_log(layout: JobLayout, task: TaskId) -> dict[int, Path]:

@@ -118,6 +118,8 @@ def submit(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
     """
     from pipeline.job.loading import read_job
 
+    if job_file.name == "job.toml":
+        _complete_take(JobLayout(job_file.parent))
     loaded = read_job(job_file, overrides, preview=preview)
     require_own_programs(loaded, overrides)
     require_plannable(loaded)
@@ -159,6 +161,7 @@ def resume(job: str, output: Path, options: QueueOptions) -> None:
         submitted = job_of_text(waiting.text, layout.job_file)
     else:
         layout = find_job(job, output)
+        _complete_take(layout)
         submitted = _job_in(layout)
     state = _look_at(submitted, layout)
     _end_if_at_rest(state, layout, None)
@@ -272,6 +275,14 @@ def run(
         if not is_disk_full(error):
             raise
         raise DiskFullError.of(layout.root) from error
+
+
+def _complete_take(layout: JobLayout) -> None:
+    """Take over all frames of a take whose recorder crashed, and say so."""
+    from pipeline.crashed_take import complete_crashed_take
+
+    if sentence := complete_crashed_take(layout):
+        click.echo(sentence, err=True)
 
 
 def _say_what_it_takes(state: JobAssessment, size: Size, layout: JobLayout, reserve_bytes: int | None) -> None:

@@ -27,6 +27,7 @@ from pipeline.job.loading import job_of_text
 from pipeline.job.overrides import Override
 from pipeline.layout import JobLayout
 from pipeline.lease import Lease
+from pipeline.live.knobs import Value
 from pipeline.live.saving import bodies_led_before, numbered_paths, text_with_values
 from pipeline.live.session import Session
 from pipeline.manifest import Manifest
@@ -101,7 +102,8 @@ class Recorder:
             trouble = _told(error)
         frames = "1 frame" if take.frames == 1 else f"{take.frames} frames"
         if take.frames and take.frames != take.frames_in_job:
-            became = f"{take.layout.job_file} has 1 frame; {frames} are in {take.layout.checkpoints.parent}"
+            # Which submitting finds, as after a crash.
+            became = f"{take.layout.job_file} has 1 frame yet; submitting it takes over what is there, {frames}"
         elif take.frames:
             became = f"{frames}: pipeline submit {shlex.quote(str(take.layout.job_file))}"
         else:
@@ -131,10 +133,11 @@ class _Take:
         self._name = f"live-{uuid.uuid4().hex[:12]}"
         self.layout = JobLayout(_new_folder(output, f"{loaded.job.name}-take"))
         self.frames = self._handed_in = 0
-        self._values = {"first": dict(session.values)}
+        self._values = dict(session.values)
         with ExitStack() as held:
             self._lease = held.enter_context(Lease.acquire(self.layout.lease))
             self._write_job(frames=1)
+            self._write_story(frames=None, last=None)
             Manifest(self.layout.manifest).close()  # without a record, commands take the folder for none of a job's
             job = job_of_text(self._text(frames=1), self.layout.job_file)
             self._dt = 1.0 / job.fps
@@ -173,19 +176,23 @@ class _Take:
     def _write_what_it_is(self) -> None:
         self._lease.heartbeat()  # raises if the folder is not ours any more
         self._write_job(frames=max(1, self.frames))  # no job has none
+        self._write_story(frames=self.frames, last=dict(self._session.values))
+        with Manifest(self.layout.manifest) as manifest:
+            reconcile(manifest, self.layout, clean=False)
+
+    def _write_story(self, *, frames: int | None, last: dict[str, Value] | None) -> None:
+        """Tell what the take is; None while it is recorded, and for good if this process crashes."""
         story = {
             "take": self._name,
             "job": self._loaded.job.name,
-            "frames": self.frames,
+            "frames": frames,
             "device": self._device,
             "maker": maker(),
-            "values": {**self._values, "last": dict(self._session.values)},
+            "values": {"first": self._values, "last": last},
             "led": self._led(),
             "note": "Steered by hand: no job file makes these frames again.",
         }
         replace_durably(self.layout.take_story, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
-        with Manifest(self.layout.manifest) as manifest:
-            reconcile(manifest, self.layout, clean=False)
 
     def _led(self) -> list[str]:
         """Bodies that the job has at rest, and that could be led here."""

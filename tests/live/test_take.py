@@ -13,6 +13,7 @@ from live_jobs import BALL_OVER_SHEET, loaded
 
 from pipeline.cache import read_frame
 from pipeline.cli import main
+from pipeline.crashed_take import complete_crashed_take, frames_of_crashed_take
 from pipeline.dashboard.actions import actions_of
 from pipeline.dashboard.farm_view import FarmView
 from pipeline.dashboard.places import Places
@@ -169,10 +170,73 @@ def test_a_take_whose_folder_another_process_has_taken_over_writes_nothing_more(
     session.advance()
     assert not recorder.is_recording
     folder = tmp_path / "drape-take"
-    became = f"{folder / 'job.toml'} has 1 frame; 2 frames are in {folder / 'cache'}"
+    became = f"{folder / 'job.toml'} has 1 frame yet; submitting it takes over what is there, 2 frames"
     assert session.message == f"the take ends early: drape-take was taken over; {became}"
     assert load_job(folder / "job.toml").frame_count == 1
-    assert not (folder / "take.json").exists()
+    assert json.loads((folder / "take.json").read_text())["frames"] is None
+
+
+def crashed(folder, monkeypatch, frames: int = 3, text: str = BALL_OVER_SHEET) -> tuple[Spool, JobLayout]:
+    """A farm and its take of so many frames, which a killed process leaves: nobody writes what it is."""
+    read = loaded(folder, text)
+    session = Session(live_job(read.job))
+    recorder = Recorder(read, session, folder / "farm", device="cpu")
+    recorder.toggle()
+    for _ in range(frames - 1):
+        session.advance()
+    take = recorder._take
+    assert take is not None
+    with monkeypatch.context() as dead:
+        dead.setattr(take, "_write_what_it_is", lambda: None)
+        take.end()
+    spool = Spool(folder / "farm")
+    return spool, spool.layout("drape-take")
+
+
+@pytest.mark.parametrize("length", ["frames = 90", "duration = 1.5", "duration = 1.5\nfps = 30"])
+def test_a_take_whose_process_was_killed_has_all_its_frames_again_once_it_is_submitted(tmp_path, monkeypatch, length):
+    _, layout = crashed(tmp_path, monkeypatch, text=f"{length}\n{BALL_OVER_SHEET}")
+    part = layout.path(layout.frame_cache(3)).with_name(".000003.h5.part.1")
+    part.touch()  # it was writing
+    assert load_job(layout.job_file).frame_count == 1
+    told = CliRunner().invoke(main, ["status", str(layout.root)])
+    assert told.output.splitlines()[0] == (
+        f"{layout.root}: a take that was cut short with 3 frames; submitting {layout.job_file} makes the film of all"
+    )
+    submitted = []
+    monkeypatch.setattr("pipeline.commands.running.run", lambda job, *_, **__: submitted.append(job.frame_count))
+    ended = CliRunner().invoke(main, ["submit", str(layout.job_file)])
+    assert ended.exit_code == 0, ended.output
+    assert "the recording of drape-take was cut short: it has 3 frames, and so has its job file now" in ended.output
+    assert submitted == [3]
+    assert load_job(layout.job_file).frame_count == 3
+    assert not part.exists()
+    assert json.loads((layout.root / "take.json").read_text())["frames"] == 3
+    planned = CliRunner().invoke(main, ["plan", str(layout.job_file), "--json"])
+    verdicts = {each["task"]: each["verdict"] for each in json.loads(planned.output)}
+    assert verdicts["simulate"] == "up to date"
+    told = CliRunner().invoke(main, ["status", str(layout.root)])
+    assert told.output.splitlines()[0] == f"{layout.root}: a take; submitting {layout.job_file} makes the film"
+
+
+def test_the_dashboard_starts_a_take_whose_process_was_killed_with_all_its_frames(tmp_path, monkeypatch):
+    spool, layout = crashed(tmp_path, monkeypatch)
+    (found,) = FarmView(Places(spool.farm), spool).glance().jobs
+    assert (found.state, [action.label for action in actions_of(found, has_runner=False)]) == ("recorded", ["Start"])
+    continuation(spool, "drape-take")
+    assert load_job(layout.job_file).frame_count == 3
+
+
+def test_a_damaged_frame_ends_what_is_taken_over_of_a_killed_take_and_a_length_that_was_chosen_stays(
+    tmp_path, monkeypatch
+):
+    _, layout = crashed(tmp_path, monkeypatch)
+    layout.path(layout.frame_cache(2)).write_bytes(b"")
+    assert frames_of_crashed_take(layout) == 2
+    layout.job_file.write_text(layout.job_file.read_text().replace("frames = 1", "frames = 7"))
+    complete_crashed_take(layout)
+    assert load_job(layout.job_file).frame_count == 7
+    assert (frames_of_crashed_take(layout), complete_crashed_take(layout)) == (None, "")
 
 
 def test_a_take_whose_lease_did_not_answer_but_is_its_own_still_becomes_a_film_of_all_its_frames(tmp_path):
