@@ -4,9 +4,8 @@
 
 writes the names to standard output as a line `MATERIALS ["...", ...]`, among the lines that Blender itself writes, or a
 line `MATERIALS_FAILED reason`; so does `python blend_materials.py FILE` with the bpy module. Those that are named are
-also tried, if they are there, and before that line come one of the pictures in them, each once, as
-`TEXTURES [{"width": 4096, "height": 4096, "float": false}, ...]`, and one of the materials whose pictures lie by the
-texture coordinates of a mesh, `PICTURES_BY_UV ["..."]`.
+also tried, if they are there, and before that line comes one of the pictures in them, each once, as
+`TEXTURES [{"width": 4096, "height": 4096, "float": false}, ...]`.
 """
 
 from __future__ import annotations
@@ -127,7 +126,6 @@ def main(arguments: list[str]) -> int:
         names = material_names(path)
         tried = [append_material(path, name) for name in wanted if name in names]
         sys.stdout.write(f"TEXTURES {json.dumps(textures(tried))}\n")
-        sys.stdout.write(f"PICTURES_BY_UV {json.dumps([each.name for each in tried if has_pictures_by_uv(each)])}\n")
         sys.stdout.write(f"MATERIALS {json.dumps(names)}\n")
     except RenderInputError as error:
         sys.stdout.write(f"MATERIALS_FAILED {str(error).replace(chr(10), ' ')}\n")

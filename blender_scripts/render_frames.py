@@ -5,14 +5,15 @@
 
 Both forms write one line per frame to standard output, `FRAME_DONE 12 /path` or `FRAME_FAILED 12 reason`, among the
 lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line
-(after a tab, the path of the EXR that is wanted too), after a line `RENDERER_READY version device`; the process ends
-with its input, so it cannot outlive who started it. `stage 12 96x54 /path` asks for the empty stage of that frame, in
-so many pixels.
+(after a tab, the path of the EXR that is wanted too), after a line `PICTURES_BY_UV ["object", ...]`, see SceneRenderer,
+and a line `RENDERER_READY version device`; the process ends with its input, so it cannot outlive who started it.
+`stage 12 96x54 /path` asks for the empty stage of that frame, in so many pixels.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import queue
 import sys
@@ -61,6 +62,8 @@ class SceneRenderer:
 
     Attributes:
         device: what Cycles renders on, e.g. `CPU`; `Workbench` for that engine.
+        pictures_by_uv: names of the objects, as the specification has them, with pictures in their material that lie by
+            the texture coordinates of the mesh.
     """
 
     _current: SceneRenderer | None = None
@@ -102,6 +105,7 @@ class SceneRenderer:
         # Workbench sees through nothing.
         is_plain = spec.get("engine") == "workbench"
         self._has_wet = not is_plain and any(_wets(description) for description in spec["objects"])
+        self.pictures_by_uv: list[str] = []
         self._floor_z = spec["domain_min"][2]
         drawn = [(description, self._add_object(description, spec)) for description in spec["objects"]]
         # Blender may have chosen another name than the job's.
@@ -258,6 +262,8 @@ class SceneRenderer:
         else:
             file, inside = blend_materials.split_reference(description["material"]["blend"])
             material = blend_materials.append_material(self._folder / file, inside)
+            if blend_materials.has_pictures_by_uv(material):
+                self.pictures_by_uv.append(name)
         if at_rest is not None:
             blender_object = geometry.new_mesh_object(name, at_rest)
             blender_object.rotation_mode = "QUATERNION"
@@ -383,6 +389,7 @@ def _follow(stream: TextIO, requests: queue.SimpleQueue[str | None]) -> None:
 def _serve(renderer: SceneRenderer) -> None:
     requests: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     threading.Thread(target=_follow, args=(sys.stdin, requests), daemon=True).start()
+    _report(f"PICTURES_BY_UV {json.dumps(renderer.pictures_by_uv)}")
     _report(f"RENDERER_READY {blender_version()} {renderer.device}")
     while True:
         request = requests.get().rstrip("\n")

@@ -30,14 +30,6 @@ def read_textures(path: Path, name: str, blender: str | None) -> list[Texture]:
     return [Texture(int(each["width"]), int(each["height"]), bool(each["float"])) for each in told]
 
 
-def has_pictures_by_uv(path: Path, name: str, blender: str | None) -> bool:
-    """Whether a material of a .blend file has pictures that lie by the texture coordinates of the mesh that it is on.
-
-    Args and Raises as of `read_material_names`.
-    """
-    return bool(json.loads(_ask(path, blender, [name], "PICTURES_BY_UV")))
-
-
 def read_material_names(path: Path, blender: str | None, *, tried: Sequence[str] = ()) -> list[str]:
     """Names of the materials in a .blend file, in any order.
 

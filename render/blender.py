@@ -6,6 +6,7 @@ Both draw with `blender_scripts`; the executable is started once and asked for f
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import re
 import subprocess
@@ -85,6 +86,8 @@ class Renderer(Protocol):
 
     device: str
     """What Cycles renders on, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`."""
+    pictures_by_uv: frozenset[str]
+    """Names of the objects with pictures in their material that lie by the texture coordinates of the mesh."""
 
     def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
         """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
@@ -150,6 +153,7 @@ class ModuleRenderer:
         except (RenderInputError, RuntimeError) as error:
             raise BlenderUnavailableError(str(error)) from error
         self.device: str = self._scene.device
+        self.pictures_by_uv = frozenset(self._scene.pictures_by_uv)
 
     def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
         """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
@@ -181,7 +185,10 @@ class ExecutableRenderer:
             errors="replace",
         )
         try:
-            answer = self._read_answer(("RENDERER_READY", "RENDERER_FAILED"))
+            self.pictures_by_uv: frozenset[str] = frozenset()
+            words = ("RENDERER_READY", "RENDERER_FAILED", "PICTURES_BY_UV")
+            while (answer := self._read_answer(words)) is not None and answer.startswith("PICTURES_BY_UV"):
+                self.pictures_by_uv = frozenset(json.loads(answer.partition(" ")[2]))
             if answer is None:
                 code = self._exit_code()
                 raise (BlenderKilledError if code < 0 else BlenderUnavailableError)(

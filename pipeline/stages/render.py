@@ -135,7 +135,6 @@ class RenderStage:
         poses, view = write_motion(job, layout, task.frame, attempt=context.attempt)
         bodies = list(bodies_at(job, layout, task.frame, poses))
         warn_of_sight(context, view, bodies)
-        warn_of_flat_pictures(context)
 
         def validate(path: Path) -> None:
             validate_picture(path, job.render.resolution, may_be_empty=may_be_empty(job))
@@ -146,7 +145,9 @@ class RenderStage:
 
         try:
             with ExitStack() as stack:
-                device = warm_renderer(context).device
+                renderer = warm_renderer(context)
+                device = renderer.device
+                warn_of_flat_pictures(context, renderer.pictures_by_uv)
                 print(f"Cycles draws on {device}{'' if device == CPU else f', GPU {context.gpu}'}", flush=True)
                 masters = [
                     stack.enter_context(context.committing(output, validate_master, device=device))

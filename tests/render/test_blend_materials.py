@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,10 +19,10 @@ from pipeline.job.loading import load_job
 from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.stages.bodies import BodiesStage
-from pipeline.stages.flat_pictures import warn_of_flat_pictures
+from pipeline.stages.flat_pictures import FLAT_PICTURES
 from pipeline.stages.render import RenderStage
 from render.blend_file import read_material_names
-from render.blender import BlenderHungError, BlenderUnavailableError, script_argv
+from render.blender import open_renderer, script_argv
 from render.errors import InvalidFileError
 from render.meshes import write_ply
 from render.parameters import MaterialParameters
@@ -138,58 +139,60 @@ def test_a_picture_lies_where_the_bodys_texture_coordinates_say(materials, tmp_p
         assert all(side[:2].max() > 1.5 * side[:2].min() for side in sides)
 
 
-def told_of(folder: Path, blend: str, *more: str) -> list[tuple[int, str]]:
-    """The frames and texts of warnings about pictures in a film of the ball, and of more of that material."""
-    layout = JobLayout(folder)
-    text = JOB.format(blend=blend)
-    for name in more:
-        text += f'[[rigid]]\nname = "{name}"\nshape = {{ type = "sphere", radius = 0.1 }}\n'
-        text += f"[material.{name}]\nblend = '{blend}'\n"
+def test_the_renderer_tells_on_what_pictures_lie_by_texture_coordinates(materials, tmp_path):
+    write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.5), 0.3))
+    insides = {"halves": "Halves", "named": "Named", "bright": "Green: bright"}
+    objects = [
+        MeshObject(name=name, file="ball.ply", material=MaterialParameters(blend=f"{materials}:{inside}"))
+        for name, inside in insides.items()
+    ]
+    objects.append(MeshObject(name="plain", file="ball.ply", material=MaterialParameters(look="stone")))
+    spec_of(*objects).write(tmp_path / "spec.json")
+    renderer = open_renderer(tmp_path / "spec.json", threads=1, blender=str(write_blender_stand_in(tmp_path)))
+    renderer.close()
+    assert renderer.pictures_by_uv == {"halves", "named"}
+
+
+class DrawnEnoughError(Exception):
+    """A frame would be drawn now."""
+
+
+def test_a_picture_without_texture_coordinates_is_told_once_and_blender_is_not_started_for_it(tmp_path, monkeypatch):
+    layout = JobLayout(tmp_path)
+    text = JOB.format(blend="own.blend:Halves")
+    for name in ("second", "generated"):
+        text += f'[[rigid]]\nname = "{name}"\nshape = {{ type = "sphere", radius = 0.1 }}\nposition = [0, 0, 0.5]\n'
+        text += f'[material.{name}]\nblend = "own.blend:Halves"\n'
     layout.job_file.write_text(text)
     film = load_job(layout.job_file)
     for body in BodiesStage().plan(film, layout):
         assert isinstance(run_task(body, layout), Finished)
+
+    def no_process(*_arguments: object, **_options: object) -> None:
+        raise AssertionError("Blender is asked in a process of its own")
+
+    def draw(*_arguments: object) -> None:
+        raise DrawnEnoughError
+
+    renderer = SimpleNamespace(device="CPU", pictures_by_uv={"ball", "second"})
+    monkeypatch.setattr("render.blender.run_script", no_process)
+    monkeypatch.setattr("render.blend_file.run_script", no_process)
+    monkeypatch.setattr("pipeline.stages.render.content_name", lambda *_: "own")
+    monkeypatch.setattr("pipeline.stages.render.own_picture_bytes", lambda _: 0)
+    monkeypatch.setattr("pipeline.stages.render.warm_renderer", lambda _: renderer)
+    monkeypatch.setattr("pipeline.stages.render.draw_until_good", draw)
     told = []
     for frame, task in enumerate(RenderStage().plan(film, layout)[:2]):
         events: list[TaskEvent] = []
         assignment = Assignment(task, 1, "f", {}, 1, layout.job_file, layout.root, "pipeline.stages:STAGES")
-        warn_of_flat_pictures(AttemptContext(assignment, events.append, lambda: False))
-        told += [(frame, event.message) for event in events if isinstance(event, Warned)]
-    return told
-
-
-@pytest.mark.parametrize(("name", "flat"), [("Halves", True), ("Named", True), ("Green: bright", False)])
-def test_a_picture_on_a_body_without_texture_coordinates_is_told_once(materials, tmp_path, name, flat):
-    told = told_of(tmp_path, f"{materials}:{name}")
-    assert [frame for frame, _ in told] == ([0] if flat else [])
-    assert all(f'"ball" has no texture coordinates, so pictures in its material "{name}"' in line for _, line in told)
-
-
-def test_blender_is_asked_once_of_a_material_that_several_bodies_have(materials, tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr("render.blend_file.has_pictures_by_uv", lambda *wanted: not asked.append(wanted))
-    told = told_of(tmp_path, f"{materials}:Halves", "second", "third")
-    assert asked == [(materials, "Halves", None)]
-    assert [line.partition(" has no")[0] for _, line in told] == ['"ball"', '"second"', '"third"']
-
-
-@pytest.mark.parametrize(
-    "trouble",
-    [
-        BlenderHungError("Blender took more than 120 s to read it"),
-        BlenderUnavailableError("cannot start"),
-        InvalidFileError(Path("own.blend"), "Blender ended with exit code -11 while it read it"),
-    ],
-    ids=lambda trouble: type(trouble).__name__,
-)
-def test_a_material_that_cannot_be_looked_at_is_told_and_fails_no_frame(materials, tmp_path, monkeypatch, trouble):
-    def ask(*wanted: object) -> bool:
-        raise trouble
-
-    monkeypatch.setattr("render.blend_file.has_pictures_by_uv", ask)
-    ((frame, line),) = told_of(tmp_path, f"{materials}:Halves", "second")
-    assert frame == 0
-    assert line.startswith(f'the material "Halves" of "ball", "second" could not be looked at ({trouble}); ')
+        with pytest.raises(DrawnEnoughError):
+            RenderStage().run(AttemptContext(assignment, events.append, lambda: False))
+        told += [
+            (frame, event.message) for event in events if isinstance(event, Warned) and event.kind == FLAT_PICTURES
+        ]
+    assert [frame for frame, _ in told] == [0, 0]
+    for name, (_, line) in zip(("ball", "second"), told, strict=True):
+        assert line.startswith(f'"{name}" has no texture coordinates, so pictures in its material "Halves" show one')
 
 
 def test_no_program_of_the_file_is_run(materials, tmp_path):
