@@ -67,10 +67,10 @@ def live(
     loaded = read_job(job_file, overrides, preview=preview)
     require_own_programs(loaded, overrides)
     job = live_job(loaded.job, substeps=substeps)
+    loaded, findings = load_checked_job(job_file, overrides, preview=preview)
     threads, on_gpu = cores or machine_capacity().cores, resolve_device(job.device) != "cpu"
     if not as_written and substeps is None:
         job = fluent(job, power=computing_power(cores=threads, on_gpu=on_gpu))
-    loaded, findings = load_checked_job(job_file, overrides, preview=preview)
     if not anyway:
         require_small(job, findings.particles, cores=threads, on_gpu=on_gpu)
     print_warnings(loaded.warnings)

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from pipeline.live.knobs import Value, knobs_of, with_substeps
-from pipeline.stages.inputs import estimated_cloth_nodes
+from pipeline.stages.inputs import count_cloth_nodes
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def cloth_frame_s(job: Job, *, power: float) -> float:
         return 0.0
     substeps = max(job.cloth[0].substeps or DEFAULT_SUBSTEPS, fewest_for_bodies(job))
     meets = any(cloth.self_collision for cloth in job.cloth) or len(job.cloth) > 1
-    return estimated_cloth_nodes(job) * substeps * NODE_SUBSTEP_S * (1.0 if meets else APART_SHARE) / power
+    return count_cloth_nodes(job) * substeps * NODE_SUBSTEP_S * (1.0 if meets else APART_SHARE) / power
 
 
 def fluent_frame_s(job: Job) -> float:

@@ -9,7 +9,7 @@ from pipeline.errors import PipelineError
 from pipeline.live.fluid_pace import fluid_frame_s, steps_a_frame
 from pipeline.live.knobs import with_substeps
 from pipeline.live.pace import cloth_frame_s, fewest_for_bodies
-from pipeline.stages.inputs import estimated_cloth_nodes
+from pipeline.stages.inputs import count_cloth_nodes
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def require_small(job: Job, particles: int, *, cores: int, on_gpu: bool) -> None
     Raises:
         PipelineError: says about how long a frame takes, and what would fit.
     """
-    nodes = estimated_cloth_nodes(job)
+    nodes = count_cloth_nodes(job)
     power = computing_power(cores=cores, on_gpu=on_gpu)
     cloth_s = cloth_frame_s(job, power=power)
     fluid_s = fluid_frame_s(job, particles, power=power)

@@ -15,7 +15,7 @@ from pipeline.job.models import Job
 from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import estimated_cloth_nodes, most_particles, tool_version
+from pipeline.stages.inputs import count_cloth_nodes, most_particles, tool_version
 from pipeline.task import ArtifactPath, Resources, Task, TaskId
 from sim.rigid.parameters import RigidBodyParameters
 
@@ -116,7 +116,7 @@ def read_framed(path: Path) -> NDArray[np.float64]:
 def _memory_bytes(job: Job) -> int:
     cells = max((prod(smoke.cell_counts(job.domain)) for smoke in job.smoke), default=0)
     particles = BYTES_PER_PARTICLE * most_particles(job)
-    return int(BASE_BYTES + particles + BYTES_PER_NODE * estimated_cloth_nodes(job) + BYTES_PER_CELL * cells)
+    return int(BASE_BYTES + particles + BYTES_PER_NODE * count_cloth_nodes(job) + BYTES_PER_CELL * cells)
 
 
 def _of_frame(job: Job, layout: JobLayout, frame: int) -> dict[str, Reach]:

@@ -8,7 +8,7 @@ from pipeline.layout import JobLayout
 from pipeline.parameter_set import ParameterSet
 from pipeline.stages.base import TaskContext
 from pipeline.stages.body_frames import tasks_of_bodies
-from pipeline.stages.inputs import estimated_nodes, tool_version
+from pipeline.stages.inputs import count_nodes, tool_version
 from pipeline.task import Resources, Task
 
 BASE_BYTES = 250_000_000
@@ -27,7 +27,7 @@ class ClothStage:
         """One task a cloth and frame."""
         parameters = ParameterSet.of(stage=self.name, version=self.version, tools={"numpy": tool_version("numpy")})
         cloths = [
-            (cloth.name, Resources(memory_bytes=BASE_BYTES + BYTES_PER_NODE * estimated_nodes(cloth)))
+            (cloth.name, Resources(memory_bytes=BASE_BYTES + BYTES_PER_NODE * count_nodes(cloth)))
             for cloth in job.cloth
         ]
         return tasks_of_bodies(self.name, job, layout, bodies=cloths, output=layout.cloth, parameters=parameters)

@@ -26,10 +26,6 @@ P = TypeVar("P", Placement, ClothParameters)
 MOST_IN_A_VOLUME = 1.5
 """Of a thin block or a narrow opening, whose last particles reach beyond it, as against what the volume tells."""
 
-BYTES_PER_VERTEX = 8
-"""What a vertex takes in a mesh file, with its share of the triangles, at the low end, which is OBJ of short numbers
-(float32 coordinates are 12); only files that compress or quantise take less."""
-
 
 @cache
 def tool_version(package: str) -> str:
@@ -117,24 +113,37 @@ def emitted_volume(emitter: EmitterParameters, *, until_s: float) -> float:
     return area * emitter.speed * max(0.0, end_s - emitter.start_s)
 
 
-def estimated_cloth_nodes(scene: SceneParameters) -> int:
-    """About how many nodes all cloths have, `estimated_nodes` of each.
+def count_cloth_nodes(scene: SceneParameters) -> int:
+    """How many nodes all cloths have, `count_nodes` of each.
 
     Raises:
-        MissingInputError: a mesh file cannot be read.
+        MissingInputError: a mesh file cannot be read, or holds no sheet.
     """
-    return sum(estimated_nodes(cloth) for cloth in scene.cloth)
+    return sum(count_nodes(cloth) for cloth in scene.cloth)
 
 
-def estimated_nodes(cloth: ClothParameters) -> int:
-    """Number of nodes of a rectangle; of a mesh an estimate on the high side by the file's size, without reading it.
+def count_nodes(cloth: ClothParameters) -> int:
+    """Number of nodes; a mesh is read for it, once, as files of a size hold ten times as many or as few.
 
     Raises:
-        MissingInputError: a mesh file cannot be read.
+        MissingInputError: a mesh file cannot be read, or holds no sheet.
     """
-    if isinstance(cloth.shape, RectangleSheet):
-        return prod(cloth.shape.node_counts)
-    return _status(cloth.shape.file, "mesh").st_size // BYTES_PER_VERTEX
+    shape = cloth.shape
+    if isinstance(shape, RectangleSheet):
+        return prod(shape.node_counts)
+    status = _status(shape.file, "mesh")
+    return _nodes_of_mesh(shape, status.st_size, status.st_mtime_ns)
+
+
+@cache
+def _nodes_of_mesh(shape: MeshShape, _size: int, _mtime_ns: int) -> int:
+    from sim.cloth.sheet import build_sheet
+    from sim.shapes import ShapeError
+
+    try:
+        return len(build_sheet(shape).vertices)
+    except ShapeError as error:
+        raise MissingInputError(f"{error}; the job needs it") from error
 
 
 def content_name(file: str, kind: str) -> str:

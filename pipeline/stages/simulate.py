@@ -26,7 +26,7 @@ from pipeline.receipts import read_receipt
 from pipeline.stages.base import TaskContext
 from pipeline.stages.inputs import (
     bodies_by_content,
-    estimated_cloth_nodes,
+    count_cloth_nodes,
     most_particles,
     tool_version,
 )
@@ -267,9 +267,9 @@ def _resources(job: Job) -> Resources:
 
 
 def _snapshot_bytes(job: Job) -> int:
-    """What a snapshot or a checkpoint takes: an upper bound for fluids and smoke, an estimate for cloths of meshes."""
+    """What a snapshot or a checkpoint takes: an upper bound."""
     cells = sum(prod(smoke.cell_counts(job.domain)) for smoke in job.smoke)
-    nodes = estimated_cloth_nodes(job)
+    nodes = count_cloth_nodes(job)
     return ceil(most_particles(job) * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL + nodes * BYTES_PER_CLOTH_NODE)
 
 

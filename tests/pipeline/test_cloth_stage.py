@@ -10,6 +10,7 @@ import trimesh
 from inline_tasks import run_task
 
 from pipeline.cache import read_frame, validate_frame, write_frame
+from pipeline.errors import MissingInputError
 from pipeline.executors.base import Finished
 from pipeline.job.checks import load_checked_job
 from pipeline.job.inputs import keep_inputs
@@ -19,7 +20,7 @@ from pipeline.layout import JobLayout
 from pipeline.plan import plan_job
 from pipeline.stages import STAGES
 from pipeline.stages.cloth import ClothStage
-from pipeline.stages.inputs import estimated_cloth_nodes, estimated_nodes
+from pipeline.stages.inputs import count_cloth_nodes, count_nodes
 from pipeline.stages.render_scene import render_spec
 from render.meshes import read_ply
 from sim.cloth.sheet import build_sheet
@@ -90,19 +91,39 @@ def test_a_mesh_of_a_cloth_is_kept_with_the_job_and_counts_by_its_content(tmp_pa
     first, text = keep_inputs(read_job(with_mesh(tmp_path, width=1.0)), layout)
     (copy,) = layout.inputs.iterdir()
     assert f'file = "inputs/{copy.name}"' in text
-    assert estimated_cloth_nodes(first) >= 4
+    assert count_cloth_nodes(first) == 4
     digest = digests(read_job(with_mesh(tmp_path, width=1.0)).job)["simulate"]
     assert digests(first)["simulate"] == digest
     assert digests(read_job(with_mesh(tmp_path, width=2.0)).job)["simulate"] != digest
 
 
-def test_nodes_of_a_mesh_are_not_estimated_too_low_by_a_file_of_short_numbers(tmp_path):
+def test_nodes_of_a_mesh_are_counted_however_large_its_file_is(tmp_path):
     octagon = ["3 0", "6 0", "9 3", "9 6", "6 9", "3 9", "0 6", "0 3"]
+    short = "".join(f"v {point} 0\n" for point in octagon) + "f 1 2 3 4 5 6 7 8\n"
+    corners = [f"{float(x):.12f} {float(y):.12f}" for x, y in map(str.split, octagon)]
+    long = "".join(f"v {corner} {0.0:.12f}\nvt {corner}\nvn 0 0 1\n" for corner in corners)
+    long += "f " + " ".join(f"{n}/{n}/{n}" for n in range(1, 9)) + "\n"
+    for name, text in (("short.obj", short), ("long.obj", long)):
+        (tmp_path / name).write_text(text)
+    trimesh.load_mesh(tmp_path / "short.obj").export(tmp_path / "soup.stl")  # three vertices a triangle
+    for name in ("short.obj", "long.obj", "soup.stl"):
+        shape = {"type": "mesh", "file": str(tmp_path / name)}
+        cloth = job(cloth=({"name": "sheet", "shape": shape},)).cloth[0]
+        assert count_nodes(cloth) == len(build_sheet(cloth.shape).vertices) == 8, name
+    path = tmp_path / "short.obj"
+    path.write_text(short.replace("f 1 2", "v 1 1 1\nf 1 2").replace(" 8\n", "\n"))
+    assert count_nodes(job(cloth=({"name": "sheet", "shape": {"type": "mesh", "file": str(path)}},)).cloth[0]) == 7
+
+
+@pytest.mark.parametrize("text", ["f 1 2 3\n", "v 0 0 0\n", "no mesh"])
+def test_a_mesh_without_a_sheet_is_no_matter_of_the_plan_but_told(tmp_path, text):
     path = tmp_path / "shawl.obj"
-    path.write_text("".join(f"v {point} 0\n" for point in octagon) + "f 1 2 3 4 5 6 7 8\n")
-    cloth = job(cloth=({"name": "sheet", "shape": {"type": "mesh", "file": str(path)}},)).cloth[0]
-    assert len(build_sheet(cloth.shape).vertices) == 8
-    assert estimated_nodes(cloth) >= 8
+    path.write_text(text)
+    with pytest.raises(MissingInputError, match=r"shape\.file: .*shawl\.obj.*; the job needs it"):
+        count_nodes(job(cloth=({"name": "sheet", "shape": {"type": "mesh", "file": str(path)}},)).cloth[0])
+    path.unlink()
+    with pytest.raises(MissingInputError, match="cannot read the mesh"):
+        count_nodes(job(cloth=({"name": "sheet", "shape": {"type": "mesh", "file": str(path)}},)).cloth[0])
 
 
 def test_memory_of_a_mesh_task_grows_with_the_nodes_of_its_cloth():
