@@ -3,8 +3,8 @@
 A worker leads its own session and dies with its supervisor, and nothing that it started outlives it:
 
 - `PR_SET_PDEATHSIG` (Linux) kills it when the thread that started it ends; everywhere else the end of the channel does.
-- A *guardian*, a shell in the worker's process group that waits for the worker's end, kills the rest of the group: an
-  external Blender for example, which knows nothing of us.
+- A *guardian*, a shell in the worker's process group that waits for the worker's end, removes the worker's temporary
+  folder and kills the rest of the group: an external Blender for example, which knows nothing of us.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ class Vitals:
 
 
 def main() -> None:
-    """Serve the channel whose descriptor and supervisor are in the arguments: `worker FD SUPERVISOR_PID`."""
-    descriptor, supervisor = int(sys.argv[1]), int(sys.argv[2])
+    """Serve the channel that is in the arguments, with the supervisor: `worker FD SUPERVISOR_PID TEMPORARY_FOLDER`."""
+    descriptor, supervisor, scratch = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+    _start_guardian(scratch)
     _die_with(supervisor)
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE)
     faulthandler.enable()
     faulthandler.register(STACK_DUMP_SIGNAL, all_threads=True)
-    _start_guardian()
     _Worker(WorkerChannel(socket.socket(fileno=descriptor))).serve()
 
 
@@ -104,7 +104,7 @@ class _Worker:
             traceback.print_exc()
             os._exit(1)
         if self._current is not None:  # the supervisor died in the middle of our task
-            os.killpg(os.getpgrp(), signal.SIGKILL)
+            _end_with_all()
         self._assignments.put(None)
 
     def _sort(self, message: Assignment | Stop) -> None:
@@ -139,18 +139,25 @@ def _die_with(supervisor: int) -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != supervisor:  # it died before we asked to be told
-        os.killpg(os.getpgrp(), signal.SIGKILL)
+        _end_with_all()
 
 
-def _start_guardian() -> None:
+def _end_with_all() -> None:
+    """End this process at once; the guardian ends the others of its group."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _start_guardian(scratch: str) -> None:
     """Start a shell that outlives this process by a moment, and takes the rest of the process group with it.
+
+    Before that it removes the temporary folder `scratch`, which the supervisor cannot if it was killed.
 
     It waits for the end of a pipe whose other end is open in this process alone, and never closed by it: only the
     kernel does that, however this process ends.
     """
     reading, _never_closed = os.pipe()
     subprocess.Popen(
-        ["/bin/sh", "-c", "trap '' TERM INT HUP; read _; kill -s KILL 0"],
+        ["/bin/sh", "-c", "trap '' TERM INT HUP; read _; rm -rf -- \"$1\"; kill -s KILL 0", "guardian", scratch],
         stdin=reading,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Protocol
 
 from render.system_libraries import install_line, missing_libraries, missing_packages
@@ -176,14 +178,18 @@ class ExecutableRenderer:
         require_supported_executable(blender)
         self._log_tail: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
         self._argv = build_argv(blender, spec_path.resolve(), threads=threads, gpu=gpu)
-        self._process = subprocess.Popen(
-            self._argv,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            encoding="utf-8",
-            errors="replace",
-        )
+        with contextlib.ExitStack() as on_failure:
+            environment = on_failure.enter_context(environment_of_child())
+            self._process = subprocess.Popen(
+                self._argv,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                encoding="utf-8",
+                errors="replace",
+                env=environment,
+            )
+            self._leftovers = on_failure.pop_all()
         try:
             self.pictures_by_uv: frozenset[str] = frozenset()
             words = ("RENDERER_READY", "RENDERER_FAILED", "PICTURES_BY_UV")
@@ -245,6 +251,7 @@ class ExecutableRenderer:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+        self._leftovers.close()
 
     def _read_answer(self, prefixes: tuple[str, ...]) -> str | None:
         """The next line of the protocol, or None when the child has closed its output; other lines are logged."""
@@ -315,6 +322,20 @@ def script_argv(blender: str | None, script: str, options: Sequence[str], *, own
     return [*start, "--python", path, "--", *options]
 
 
+@contextlib.contextmanager
+def environment_of_child() -> Iterator[dict[str, str]]:
+    """The environment for a Blender in a process of its own, whose temporary folder goes at the end of the block.
+
+    Blender makes a folder in it, and removes that only if it ends by itself.
+
+    Raises:
+        OSError: there is no place for it.
+    """
+    # What cannot be removed is no reason to lose a picture.
+    with TemporaryDirectory(prefix="blender-", ignore_cleanup_errors=True) as folder:
+        yield {**os.environ, "TMPDIR": folder}
+
+
 def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subprocess.CompletedProcess[str]:
     """Run a script to its end, whatever that is; its output is text.
 
@@ -328,9 +349,16 @@ def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subpro
         BlenderUnavailableError: it cannot be started.
     """
     try:
-        return subprocess.run(
-            argv, capture_output=True, encoding="utf-8", errors="replace", timeout=timeout_s, check=False
-        )
+        with environment_of_child() as environment:
+            return subprocess.run(
+                argv,
+                capture_output=True,
+                encoding="utf-8",
+                errors="replace",
+                timeout=timeout_s,
+                check=False,
+                env=environment,
+            )
     except OSError as error:
         raise BlenderUnavailableError(f"cannot start {argv[0]}: {error.strerror}") from error
     except subprocess.TimeoutExpired as error:

@@ -6,7 +6,14 @@ import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from render.blender import BlenderUnavailableError, FrameRenderError, require_bpy, run_script, script_argv
+from render.blender import (
+    BlenderUnavailableError,
+    FrameRenderError,
+    environment_of_child,
+    require_bpy,
+    run_script,
+    script_argv,
+)
 from render.system_libraries import install_line, missing_libraries
 
 EGL_PACKAGES = {"libEGL.so.1": "libegl1"}
@@ -73,9 +80,17 @@ def draw_frames(
     options = [str(spec_path), "--frames", wanted, "--output", output, "--threads", str(threads)]
     argv = script_argv(blender, "render_frames.py", options)
     done, last = 0, ""
-    with subprocess.Popen(
-        argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8", errors="replace"
-    ) as process:
+    with (
+        environment_of_child() as environment,
+        subprocess.Popen(
+            argv,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            encoding="utf-8",
+            errors="replace",
+            env=environment,
+        ) as process,
+    ):
         assert process.stdout is not None
         try:
             for line in process.stdout:

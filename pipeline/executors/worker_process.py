@@ -13,6 +13,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import psutil
 
@@ -61,7 +62,7 @@ class WorkerProcess:
         self.kill_at: float | None = None
         self.verdict: tuple[FailureKind, str] | None = None
         self._out_of_memory_kills = 0
-        self._process, self.channel = _spawn(first)
+        self._process, self.channel, self._scratch = _spawn(first)
         self.exit_descriptor = _open_exit_descriptor(self._process.pid)
 
     @property
@@ -159,7 +160,8 @@ class WorkerProcess:
         return out_of_memory_kills() > self._out_of_memory_kills
 
     def close(self) -> None:
-        """Give its descriptors back."""
+        """Give its descriptors back, and remove its temporary folder."""
+        self._scratch.cleanup()
         self.channel.close()
         if self.exit_descriptor is not None:
             os.close(self.exit_descriptor)
@@ -196,23 +198,29 @@ def _describe_process(pid: int) -> str:
         return f"  process {pid} has ended"
 
 
-def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel]:
-    """Start a fresh interpreter; what it prints before its first task goes into that task's log."""
+def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, TemporaryDirectory[str]]:
+    """Start a fresh interpreter; what it prints before its first task goes into that task's log.
+
+    Its temporary folder is its own: Blender and Taichi leave theirs behind where they are killed.
+    """
     first.log.parent.mkdir(parents=True, exist_ok=True)
     ours, theirs = socket.socketpair()
     with ExitStack() as on_failure, theirs, first.log.open("ab") as log:
         on_failure.enter_context(ours)
+        # What somebody still writes goes with the worker's guardian.
+        scratch = TemporaryDirectory(prefix="pipeline-worker-", ignore_cleanup_errors=True)
+        on_failure.callback(scratch.cleanup)
         process = subprocess.Popen(
-            python_argv("pipeline.worker", str(theirs.fileno()), str(os.getpid())),
+            python_argv("pipeline.worker", str(theirs.fileno()), str(os.getpid()), scratch.name),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             pass_fds=[theirs.fileno()],
             start_new_session=True,
-            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(first.threads))},
+            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(first.threads)), "TMPDIR": scratch.name},
         )
         on_failure.pop_all()
-    return process, Channel(ours)
+    return process, Channel(ours), scratch
 
 
 def _open_exit_descriptor(pid: int) -> int | None:

@@ -18,6 +18,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -272,6 +273,23 @@ def _start_child_and_hang(context: TaskContext) -> None:
     time.sleep(600)
 
 
+def _write_temporary_files(context: TaskContext) -> None:
+    """As Blender and Taichi do, which remove them only where they end by themselves."""
+    folder = Path(tempfile.mkdtemp(prefix="blender_"))
+    (folder / "picture").write_bytes(b"pixels")
+    (context.layout.root / "temporary").write_text(str(folder))
+
+
+def _write_temporary_files_and_die(context: TaskContext) -> None:
+    _write_temporary_files(context)
+    _kill(context)
+
+
+def _write_temporary_files_and_hang(context: TaskContext) -> None:
+    _write_temporary_files(context)
+    _start_child_and_hang(context)
+
+
 def _print_from_c(context: TaskContext) -> None:
     ctypes.CDLL(None).puts(b"a line from C")
 
@@ -293,6 +311,9 @@ FAULTS = {
     "wait for reader": _wait_for_reader,
     "leave child": _leave_child,
     "puts": _print_from_c,
+    "temporary files": _write_temporary_files,
+    "temporary files and kill": _write_temporary_files_and_die,
+    "temporary files and hang": _write_temporary_files_and_hang,
     "large child": _start_large_child,
     "lose Blender": _lose_blender,
 }

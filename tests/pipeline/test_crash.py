@@ -149,3 +149,25 @@ def test_a_signal_drains_the_runner_and_the_next_run_continues(tmp_path: Path, n
     write_faults(root, {})
     assert start_runner(root).wait(timeout=PATIENCE_S) == 0
     assert_like_undisturbed(root, tmp_path)
+
+
+def test_temporary_files_of_workers_go_although_the_runner_was_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, temporary = tmp_path / "job", tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    write_faults(root, {"film": ["temporary files and hang"]})
+    runner = start_runner(root)
+    until = time.monotonic() + PATIENCE_S
+    while not ((root / "child.pid").exists() and (root / "child.pid").read_text()):
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    assert Path((root / "temporary").read_text()).is_relative_to(temporary)
+    family = psutil.Process(runner.pid).children(recursive=True)
+    runner.kill()
+    runner.communicate()
+    assert_all_gone(family)
+    while list(temporary.iterdir()):
+        assert time.monotonic() < until, f"left: {list(temporary.iterdir())}"
+        time.sleep(0.01)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -153,6 +154,26 @@ class TestProcesses(ProcessesContract):
         os.kill(executor.worker_pids[0], signal.SIGKILL)
         assert failure(events_until_end(executor)).kind is FailureKind.WORKER_LOST
         assert_gone(child)
+
+    @pytest.mark.parametrize("fault", ["temporary files", "temporary files and kill", "temporary files and hang"])
+    def test_temporary_files_of_a_worker_go_with_it(
+        self, layout: JobLayout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
+    ) -> None:
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+        (tmp_path / "temporary").mkdir()
+        write_faults(layout.root, {"film": [fault]})
+        with ProcessExecutor() as executor:
+            for name in ("steps", *(f"double/{frame:06d}" for frame in range(6))):
+                run(executor, assign(layout, name))
+            executor.submit(assign(layout, "film"))
+            if fault.endswith("hang"):
+                wait_for_pid(executor, layout.root / "child.pid")
+                executor.cancel(TaskId("film"), grace_s=0.0)
+            events_until_end(executor)
+            folder = Path((layout.root / "temporary").read_text())
+            assert folder.is_relative_to(tmp_path / "temporary")
+            assert folder.exists() == (fault == "temporary files")  # whose worker is kept
+        assert list((tmp_path / "temporary").iterdir()) == []
 
     @pytest.mark.slow
     def test_a_stalled_task_is_ended_and_its_stack_is_in_the_log(self, layout: JobLayout) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import sys
+import tempfile
 import threading
 from pathlib import Path
 
@@ -41,6 +43,7 @@ from render.blender import (
     open_renderer,
     parse_blender_version,
     require_supported_executable,
+    run_script,
 )
 from render.parameters import CameraParameters, MaterialParameters, StageParameters
 from render.spec import MeshObject, MeshSequenceObject, RenderSpec
@@ -187,6 +190,30 @@ def test_a_killed_executable_is_reported_with_its_last_lines(ball_pictures, blen
     again = pickle.loads(pickle.dumps(death.value))
     assert (str(again), again.returncode) == (str(death.value), -9)
     renderer.close()
+
+
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_an_executable_leaves_no_temporary_files(ball_pictures, blender_stand_in, tmp_path, monkeypatch, is_killed):
+    folder, _ = ball_pictures
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    renderer = ExecutableRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
+    (own,) = temporary.iterdir()
+    assert list(own.glob("blender_*"))  # Blender's own folder lies there
+    if is_killed:
+        renderer._process.kill()
+        renderer._process.wait()
+    renderer.close()
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_script_leaves_no_temporary_files_however_it_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    code = "import bpy, os; print(bpy.app.tempdir, flush=True); os._exit(1)"
+    told = run_script([sys.executable, "-c", code], timeout_s=120.0, purpose="end").stdout
+    assert told.startswith(f"{tmp_path}/")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_executable_killed_between_frames_or_while_it_draws_costs_an_attempt(tmp_path, blender_stand_in):
