@@ -23,7 +23,7 @@ class JobLayout:
 
     @property
     def take_story(self) -> Path:
-        """What a take of `pipeline live` is, beside its job file; written at its end."""
+        """What a take of `pipeline live` is, beside its job file; how many frames it has is written at its end."""
         return self.root / "take.json"
 
     @property
