@@ -306,7 +306,7 @@ def test_memory_that_it_tells_is_what_it_allocates(monkeypatch, moving):
 
 def test_a_plain_box_takes_less_than_120_bytes_a_cell(monkeypatch):
     sizes = count_values(ti, monkeypatch)
-    solver = SmokeSolver(plume(cell_size=1 / 32), domain=DOMAIN, gravity=GRAVITY)
+    solver = SmokeSolver(plume(cell_size=1 / 48), domain=DOMAIN, gravity=GRAVITY)  # a GPU sums over 32,768 lanes
     cells = math.prod(solver.grid.cells)
     # Required of the solver. What it tells leaves out a few numbers, so what it allocates is looked at as well.
     assert solver.device_bytes < 120 * cells
