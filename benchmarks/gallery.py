@@ -1,4 +1,4 @@
-"""The gallery of the sample jobs: docs/gallery.md, with a picture and a contact sheet of each.
+"""The gallery of the sample jobs: docs/gallery.md, with a picture and a contact sheet of each, and one of them all.
 
     python -m benchmarks.gallery renders --machine "32 cores and two NVIDIA H200" [-o docs]
 
@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from PIL import Image
+from PIL import Image, ImageOps
 
 from pipeline.job.loading import load_job
 from pipeline.layout import JobLayout
@@ -40,6 +40,10 @@ HERO_WIDTH, SHEET_WIDTH = 1280, 1200
 """Of the pictures [pixels]."""
 PICTURES, COLUMNS = 12, 4
 """On a contact sheet."""
+OVERVIEW, OVERVIEW_WIDTH, OVERVIEW_GAP = "jobs.webp", 1288, 3
+"""One picture of each job but the one that the README begins with: its file, width and gaps [pixels]."""
+FIRST = "quickstart"
+OVERVIEW_BACKGROUND = (16, 16, 18)
 QUALITY = 85
 """Of WebP."""
 QUALITIES = ("draft", "preview", "final")
@@ -144,6 +148,22 @@ def write_pictures(shot: Shot, frames: list[Path], images: Path) -> None:
     contact_sheet(spread_in_time(frames, PICTURES), path, columns=COLUMNS, width=SHEET_WIDTH)
 
 
+def write_overview(names: Sequence[str], images: Path) -> None:
+    """The large pictures of jobs side by side, as they stand in the gallery."""
+    width = (OVERVIEW_WIDTH - (COLUMNS + 1) * OVERVIEW_GAP) // COLUMNS
+    height = round(width * 9 / 16)
+    rows = -(-len(names) // COLUMNS)
+    size = (OVERVIEW_WIDTH, rows * (height + OVERVIEW_GAP) + OVERVIEW_GAP)
+    overview = Image.new("RGB", size, OVERVIEW_BACKGROUND)
+    for number, name in enumerate(names):
+        row, column = divmod(number, COLUMNS)
+        with Image.open(images / f"gallery-{name}.webp") as picture:
+            small = ImageOps.fit(picture.convert("RGB"), (width, height), Image.Resampling.LANCZOS)
+        corner = (OVERVIEW_GAP + column * (width + OVERVIEW_GAP), OVERVIEW_GAP + row * (height + OVERVIEW_GAP))
+        overview.paste(small, corner)
+    overview.save(images / OVERVIEW, quality=QUALITY, method=6)
+
+
 def section(shot: Shot, machine: str) -> str:
     """A job in Markdown, which begins with its heading and ends with a line break."""
     times = "; ".join(f"{stage} {figure(shot.seconds[stage])} s" for stage in STAGES if stage in shot.seconds)
@@ -215,6 +235,8 @@ def main() -> int:
         sections[shot.name] = section(shot, arguments.machine)
         drawn.append(shot.name)
     write_page(page, sections)
+    pictured = [name for name in sorted(sections) if (images / f"gallery-{name}.webp").exists()]
+    write_overview([name for name in pictured if name != FIRST], images)
     kept = [name for name in sections if name not in drawn]
     missing = [path.stem for path in jobs if path.stem not in sections]
     for what, names in (("drawn", drawn), ("kept", kept), ("missing", missing)):

@@ -7,12 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import drawing_stages
+import numpy as np
 import pytest
 from drawn_films import draw_film
 from PIL import Image
 
 from benchmarks import gallery
-from benchmarks.gallery import main, section, sections_of, shot_of, spread_in_time
+from benchmarks.gallery import main, section, sections_of, shot_of, spread_in_time, write_overview
 from pipeline.layout import JobLayout
 from pipeline.manifest import Manifest
 from pipeline.receipts import read_receipt
@@ -115,10 +116,30 @@ def test_jobs_that_are_not_drawn_keep_their_sections_and_pictures(job_file, layo
     assert {name: sections[name] for name in kept} == kept
     assert sections["ball"] == told(job_file, layout)
     drawn = sorted(path.name for path in (docs / "images").iterdir())
-    assert drawn == ["gallery-ball-sheet.webp", "gallery-ball.webp"]
+    assert drawn == ["gallery-ball-sheet.webp", "gallery-ball.webp", "jobs.webp"]
     once = (docs / "gallery.md").read_text()
     main()
     assert (docs / "gallery.md").read_text() == once
+
+
+def test_the_overview_shows_the_large_pictures_in_rows_of_four_by_the_order_of_their_names(tmp_path):
+    colors = {
+        "apple": (200, 0, 0),
+        "ball": (0, 200, 0),
+        "kite": (0, 0, 200),
+        "lemon": (200, 200, 0),
+        "sea": (0, 200, 200),
+    }
+    for name, color in colors.items():
+        Image.new("RGB", (640, 360), color).save(tmp_path / f"gallery-{name}.webp")
+    write_overview(list(colors), tmp_path)
+    with Image.open(tmp_path / "jobs.webp") as picture:
+        overview = np.asarray(picture.convert("RGB"), np.int16)
+    height, width = overview.shape[:2]
+    assert width == 1288
+    middles = overview[height // 4 :: height // 2, width // 8 :: width // 4].reshape(8, 3)
+    np.testing.assert_allclose(middles[:5], list(colors.values()), atol=12)
+    assert middles[5:].max() < 30  # empty places are dark
 
 
 def test_a_sheet_has_all_frames_that_are_there_if_they_are_few_and_else_those_next_to_even_steps():
