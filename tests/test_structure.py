@@ -84,3 +84,12 @@ def test_scripts_are_executable_and_valid_shell():
         path = ROOT / script
         assert path.stat().st_mode & 0o111
         subprocess.run([shell, "-n", path], check=True)
+
+
+def test_no_two_test_files_have_one_name():
+    """Pytest imports them by it, and collects only the first; each alone would pass."""
+    seen: dict[str, Path] = {}
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        if path.name not in ("conftest.py", "__init__.py"):
+            assert path.name not in seen, f"{path} and {seen[path.name]}"
+            seen[path.name] = path
