@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -15,8 +16,12 @@ from sim.smoke.parameters import MOST_CELLS, SmokeParameters
 
 if TYPE_CHECKING:
     from pipeline.job.models import Job
+    from sim.domain import DomainParameters
     from sim.shapes import PlacedSolid
     from sim.smoke.thin_walls import ThinWalls
+
+LEAST_LAYERS = 4.0
+"""Cells along each edge of a smoke's box, at least."""
 
 MISSED = 0.05
 """Share of a body's surface that cells may miss without a word: what is beside sharp edges they always do."""
@@ -32,8 +37,7 @@ def check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, PlacedSolid], findi
     _check_moving_bodies(job, solids, findings)
     for smoke in job.smoke:
         box = smoke_box(smoke, job.domain)
-        # An empty box and too many cells are told where its size is looked at.
-        if np.any(box[1] <= box[0]) or np.prod((box[1] - box[0]) / smoke.cell_size) > MOST_CELLS:
+        if not has_grid(smoke, job.domain):
             continue
         for index, body in enumerate(job.rigid):
             solid = solids.get(("rigid", index))
@@ -42,6 +46,13 @@ def check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, PlacedSolid], findi
             if not _check_static_body(job, smoke, index, solid, findings):
                 refused.add(index)
     return refused
+
+
+def has_grid(smoke: SmokeParameters, domain: DomainParameters) -> bool:
+    """Whether a smoke's box has as many cells as it may; if not, that is told where its size is looked at."""
+    box = smoke_box(smoke, domain)
+    is_large_enough = np.all(box[1] - box[0] >= LEAST_LAYERS * smoke.cell_size)
+    return bool(is_large_enough and math.prod(smoke.cell_counts(domain)) <= MOST_CELLS)
 
 
 def _check_static_body(job: Job, smoke: SmokeParameters, index: int, solid: PlacedSolid, findings: Findings) -> bool:

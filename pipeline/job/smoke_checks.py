@@ -15,7 +15,7 @@ from pipeline.job.memory_budget import MemoryBudget
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings, format_path, suggestion
 from pipeline.job.shut_in_air_checks import check_shut_in_air
-from pipeline.job.smoke_body_checks import check_bodies_in_smoke
+from pipeline.job.smoke_body_checks import LEAST_LAYERS, check_bodies_in_smoke
 from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, SmokeSourceParameters
 
 if TYPE_CHECKING:
@@ -34,8 +34,6 @@ ALL = 1.0 - 1e-6
 COUNTED_CELLS = 1_000_000
 """A source whose box has more cells than this is taken to have some of its own; in a larger box of smoke nobody looks
 for air that bodies shut in."""
-LEAST_LAYERS = 4.0
-"""Cells along each edge of a smoke's box, at least."""
 HOTTEST = 10_000.0
 """Hotter gas is a plasma, which neither these equations nor a film's light describe [K]."""
 HOTTEST_FLAME = 4_000.0

@@ -62,7 +62,14 @@ def test_a_room_with_thin_walls_is_told_whether_it_moves_or_not(motion, tmp_path
 
 
 @pytest.mark.parametrize(
-    "changes", ["cell_size = 1e-6", "cell_size = 0.02\nmin = [0.0, 0.0, 0.495]\nmax = [0.1, 0.1, 0.3]"]
+    "changes",
+    [
+        "cell_size = 1e-6",
+        "cell_size = 0.02\nmin = [0.0, 0.0, 0.495]\nmax = [0.1, 0.1, 0.3]",
+        # A thousandth of a layer is a layer: 10¹² cells.
+        "cell_size = 1e-3\nmin = [-500, -500, 0.5]\nmax = [500, 500, 0.500001]",
+        "cell_size = 0.3",
+    ],
 )
 def test_of_a_grid_that_cannot_be_only_its_size_is_told(changes, tmp_path):
     """It is not built to look for bodies in it."""
