@@ -12,7 +12,8 @@ from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
-from sim.smoke.parameters import MOST_CELLS, SmokeParameters
+from pipeline.job.smoke_body_checks import LEAST_LAYERS, has_grid
+from sim.smoke.parameters import SmokeParameters
 
 if TYPE_CHECKING:
     from sim.shapes import PlacedSolid
@@ -49,29 +50,30 @@ def coarser_cell_sizes(job: Job, largest_factor: float) -> list[float]:
 
 def _carries(job: Job, index: int, cell_size: float, solids: Mapping[KeyPath, PlacedSolid]) -> bool:
     """Whether cells of this size [m] show a smoke's box, its sources and the bodies in it."""
-    from pipeline.job.smoke_checks import LEAST_LAYERS
-
     smoke = job.smoke[index].model_copy(update={"cell_size": cell_size})
     box = smoke_box(smoke, job.domain)
-    extent = box[1] - box[0]
-    if np.any(extent < LEAST_LAYERS * cell_size):
+    if np.any(box[1] - box[0] < LEAST_LAYERS * cell_size):
         return False
-    if np.prod(extent / cell_size) > MOST_CELLS:
-        return True  # refused for that
+    if not has_grid(smoke, job.domain):
+        return True  # refused for its many cells
     sources = {path[3]: solid for path, solid in solids.items() if path[:3] == ("smoke", index, "source")}
     bodies = {path[1]: solid for path, solid in solids.items() if path[0] == "rigid"}
     return all(
-        _has_cells(solid, box, cell_size, moves=smoke.source[int(number)].moves) for number, solid in sources.items()
+        _has_cells(job, solid, box, cell_size, solids, moves=smoke.source[int(number)].moves)
+        for number, solid in sources.items()
     ) and not any(_is_lost(job, int(number), solid, smoke) for number, solid in bodies.items())
 
 
-def _has_cells(source: PlacedSolid, box: Box, cell_size: float, *, moves: bool) -> bool:
-    from pipeline.job.smoke_checks import centres_inside
+def _has_cells(
+    job: Job, source: PlacedSolid, box: Box, cell_size: float, solids: Mapping[KeyPath, PlacedSolid], *, moves: bool
+) -> bool:
+    """Whether a source is as thick as a cell if it moves, or else has the centre of one in free air."""
+    from pipeline.job.smoke_checks import are_free, centres_inside
 
     if moves:
         return bool(np.ptp(source.bounds, axis=0).min() >= cell_size)
     centres = centres_inside(source, box, cell_size)
-    return centres is None or len(centres) > 0
+    return centres is None or bool(are_free(job, centres, source, solids).any())
 
 
 def _is_lost(job: Job, number: int, solid: PlacedSolid, smoke: SmokeParameters) -> bool:

@@ -276,13 +276,20 @@ def _check_source(job: Job, path: KeyPath, solids: Mapping[KeyPath, Solid], box:
             "enlarge it or use a smaller cell_size",
         )
         return
-    is_free = np.ones(len(centres), bool)
-    for other, body in solids.items():
-        if other[0] == "rigid" and job.rigid[int(other[1])].kind == "static":
-            near = touch(body.bounds, solid.bounds, margin=0.0)
-            is_free &= body.signed_distance(centres) >= 0.0 if near else True
-    if not is_free.any():
+    if not are_free(job, centres, solid, solids).any():
         findings.error(path, "lies wholly inside solid bodies, so it emits nothing; move it")
+
+
+def are_free(
+    job: Job, centres: NDArray[np.float64], source: Solid, solids: Mapping[KeyPath, Solid]
+) -> NDArray[np.bool_]:
+    """Which centres of cells [m], (n, 3), in a source lie outside every static body, (n,)."""
+    is_free = np.ones(len(centres), bool)
+    for path, body in solids.items():
+        if path[0] == "rigid" and job.rigid[int(path[1])].kind == "static":
+            near = touch(body.bounds, source.bounds, margin=0.0)
+            is_free &= body.signed_distance(centres) >= 0.0 if near else True
+    return is_free
 
 
 def centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float64] | None:

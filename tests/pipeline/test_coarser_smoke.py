@@ -30,6 +30,17 @@ position = [0.0, 0.3, 0.505]
 MOVES = 'kind = "kinematic"\nvelocity = [0.1, 0.0, 0.0]\n'
 
 
+BURNER = """
+[[rigid]]
+name = "burner"
+shape = { type = "box", size = [0.4, 0.4, 0.1] }
+position = [0.0, 0.0, 0.05]
+"""
+# From 0.089 to 0.109 m, above 0.1 m in free air.
+ON_BURNER = PLUME.replace("height = 0.1", "height = 0.02").replace("[0.0, 0.0, 0.2]", "[0.0, 0.0, 0.099]")
+FINE = ("cell_size = 0.02", "cell_size = 0.01")
+
+
 def preview(text, folder):
     """Cell size of a job's preview [m], which has no errors."""
     path = folder / "job.toml"
@@ -48,6 +59,8 @@ def preview(text, folder):
         (PLUME + PADDLE.replace("0.505", "0.5"), 0.04),  # a centre of such cells lies in it
         (PLUME + PADDLE.replace("0.505", "0.52"), 0.035),
         (PLUME + PADDLE + MOVES, 0.03),
+        # Centres are at 0.105 m as written, at 0.09, 0.09625 and 0.0975 m in larger cells, and at 0.10625 m in these.
+        (ON_BURNER.replace(*FINE) + BURNER, 0.0125),
         # It never comes into the smoke's box.
         (PLUME.replace("[[smoke.source]]", "max = [0.5, 0.5, 0.28]\n[[smoke.source]]") + PADDLE + MOVES, 0.04),
         # Four cells high, at least.
