@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sim.domain import DomainParameters, Face
-from sim.smoke.parameters import SmokeParameters
+from sim.smoke.parameters import WHOLE, SmokeParameters
 
 Index3 = tuple[int, int, int]
 
@@ -108,11 +108,16 @@ class SmokeGrid:
         return cls(lower, parameters.cell_size, (nx, ny, nz), is_open, np.zeros((nx, ny, nz), bool), inflow)
 
     def misses(self, region: SolidRegion) -> bool:
-        """Whether a region that reaches into the box is thinner than a cell, and holds no centre of one."""
+        """Whether a region that reaches into the box is thinner than a cell, and holds no centre of one.
+
+        On a closed side one counts from the first layer of centres on: below that the side is there in its place.
+        """
         lower, upper = region.bounds
-        touches = np.all((lower < self.upper) & (upper > self.origin))
+        from_side = [[WHOLE if self.lets_in(axis, side) else 0.5 for axis in range(3)] for side in (0, 1)]
+        low, high = self.cell_size * np.asarray(from_side)
+        reaches_in = np.all((lower < np.asarray(self.upper) - high) & (upper > np.asarray(self.origin) + low))
         is_thin = np.min(upper - lower) < self.cell_size
-        return bool(touches and is_thin and not self._near(region, self.cells, CENTRE)[1].any())
+        return bool(reaches_in and is_thin and not self._near(region, self.cells, CENTRE)[1].any())
 
     @property
     def padded(self) -> Index3:

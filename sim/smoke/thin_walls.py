@@ -9,7 +9,6 @@ the rim of a cone, a body is thin as well; cells only blunt it, and what they mi
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from sim.domain import DomainParameters
 from sim.shapes import Solid
 from sim.shapes.sampling import stratified_points
-from sim.smoke.parameters import SmokeParameters
+from sim.smoke.parameters import WHOLE, SmokeParameters
 
 Points = NDArray[np.float64]
 
@@ -59,7 +58,9 @@ class ThinWalls:
 
 def thin_walls(solid: Solid, smoke: SmokeParameters, domain: DomainParameters) -> ThinWalls:
     """What a smoke's cells miss of a body that stands still in its box; what lies on a closed side counts as seen."""
-    points, inwards = _probes(solid, smoke.corners(domain))
+    low, high = (np.asarray(corner) for corner in smoke.corners(domain))
+    # A face that lies in a side of the box, but for round-off, is not in it.
+    points, inwards = _probes(solid, (low + WHOLE * smoke.cell_size, high - WHOLE * smoke.cell_size))
     depth = _thickness(solid, points, inwards, smoke.cell_size)
     thin = np.flatnonzero(np.isfinite(depth))
     missed = thin[~_has_solid_cell(solid, points[thin], inwards[thin], smoke, domain)]
@@ -84,13 +85,13 @@ def _walls(depth: NDArray[np.float64], missed: NDArray[np.int64], looked_at: int
     return ThinWalls(len(missed) / looked_at, float(np.median(depth[missed])))
 
 
-def _probes(solid: Solid, box: tuple[Iterable[float], Iterable[float]] | None) -> tuple[Points, Points]:
+def _probes(solid: Solid, box: tuple[Points, Points] | None) -> tuple[Points, Points]:
     """Points of the surface within a box [m], evenly by area, and unit vectors into the body, (n, 3) each."""
     mesh = solid.surface_mesh()
     points, face = stratified_points(mesh, POINTS_DRAWN)
     kept = np.arange(len(points))
     if box is not None:
-        low, high = (np.asarray(tuple(corner)) for corner in box)
+        low, high = box
         kept = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
     kept = kept[:: max(1, len(kept) // PROBES)]
     inwards = -mesh.area_vectors[face[kept]]

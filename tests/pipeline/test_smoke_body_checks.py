@@ -34,6 +34,24 @@ def test_a_flat_static_plate_between_the_cells_is_refused_with_its_name(tmp_path
     ]
 
 
+@pytest.mark.parametrize(
+    ("changes", "body"),
+    [
+        # A pane that begins where the box ends, but for 6e-17 m.
+        (
+            "cell_size = 0.02\nmin = [-0.5, -0.5, 0.0]\nmax = [0.5, 0.5, 1.0]",
+            PLATE.replace("0.9, 0.9, 0.01", "0.005, 1, 1").replace("[0.0, 0.0, 0.5]", "[0.5025, 0.0, 0.5]"),
+        ),
+        # 8 mm of it are above a closed floor, below the first centres.
+        ("cell_size = 0.02", PLATE.replace("0.01]", "0.016]").replace("[0.0, 0.0, 0.5]", "[0.0, 0.0, 0.0]")),
+    ],
+)
+def test_a_thin_plate_in_a_side_of_the_box_passes_without_a_word(changes, body, tmp_path):
+    wide = PLUME.replace("[-0.5, -0.5, 0.0]", "[-0.6, -0.6, 0.0]").replace("[0.5, 0.5, 1.0]", "[0.6, 0.6, 1.0]")
+    found = checked(wide.replace("cell_size = 0.02", changes) + body, tmp_path / "side.toml")
+    assert [*found.errors, *found.warnings] == []
+
+
 def test_wind_past_such_a_plate_is_one_error(tmp_path):
     windy = PLUME.replace("cell_size = 0.02", "cell_size = 0.02\nwind = [1.0, 0.0, 0.0]")
     assert len(checked(windy + PLATE, tmp_path / "flat.toml").errors) == 1
