@@ -25,7 +25,7 @@ PROBES = 1000
 """Points of the surface within the box below which a body's thickness is looked at: shares are right to 0.03."""
 
 POINTS_DRAWN = 64 * PROBES
-"""Of the whole surface: of one of which less than a 64th lies in the box fewer are looked at."""
+"""Of the whole surface if the box cuts some off: of one of which less than a 64th lies in it fewer are looked at."""
 
 DEPTHS = 8
 """Along the ray inwards, up to the edge of a cell, where it is seen whether it is still in the body."""
@@ -88,11 +88,10 @@ def _walls(depth: NDArray[np.float64], missed: NDArray[np.int64], looked_at: int
 def _probes(solid: Solid, box: tuple[Points, Points] | None) -> tuple[Points, Points]:
     """Points of the surface within a box [m], evenly by area, and unit vectors into the body, (n, 3) each."""
     mesh = solid.surface_mesh()
-    points, face = stratified_points(mesh, POINTS_DRAWN)
-    kept = np.arange(len(points))
-    if box is not None:
-        low, high = box
-        kept = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
+    low, high = box if box is not None else (np.full(3, -np.inf), np.full(3, np.inf))
+    is_cut = np.any((solid.bounds[0] <= low) | (solid.bounds[1] >= high))
+    points, face = stratified_points(mesh, POINTS_DRAWN if is_cut else PROBES)
+    kept = np.flatnonzero(np.all((points > low) & (points < high), axis=1))
     kept = kept[:: max(1, len(kept) // PROBES)]
     inwards = -mesh.area_vectors[face[kept]]
     return points[kept], inwards / np.linalg.norm(inwards, axis=1, keepdims=True)
@@ -142,12 +141,23 @@ def _has_solid_cell(
 
 
 def _column(solid: Solid, points: Points, inwards: Points, low: Points, cell_size: float) -> NDArray[np.bool_]:
-    """Whether a cell of the column at each point is solid, (n,); `low` is a corner of cells [m], (3,)."""
+    """Whether the column at each point crosses a layer of centres in the body, (n,).
+
+    The column stands on the point, not on the centre of its cell: the rim of a plate, of which cells cut off up to half
+    their width, is not missed.
+
+    Args:
+        solid: the body.
+        points: of its surface [m], (n, 3).
+        inwards: unit vectors into it there, (n, 3).
+        low: a corner of cells [m], (3,).
+        cell_size: their edge [m].
+    """
     found = np.zeros(len(points), bool)
     axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))
-    cell = np.floor((points - low) / cell_size)
+    layer = np.floor((points - low) / cell_size)[every, axis]
     for offset in COLUMN:
-        place = cell.copy()
-        place[every, axis] += offset
-        found |= solid.signed_distance(low + (place + 0.5) * cell_size) < 0.0
+        place = points.copy()
+        place[every, axis] = low[axis] + (layer + offset + 0.5) * cell_size
+        found |= solid.signed_distance(place) < 0.0
     return found

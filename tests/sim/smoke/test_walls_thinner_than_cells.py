@@ -53,6 +53,12 @@ def test_a_thin_plate_along_a_layer_of_cells_is_seen_whole():
     assert thin_walls(solid, AIR, DOMAIN).share == 0.0
 
 
+def test_the_rim_that_cells_cut_off_a_small_plate_is_no_hole():
+    """From -0.15 to 0.15 m, of which cells of 0.04 m show what is between -0.14 and 0.14 m."""
+    small = placed({"type": "box", "size": (0.3, 0.3, 0.03)})
+    assert thin_walls(small, AIR.model_copy(update={"cell_size": 0.04}), DOMAIN).share == 0.0
+
+
 def test_a_slab_on_a_closed_side_lets_nothing_through():
     slab = plate(0.016, position=(0.0, 0.0, 0.0))  # 8 mm of it in the box, below the first centres
     assert thin_walls(slab, AIR, DOMAIN).share == 0.0
