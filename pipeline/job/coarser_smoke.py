@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.job.boxes import Box, smoke_box
+from pipeline.job.boxes import Box, smoke_box, touch
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
-from pipeline.job.smoke_body_checks import LEAST_LAYERS, has_grid
+from pipeline.job.smoke_body_checks import LEAST_LAYERS, has_grid, leaks
 from sim.smoke.parameters import SmokeParameters
 
 if TYPE_CHECKING:
     from sim.shapes import PlacedSolid
+    from sim.smoke.thin_walls import ThinWalls
 
 STEPS = 4
 """Factors that are tried between 1 and the largest."""
@@ -25,8 +26,8 @@ STEPS = 4
 def coarser_cell_sizes(job: Job, largest_factor: float) -> list[float]:
     """Cell sizes [m] of the smokes, grown by this factor at most, that lose no source and no body.
 
-    Where the job's own cells do so they are kept: what is told of them is then told of what was written. Bodies that
-    close a gap that wind needs, and walls that are thin but there, do not count.
+    Where the job's own cells do so they are kept: what is told of them is then told of what was written. So it is of
+    walls that these are too large for already. Bodies that close a gap that wind needs do not count.
 
     Args:
         job: with absolute mesh paths; its shapes are built as far as they can be.
@@ -61,7 +62,7 @@ def _carries(job: Job, index: int, cell_size: float, solids: Mapping[KeyPath, Pl
     return all(
         _has_cells(job, solid, box, cell_size, solids, moves=smoke.source[int(number)].moves)
         for number, solid in sources.items()
-    ) and not any(_is_lost(job, int(number), solid, smoke) for number, solid in bodies.items())
+    ) and not any(_is_lost(job, int(number), solid, job.smoke[index], smoke) for number, solid in bodies.items())
 
 
 def _has_cells(
@@ -76,22 +77,38 @@ def _has_cells(
     return centres is None or bool(are_free(job, centres, source, solids).any())
 
 
-def _is_lost(job: Job, number: int, solid: PlacedSolid, smoke: SmokeParameters) -> bool:
-    """Whether a body falls between the cells of a smoke, now or, if it moves, in some place that it can come to."""
-    from sim.coupling.smoke_reach import too_thin_bodies
+def _is_lost(job: Job, number: int, solid: PlacedSolid, as_written: SmokeParameters, smoke: SmokeParameters) -> bool:
+    """Whether a body falls between the cells of a smoke, now or, if it moves, in some place that it can come to.
+
+    So does one with walls that air passes through, unless it passes through them in the job's own cells.
+    """
+    from sim.coupling.smoke_reach import can_come
     from sim.rigid.geometry import BodyGeometry
     from sim.shapes import PlacedSolid, ShapeError
     from sim.smoke.grid import SmokeGrid
+    from sim.smoke.thin_walls import thin_walls, thin_walls_on_the_way
 
     body = job.rigid[number]
     if body.kind == "static":
         is_thin = np.ptp(solid.bounds, axis=0).min() < smoke.cell_size
-        return bool(is_thin and SmokeGrid.of_box(smoke, job.domain).misses(solid))
+        if is_thin and SmokeGrid.of_box(smoke, job.domain).misses(solid):
+            return True
+        return touch(solid.bounds, smoke_box(smoke, job.domain), margin=0.0) and _leaks_more(
+            as_written, smoke, lambda each: thin_walls(solid, each, job.domain)
+        )
     at_rest = PlacedSolid(solid.shape, solid.scale, np.eye(3), np.zeros(3))
-    if np.ptp(at_rest.bounds, axis=0).min() >= smoke.cell_size:
+    is_thin = np.ptp(at_rest.bounds, axis=0).min() < smoke.cell_size
+    if not (is_thin or _leaks_more(as_written, smoke, lambda each: thin_walls_on_the_way(solid, each))):
         return False
     try:
         geometry = BodyGeometry(body)
     except ShapeError:
         return False  # refused for that
-    return bool(too_thin_bodies(smoke, [body], [geometry], job.domain))
+    return can_come(body, geometry, smoke, job.domain)
+
+
+def _leaks_more(
+    as_written: SmokeParameters, smoke: SmokeParameters, walls_in: Callable[[SmokeParameters], ThinWalls]
+) -> bool:
+    """Whether air passes through a body in the cells of a smoke, but not in those as written."""
+    return leaks(walls_in(smoke)) and not leaks(walls_in(as_written))

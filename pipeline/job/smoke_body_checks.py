@@ -55,6 +55,11 @@ def has_grid(smoke: SmokeParameters, domain: DomainParameters) -> bool:
     return bool(is_large_enough and math.prod(smoke.cell_counts(domain)) <= MOST_CELLS)
 
 
+def leaks(walls: ThinWalls) -> bool:
+    """Whether cells miss more of a body than what is beside its edges: air passes through it."""
+    return walls.share > MISSED
+
+
 def _check_static_body(job: Job, smoke: SmokeParameters, index: int, solid: PlacedSolid, findings: Findings) -> bool:
     """Note a static body that has no cell, or too few; whether the smoke can be simulated with it."""
     from sim.smoke.grid import SmokeGrid
@@ -69,7 +74,7 @@ def _check_static_body(job: Job, smoke: SmokeParameters, index: int, solid: Plac
         )
         return False
     walls = thin_walls(solid, smoke, job.domain)
-    if walls.share > MISSED:
+    if leaks(walls):
         findings.warn(("rigid", index), _of_thin_walls(walls, smoke))
     return True
 
@@ -100,7 +105,7 @@ def _check_moving_bodies(job: Job, solids: Mapping[KeyPath, PlacedSolid], findin
             if number in refused or not can_come(body, geometry, smoke, job.domain):
                 continue
             walls = thin_walls_on_the_way(solids["rigid", moving[number]], smoke)
-            if walls.share > MISSED:
+            if leaks(walls):
                 findings.warn(("rigid", moving[number]), _of_thin_walls(walls, smoke))
 
 

@@ -36,6 +36,8 @@ name = "burner"
 shape = { type = "box", size = [0.4, 0.4, 0.1] }
 position = [0.0, 0.0, 0.05]
 """
+# 0.025 m thick and turned: a column along z crosses 0.0272 m of it.
+LEANING = PADDLE.replace("0.3, 0.3, 0.03]", "0.6, 0.6, 0.025]") + "rotation_deg = [20.0, 12.0, 0.0]\n"
 # From 0.089 to 0.109 m, above 0.1 m in free air.
 ON_BURNER = PLUME.replace("height = 0.1", "height = 0.02").replace("[0.0, 0.0, 0.2]", "[0.0, 0.0, 0.099]")
 FINE = ("cell_size = 0.02", "cell_size = 0.01")
@@ -59,6 +61,10 @@ def preview(text, folder):
         (PLUME + PADDLE.replace("0.505", "0.5"), 0.04),  # a centre of such cells lies in it
         (PLUME + PADDLE.replace("0.505", "0.52"), 0.035),
         (PLUME + PADDLE + MOVES, 0.03),
+        (PLUME + LEANING, 0.025),
+        (PLUME + LEANING + MOVES, 0.025),
+        # Air passes through it in the cells as written.
+        (PLUME + LEANING.replace("0.025]", "0.015]"), 0.04),
         # Centres are at 0.105 m as written, at 0.09, 0.09625 and 0.0975 m in larger cells, and at 0.10625 m in these.
         (ON_BURNER.replace(*FINE) + BURNER, 0.0125),
         # It never comes into the smoke's box.
