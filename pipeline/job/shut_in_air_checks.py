@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.job.boxes import Box, overlap, smoke_box
 from pipeline.job.positions import KeyPath
@@ -36,8 +37,8 @@ def check_shut_in_air(
     for index, body in enumerate(job.rigid):
         solid = solids.get(("rigid", index))
         if body.kind == "kinematic" and solid is not None:
-            shares = list(_shares_inside(job, body, solid, box))
-            more, less = (solid.volume / room * abs(end - shares[0]) for end in (max(shares), min(shares)))
+            shares = _shares_inside(job, body, solid, box)
+            more, less = (solid.volume / room * abs(float(end - shares[0])) for end in (shares.max(), shares.min()))
             if max(more, less) > SQUEEZED:
                 way, flow = ("comes into", "out") if more >= less else ("leaves", "in")
                 findings.warn(
@@ -65,15 +66,43 @@ def _as_much_must_flow(where: str) -> str:
     )
 
 
-def _shares_inside(job: Job, body: RigidBodyParameters, solid: PlacedSolid, box: Box) -> Iterator[float]:
-    """Share of a kinematic body's bounds that is in a box at moments of the film, from its start on [-]."""
+def _shares_inside(job: Job, body: RigidBodyParameters, solid: PlacedSolid, box: Box) -> NDArray[np.float64]:
+    """Share of a kinematic body's bounds that is in a box at moments of the film, from its start on [-], (n,)."""
     from sim.rigid import rotation
     from sim.rigid.keyframes import path_of
     from sim.shapes import PlacedSolid
 
     path, film_s = path_of(body), job.frame_count / job.fps
     turns = [key.time_s for key in body.keyframe if key.time_s < film_s]
-    for time in sorted({*np.linspace(0.0, film_s, POSES).tolist(), *turns}):
-        pose = path.at(time)
-        placed = PlacedSolid(solid.shape, solid.scale, rotation.matrices(pose.orientation), pose.position)
-        yield overlap(placed.bounds, box)
+    poses = [path.at(time) for time in sorted({*np.linspace(0.0, film_s, POSES).tolist(), *turns})]
+    places = np.array([pose.position for pose in poses])
+    rotations = rotation.matrices(np.array([pose.orientation for pose in poses]))
+    at_rest = PlacedSolid(solid.shape, solid.scale, np.eye(3), np.zeros(3))
+    reach = np.linalg.norm(np.abs(at_rest.bounds).max(axis=0))
+    is_inside = np.all((box[0] <= places - reach) & (places + reach <= box[1]), axis=1)
+    is_outside = np.any((places + reach <= box[0]) | (box[1] <= places - reach), axis=1)
+    shares = is_inside.astype(np.float64)
+    near = np.flatnonzero(~(is_inside | is_outside))
+    for number, bounds in zip(near.tolist(), _bounds_of_turned(at_rest, rotations[near]), strict=True):
+        shares[number] = overlap(places[number] + bounds, box)
+    return shares
+
+
+def _bounds_of_turned(at_rest: PlacedSolid, rotations: NDArray[np.float64]) -> Iterator[Box]:
+    """Bounds of a solid about its origin, by rotation matrices (n, 3, 3); of a mesh by its hull, mostly smaller."""
+    from scipy.spatial import ConvexHull
+
+    from sim.shapes import PlacedSolid
+    from sim.shapes.mesh_solid import MeshSolid
+
+    shape, scale = at_rest.shape, at_rest.scale
+    if len(rotations) and np.all(rotations == rotations[0]):
+        yield from [PlacedSolid(shape, scale, rotations[0], np.zeros(3)).bounds] * len(rotations)
+    elif len(rotations) and isinstance(shape, MeshSolid):
+        corners = scale * shape.mesh.vertices[ConvexHull(shape.mesh.vertices).vertices]
+        for matrix in rotations:
+            turned = corners @ matrix.T
+            yield np.stack([turned.min(axis=0), turned.max(axis=0)])
+    else:
+        for matrix in rotations:
+            yield PlacedSolid(shape, scale, matrix, np.zeros(3)).bounds

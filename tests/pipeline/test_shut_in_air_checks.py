@@ -1,7 +1,10 @@
 """Air that cannot get out of its box, told with their lines."""
 
 import pytest
+import trimesh
 from checked_jobs import checked
+
+from sim.shapes.mesh_solid import MeshSolid
 
 PLUME = """
 name = "air"
@@ -81,3 +84,23 @@ def test_what_presses_on_air_that_is_shut_in_is_told_with_this_line(text, expect
 def test_air_that_keeps_its_room_passes_without_a_word(text, tmp_path):
     warnings = checked(text, tmp_path / "closed.toml").warnings
     assert not [each for each in warnings if "no side of that is open" in each]
+
+
+@pytest.mark.parametrize(
+    ("motion", "share"),
+    [
+        ("position = [0.0, 0.0, 0.5]\nvelocity = [0.1, 0.0, 0.0]\n", None),
+        ("position = [-0.8, 0.0, 0.5]\nvelocity = [0.6, 0.0, 0.0]\n", "6.4 %"),
+        ("position = [-0.8, 0.0, 0.5]\nvelocity = [0.6, 0.0, 0.0]\nangular_velocity = [1.6, 0.0, 0.0]\n", "6.4 %"),
+    ],
+)
+def test_all_of_a_mesh_is_not_looked_at_in_each_moment(motion, share, tmp_path, monkeypatch):
+    trimesh.creation.box((0.4, 0.4, 0.4)).export(tmp_path / "block.obj")
+    looks, support = [], MeshSolid.support
+    monkeypatch.setattr(MeshSolid, "support", lambda solid, axes: looks.append(axes) or support(solid, axes))
+    block = PISTON.replace('{ type = "box", size = [0.5, 0.5, 0.5] }', '{ type = "mesh", file = "block.obj" }')
+    path = tmp_path / "closed.toml"
+    told = [each for each in checked(CLOSED + block + motion, path).warnings if "comes into the box" in each]
+    assert len(told) == (share is not None)
+    assert all(f"about {share}" in each for each in told)
+    assert len(looks) < 50
