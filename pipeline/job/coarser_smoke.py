@@ -12,7 +12,7 @@ from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.models import Job
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
-from pipeline.job.smoke_body_checks import LEAST_LAYERS, has_grid, leaks
+from pipeline.job.smoke_body_checks import LEAST_LAYERS, bodies_beside, has_grid, leaks
 from sim.smoke.parameters import SmokeParameters
 
 if TYPE_CHECKING:
@@ -58,11 +58,11 @@ def _carries(job: Job, index: int, cell_size: float, solids: Mapping[KeyPath, Pl
     if not has_grid(smoke, job.domain):
         return True  # refused for its many cells
     sources = {path[3]: solid for path, solid in solids.items() if path[:3] == ("smoke", index, "source")}
-    bodies = {path[1]: solid for path, solid in solids.items() if path[0] == "rigid"}
+    bodies = [int(path[1]) for path in solids if path[0] == "rigid"]
     return all(
         _has_cells(job, solid, box, cell_size, solids, moves=smoke.source[int(number)].moves)
         for number, solid in sources.items()
-    ) and not any(_is_lost(job, int(number), solid, job.smoke[index], smoke) for number, solid in bodies.items())
+    ) and not any(_is_lost(job, number, solids, job.smoke[index], smoke) for number in bodies)
 
 
 def _has_cells(
@@ -77,7 +77,13 @@ def _has_cells(
     return centres is None or bool(are_free(job, centres, source, solids).any())
 
 
-def _is_lost(job: Job, number: int, solid: PlacedSolid, as_written: SmokeParameters, smoke: SmokeParameters) -> bool:
+def _is_lost(
+    job: Job,
+    number: int,
+    solids: Mapping[KeyPath, PlacedSolid],
+    as_written: SmokeParameters,
+    smoke: SmokeParameters,
+) -> bool:
     """Whether a body falls between the cells of a smoke, now or, if it moves, in some place that it can come to.
 
     So does one with walls that air passes through, unless it passes through them in the job's own cells.
@@ -88,13 +94,15 @@ def _is_lost(job: Job, number: int, solid: PlacedSolid, as_written: SmokeParamet
     from sim.smoke.grid import SmokeGrid
     from sim.smoke.thin_walls import thin_walls, thin_walls_on_the_way
 
-    body = job.rigid[number]
+    body, solid = job.rigid[number], solids["rigid", number]
     if body.kind == "static":
         is_thin = np.ptp(solid.bounds, axis=0).min() < smoke.cell_size
         if is_thin and SmokeGrid.of_box(smoke, job.domain).misses(solid):
             return True
         return touch(solid.bounds, smoke_box(smoke, job.domain), margin=0.0) and _leaks_more(
-            as_written, smoke, lambda each: thin_walls(solid, each, job.domain)
+            as_written,
+            smoke,
+            lambda each: thin_walls(solid, each, job.domain, bodies_beside(job, each, number, solids)),
         )
     at_rest = PlacedSolid(solid.shape, solid.scale, np.eye(3), np.zeros(3))
     is_thin = np.ptp(at_rest.bounds, axis=0).min() < smoke.cell_size

@@ -81,7 +81,7 @@ def _shares_inside(job: Job, body: RigidBodyParameters, solid: PlacedSolid, box:
     reach = np.linalg.norm(np.abs(at_rest.bounds).max(axis=0))
     is_inside = np.all((box[0] <= places - reach) & (places + reach <= box[1]), axis=1)
     is_outside = np.any((places + reach <= box[0]) | (box[1] <= places - reach), axis=1)
-    shares = is_inside.astype(np.float64)
+    shares: NDArray[np.float64] = is_inside.astype(np.float64)
     near = np.flatnonzero(~(is_inside | is_outside))
     for number, bounds in zip(near.tolist(), _bounds_of_turned(at_rest, rotations[near]), strict=True):
         shares[number] = overlap(places[number] + bounds, box)

@@ -39,11 +39,8 @@ def check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, PlacedSolid], findi
         box = smoke_box(smoke, job.domain)
         if not has_grid(smoke, job.domain):
             continue
-        for index, body in enumerate(job.rigid):
-            solid = solids.get(("rigid", index))
-            if body.kind != "static" or solid is None or not touch(solid.bounds, box, margin=0.0):
-                continue
-            if not _check_static_body(job, smoke, index, solid, findings):
+        for index, solid in static_bodies(job, solids).items():
+            if touch(solid.bounds, box, margin=0.0) and not _check_static_body(job, smoke, index, solids, findings):
                 refused.add(index)
     return refused
 
@@ -60,11 +57,35 @@ def leaks(walls: ThinWalls) -> bool:
     return walls.share > MISSED
 
 
-def _check_static_body(job: Job, smoke: SmokeParameters, index: int, solid: PlacedSolid, findings: Findings) -> bool:
+def static_bodies(job: Job, solids: Mapping[KeyPath, PlacedSolid]) -> dict[int, PlacedSolid]:
+    """The bodies that stand still, as far as they can be built, by number."""
+    return {
+        index: solids["rigid", index]
+        for index, body in enumerate(job.rigid)
+        if body.kind == "static" and ("rigid", index) in solids
+    }
+
+
+def bodies_beside(
+    job: Job, smoke: SmokeParameters, index: int, solids: Mapping[KeyPath, PlacedSolid]
+) -> list[PlacedSolid]:
+    """Other static bodies that may hold a centre next to the surface of a static one."""
+    at_rest = static_bodies(job, solids)
+    return [
+        solid
+        for number, solid in at_rest.items()
+        if number != index and touch(solid.bounds, at_rest[index].bounds, margin=smoke.cell_size)
+    ]
+
+
+def _check_static_body(
+    job: Job, smoke: SmokeParameters, index: int, solids: Mapping[KeyPath, PlacedSolid], findings: Findings
+) -> bool:
     """Note a static body that has no cell, or too few; whether the smoke can be simulated with it."""
     from sim.smoke.grid import SmokeGrid
     from sim.smoke.thin_walls import thin_walls
 
+    solid = solids["rigid", index]
     thinnest = float(np.ptp(solid.bounds, axis=0).min())
     if SmokeGrid.of_box(smoke, job.domain).misses(solid):
         findings.error(
@@ -73,7 +94,7 @@ def _check_static_body(job: Job, smoke: SmokeParameters, index: int, solid: Plac
             "the air would not notice it; use a smaller cell_size or a thicker body",
         )
         return False
-    walls = thin_walls(solid, smoke, job.domain)
+    walls = thin_walls(solid, smoke, job.domain, bodies_beside(job, smoke, index, solids))
     if leaks(walls):
         findings.warn(("rigid", index), _of_thin_walls(walls, smoke))
     return True

@@ -9,6 +9,7 @@ the rim of a cone, a body is thin as well; cells only blunt it, and what they mi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,9 +37,6 @@ HALVINGS = 5
 OPPOSITE = np.cos(np.deg2rad(45.0))
 """Cosine of the angle between a ray and the surface's normal where it leaves a wall, at least."""
 
-COLUMN = (-2, -1, 0, 1, 2)
-"""Cells of a column that may be solid below a point: its wall crosses the column's middle less than two cells off."""
-
 LUCK = (0.0, 1.0 / 3.0, 2.0 / 3.0)
 """Where in a cell a body that moves may be, for an average [cells]."""
 
@@ -56,14 +54,25 @@ class ThinWalls:
     thickness: float
 
 
-def thin_walls(solid: Solid, smoke: SmokeParameters, domain: DomainParameters) -> ThinWalls:
-    """What a smoke's cells miss of a body that stands still in its box; what lies on a closed side counts as seen."""
+def thin_walls(
+    solid: Solid, smoke: SmokeParameters, domain: DomainParameters, others: Sequence[Solid] = ()
+) -> ThinWalls:
+    """What a smoke's cells miss of a body that stands still in its box.
+
+    What lies on a closed side counts as seen, and so does what has a cell of another body right beside it.
+
+    Args:
+        solid: the body.
+        smoke: whose box and cells they are.
+        domain: the box of a smoke without its own.
+        others: further bodies that stand still.
+    """
     low, high = (np.asarray(corner) for corner in smoke.corners(domain))
     # A face that lies in a side of the box, but for round-off, is not in it.
     points, inwards = _probes(solid, (low + WHOLE * smoke.cell_size, high - WHOLE * smoke.cell_size))
     depth = _thickness(solid, points, inwards, smoke.cell_size)
     thin = np.flatnonzero(np.isfinite(depth))
-    missed = thin[~_has_solid_cell(solid, points[thin], inwards[thin], smoke, domain)]
+    missed = thin[~_has_solid_cell([solid, *others], points[thin], inwards[thin], smoke, domain)]
     return _walls(depth, missed, len(points))
 
 
@@ -73,7 +82,7 @@ def thin_walls_on_the_way(solid: Solid, smoke: SmokeParameters) -> ThinWalls:
     depth = _thickness(solid, points, inwards, smoke.cell_size)
     thin = np.flatnonzero(np.isfinite(depth))
     missed = [
-        thin[~_column(solid, points[thin], inwards[thin], np.full(3, part * smoke.cell_size), smoke.cell_size)]
+        thin[~_column([solid], points[thin], inwards[thin], np.full(3, part * smoke.cell_size), smoke.cell_size)]
         for part in LUCK
     ]
     return _walls(depth, np.concatenate(missed), len(LUCK) * len(points))
@@ -128,11 +137,11 @@ def _normals(solid: Solid, points: Points, step: float) -> Points:
 
 
 def _has_solid_cell(
-    solid: Solid, points: Points, inwards: Points, smoke: SmokeParameters, domain: DomainParameters
+    solids: Sequence[Solid], points: Points, inwards: Points, smoke: SmokeParameters, domain: DomainParameters
 ) -> NDArray[np.bool_]:
     """Whether the column of cells at each point has a solid one, or ends right there at a closed side, (n,)."""
     low, high = (np.asarray(corner) for corner in smoke.corners(domain))
-    found = _column(solid, points, inwards, low, smoke.cell_size)
+    found = _column(solids, points, inwards, low, smoke.cell_size)
     axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))
     for side, beside in (("-", points - low < smoke.cell_size), ("+", high - points < smoke.cell_size)):
         closed = np.array([f"{name}{side}" not in smoke.open_faces for name in "xyz"])
@@ -140,14 +149,16 @@ def _has_solid_cell(
     return found
 
 
-def _column(solid: Solid, points: Points, inwards: Points, low: Points, cell_size: float) -> NDArray[np.bool_]:
-    """Whether the column at each point crosses a layer of centres in the body, (n,).
+def _column(
+    solids: Sequence[Solid], points: Points, inwards: Points, low: Points, cell_size: float
+) -> NDArray[np.bool_]:
+    """Whether a body holds one of the two centres next to each point, along the axis of its largest |n_i|, (n,).
 
     The column stands on the point, not on the centre of its cell: the rim of a plate, of which cells cut off up to half
     their width, is not missed.
 
     Args:
-        solid: the body.
+        solids: the body, and those that may lie beside it.
         points: of its surface [m], (n, 3).
         inwards: unit vectors into it there, (n, 3).
         low: a corner of cells [m], (3,).
@@ -155,9 +166,11 @@ def _column(solid: Solid, points: Points, inwards: Points, low: Points, cell_siz
     """
     found = np.zeros(len(points), bool)
     axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))
-    layer = np.floor((points - low) / cell_size)[every, axis]
-    for offset in COLUMN:
-        place = points.copy()
-        place[every, axis] = low[axis] + (layer + offset + 0.5) * cell_size
-        found |= solid.signed_distance(place) < 0.0
+    layer = (points - low)[every, axis] / cell_size - 0.5
+    for next_layer in (np.floor(layer), np.floor(layer) + 1.0):
+        places = points.copy()
+        places[every, axis] = low[axis] + (next_layer + 0.5) * cell_size
+        for solid in solids:
+            left = np.flatnonzero(~found)
+            found[left] = solid.signed_distance(places[left]) < 0.0
     return found

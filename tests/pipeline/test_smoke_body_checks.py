@@ -4,6 +4,9 @@ import pytest
 import trimesh
 from checked_jobs import checked
 
+from sim.shapes import build_solid
+from sim.shapes.parameters import Placement
+
 PLUME = """
 name = "air"
 frames = 24
@@ -65,6 +68,17 @@ def test_a_static_plate_that_leaks_is_told_with_the_cells_that_would_not(tmp_pat
     assert warning.endswith("air passes through there; use a cell_size of 0.01 m or less, or thicker walls")
     finer = (PLUME + PLATE + TURNED).replace("cell_size = 0.02", "cell_size = 0.01")
     assert checked(finer, tmp_path / "fine.toml").warnings == []
+
+
+def test_a_flat_body_on_a_thick_one_passes_without_a_word(tmp_path):
+    table = PLATE.replace("0.9, 0.9, 0.01", "0.9, 0.9, 0.1").replace("0.0, 0.5]", "0.0, 0.257]")
+    cone = PLATE.replace('{ type = "box", size = [0.9, 0.9, 0.01] }', '{ type = "cone", radius = 0.3, height = 0.03 }')
+    cone = cone.replace("plate", "cone").replace("0.0, 0.5]", "0.0, CENTRE]")
+    centre = 0.307 - build_solid(Placement(shape={"type": "cone", "radius": 0.3, "height": 0.03})).bounds[0, 2]
+    plume = PLUME.replace("[0.0, 0.0, 0.2]", "[0.0, 0.0, 0.7]")
+    assert checked(plume + table + cone.replace("CENTRE", f"{centre}"), tmp_path / "on.toml").warnings == []
+    (warning,) = checked(plume + cone.replace("CENTRE", f"{centre}"), tmp_path / "off.toml").warnings
+    assert "has walls thinner than the cells" in warning
 
 
 @pytest.mark.parametrize(
