@@ -1,5 +1,6 @@
 """Bodies that the cells of a smoke cannot show, told with their lines."""
 
+import numpy as np
 import pytest
 import trimesh
 from checked_jobs import checked
@@ -91,6 +92,19 @@ def test_a_room_with_thin_walls_is_told_whether_it_moves_or_not(motion, tmp_path
     room = f'[[rigid]]\nname = "room"\nshape = {{ type = "mesh", file = "room.obj" }}\nposition = [0, 0, 0.5]\n{motion}'
     (warning,) = checked(PLUME + room, tmp_path / "room.toml").warnings
     assert "rigid[0]: has walls thinner than the cells" in warning
+
+
+@pytest.mark.parametrize(("wall", "is_told"), [(0.02, True), (0.06, False)])
+def test_walls_of_a_cell_that_the_grid_of_a_large_mesh_cannot_feel_are_told(wall, is_told, tmp_path):
+    """Of a cube of 4 m it has cells of 4 m / 250."""
+    inner = trimesh.creation.box(np.full(3, 4.0 - 2.0 * wall))
+    inner.invert()
+    trimesh.util.concatenate([trimesh.creation.box((4.0, 4.0, 4.0)), inner]).export(tmp_path / "hall.obj")
+    hall = '[[rigid]]\nname = "hall"\nkind = "kinematic"\nshape = { type = "mesh", file = "hall.obj" }\n'
+    hall += "position = [0, 0, 0.5]\nvelocity = [0.1, 0, 0]\n"
+    told = [line for line in checked(PLUME + hall, tmp_path / "hall.toml").warnings if "air may pass" in line]
+    assert len(told) == is_told
+    assert all('the finest grid that smoke "plume" may meet it by has cells of 0.016' in line for line in told)
 
 
 @pytest.mark.parametrize(
