@@ -514,13 +514,17 @@ class Session:
         return _Moment(self.world.frame, self.world.checkpoint(), paths, dict(self.values))
 
     def _begin_anew(self, values: Mapping[str, Value]) -> None:
-        """Build the scene again, with these values of its knobs, and nothing held; a value that is refused is told."""
+        """Build the scene again, with these values of its knobs, and nothing held; a value that is refused is told.
+
+        Raises:
+            ShapeError, ValueError: as `sim.build.build_world`; the world that there was stays as it is.
+        """
         self.revision += 1
-        self._hands.clear()
         if self.on_jump is not None:
             self.on_jump()
-        self.values = {name: knob.start for name, knob in self.knobs.items()}
         self._build()
+        self._hands.clear()  # of the world that was
+        self.values = {name: knob.start for name, knob in self.knobs.items()}
         refused = self._turn_all(values)
         if refused:
             self.message = f"{self.message} Not taken over: {'; '.join(refused)}.".lstrip()

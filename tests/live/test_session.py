@@ -442,11 +442,13 @@ def test_a_scene_that_cannot_be_built_again_ends_live_with_a_line(tmp_path, monk
 def test_a_reset_with_memory_for_one_scene_only_lets_the_old_one_go_and_a_refused_one_does_not(tmp_path, monkeypatch):
     session = session_of(tmp_path)
     session.turn("cloth.sheet.friction", 1.5)
+    session.grab_body("ball", (0.0, 0.0, 0.62))
     run(session, 2)
     kept = built(monkeypatch, session, ValueError("no mesh"), MemoryError("no 9 GiB"), None)
     session.ask(session.reset)
     session.meet_requests()
     assert (session.message, session.world.frame) == ("no mesh", 2)
+    assert (session.values["cloth.sheet.friction"], session.is_holding) == (1.5, True)  # as the world has it
     session.turn("cloth.sheet.friction", 1.4)
     session.ask(session.reset)
     session.meet_requests()
