@@ -10,13 +10,14 @@ import json
 import logging
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import Protocol
 
 from render.system_libraries import install_line, missing_libraries, missing_packages
@@ -331,9 +332,11 @@ def environment_of_child() -> Iterator[dict[str, str]]:
     Raises:
         OSError: there is no place for it.
     """
-    # What cannot be removed is no reason to lose a picture.
-    with TemporaryDirectory(prefix="blender-", ignore_cleanup_errors=True) as folder:
+    folder = mkdtemp(prefix="blender-")
+    try:
         yield {**os.environ, "TMPDIR": folder}
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)  # what cannot be removed is no reason to lose a picture
 
 
 def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subprocess.CompletedProcess[str]:

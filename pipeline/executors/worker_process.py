@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -13,7 +14,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 import psutil
 
@@ -161,10 +162,10 @@ class WorkerProcess:
 
     def close(self) -> None:
         """Give its descriptors back, and remove its temporary folder."""
-        self._scratch.cleanup()
         self.channel.close()
         if self.exit_descriptor is not None:
             os.close(self.exit_descriptor)
+        shutil.rmtree(self._scratch, ignore_errors=True)  # what cannot be removed is no reason to lose a run
 
 
 def log_tail(log: Path) -> str:
@@ -198,7 +199,7 @@ def _describe_process(pid: int) -> str:
         return f"  process {pid} has ended"
 
 
-def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, TemporaryDirectory[str]]:
+def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, str]:
     """Start a fresh interpreter; what it prints before its first task goes into that task's log.
 
     Its temporary folder is its own: Blender and Taichi leave theirs behind where they are killed.
@@ -208,16 +209,16 @@ def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, Tempora
     with ExitStack() as on_failure, theirs, first.log.open("ab") as log:
         on_failure.enter_context(ours)
         # What somebody still writes goes with the worker's guardian.
-        scratch = TemporaryDirectory(prefix="pipeline-worker-", ignore_cleanup_errors=True)
-        on_failure.callback(scratch.cleanup)
+        scratch = mkdtemp(prefix="pipeline-worker-")
+        on_failure.callback(shutil.rmtree, scratch, ignore_errors=True)
         process = subprocess.Popen(
-            python_argv("pipeline.worker", str(theirs.fileno()), str(os.getpid()), scratch.name),
+            python_argv("pipeline.worker", str(theirs.fileno()), str(os.getpid()), scratch),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             pass_fds=[theirs.fileno()],
             start_new_session=True,
-            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(first.threads)), "TMPDIR": scratch.name},
+            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(first.threads)), "TMPDIR": scratch},
         )
         on_failure.pop_all()
     return process, Channel(ours), scratch

@@ -25,6 +25,7 @@ from executor_contract import (
     wait_for_pid,
 )
 from processes_seen import pid_lives
+from refused_removal import refuse_removal
 from synthetic_stages import write_faults
 
 from pipeline.errors import InvalidArtifactError, StageUnavailableError
@@ -174,6 +175,16 @@ class TestProcesses(ProcessesContract):
             assert folder.is_relative_to(tmp_path / "temporary")
             assert folder.exists() == (fault == "temporary files")  # whose worker is kept
         assert list((tmp_path / "temporary").iterdir()) == []
+
+    def test_a_temporary_folder_that_cannot_be_removed_costs_no_run(
+        self, layout: JobLayout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        temporary = tmp_path / "temporary"
+        temporary.mkdir()
+        monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+        with ProcessExecutor() as executor:
+            run(executor, assign(layout, "steps"))
+            refuse_removal(monkeypatch, temporary)
 
     @pytest.mark.slow
     def test_a_stalled_task_is_ended_and_its_stack_is_in_the_log(self, layout: JobLayout) -> None:

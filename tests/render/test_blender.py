@@ -27,6 +27,7 @@ from blender_stand_in import write_blender_stand_in
 from fresh_python import run_python
 from inline_tasks import run_task
 from needed_blender import needs_bpy
+from refused_removal import refuse_removal
 
 from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.job.loading import load_job
@@ -40,6 +41,7 @@ from render.blender import (
     ExecutableRenderer,
     FrameRenderError,
     build_argv,
+    environment_of_child,
     open_renderer,
     parse_blender_version,
     require_supported_executable,
@@ -214,6 +216,13 @@ def test_a_script_leaves_no_temporary_files_however_it_ends(tmp_path, monkeypatc
     told = run_script([sys.executable, "-c", code], timeout_s=120.0, purpose="end").stdout
     assert told.startswith(f"{tmp_path}/")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_temporary_folder_that_cannot_be_removed_costs_no_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with environment_of_child() as environment:
+        refuse_removal(monkeypatch, tmp_path)
+    assert environment["TMPDIR"].startswith(f"{tmp_path}/")
 
 
 def test_an_executable_killed_between_frames_or_while_it_draws_costs_an_attempt(tmp_path, blender_stand_in):
