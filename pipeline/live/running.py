@@ -87,7 +87,13 @@ def show_live(
         )
         say(address_of(server))
         try:
-            run(session, page, ends=ends)
+            with _memory_told(job):
+                run(session, page, ends=ends)
+        except CannotGoOnError as error:
+            recorder.stop()
+            if recorder.became:
+                raise CannotGoOnError(f"{error}; {recorder.became}") from error
+            raise
         finally:
             if recorder.is_recording:
                 recorder.stop()

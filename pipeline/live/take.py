@@ -49,6 +49,9 @@ record."""
 class Recorder:
     """Records a session, take after take, each into a folder NAME-take, NAME-take-2, ... of its own.
 
+    Attributes:
+        became: what became of the last take that has ended, "" before.
+
     Args:
         loaded: the job that is played with, as it was read.
         session: the scene.
@@ -59,6 +62,7 @@ class Recorder:
     def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:
         self._loaded, self._session, self._output, self._device = loaded, session, output, device
         self._take: _Take | None = None
+        self.became = ""
         session.on_jump = self.stop
 
     @property
@@ -108,7 +112,8 @@ class Recorder:
             became = f"{frames}: pipeline submit {shlex.quote(str(take.layout.job_file))}"
         else:
             became = f"none of its frames is in {take.layout.root}"
-        self._session.message = f"the take ends early: {trouble}; {became}" if trouble else became
+        self.became = f"the take ends early: {trouble}; {became}" if trouble else became
+        self._session.message = self.became
 
     def _add(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
         if self._take is None:

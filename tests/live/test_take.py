@@ -24,7 +24,7 @@ from pipeline.layout import JobLayout
 from pipeline.lease import Lease
 from pipeline.live.saving import save_job
 from pipeline.live.scene import live_job
-from pipeline.live.session import Session
+from pipeline.live.session import CannotGoOnError, Session
 from pipeline.live.take import Recorder
 from pipeline.queue_changes import continuation
 from pipeline.resources import machine_capacity
@@ -396,3 +396,30 @@ def test_ctrl_c_ends_a_take_tells_what_became_of_it_and_leaves_signals_as_they_w
     assert ended.exit_code == 0
     assert f"1 frame: pipeline submit {tmp_path / 'drape-take' / 'job.toml'}\n" in ended.output
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.parametrize("is_built_anew", [False, True])
+def test_where_live_cannot_go_on_the_terminal_tells_what_became_of_the_take(tmp_path, monkeypatch, is_built_anew):
+    from pipeline.live import running
+
+    class Recording(Recorder):
+        """One that is recording from the start."""
+
+        def __init__(self, *arguments, **options) -> None:
+            super().__init__(*arguments, **options)
+            self.toggle()
+
+    def fails(session: Session, _page, *, ends) -> None:
+        if is_built_anew:
+            session.on_jump()
+            raise CannotGoOnError("drape cannot begin anew: MemoryError: no 9 GiB")
+        raise MemoryError("no 9 GiB")
+
+    monkeypatch.setattr(running, "Recorder", Recording)
+    monkeypatch.setattr(running, "run", fails)
+    loaded(tmp_path)
+    ended = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path)])
+    assert ended.exit_code == 1
+    became = f"; 1 frame: pipeline submit {tmp_path / 'drape-take' / 'job.toml'}"
+    (told,) = (line for line in ended.output.splitlines() if line.startswith("error: "))
+    assert told.endswith(f"MemoryError: no 9 GiB{became}")
