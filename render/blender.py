@@ -334,7 +334,7 @@ def environment_of_child() -> Iterator[dict[str, str]]:
     """
     folder = mkdtemp(prefix="blender-")
     try:
-        yield {**os.environ, "TMPDIR": folder}
+        yield {**os.environ, "TMPDIR": folder, "TMP": folder}  # Blender up to 4.5 asks the second first
     finally:
         shutil.rmtree(folder, ignore_errors=True)  # what cannot be removed is no reason to lose a picture
 

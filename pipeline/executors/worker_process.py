@@ -25,6 +25,8 @@ from pipeline.task import FailureKind
 from pipeline.worker import STACK_DUMP_SIGNAL
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+_TEMPORARY_FOLDER_VARIABLES = ("TMPDIR", "TMP")
+"""Blender up to 4.5 asks the second first."""
 _LOG_TAIL_LINES = 20
 WorkerKey = tuple[str, int, int | None]
 """Stage, thread count and GPU."""
@@ -218,7 +220,11 @@ def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, str]:
             stderr=log,
             pass_fds=[theirs.fileno()],
             start_new_session=True,
-            env={**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(first.threads)), "TMPDIR": scratch},
+            env={
+                **os.environ,
+                **dict.fromkeys(THREAD_VARIABLES, str(first.threads)),
+                **dict.fromkeys(_TEMPORARY_FOLDER_VARIABLES, scratch),
+            },
         )
         on_failure.pop_all()
     return process, Channel(ours), scratch

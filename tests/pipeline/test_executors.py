@@ -166,6 +166,8 @@ class TestProcesses(ProcessesContract):
         with ProcessExecutor() as executor:
             for name in ("steps", *(f"double/{frame:06d}" for frame in range(6))):
                 run(executor, assign(layout, name))
+            for environment in (psutil.Process(pid).environ() for pid in executor.worker_pids):
+                assert environment["TMP"] == environment["TMPDIR"]  # Blender up to 4.5 asks the first before the second
             executor.submit(assign(layout, "film"))
             if fault.endswith("hang"):
                 wait_for_pid(executor, layout.root / "child.pid")

@@ -225,6 +225,13 @@ def test_a_temporary_folder_that_cannot_be_removed_costs_no_picture(tmp_path, mo
     assert environment["TMPDIR"].startswith(f"{tmp_path}/")
 
 
+def test_blender_up_to_4_5_asks_for_its_temporary_folder_by_another_name_first(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMP", "/elsewhere")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with environment_of_child() as environment:
+        assert environment["TMP"] == environment["TMPDIR"] != "/elsewhere"
+
+
 def test_an_executable_killed_between_frames_or_while_it_draws_costs_an_attempt(tmp_path, blender_stand_in):
     layout = JobLayout(tmp_path / "job")
     layout.root.mkdir()
