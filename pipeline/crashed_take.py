@@ -6,8 +6,7 @@ Only the end of a take writes `frames` into its job; until then the job has one,
 from __future__ import annotations
 
 import json
-from itertools import count
-from typing import Any
+from typing import Any, NamedTuple, TypeGuard
 
 from pipeline.files import replace_durably
 from pipeline.job.loading import changed_text, read_job
@@ -19,8 +18,30 @@ from pipeline.receipts import read_receipt, verify_artifact
 from pipeline.reconcile import reconcile
 
 
-def frames_of_crashed_take(layout: JobLayout) -> int | None:
-    """How many frames, from the first on, a take has whose job does not know of them; None if there is no such take.
+class FoundFrames(NamedTuple):
+    """What a take has whose job does not know of its frames.
+
+    Attributes:
+        whole: how many frames are there, from the first on.
+        behind: how many lie behind the first one that is missing or damaged, that one not counted.
+        is_cut: whether one is missing or damaged, and not just the end.
+    """
+
+    whole: int
+    behind: int
+    is_cut: bool
+
+    @property
+    def flaw(self) -> str:
+        """What is wrong with frames behind those that count, a sentence; "" if there are none."""
+        if not self.is_cut:
+            return ""
+        more = f"; {self.behind} more {'lies' if self.behind == 1 else 'lie'} behind it" if self.behind else ""
+        return f"frame {self.whole} is missing or damaged{more}"
+
+
+def frames_of_crashed_take(layout: JobLayout) -> FoundFrames | None:
+    """Which frames a take has whose job does not know of them; None if there is no such take.
 
     One that is being recorded looks the same: its folder is held.
 
@@ -29,21 +50,23 @@ def frames_of_crashed_take(layout: JobLayout) -> int | None:
     """
     if (story := _story(layout)) is None or story["frames"] is not None:
         return None
-    fingerprint = None
-    for frame in count():
-        receipt = read_receipt(layout, layout.frame_cache(frame))
-        if receipt is None or receipt.fingerprint != (fingerprint or receipt.fingerprint):
-            return frame
-        if verify_artifact(layout, receipt) is not None:
-            return frame
-        fingerprint = receipt.fingerprint
-    raise AssertionError("numbers do not end")
+    frames, fingerprint = 0, None
+    while (receipt := read_receipt(layout, layout.frame_cache(frames))) is not None:
+        if receipt.fingerprint != (fingerprint or receipt.fingerprint) or verify_artifact(layout, receipt) is not None:
+            break
+        frames, fingerprint = frames + 1, receipt.fingerprint
+    folder = layout.receipt(layout.frame_cache(0)).parent
+    receipts = [int(path.name.partition(".")[0]) for path in folder.glob(f"{'[0-9]' * 6}.h5.json")]
+    return FoundFrames(
+        frames, sum(number > frames for number in receipts), any(number >= frames for number in receipts)
+    )
 
 
 def complete_crashed_take(layout: JobLayout) -> str:
     """Write into a take's job and story how many frames it has, if its recorder could not.
 
-    A job that somebody has given another length meanwhile keeps it.
+    A job that somebody has given another length meanwhile keeps it. Where a frame is missing or damaged and others lie
+    behind it, the story stays open: should that frame come back, the next call takes over the rest.
 
     Args:
         layout: of any folder.
@@ -56,25 +79,33 @@ def complete_crashed_take(layout: JobLayout) -> str:
         JobFileError: its job file is damaged.
         OSError: the folder cannot be read or written.
     """
-    if not frames_of_crashed_take(layout):
+    if not _has_any(frames_of_crashed_take(layout)):
         return ""
     with Lease.acquire(layout.lease):
-        frames, story = frames_of_crashed_take(layout), _story(layout)
-        if not frames or story is None:  # another process was faster
+        found, story = frames_of_crashed_take(layout), _story(layout)
+        if not _has_any(found) or story is None:  # another process was faster
             return ""
         loaded = read_job(layout.job_file)
         job = loaded.job
         if job.recorded != story["take"]:  # somebody has put another job into the folder
             return ""
-        if job.frame_count == 1:
-            length = ("duration", frames / job.fps) if job.duration is not None else ("frames", frames)
+        told = f"the recording of {job.name} was cut short: "
+        if not found.whole:
+            return f"{told}{found.flaw}"
+        if job.frame_count == story.get("taken_over", 1):
+            length = ("duration", found.whole / job.fps) if job.duration is not None else ("frames", found.whole)
             replace_durably(layout.job_file, changed_text(loaded.text, [Override((length[0],), length[1], "take")]))
-        story["frames"] = frames
+        story["frames" if not found.is_cut else "taken_over"] = found.whole
         replace_durably(layout.take_story, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
         with Manifest(layout.manifest) as manifest:
             reconcile(manifest, layout, clean=False)
-    told = "1 frame" if frames == 1 else f"{frames} frames"
-    return f"the recording of {job.name} was cut short: it has {told}, and so has its job file now"
+    frames = "1 frame" if found.whole == 1 else f"{found.whole} frames"
+    return f"{told}it has {frames}, and so has its job file now{f'; {found.flaw}' if found.is_cut else ''}"
+
+
+def _has_any(found: FoundFrames | None) -> TypeGuard[FoundFrames]:
+    """Whether there is a frame, whole or not."""
+    return found is not None and (found.whole > 0 or found.is_cut)
 
 
 def _story(layout: JobLayout) -> dict[str, Any] | None:

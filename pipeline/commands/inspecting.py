@@ -263,9 +263,14 @@ def _activity_before_runs(layout: JobLayout, *, is_empty: bool) -> str:
     """How a job stands whose record has no tasks: a take, a new job, or one whose record was lost."""
     from pipeline.crashed_take import frames_of_crashed_take
 
-    if (frames := frames_of_crashed_take(layout)) is not None:
-        there = f"with {frames} frame{'' if frames == 1 else 's'}; submitting {layout.job_file} makes the film of all"
-        return f"a take that was cut short {there if frames else 'before its first frame'}"
+    if (found := frames_of_crashed_take(layout)) is not None:
+        short = "a take that was cut short"
+        if not found.whole:
+            return f"{short}: {found.flaw}" if found.is_cut else f"{short} before its first frame"
+        there = f"{short} with {found.whole} frame{'' if found.whole == 1 else 's'}"
+        if found.is_cut:
+            return f"{there}, and {found.flaw}; submitting {layout.job_file} makes the film of those before it"
+        return f"{there}; submitting {layout.job_file} makes the film of all"
     if layout.take_story.exists():
         return f"a take; submitting {layout.job_file} makes the film"
     return "not started" if is_empty else "not running; its record does not tell of tasks"

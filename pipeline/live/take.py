@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.artifacts import committing
 from pipeline.cache import validate_frame, write_frame
-from pipeline.errors import PipelineError
+from pipeline.errors import LeaseLostError, PipelineError
 from pipeline.executors.failures import describe, is_out_of_memory
 from pipeline.files import replace_durably
 from pipeline.fingerprint import task_fingerprint
@@ -98,14 +98,19 @@ class Recorder:
         """
         take, self._take = self._take, None
         self._session.on_frame = None
+        is_taken_over = False
         if take is None:
             return
         try:
             take.end()
         except _TROUBLES as error:
-            trouble = _told(error)
+            trouble, is_taken_over = _told(error), isinstance(error, LeaseLostError) and not take.is_told
         frames = "1 frame" if take.frames == 1 else f"{take.frames} frames"
-        if take.frames and take.frames != take.frames_in_job:
+        if take.frames and is_taken_over:
+            # What becomes of them is for whoever has the folder now: they may have been taken over before the last.
+            folder = take.layout.path(take.layout.frame_cache(0)).parent
+            became = f"{frames} {'is' if take.frames == 1 else 'are'} in {folder}"
+        elif take.frames and not take.is_told and take.frames != 1:
             # Which submitting finds, as after a crash.
             became = f"{take.layout.job_file} has 1 frame yet; submitting it takes over what is there, {frames}"
         elif take.frames:
@@ -130,7 +135,7 @@ class _Take:
     Attributes:
         layout: its folder.
         frames: how many are committed; the writer's thread counts them.
-        frames_in_job: how many its job file has: 1 until the end, and where nothing could be written then.
+        is_told: whether its job file has them all: not until the end, nor where nothing could be written then.
     """
 
     def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:
@@ -138,6 +143,7 @@ class _Take:
         self._name = f"live-{uuid.uuid4().hex[:12]}"
         self.layout = JobLayout(_new_folder(output, f"{loaded.job.name}-take"))
         self.frames = self._handed_in = 0
+        self.is_told = False
         self._values = dict(session.values)
         with ExitStack() as held:
             self._lease = held.enter_context(Lease.acquire(self.layout.lease))
@@ -181,6 +187,7 @@ class _Take:
     def _write_what_it_is(self) -> None:
         self._lease.heartbeat()  # raises if the folder is not ours any more
         self._write_job(frames=max(1, self.frames))  # no job has none
+        self.is_told = True
         self._write_story(frames=self.frames, last=dict(self._session.values))
         with Manifest(self.layout.manifest) as manifest:
             reconcile(manifest, self.layout, clean=False)
@@ -206,6 +213,12 @@ class _Take:
         return [*(bodies_led_before(self._loaded) or ()), *here]
 
     def _commit(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
+        """Write a frame into the folder, if that is ours: its frames may have been counted by another process.
+
+        Raises:
+            LeaseLostError: it is another process's now.
+        """
+        self._lease.heartbeat()  # which asks now, as this process may have stood still since the last time
         commit = committing(
             self.layout,
             self.layout.frame_cache(report.frame),
@@ -220,7 +233,6 @@ class _Take:
 
     def _write_job(self, *, frames: int) -> None:
         replace_durably(self.layout.job_file, self._text(frames=frames))
-        self.frames_in_job = frames
 
     def _text(self, *, frames: int) -> str:
         """The job with the present values, and bodies as they could be moved: the renderer asks the frames for them."""

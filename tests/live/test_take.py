@@ -5,6 +5,7 @@ import json
 import shlex
 import signal
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -155,6 +156,31 @@ def test_nobody_runs_a_take_while_it_is_recorded_and_then_it_waits_to_be_started
     assert continuation(spool, "drape-take").name == "drape-take"
 
 
+def wait_for_frames(recorder: Recorder, count: int) -> None:
+    assert recorder._take is not None
+    until = time.monotonic() + 60.0
+    while recorder._take.frames < count:
+        assert time.monotonic() < until
+        time.sleep(0.001)
+
+
+def test_a_frame_that_waited_while_another_process_took_the_folder_over_is_not_written(tmp_path):
+    read = loaded(tmp_path)
+    session = Session(live_job(read.job))
+    recorder = Recorder(read, session, tmp_path, device="cpu")
+    recorder.toggle()
+    session.advance()
+    wait_for_frames(recorder, 2)
+    folder = tmp_path / "drape-take"
+    lease = JobLayout(folder).lease
+    assert recorder._take is not None
+    lease.write_text(lease.read_text().replace(recorder._take._lease.holder.token, "theirs"))
+    session.advance()  # before any heartbeat
+    recorder.stop()
+    assert sorted(path.name for path in (folder / "cache").glob("[0-9]*.h5")) == ["000000.h5", "000001.h5"]
+    assert session.message.endswith(f"; 2 frames are in {folder / 'cache'}")
+
+
 def test_a_take_whose_folder_another_process_has_taken_over_writes_nothing_more(tmp_path, monkeypatch):
     read = loaded(tmp_path)
     session = Session(live_job(read.job))
@@ -165,12 +191,13 @@ def test_a_take_whose_folder_another_process_has_taken_over_writes_nothing_more(
     def lost(_lease: Lease) -> None:
         raise LeaseLostError("drape-take was taken over")
 
+    wait_for_frames(recorder, 2)
     monkeypatch.setattr(Lease, "check", lost)
     monkeypatch.setattr(Lease, "heartbeat", lost)
     session.advance()
     assert not recorder.is_recording
     folder = tmp_path / "drape-take"
-    became = f"{folder / 'job.toml'} has 1 frame yet; submitting it takes over what is there, 2 frames"
+    became = f"2 frames are in {folder / 'cache'}"
     assert session.message == f"the take ends early: drape-take was taken over; {became}"
     assert load_job(folder / "job.toml").frame_count == 1
     assert json.loads((folder / "take.json").read_text())["frames"] is None
@@ -227,12 +254,41 @@ def test_the_dashboard_starts_a_take_whose_process_was_killed_with_all_its_frame
     assert load_job(layout.job_file).frame_count == 3
 
 
-def test_a_damaged_frame_ends_what_is_taken_over_of_a_killed_take_and_a_length_that_was_chosen_stays(
-    tmp_path, monkeypatch
-):
+def test_frames_behind_one_that_is_damaged_are_told_of_and_taken_over_once_that_is_back(tmp_path, monkeypatch):
+    _, layout = crashed(tmp_path, monkeypatch, frames=5)
+    damaged = layout.path(layout.frame_cache(2))
+    aside = damaged.rename(damaged.with_name("aside"))
+    told = CliRunner().invoke(main, ["status", str(layout.root)])
+    assert told.output.splitlines()[0] == (
+        f"{layout.root}: a take that was cut short with 2 frames, and frame 2 is missing or damaged; 2 more lie behind "
+        f"it; submitting {layout.job_file} makes the film of those before it"
+    )
+    became = "the recording of drape-take was cut short: it has {}, and so has its job file now"
+    cut = f"{became.format('2 frames')}; frame 2 is missing or damaged; 2 more lie behind it"
+    assert complete_crashed_take(layout) == cut
+    assert load_job(layout.job_file).frame_count == 2
+    assert complete_crashed_take(layout) == cut
+    aside.rename(damaged)
+    assert complete_crashed_take(layout) == became.format("5 frames")
+    assert load_job(layout.job_file).frame_count == 5
+    assert complete_crashed_take(layout) == ""
+
+
+def test_a_take_whose_first_frame_is_damaged_is_left_as_it_is_and_told_of(tmp_path, monkeypatch):
+    _, layout = crashed(tmp_path, monkeypatch, frames=2)
+    layout.path(layout.frame_cache(0)).write_bytes(b"")
+    flaw = "frame 0 is missing or damaged; 1 more lies behind it"
+    assert complete_crashed_take(layout) == f"the recording of drape-take was cut short: {flaw}"
+    assert load_job(layout.job_file).frame_count == 1
+    told = CliRunner().invoke(main, ["status", str(layout.root)])
+    assert told.output.splitlines()[0] == f"{layout.root}: a take that was cut short: {flaw}"
+
+
+def test_a_length_that_was_chosen_for_a_killed_take_stays(tmp_path, monkeypatch):
     _, layout = crashed(tmp_path, monkeypatch)
-    layout.path(layout.frame_cache(2)).write_bytes(b"")
-    assert frames_of_crashed_take(layout) == 2
+    found = frames_of_crashed_take(layout)
+    assert found is not None
+    assert (found.whole, found.flaw) == (3, "")
     layout.job_file.write_text(layout.job_file.read_text().replace("frames = 1", "frames = 7"))
     complete_crashed_take(layout)
     assert load_job(layout.job_file).frame_count == 7
