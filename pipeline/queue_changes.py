@@ -7,11 +7,24 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import NamedTuple
 
 from pipeline.crashed_take import complete_crashed_take
 from pipeline.errors import JobBusyError, PipelineError
 from pipeline.lease import live_holder
 from pipeline.spool import QueuedJob, Spool, Wish, new_ticket, submission
+
+
+class Continuation(NamedTuple):
+    """How a job goes on.
+
+    Attributes:
+        entry: to be queued.
+        note: what was done to its folder for that, a sentence; "" for nothing.
+    """
+
+    entry: QueuedJob
+    note: str = ""
 
 
 def queue_state(spool: Spool, job: QueuedJob) -> str:
@@ -83,7 +96,7 @@ def another_try(spool: Spool, name: str, *, background: bool) -> QueuedJob:
     return replace(entry, ticket=new_ticket(), wish=Wish.RUN, note="", submitted=time.time(), background=background)
 
 
-def continuation(spool: Spool, name: str) -> QueuedJob:
+def continuation(spool: Spool, name: str) -> Continuation:
     """The entry by which a job goes on in the background as it was meant, to be queued.
 
     Of a take whose recorder crashed, all frames that are there are taken over.
@@ -99,12 +112,13 @@ def continuation(spool: Spool, name: str) -> QueuedJob:
             raise PipelineError(f"no submitted job in {layout.root}; submit one with: pipeline submit JOB.toml")
         if live_holder(layout.lease) is not None:
             raise JobBusyError(f"{name} runs already")
-        complete_crashed_take(layout)
-        return submission(name, background=True)
+        note = complete_crashed_take(layout)
+        return Continuation(submission(name, background=True), note)
     if paused.wish is Wish.RUN:
         state = queue_state(spool, paused)
         raise JobBusyError(f"{name} runs already" if state == "running" else f"{name} waits for its turn already")
-    return replace(paused, ticket=new_ticket(), wish=Wish.RUN, note="", submitted=time.time(), background=True)
+    entry = replace(paused, ticket=new_ticket(), wish=Wish.RUN, note="", submitted=time.time(), background=True)
+    return Continuation(entry)
 
 
 def _not_queued(spool: Spool, name: str) -> PipelineError:

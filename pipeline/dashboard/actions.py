@@ -116,8 +116,9 @@ class Queue:
                 cancel_job(self.spool, name)
                 return f"{name} is cancelled; what is finished stays"
             case "resume":
-                self.spool.enqueue(continuation(self.spool, name))
-                return f"{name} is queued{self.run()}"
+                entry, note = continuation(self.spool, name)
+                self.spool.enqueue(entry)
+                return f"{f'{note}; ' if note else ''}{name} is queued{self.run()}"
             case "retry":
                 self.spool.enqueue(another_try(self.spool, name, background=True))
                 return f"{name} is queued to try again{self.run()}"

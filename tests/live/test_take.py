@@ -15,7 +15,7 @@ from live_jobs import BALL_OVER_SHEET, loaded
 from pipeline.cache import read_frame
 from pipeline.cli import main
 from pipeline.crashed_take import complete_crashed_take, frames_of_crashed_take
-from pipeline.dashboard.actions import actions_of
+from pipeline.dashboard.actions import Queue, actions_of
 from pipeline.dashboard.farm_view import FarmView
 from pipeline.dashboard.places import Places
 from pipeline.errors import JobBusyError, LeaseLostError
@@ -153,7 +153,7 @@ def test_nobody_runs_a_take_while_it_is_recorded_and_then_it_waits_to_be_started
     assert spool.find("drape-take") is None
     recorder.stop()
     assert card() == ("recorded", ["Start"])
-    assert continuation(spool, "drape-take").name == "drape-take"
+    assert continuation(spool, "drape-take").entry.name == "drape-take"
 
 
 def wait_for_frames(recorder: Recorder, count: int) -> None:
@@ -250,7 +250,11 @@ def test_the_dashboard_starts_a_take_whose_process_was_killed_with_all_its_frame
     spool, layout = crashed(tmp_path, monkeypatch)
     (found,) = FarmView(Places(spool.farm), spool).glance().jobs
     assert (found.state, [action.label for action in actions_of(found, has_runner=False)]) == ("recorded", ["Start"])
-    continuation(spool, "drape-take")
+    monkeypatch.setattr("pipeline.dashboard.actions.start_in_background", lambda _spool: None)
+    assert Queue(spool).act("drape-take", "resume", "") == (
+        "the recording of drape-take was cut short: it has 3 frames, and so has its job file now; "
+        "drape-take is queued; the runner takes it when its turn comes"
+    )
     assert load_job(layout.job_file).frame_count == 3
 
 
