@@ -136,6 +136,11 @@ class Job(SceneParameters):
         yield from self.cloth
 
     @property
+    def has_panes(self) -> bool:
+        """Whether there is a tank of glass to be seen: a side of the domain that is open has no pane."""
+        return self.stage.tank and not {"x-", "x+", "y-", "y+"} <= set(self.domain.open_faces)
+
+    @property
     def moving_bodies(self) -> tuple[str, ...]:
         """Names of the rigid bodies whose pose changes from frame to frame."""
         return tuple(body.name for body in self.rigid if body.kind != "static")

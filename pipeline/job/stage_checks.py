@@ -31,7 +31,7 @@ def check_stage(job: Job, findings: Findings) -> None:
             findings.error(
                 ("stage", key), f'has no effect on the stage "{stage.name}", which has no sun; set name = "outdoor"'
             )
-    if stage.tank and {"x-", "x+", "y-", "y+"} <= set(job.domain.open_faces):
+    if stage.tank and not job.has_panes:
         findings.warn(("stage", "tank"), "has no effect, as all sides of the domain are open: there is no pane")
     if stage.background != "stage" and stage.ground is not None:
         findings.warn(

@@ -86,7 +86,7 @@ class BoundsStage:
                 domain=job.domain,
                 smoke={smoke.name: smoke.corners(job.domain) for smoke in job.smoke},
                 static={body.name: {"position": body.position, "rotation_deg": body.rotation_deg} for body in static},
-                tank=job.stage.tank,
+                tank=job.has_panes,
             ),
         )
         return [*frames, film]
@@ -164,7 +164,7 @@ def _of_film(context: TaskContext) -> Reach:
         if body.kind == "static":
             turned = rotated(from_degrees(body.rotation_deg), _mesh_of(layout, body))
             reaches.append(reach_of_points(np.array(body.position) + turned))
-    if job.stage.tank and reaches:
+    if job.has_panes and reaches:
         # Its glass is seen, and walls that the picture cuts off look like a mistake.
         reaches.append(reach_of_box(np.array([domain[0], [*domain[1, :2], domain[0, 2]]])))
     return framed(around(reaches), domain=domain, world=world)

@@ -53,10 +53,10 @@ position = [0.0, 0.0, 0.6]
 FRAMED = '[camera]\nframing = "action"\n'
 
 
-def job_in(folder, more: str = FRAMED) -> tuple[Job, JobLayout]:
+def job_in(folder, more: str = FRAMED, *, job: str = JOB) -> tuple[Job, JobLayout]:
     layout = JobLayout(folder / "pond")
     layout.root.mkdir(parents=True, exist_ok=True)
-    layout.job_file.write_text(JOB + more)
+    layout.job_file.write_text(job + more)
     return load_job(layout.job_file), layout
 
 
@@ -148,6 +148,18 @@ def test_a_tank_is_framed_with_its_whole_floor(pond):
     box = box_of_film(layout)
     assert box[:, :2] == pytest.approx(np.array([[-1.0, -1.0], [1.0, 1.0]]))
     assert box[1, 2] == pytest.approx(1.1, abs=0.01)
+
+
+def test_a_tank_whose_sides_are_all_open_has_no_floor_to_be_framed(pond):
+    _, layout = pond
+    without_walls = JOB.replace("[domain]", '[domain]\nopen_faces = ["x-", "x+", "y-", "y+"]')
+    without, _ = job_in(layout.root.parent, job=without_walls)
+    digests = [task.parameters.digest for task in tasks_of_bounds(without, layout)]
+    job, _ = job_in(layout.root.parent, FRAMED + "[stage]\ntank = true\n", job=without_walls)
+    assert [task.parameters.digest for task in tasks_of_bounds(job, layout)] == digests
+    for task in tasks_of_bounds(job, layout):
+        run_task(task, layout)
+    assert box_of_film(layout)[1, 0] < 0.7
 
 
 def test_the_same_frames_give_the_same_bytes_and_a_damaged_one_none(pond):
