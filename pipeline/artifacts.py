@@ -55,6 +55,15 @@ def edited_name(layout: JobLayout, artifact: ArtifactPath) -> ArtifactPath:
     return ArtifactPath(f"{artifact}.edited-{number}")
 
 
+def holds_frames(layout: JobLayout) -> bool:
+    """Whether anything lies where a job's simulated frames and its pictures go. Raises OSError."""
+    for frame in (layout.frame_cache(0), layout.picture(0)):
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(layout.path(frame).parent) as entries:
+            if any(entries):
+                return True
+    return False
+
+
 class Commit:
     """An artifact on its way, as a context manager; see `committing`.
 

@@ -62,6 +62,20 @@ def frames_of_crashed_take(layout: JobLayout) -> FoundFrames | None:
     )
 
 
+def is_job_of_take(layout: JobLayout) -> bool:
+    """Whether the job in a take's folder is the take's; any other simulates, over its frames.
+
+    Args:
+        layout: of a folder with a take's story; one that is illegible names no take.
+
+    Raises:
+        JobFileError: the job file is damaged.
+    """
+    story = _story(layout)
+    recorded = read_job(layout.job_file).job.recorded
+    return recorded is not None and (story is None or recorded == story["take"])
+
+
 def complete_crashed_take(layout: JobLayout) -> str:
     """Write into a take's job and story how many frames it has, if its recorder could not.
 

@@ -23,7 +23,7 @@ from pipeline.commands.arguments import (
     submission_folder,
     submitted_job_argument,
 )
-from pipeline.errors import PipelineError
+from pipeline.errors import JobFileError, PipelineError
 from pipeline.layout import JobLayout
 from pipeline.task import TaskId, TaskState
 
@@ -261,19 +261,32 @@ def _activity(pid: int | None, summary: Sequence[StageSummary]) -> str:
 
 def _activity_before_runs(layout: JobLayout, *, is_empty: bool) -> str:
     """How a job stands whose record has no tasks: a take, a new job, or one whose record was lost."""
-    from pipeline.crashed_take import frames_of_crashed_take
+    from pipeline.artifacts import holds_frames
 
-    if (found := frames_of_crashed_take(layout)) is not None:
-        short = "a take that was cut short"
-        if not found.whole:
-            return f"{short}: {found.flaw}" if found.is_cut else f"{short} before its first frame"
-        there = f"{short} with {found.whole} frame{'' if found.whole == 1 else 's'}"
-        if found.is_cut:
-            return f"{there}, and {found.flaw}; submitting {layout.job_file} makes the film of those before it"
-        return f"{there}; submitting {layout.job_file} makes the film of all"
     if layout.take_story.exists():
-        return f"a take; submitting {layout.job_file} makes the film"
-    return "not started" if is_empty else "not running; its record does not tell of tasks"
+        return _activity_of_take(layout)
+    is_new = is_empty and not holds_frames(layout)
+    return "not started" if is_new else "not running; its record does not tell of tasks"
+
+
+def _activity_of_take(layout: JobLayout) -> str:
+    """What submitting a take would do."""
+    from pipeline.crashed_take import frames_of_crashed_take, is_job_of_take
+
+    film = f"submitting {layout.job_file} makes the film"
+    try:
+        if not is_job_of_take(layout):
+            return f"a take, but {layout.job_file} is not its job: submitting that makes no film of its frames"
+    except JobFileError:
+        return f"a take, whose job file is damaged; see: pipeline check {layout.job_file}"
+    found = frames_of_crashed_take(layout)
+    if found is None:
+        return f"a take; {film}"
+    short = "a take that was cut short"
+    if not found.whole:
+        return f"{short}: {found.flaw}" if found.is_cut else f"{short} before its first frame"
+    short += f" with {found.whole} frame{'' if found.whole == 1 else 's'}"
+    return f"{short}, and {found.flaw}; {film} of those before it" if found.is_cut else f"{short}; {film} of all"
 
 
 def _attempts_with_log(layout: JobLayout, task: TaskId) -> dict[int, Path]:

@@ -12,6 +12,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
+from pipeline.artifacts import holds_frames
 from pipeline.dashboard.estimates import LongTask, Remaining, StageRow, remaining, stage_rows
 from pipeline.dashboard.places import NotThereError, Places, printable
 from pipeline.errors import ManifestError
@@ -278,7 +279,7 @@ class FarmView:
             self.places.file(name, layout.take_story.name)
             return JobState.RECORDED
         # A record may be lost; and of a take that crashed it is empty, as it is filled at the end.
-        is_new = record.is_empty and not _holds_frames(layout)
+        is_new = record.is_empty and not holds_frames(layout)
         return JobState.NOT_STARTED if is_new else JobState.INTERRUPTED
 
     def _record(self, name: str, layout: JobLayout, *, runs: bool) -> _Remembered:
@@ -360,15 +361,6 @@ def _holds_job(layout: JobLayout) -> bool:
         return layout.job_file.is_file() or layout.manifest.is_file()
     except PermissionError:
         return True
-
-
-def _holds_frames(layout: JobLayout) -> bool:
-    """Whether anything lies where a job's simulated frames and its pictures go. Raises OSError."""
-    for frame in (layout.frame_cache(0), layout.picture(0)):
-        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(layout.path(frame).parent) as entries:
-            if any(entries):
-                return True
-    return False
 
 
 def _state_of_outcome(outcome: str | None) -> JobState:

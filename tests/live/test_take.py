@@ -288,6 +288,18 @@ def test_a_take_whose_first_frame_is_damaged_is_left_as_it_is_and_told_of(tmp_pa
     assert told.output.splitlines()[0] == f"{layout.root}: a take that was cut short: {flaw}"
 
 
+def test_status_promises_no_film_of_a_take_whose_folder_has_another_job(tmp_path, monkeypatch):
+    _, layout = crashed(tmp_path, monkeypatch)
+    text = layout.job_file.read_text()
+    layout.job_file.write_text("".join(line for line in text.splitlines(True) if not line.startswith("recorded")))
+    told = CliRunner().invoke(main, ["status", str(layout.root)])
+    activity = f"a take, but {layout.job_file} is not its job: submitting that makes no film of its frames"
+    assert told.output.splitlines()[0] == f"{layout.root}: {activity}"
+    layout.take_story.unlink()
+    told = CliRunner().invoke(main, ["status", str(layout.root)])
+    assert told.output.splitlines()[0] == f"{layout.root}: not running; its record does not tell of tasks"
+
+
 def test_a_length_that_was_chosen_for_a_killed_take_stays(tmp_path, monkeypatch):
     _, layout = crashed(tmp_path, monkeypatch)
     found = frames_of_crashed_take(layout)
