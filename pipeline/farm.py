@@ -282,7 +282,8 @@ class FarmRunner:
                 note = f"{first.task_id}: {first.message}" if first is not None else outcome.kind.value
                 self._settle(job, Wish.NONE, note)
             case JobOutcome.DISK_FULL:
-                self._settle(job, Wish.PAUSE, "the disk is full")
+                place = f" ({outcome.full_place})" if outcome.full_place else ""
+                self._settle(job, Wish.PAUSE, f"the disk is full{place}")
             case _ if control.signals and self.pause_on_signal and job.ticket == self.ticket:
                 self._settle(job, Wish.PAUSE, "stopped by hand")
             case _:  # its entry says what is wanted: it pauses, or waits for its next turn

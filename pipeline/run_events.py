@@ -45,6 +45,7 @@ class Outcome:
         failures: the last failure of each task that failed for good, in order.
         counts: number of tasks by stage and state.
         seconds: how long the run took [s].
+        full_place: what a task could not write as its disk is full; "" where none says so.
     """
 
     kind: JobOutcome
@@ -52,6 +53,7 @@ class Outcome:
     failures: tuple[Failed, ...] = ()
     counts: dict[tuple[str, TaskState], int] = field(default_factory=dict)
     seconds: float = 0.0
+    full_place: str = ""
 
     @property
     def exit_code(self) -> int:

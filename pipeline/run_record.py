@@ -152,7 +152,8 @@ class RunRecord:
             return [*adopted, TaskSucceeded(failed.task_id)]
         self.failures[failed.task_id] = failed
         if failed.kind is FailureKind.DISK_FULL:
-            sentence = f"the disk is full ({self._layout.root}): the job pauses; free some space and submit it again"
+            place = failed.full_place or self._layout.root
+            sentence = f"the disk is full ({place}): the job pauses; free some space and submit it again"
             self._observer.notify(Notice(sentence))
         return [*adopted, TaskFailed(failed.task_id, failed.kind, time.monotonic())]
 

@@ -229,6 +229,7 @@ class _Run:
             ),
             counts=counts,
             seconds=seconds,
+            full_place=next((failed.full_place for failed in self._record.failures.values() if failed.full_place), ""),
         )
 
     # --- one turn ---

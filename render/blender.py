@@ -350,9 +350,10 @@ def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subpro
     Raises:
         BlenderHungError: it does not end in time.
         BlenderUnavailableError: it cannot be started.
+        OSError: there is no place for its temporary files.
     """
-    try:
-        with environment_of_child() as environment:
+    with environment_of_child() as environment:
+        try:
             return subprocess.run(
                 argv,
                 capture_output=True,
@@ -362,11 +363,11 @@ def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subpro
                 check=False,
                 env=environment,
             )
-    except OSError as error:
-        raise BlenderUnavailableError(f"cannot start {argv[0]}: {error.strerror}") from error
-    except subprocess.TimeoutExpired as error:
-        told = (error.stdout or b"").decode(errors="replace")  # bytes, whatever was asked for
-        raise BlenderHungError(f"Blender took more than {timeout_s:g} s to {purpose}", told) from error
+        except OSError as error:
+            raise BlenderUnavailableError(f"cannot start {argv[0]}: {error.strerror}") from error
+        except subprocess.TimeoutExpired as error:
+            told = (error.stdout or b"").decode(errors="replace")  # bytes, whatever was asked for
+            raise BlenderHungError(f"Blender took more than {timeout_s:g} s to {purpose}", told) from error
 
 
 def parse_blender_version(text: str) -> tuple[int, int, int] | None:

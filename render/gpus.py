@@ -60,7 +60,7 @@ def find_gpus(blender: str | None) -> Probe:
         completed = run_script(script_argv(blender, "gpus.py", []), timeout_s=PROBE_TIMEOUT_S, purpose="look for GPUs")
     except BlenderHungError as error:
         return Probe(read_answer(error.told.splitlines()), str(error))
-    except BlenderUnavailableError as error:
+    except (BlenderUnavailableError, OSError) as error:
         return Probe(trouble=str(error))
     lines = completed.stdout.splitlines()
     if any(line.startswith("GPUS_DONE ") for line in lines):

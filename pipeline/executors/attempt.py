@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from pipeline import artifacts, receipts
 from pipeline.errors import PipelineError
 from pipeline.executors.base import Assignment, Committed, Failed, Finished, Progress, Started, TaskEvent, Warned
-from pipeline.executors.failures import classify, describe
+from pipeline.executors.failures import classify, describe, full_place
 from pipeline.executors.memory import peak_memory_bytes, reset_peak_memory
 from pipeline.task import ArtifactPath, FailureKind
 
@@ -144,9 +144,9 @@ def run_attempt(
         details = traceback.format_exc()
         with suppress(OSError):  # on a full disk the failure must get through, even if its traceback cannot
             print(details, end="", flush=True)
-        failure = classify(error), describe(error)
+        failure, full = (classify(error), describe(error)), full_place(error)
     else:
-        details = ""
+        details = full = ""
         if not missing:
             emit(Finished(task.id, attempt, time.monotonic() - began, peak_memory_bytes()))
             return
@@ -156,7 +156,7 @@ def run_attempt(
         else:
             failure = FailureKind.FAILED, f"the stage returned without committing {missing[0]}"
     kind, message = failure
-    emit(Failed(task.id, attempt, kind, message, details, time.monotonic() - began, peak_memory_bytes()))
+    emit(Failed(task.id, attempt, kind, message, details, time.monotonic() - began, peak_memory_bytes(), full))
 
 
 def _stage_of(assignment: Assignment) -> Stage:

@@ -115,6 +115,8 @@ class Failed:
         details: traceback, or the last lines of the log where the process could tell nothing any more.
         seconds: how long it ran [s].
         peak_memory_bytes: largest resident memory seen; 0 when unknown.
+        full_place: what could not be written as its disk is full, "" where that is not known; it may lie outside the
+            job's folder.
     """
 
     task_id: TaskId
@@ -124,6 +126,7 @@ class Failed:
     details: str = ""
     seconds: float = 0.0
     peak_memory_bytes: int = 0
+    full_place: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 from pipeline.errors import PipelineError
 from pipeline.task import FailureKind
@@ -44,6 +45,12 @@ def describe(error: BaseException) -> str:
 def is_disk_full(error: BaseException) -> bool:
     """Whether an exception comes of a full disk or an exhausted quota."""
     return any(map(_means_disk_full, _chain(error)))
+
+
+def full_place(error: BaseException) -> str:
+    """What could not be written as a disk is full, as far as an exception names it; "" if it does not."""
+    full = (link for link in _chain(error) if isinstance(link, OSError) and link.errno in _DISK_FULL_CODES)
+    return next((os.fsdecode(link.filename) for link in full if isinstance(link.filename, str | bytes | Path)), "")
 
 
 def is_out_of_memory(error: BaseException) -> bool:

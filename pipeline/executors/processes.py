@@ -15,7 +15,7 @@ from math import inf
 
 from pipeline.executors.base import Assignment, Failed, Finished, Progress, ShutDownOnExit, TaskEvent
 from pipeline.executors.channel import Channel
-from pipeline.executors.failures import is_disk_full
+from pipeline.executors.failures import full_place, is_disk_full
 from pipeline.executors.gpu_places import places_of_process
 from pipeline.executors.memory import machine_memory_bytes
 from pipeline.executors.worker_process import WorkerProcess, log_tail
@@ -107,7 +107,8 @@ class ProcessExecutor(ShutDownOnExit):
             except OSError as error:  # too many processes or files, no memory, a full disk: the task may try again
                 kind = FailureKind.DISK_FULL if is_disk_full(error) else FailureKind.WORKER_LOST
                 sentence = f"no worker could be started: {error}"
-                self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence))
+                task_id, attempt, full = assignment.task.id, assignment.attempt, full_place(error)
+                self._events.append(Failed(task_id, attempt, kind, sentence, full_place=full))
                 self._give_place_back(assignment)
                 return
             self._workers.append(worker)

@@ -196,6 +196,10 @@ def _fill_disk(context: TaskContext) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+def _fill_temporary_disk(_context: TaskContext) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/temporary/file")
+
+
 def _run_out_of_memory(context: TaskContext) -> None:
     bytearray(1 << 62)
 
@@ -298,6 +302,7 @@ FAULTS = {
     "fail": _fail,
     "diverge": _diverge,
     "disk full": _fill_disk,
+    "temporary disk full": _fill_temporary_disk,
     "memory error": _run_out_of_memory,
     "segfault": _segfault,
     "exit": _exit,

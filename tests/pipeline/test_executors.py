@@ -178,6 +178,17 @@ class TestProcesses(ProcessesContract):
             assert folder.exists() == (fault == "temporary files")  # whose worker is kept
         assert list((tmp_path / "temporary").iterdir()) == []
 
+    def test_a_full_disk_of_temporary_files_is_named_where_no_worker_can_be_started(
+        self, layout: JobLayout, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def full(**_options: object) -> str:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/temporary/pipeline-worker-1")
+
+        monkeypatch.setattr("pipeline.executors.worker_process.mkdtemp", full)
+        with ProcessExecutor() as executor:
+            failed = failure(run(executor, assign(layout, "steps")))
+        assert (failed.kind, failed.full_place) == (FailureKind.DISK_FULL, "/temporary/pipeline-worker-1")
+
     def test_a_temporary_folder_that_cannot_be_removed_costs_no_run(
         self, layout: JobLayout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

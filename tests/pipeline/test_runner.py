@@ -194,6 +194,14 @@ def test_a_full_disk_pauses_the_job_and_the_next_run_finishes_it(root: Path) -> 
     assert "double/000001" not in recorder.ran()
 
 
+def test_the_disk_that_is_full_is_named_also_where_it_is_not_the_one_of_the_job(root: Path) -> None:
+    write_faults(root, {"double/000002": ["temporary disk full"]})
+    outcome, recorder = run_recorded(root)
+    assert (outcome.kind, outcome.full_place) == (JobOutcome.DISK_FULL, "/temporary/file")
+    (told,) = (notice.message for notice in recorder.of(Notice) if "disk is full" in notice.message)
+    assert told.startswith("the disk is full (/temporary/file): the job pauses")
+
+
 def test_a_manifest_on_a_full_disk_loses_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     record_artifact = Manifest.record_artifact
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import signal
@@ -47,6 +48,7 @@ from render.blender import (
     require_supported_executable,
     run_script,
 )
+from render.gpus import find_gpus
 from render.parameters import CameraParameters, MaterialParameters, StageParameters
 from render.spec import MeshObject, MeshSequenceObject, RenderSpec
 
@@ -216,6 +218,16 @@ def test_a_script_leaves_no_temporary_files_however_it_ends(tmp_path, monkeypatc
     told = run_script([sys.executable, "-c", code], timeout_s=120.0, purpose="end").stdout
     assert told.startswith(f"{tmp_path}/")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_temporary_disk_is_not_told_as_a_blender_that_cannot_be_started(monkeypatch):
+    def full(**_options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/temporary/blender-1")
+
+    monkeypatch.setattr("render.blender.mkdtemp", full)
+    with pytest.raises(OSError, match="/temporary/blender-1"):
+        run_script(["blender"], timeout_s=1.0, purpose="end")
+    assert "/temporary/blender-1" in find_gpus("blender").trouble
 
 
 def test_a_temporary_folder_that_cannot_be_removed_costs_no_picture(tmp_path, monkeypatch):
