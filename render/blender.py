@@ -8,23 +8,23 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import re
-import shutil
 import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Protocol
 
 from render.system_libraries import install_line, missing_libraries, missing_packages
+from render.temporary_folder import environment_of_child
 
 logger = logging.getLogger(__name__)
 
 MINIMUM_BLENDER_VERSION = (4, 5)
+TEMPORARY_PREFIX = "blender-"
+"""Of the temporary folders of Blenders in processes of their own."""
 _STARTUP_VERSION_TIMEOUT_S = 120.0
 _TERMINATE_TIMEOUT_S = 10.0
 _LOG_TAIL_LINES = 30
@@ -180,7 +180,7 @@ class ExecutableRenderer:
         self._log_tail: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
         self._argv = build_argv(blender, spec_path.resolve(), threads=threads, gpu=gpu)
         with contextlib.ExitStack() as on_failure:
-            environment = on_failure.enter_context(environment_of_child())
+            environment = on_failure.enter_context(environment_of_child(TEMPORARY_PREFIX))
             self._process = subprocess.Popen(
                 self._argv,
                 stdin=subprocess.PIPE,
@@ -323,22 +323,6 @@ def script_argv(blender: str | None, script: str, options: Sequence[str], *, own
     return [*start, "--python", path, "--", *options]
 
 
-@contextlib.contextmanager
-def environment_of_child() -> Iterator[dict[str, str]]:
-    """The environment for a Blender in a process of its own, whose temporary folder goes at the end of the block.
-
-    Blender makes a folder in it, and removes that only if it ends by itself.
-
-    Raises:
-        OSError: there is no place for it.
-    """
-    folder = mkdtemp(prefix="blender-")
-    try:
-        yield {**os.environ, "TMPDIR": folder, "TMP": folder}  # Blender up to 4.5 asks the second first
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)  # what cannot be removed is no reason to lose a picture
-
-
 def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subprocess.CompletedProcess[str]:
     """Run a script to its end, whatever that is; its output is text.
 
@@ -352,7 +336,7 @@ def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subpro
         BlenderUnavailableError: it cannot be started.
         OSError: there is no place for its temporary files.
     """
-    with environment_of_child() as environment:
+    with environment_of_child(TEMPORARY_PREFIX) as environment:
         try:
             return subprocess.run(
                 argv,

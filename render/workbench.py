@@ -7,14 +7,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from render.blender import (
+    TEMPORARY_PREFIX,
     BlenderUnavailableError,
     FrameRenderError,
-    environment_of_child,
     require_bpy,
     run_script,
     script_argv,
 )
 from render.system_libraries import install_line, missing_libraries
+from render.temporary_folder import environment_of_child
 
 EGL_PACKAGES = {"libEGL.so.1": "libegl1"}
 """Library -> Debian package: how OpenGL draws without a screen."""
@@ -81,7 +82,7 @@ def draw_frames(
     argv = script_argv(blender, "render_frames.py", options)
     done, last = 0, ""
     with (
-        environment_of_child() as environment,
+        environment_of_child(TEMPORARY_PREFIX) as environment,
         subprocess.Popen(
             argv,
             stdout=subprocess.PIPE,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -14,7 +13,6 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from tempfile import mkdtemp
 
 import psutil
 
@@ -23,10 +21,9 @@ from pipeline.executors.channel import Channel
 from pipeline.executors.memory import out_of_memory_kills, process_tree, tree_memory_bytes
 from pipeline.task import FailureKind
 from pipeline.worker import STACK_DUMP_SIGNAL
+from render.temporary_folder import environment_of_child
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
-_TEMPORARY_FOLDER_VARIABLES = ("TMPDIR", "TMP")
-"""Blender up to 4.5 asks the second first."""
 _LOG_TAIL_LINES = 20
 WorkerKey = tuple[str, int, int | None]
 """Stage, thread count and GPU."""
@@ -167,7 +164,7 @@ class WorkerProcess:
         self.channel.close()
         if self.exit_descriptor is not None:
             os.close(self.exit_descriptor)
-        shutil.rmtree(self._scratch, ignore_errors=True)  # what cannot be removed is no reason to lose a run
+        self._scratch.close()
 
 
 def log_tail(log: Path) -> str:
@@ -201,30 +198,27 @@ def _describe_process(pid: int) -> str:
         return f"  process {pid} has ended"
 
 
-def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, str]:
+def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, ExitStack]:
     """Start a fresh interpreter; what it prints before its first task goes into that task's log.
 
-    Its temporary folder is its own: Blender and Taichi leave theirs behind where they are killed.
+    Its temporary folder is its own: Blender and Taichi leave theirs behind where they are killed. The last of what is
+    returned removes it.
     """
     first.log.parent.mkdir(parents=True, exist_ok=True)
     ours, theirs = socket.socketpair()
     with ExitStack() as on_failure, theirs, first.log.open("ab") as log:
         on_failure.enter_context(ours)
         # What somebody still writes goes with the worker's guardian.
-        scratch = mkdtemp(prefix="pipeline-worker-")
-        on_failure.callback(shutil.rmtree, scratch, ignore_errors=True)
+        scratch = on_failure.enter_context(ExitStack())
+        environment = scratch.enter_context(environment_of_child("pipeline-worker-"))
         process = subprocess.Popen(
-            python_argv("pipeline.worker", str(theirs.fileno()), str(os.getpid()), scratch),
+            python_argv("pipeline.worker", str(theirs.fileno()), str(os.getpid()), environment["TMPDIR"]),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             pass_fds=[theirs.fileno()],
             start_new_session=True,
-            env={
-                **os.environ,
-                **dict.fromkeys(THREAD_VARIABLES, str(first.threads)),
-                **dict.fromkeys(_TEMPORARY_FOLDER_VARIABLES, scratch),
-            },
+            env={**environment, **dict.fromkeys(THREAD_VARIABLES, str(first.threads))},
         )
         on_failure.pop_all()
     return process, Channel(ours), scratch

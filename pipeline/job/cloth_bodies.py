@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.job.mesh_grids import problem_of_mesh_grid
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
 
@@ -59,7 +60,6 @@ def check_bodies_for_cloth(
         cloths: its cloths, by their numbers.
         findings: where warnings go.
     """
-    from sim.rigid.shape_grids import CELLS_PER_WALL, THIN_SHARE, grid_spacing, thin_wall
     from sim.shapes.placement import PlacedSolid
 
     if not cloths:
@@ -85,15 +85,8 @@ def check_bodies_for_cloth(
                 f"{cloths[coarsest].longest_edge:.3g} m each: it may show or pass between the nodes; divide the sheet "
                 "more finely, or make the body larger",
             )
-        wall = thin_wall(solid)
-        cell = grid_spacing(solid, wall)
-        if wall < CELLS_PER_WALL * cell:
-            findings.warn(
-                (*path[:2], "shape"),
-                f"{THIN_SHARE:.0%} of its surface or more is on walls of {wall:.3g} m or thinner; the finest grid that "
-                f"cloth may meet it by has cells of {cell:.3g} m and feels walls of {CELLS_PER_WALL:g}: cloth may pass "
-                "through them; make them thicker, or build the body of several",
-            )
+        if problem := problem_of_mesh_grid(solid, who="cloth", what="cloth"):
+            findings.warn((*path[:2], "shape"), problem)
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,12 +46,10 @@ def fluid_over(job: Job, solids: Mapping[KeyPath, Solid], box: Box) -> float:
                 is_above = (box.mean(axis=0) - solid.bounds.mean(axis=0))[down] * gravity[down] > 0.0
                 shared = np.clip(np.minimum(high, box[1]) - np.maximum(low, box[0]), 0.0, None)[sides]
                 volume += is_above * solid.volume * float(np.prod(shared / (high - low)[sides]))
-        particle = (2.0 * fluid.particle_radius) ** 3
         for _, opening in openings_of(fluid):
             if _falls_onto(opening, box, gravity, down):
-                volume += len(opening.points) * opening.layers_due(job.frame_count / job.fps) * particle
-        most = math.inf if fluid.max_particles is None else fluid.max_particles * particle
-        mass += fluid.rest_density * min(volume, most)
+                volume += len(opening.points) * opening.layers_due(job.frame_count / job.fps) * fluid.lattice_volume
+        mass += fluid.rest_density * min(volume, fluid.most_volume)
     return mass
 
 

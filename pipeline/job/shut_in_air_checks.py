@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -47,9 +46,8 @@ def check_shut_in_air(
                     f"and {_as_much_must_flow(flow)}",
                 )
     for index, fluid in enumerate(job.fluid):
-        most = math.inf if fluid.max_particles is None else fluid.max_particles * (2.0 * fluid.particle_radius) ** 3
         for number, emitter in enumerate(fluid.emitter):
-            filled = min(emitted_volume(emitter, until_s=job.frame_count / job.fps), most) / room
+            filled = min(emitted_volume(emitter, until_s=job.frame_count / job.fps), fluid.most_volume) / room
             is_inside = np.all((box[0] <= emitter.position) & (emitter.position <= box[1]))
             if is_inside and filled > SQUEEZED:
                 findings.warn(

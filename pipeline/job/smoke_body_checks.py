@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.job.amounts import rounded_down
 from pipeline.job.boxes import smoke_box, touch
+from pipeline.job.mesh_grids import problem_of_mesh_grid
 from pipeline.job.positions import KeyPath
 from pipeline.job.problems import Findings
 from sim.smoke.parameters import MOST_CELLS, SmokeParameters
@@ -128,7 +129,9 @@ def _check_moving_bodies(job: Job, solids: Mapping[KeyPath, PlacedSolid], findin
             walls = thin_walls_on_the_way(solids["rigid", moving[number]], smoke)
             if leaks(walls):
                 findings.warn(("rigid", moving[number]), _of_thin_walls(walls, smoke))
-            elif problem := _of_its_grid(solids["rigid", moving[number]], smoke):
+            elif problem := problem_of_mesh_grid(
+                solids["rigid", moving[number]], who=f'smoke "{smoke.name}"', what="air"
+            ):
                 findings.warn(("rigid", moving[number], "shape"), problem)
 
 
@@ -137,19 +140,4 @@ def _of_thin_walls(walls: ThinWalls, smoke: SmokeParameters) -> str:
         f'has walls thinner than the cells of smoke "{smoke.name}", {smoke.cell_size:g} m, which miss '
         f"{100.0 * walls.share:.0f} % of its surface: air passes through there; use a cell_size of "
         f"{rounded_down(walls.thickness):g} m or less, or thicker walls"
-    )
-
-
-def _of_its_grid(solid: PlacedSolid, smoke: SmokeParameters) -> str | None:
-    """Why a mesh that moves has other walls on the device, which reads its distance from a grid; None if it has not."""
-    from sim.rigid.shape_grids import CELLS_PER_WALL, THIN_SHARE, grid_spacing, thin_wall
-
-    wall = thin_wall(solid)
-    cell = grid_spacing(solid, wall)
-    if wall >= CELLS_PER_WALL * cell:
-        return None
-    return (
-        f"{THIN_SHARE:.0%} of its surface or more is on walls of {wall:.3g} m or thinner; the finest grid that smoke "
-        f'"{smoke.name}" may meet it by has cells of {cell:.3g} m and feels walls of {CELLS_PER_WALL:g}: air may pass '
-        "through them; make them thicker, or build the body of several"
     )

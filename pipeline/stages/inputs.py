@@ -102,7 +102,7 @@ def most_particles_of(fluid: FluidParameters, scene: SceneParameters, *, until_s
     )
     emitted = sum(emitted_volume(emitter, until_s=until_s) for emitter in fluid.emitter)
     volume = min(MOST_IN_A_VOLUME * (filled + emitted), domain_volume(scene))
-    return min(volume / (2.0 * fluid.particle_radius) ** 3, fluid.max_particles or inf)
+    return min(volume, fluid.most_volume) / fluid.lattice_volume
 
 
 def emitted_volume(emitter: EmitterParameters, *, until_s: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
@@ -128,6 +129,16 @@ class FluidParameters(Parameters):
         description='Time step [s], or "adaptive": the largest that the CFL condition allows.',
     )
     cfl: Positive = Field(default=1.0, le=2.0, description="Factor on the CFL time step [-].")
+
+    @property
+    def lattice_volume(self) -> float:
+        """What a particle takes of a block, (2r)³ [m³]."""
+        return (2.0 * self.particle_radius) ** 3
+
+    @property
+    def most_volume(self) -> float:
+        """What `max_particles` take [m³]; infinite without that key."""
+        return math.inf if self.max_particles is None else self.max_particles * self.lattice_volume
 
     @property
     def skin(self) -> float:

@@ -7,6 +7,22 @@ from pipeline.job.checks import check_job
 from pipeline.job.loading import read_job
 from pipeline.job.problems import Findings
 
+PLUME_FROM_A_BALL = """
+name = "air"
+frames = 24
+fps = 24
+[domain]
+min = [-0.5, -0.5, 0.0]
+max = [0.5, 0.5, 1.0]
+[[smoke]]
+name = "plume"
+cell_size = 0.02
+[[smoke.source]]
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.2]
+"""
+"""Smoke in a box of a metre, without bodies: its lines are 2 to 14."""
+
 
 class Checked(NamedTuple):
     """Lines as a user reads them, and what was found beside them."""

@@ -2,24 +2,14 @@
 
 import pytest
 import trimesh
+from checked_jobs import PLUME_FROM_A_BALL
 
 from pipeline.errors import JobFileError
 from pipeline.job.checks import load_checked_job
 
-PLUME = """
-name = "air"
-frames = 24
-fps = 24
-[domain]
-min = [-0.5, -0.5, 0.0]
-max = [0.5, 0.5, 1.0]
-[[smoke]]
-name = "plume"
-cell_size = 0.02
-[[smoke.source]]
-shape = { type = "cylinder", radius = 0.1, height = 0.1 }
-position = [0.0, 0.0, 0.2]
-"""
+PLUME = PLUME_FROM_A_BALL.replace(
+    '{ type = "sphere", radius = 0.1 }', '{ type = "cylinder", radius = 0.1, height = 0.1 }'
+)
 THIN_SOURCE = PLUME.replace("height = 0.1", "height = 0.03").replace("[0.0, 0.0, 0.2]", "[0.0, 0.0, 0.04]")
 PADDLE = """
 [[rigid]]

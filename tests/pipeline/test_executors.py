@@ -184,7 +184,7 @@ class TestProcesses(ProcessesContract):
         def full(**_options: object) -> str:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/temporary/pipeline-worker-1")
 
-        monkeypatch.setattr("pipeline.executors.worker_process.mkdtemp", full)
+        monkeypatch.setattr("render.temporary_folder.mkdtemp", full)
         with ProcessExecutor() as executor:
             failed = failure(run(executor, assign(layout, "steps")))
         assert (failed.kind, failed.full_place) == (FailureKind.DISK_FULL, "/temporary/pipeline-worker-1")

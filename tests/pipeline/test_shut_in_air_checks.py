@@ -2,24 +2,11 @@
 
 import pytest
 import trimesh
+from checked_jobs import PLUME_FROM_A_BALL as PLUME
 from checked_jobs import checked
 
 from sim.shapes.mesh_solid import MeshSolid
 
-PLUME = """
-name = "air"
-frames = 24
-fps = 24
-[domain]
-min = [-0.5, -0.5, 0.0]
-max = [0.5, 0.5, 1.0]
-[[smoke]]
-name = "plume"
-cell_size = 0.02
-[[smoke.source]]
-shape = { type = "sphere", radius = 0.1 }
-position = [0.0, 0.0, 0.2]
-"""
 CLOSED = PLUME.replace("cell_size = 0.02", "cell_size = 0.02\nopen_faces = []")
 PISTON = """
 [[rigid]]

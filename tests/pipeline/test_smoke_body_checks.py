@@ -3,25 +3,12 @@
 import numpy as np
 import pytest
 import trimesh
+from checked_jobs import PLUME_FROM_A_BALL as PLUME
 from checked_jobs import checked
 
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
 
-PLUME = """
-name = "air"
-frames = 24
-fps = 24
-[domain]
-min = [-0.5, -0.5, 0.0]
-max = [0.5, 0.5, 1.0]
-[[smoke]]
-name = "plume"
-cell_size = 0.02
-[[smoke.source]]
-shape = { type = "sphere", radius = 0.1 }
-position = [0.0, 0.0, 0.2]
-"""
 PLATE = """
 [[rigid]]
 name = "plate"

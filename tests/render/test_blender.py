@@ -42,7 +42,6 @@ from render.blender import (
     ExecutableRenderer,
     FrameRenderError,
     build_argv,
-    environment_of_child,
     open_renderer,
     parse_blender_version,
     require_supported_executable,
@@ -51,6 +50,7 @@ from render.blender import (
 from render.gpus import find_gpus
 from render.parameters import CameraParameters, MaterialParameters, StageParameters
 from render.spec import MeshObject, MeshSequenceObject, RenderSpec
+from render.temporary_folder import environment_of_child
 
 pytestmark = needs_bpy
 
@@ -224,7 +224,7 @@ def test_a_full_temporary_disk_is_not_told_as_a_blender_that_cannot_be_started(m
     def full(**_options):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/temporary/blender-1")
 
-    monkeypatch.setattr("render.blender.mkdtemp", full)
+    monkeypatch.setattr("render.temporary_folder.mkdtemp", full)
     with pytest.raises(OSError, match="/temporary/blender-1"):
         run_script(["blender"], timeout_s=1.0, purpose="end")
     assert "/temporary/blender-1" in find_gpus("blender").trouble
@@ -232,7 +232,7 @@ def test_a_full_temporary_disk_is_not_told_as_a_blender_that_cannot_be_started(m
 
 def test_a_temporary_folder_that_cannot_be_removed_costs_no_picture(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with environment_of_child() as environment:
+    with environment_of_child("blender-") as environment:
         refuse_removal(monkeypatch, tmp_path)
     assert environment["TMPDIR"].startswith(f"{tmp_path}/")
 
@@ -240,7 +240,7 @@ def test_a_temporary_folder_that_cannot_be_removed_costs_no_picture(tmp_path, mo
 def test_blender_up_to_4_5_asks_for_its_temporary_folder_by_another_name_first(tmp_path, monkeypatch):
     monkeypatch.setenv("TMP", "/elsewhere")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with environment_of_child() as environment:
+    with environment_of_child("blender-") as environment:
         assert environment["TMP"] == environment["TMPDIR"] != "/elsewhere"
 
 

@@ -15,8 +15,9 @@ from needed_blender import needs_bpy
 from PIL import Image
 
 from pipeline.cache import write_frame
-from pipeline.executors.base import Failed, Finished
+from pipeline.executors.base import Failed, Finished, TaskEvent
 from pipeline.job.loading import load_job
+from pipeline.layout import JobLayout
 from pipeline.stages import render_drawing
 from pipeline.stages.render import RenderStage
 from render.camera_path import View, write_views
@@ -79,6 +80,17 @@ if left.is_file() and int(left.read_text()) > 0:
 """Put before a Blender: it draws no ball, as often as the counter says, and then does."""
 
 
+def draw_the_ball(layout: JobLayout) -> TaskEvent:
+    """Draw frame 1 of a job of the ball, in which it lies where it was put; how that ended."""
+    cache = layout.path(layout.frame_cache(1))
+    cache.parent.mkdir()
+    ball = Snapshot("rigid", pose()["ball"], {})
+    write_frame(cache, {"ball": ball}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu")
+    ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
+    render_drawing.close_renderers()
+    return ended
+
+
 def draw_with_faults(folder: Path, faults: int):
     """Draw a frame of the ball by a Blender that drops it in so many of its processes; how it ended, and the layout."""
     job, layout = job_of_the_ball(folder, "pond", "")
@@ -94,13 +106,7 @@ def draw_with_faults(folder: Path, faults: int):
     fault = [f"sys.path.insert(0, {str(root)!r})", *DROPS_BODIES.format(counter=str(counter)).splitlines()]
     executable.write_text("\n".join([*lines[:start], *fault, *lines[start:]]) + "\n")
     executable.chmod(executable.stat().st_mode | stat.S_IXUSR)
-    cache = layout.path(layout.frame_cache(1))
-    cache.parent.mkdir()
-    ball = Snapshot("rigid", pose()["ball"], {})
-    write_frame(cache, {"ball": ball}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu")
-    ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
-    render_drawing.close_renderers()
-    return ended, layout
+    return draw_the_ball(layout), layout
 
 
 @needs_bpy
@@ -181,13 +187,7 @@ def test_without_a_background_a_picture_may_be_empty(tmp_path):
 def test_a_frame_that_the_ball_is_not_in_is_no_fault_without_a_background(tmp_path, background):
     away = "[camera]\nposition = [0.0, -3.0, 9.0]\nlook_at = [0.0, 0.0, 12.0]\n"
     _, layout = job_of_the_ball(tmp_path, "away", f'{away}[stage]\nbackground = "{background}"\n')
-    cache = layout.path(layout.frame_cache(1))
-    cache.parent.mkdir()
-    write_frame(
-        cache, {"ball": Snapshot("rigid", pose()["ball"], {})}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu"
-    )
-    ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
-    render_drawing.close_renderers()
+    ended = draw_the_ball(layout)
     assert isinstance(ended, Finished), ended
 
 
@@ -196,12 +196,6 @@ def test_a_frame_that_the_ball_is_not_in_is_no_fault_without_a_background(tmp_pa
 def test_a_frame_that_is_nearly_white_is_warned_of(tmp_path, power, is_white):
     sun = f'[[light]]\ntype = "sun"\nposition = [0.5, -1.0, 2.0]\npower = {power}\n'
     _, layout = job_of_the_ball(tmp_path, "noon", sun)
-    cache = layout.path(layout.frame_cache(1))
-    cache.parent.mkdir()
-    write_frame(
-        cache, {"ball": Snapshot("rigid", pose()["ball"], {})}, FrameReport(1, 1 / 60, {}, {}, {}), device="cpu"
-    )
-    ended = run_task(RenderStage().plan(load_job(layout.job_file), layout)[1], layout)
-    render_drawing.close_renderers()
+    ended = draw_the_ball(layout)
     assert isinstance(ended, Finished), ended
     assert ("of the picture is white" in layout.log(ended.task_id, 1).read_text()) == is_white
