@@ -13,11 +13,6 @@ cloth (bpy of this Python) does the same drop of the same mesh; both results are
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -25,13 +20,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.runtime import initialize
+from benchmarks.compare import arguments_of, child, machine, run, spread, start_taichi, timed
 from sim.scene import SceneParameters
 
 if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver
     from sim.cloth.state import ClothState
-    from sim.world import World
+    from sim.core.world import World
 
 SIDE, HEIGHT = 1.0, 0.3
 """Length of the cloth's sides, and how high it starts [m]."""
@@ -84,14 +79,14 @@ def measure(nodes: int, arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.without_contacts:
         solver.contacts.clear()
     built_s = time.perf_counter() - start
-    seconds, processor_seconds, substeps = [], [], 0
-    for _ in range(arguments.frames):
-        start, processor_start = time.perf_counter(), time.process_time()
+    substeps = 0
+
+    def frame() -> None:
+        nonlocal substeps
         substeps = world.advance_frame().substeps[solver.name]
         ti.sync()
-        seconds.append(time.perf_counter() - start)
-        processor_seconds.append(time.process_time() - processor_start)
-    later = slice(min(5, len(seconds) - 1), None)  # the first ones compile
+
+    times = [timed(frame) for _ in range(arguments.frames)]
     dt = solver.stable_dt()
     return {
         "nodes": nodes,
@@ -99,8 +94,7 @@ def measure(nodes: int, arguments: argparse.Namespace) -> dict[str, Any]:
         "triangles": solver.state.triangle_count,
         "substeps_of_last_frame": substeps,
         "building_s": built_s,
-        "frame_ms": spread(seconds[later]),
-        "frame_processor_ms": spread(processor_seconds[later]),
+        **frame_times(times),
         "substep_parts_ms": {
             name: 1e3 * fastest(part, arguments.repeats)
             for name, part in {
@@ -142,14 +136,12 @@ def fastest(part: Callable[[], object], repeats: int) -> float:
     """Least time of a call [s]: what other programs disturbed least."""
     import taichi as ti
 
-    seconds = []
-    for _ in range(repeats):
-        ti.sync()
-        start = time.perf_counter()
+    def whole() -> None:
         part()
         ti.sync()
-        seconds.append(time.perf_counter() - start)
-    return min(seconds)
+
+    ti.sync()
+    return min(timed(whole)[0] for _ in range(repeats))
 
 
 def described(positions: NDArray[np.float64], triangles: NDArray[np.integer]) -> dict[str, Any]:
@@ -169,52 +161,94 @@ def described(positions: NDArray[np.float64], triangles: NDArray[np.integer]) ->
     }
 
 
-def spread(values: list[float]) -> dict[str, float]:
-    """In milliseconds."""
-    return {"median": 1e3 * statistics.median(values), "least": 1e3 * min(values), "most": 1e3 * max(values)}
+def frame_times(times: list[tuple[float, float]]) -> dict[str, dict[str, float]]:
+    """Wall and processor times of frames [ms], after the first ones, which compile."""
+    wall, processor = zip(*times[min(5, len(times) - 1) :], strict=True)
+    return {"frame_ms": spread(wall, scale=1e3), "frame_processor_ms": spread(processor, scale=1e3)}
 
 
-def measure_blender(nodes: int, arguments: argparse.Namespace) -> dict[str, Any]:
+def measure_blender(nodes: int, frames: int) -> dict[str, Any]:
     """Blender's cloth, in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.cloth_blender", str(nodes), str(arguments.frames)]
-    child = subprocess.run(command, capture_output=True, text=True, check=True)
-    answer = json.loads(child.stdout)
+    answer = child(["-m", "benchmarks.cloth", "--as-blender", "--nodes", str(nodes), "--frames", str(frames)])
     positions, triangles = np.array(answer.pop("positions")), np.array(answer.pop("triangles"))
-    seconds, processor_seconds = answer.pop("seconds"), answer.pop("processor_seconds")
+    return {**answer, **frame_times(answer.pop("times")), "result": described(positions, triangles)}
+
+
+def drop_in_blender(nodes: int, frames: int) -> dict[str, Any]:
+    """The same drop by Blender itself: times of frames [s], and where the cloth is in the end. Needs bpy.
+
+    Quality 5, collisions with the ball and the floor, and with itself at a distance of half the spacing of the nodes.
+    """
+    import bpy
+
+    from sim.cloth.parameters import RectangleSheet
+    from sim.cloth.sheet import rectangle
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    stage = bpy.context.scene
+    stage.render.fps = round(FRAMES_PER_SECOND)
+    sheet = rectangle(RectangleSheet(type="rectangle", size=(SIDE, SIDE), counts=(nodes, nodes)))
+    mesh = bpy.data.meshes.new("cloth")
+    mesh.from_pydata(sheet.vertices + (0.0, 0.0, HEIGHT), [], sheet.triangles.tolist())  # noqa: RUF005  an array
+    cloth = bpy.data.objects.new("cloth", mesh)
+    stage.collection.objects.link(cloth)
+    bpy.ops.mesh.primitive_uv_sphere_add(
+        segments=64, ring_count=32, radius=BALL_RADIUS, location=(0.0, 0.0, BALL_HEIGHT)
+    )
+    ball = bpy.context.object
+    bpy.ops.mesh.primitive_plane_add(size=4.0, location=(0.0, 0.0, FLOOR))
+    for obstacle in (ball, bpy.context.object):
+        obstacle.modifiers.new("collision", "COLLISION")
+        obstacle.collision.thickness_outer = 0.001
+
+    modifier = cloth.modifiers.new("cloth", "CLOTH")
+    distance = THICKNESS_IN_SPACINGS * SIDE / (nodes - 1)
+    modifier.settings.quality = 5
+    # Mass stays 0.3 kg a vertex, as in Blender's cotton: the true one, below a gram, hangs in Blender's air like down.
+    modifier.collision_settings.use_collision = modifier.collision_settings.use_self_collision = True
+    modifier.collision_settings.distance_min = modifier.collision_settings.self_distance_min = distance
+    modifier.point_cache.frame_end = frames + 1
+    evaluated = None
+
+    def show(frame: int) -> None:
+        nonlocal evaluated
+        stage.frame_set(frame)
+        evaluated = cloth.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+
+    times = [timed(lambda frame=frame: show(frame)) for frame in range(1, frames + 2)]
+    positions = np.empty(3 * nodes**2, dtype=np.float32)
+    evaluated.vertices.foreach_get("co", positions)
     return {
-        **answer,
-        "frame_ms": spread(seconds[5:]),
-        "frame_processor_ms": spread(processor_seconds[5:]),
-        "result": described(positions, triangles),
+        "blender": bpy.app.version_string,
+        "times": times[1:],
+        "positions": positions.reshape(-1, 3).tolist(),
+        "triangles": sheet.triangles.tolist(),
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> dict[str, Any]:
+    parser = arguments_of(__doc__)
     parser.add_argument("--nodes", type=int, nargs="+", default=[100], help="along each side, one drop each")
     parser.add_argument("--substeps", type=int, default=20)
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--repeats", type=int, default=20, help="of each part of a substep")
     parser.add_argument("--without-contacts", action="store_true", help="springs and air alone")
     parser.add_argument("--blender", action="store_true", help="also Blender's own cloth")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int)
-    arguments = parser.parse_args()
-    device = initialize(arguments.device, threads=arguments.threads)
+    parser.add_argument("--as-blender", action="store_true", help="Blender's own cloth alone, and where it lies")
+    asked, _ = parser.parse_known_args()
+    if asked.as_blender:
+        return drop_in_blender(asked.nodes[0], asked.frames)
+    arguments = start_taichi(parser)
     runs = []
     for nodes in arguments.nodes:
-        run = measure(nodes, arguments)
+        drop = measure(nodes, arguments)
         if arguments.blender:
-            run["blender"] = measure_blender(nodes, arguments)
+            drop["blender"] = measure_blender(nodes, arguments.frames)
             for time_of in ("frame_ms", "frame_processor_ms"):
-                run[f"blender_over_own_{time_of}"] = run["blender"][time_of]["median"] / run[time_of]["median"]
-        runs.append(run)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    json.dump(
-        {"device": device, "cores": cores, "load_average": os.getloadavg()[0], "runs": runs}, sys.stdout, indent=2
-    )
-    sys.stdout.write("\n")
+                drop[f"blender_over_own_{time_of}"] = drop["blender"][time_of]["median"] / drop[time_of]["median"]
+        runs.append(drop)
+    return {**machine(arguments.device), "runs": runs}
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

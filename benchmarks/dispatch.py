@@ -1,6 +1,6 @@
 """What running a task costs besides its own work: dispatch through the real runner, manifest and workers.
 
-Runs a job of no-op tasks and reports the overhead a task, and what the scheduler alone takes for 100,000 tasks:
+Runs a job of no-op tasks and reports the overhead a task, and what a run over a finished job takes:
 
     python -m benchmarks.dispatch [--tasks 400] [--repeats 3] [--finished-tasks 10000] [--executor processes|inline]
 
@@ -11,36 +11,33 @@ with what else the machine and its disk do.
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from pipeline import artifacts
-from pipeline.executors.base import Committed, Executor
-from pipeline.executors.inline import InlineExecutor
-from pipeline.executors.processes import ProcessExecutor, WorkerLimits
-from pipeline.fingerprint import task_fingerprint
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
-from pipeline.manifest import Manifest
-from pipeline.parameter_set import ParameterSet
-from pipeline.receipts import Receipt, hash_file
-from pipeline.run_events import RunEvent
-from pipeline.runner import run_job
-from pipeline.scheduler import Scheduler
-from pipeline.scheduler_events import ArtifactCommitted, Finish, Instruction, JobOutcome, Start, TaskSucceeded
-from pipeline.task import ArtifactPath, Resources, Task, TaskId, TaskState
+from benchmarks.compare import arguments_of, run, timed
+from pipeline.base.fingerprint import task_fingerprint
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import ArtifactPath, Resources, Task, TaskId, TaskState
+from pipeline.model.job import Job
+from pipeline.record.manifest import Manifest
+from pipeline.run.control import Selection
+from pipeline.run.events import JobOutcome
+from pipeline.run.executors.base import Executor
+from pipeline.run.executors.inline import InlineExecutor
+from pipeline.run.executors.processes import ProcessExecutor, WorkerLimits
+from pipeline.run.runner import run_job
+from pipeline.store import artifacts
+from pipeline.store.receipts import Receipt, hash_file
 
 if TYPE_CHECKING:
     from pipeline.stages.base import TaskContext
 
 JOB = 'name = "dispatch"\nframes = {frames}\n'
 PARAMETERS = ParameterSet.of(stage="noop", version=1, tools={})
-SCHEDULED_TASKS = 100_000
 
 
 def accept(path: Path) -> None:
@@ -71,8 +68,17 @@ class CommitClock:
         self.times: list[float] = []
         self.processor_times: list[float] = []
 
-    def notify(self, event: RunEvent) -> None:
-        if isinstance(event, Committed):
+    def task_ms(self) -> tuple[float, float]:
+        """Wall time and the runner's processor time a task, from the first commit to the last [ms].
+
+        Neither has the start of the workers in it.
+        """
+        both = (self.times, self.processor_times)
+        wall, processor = (1e3 * (each[-1] - each[0]) / (len(each) - 1) for each in both)
+        return wall, processor
+
+    def notify(self, event: Any) -> None:
+        if hasattr(event, "receipt"):
             self.times.append(time.perf_counter())
             self.processor_times.append(time.process_time())
 
@@ -88,7 +94,10 @@ def _task(stage: str, frame: int, inputs: tuple[ArtifactPath, ...]) -> Task:
     )
 
 
-def run(root: Path, tasks: int, workers: int, executor: Executor, clock: CommitClock) -> None:
+def run_noops(
+    root: Path, tasks: int, executor: Executor, clock: CommitClock, *, workers: int = 1, rerun: Selection | None = None
+) -> None:
+    """Run the job of so many tasks, or some of them again."""
     outcome = run_job(
         Job(name="dispatch", frames=tasks),
         JobLayout(root),
@@ -96,21 +105,10 @@ def run(root: Path, tasks: int, workers: int, executor: Executor, clock: CommitC
         job_text=JOB.format(frames=tasks),
         stages="benchmarks.dispatch:STAGES",
         observer=clock,
+        rerun=rerun,
         capacity=Resources(cores=workers),
     )
     assert outcome.kind is JobOutcome.SUCCEEDED
-
-
-def dispatch_ms(root: Path, tasks: int, workers: int, executor: Executor) -> tuple[float, float]:
-    """Wall time a task, from the first commit to the last [ms], and processor time of the runner a task [ms].
-
-    Neither has the start of the workers in it.
-    """
-    clock = CommitClock()
-    run(root, tasks, workers, executor, clock)
-    count = len(clock.times) - 1
-    wall = clock.times[-1] - clock.times[0]
-    return wall / count * 1e3, (clock.processor_times[-1] - clock.processor_times[0]) / count * 1e3
 
 
 def nothing_to_do_s(root: Path, tasks: int) -> tuple[float, float]:
@@ -141,10 +139,8 @@ def nothing_to_do_s(root: Path, tasks: int) -> tuple[float, float]:
         manifest.record_plan(plan, {task.id: TaskState.SUCCEEDED for task in plan})
         manifest.record_artifacts(receipts)
         manifest.end_run()
-    run(root, tasks, 1, InlineExecutor(), CommitClock())  # the first one takes the states over as "up to date"
-    began = time.perf_counter(), time.process_time()
-    run(root, tasks, 1, InlineExecutor(), CommitClock())
-    return time.perf_counter() - began[0], time.process_time() - began[1]
+    run_noops(root, tasks, InlineExecutor(), CommitClock())  # the first one takes the states over as "up to date"
+    return timed(lambda: run_noops(root, tasks, InlineExecutor(), CommitClock()))
 
 
 def bare_commit_ms(root: Path, count: int) -> float:
@@ -159,72 +155,39 @@ def bare_commit_ms(root: Path, count: int) -> float:
     return (time.perf_counter() - began) / count * 1e3
 
 
-def scheduler_us() -> tuple[float, float]:
-    """Processor time to set a scheduler up for 100,000 tasks [s], and a task to run through them [µs]."""
-    frames = SCHEDULED_TASKS // 3
-    tasks: list[Task] = []
-    for frame in range(frames):
-        inputs: tuple[ArtifactPath, ...] = ()
-        for stage in ("simulate", "surface", "render"):
-            tasks.append(_task(stage, frame, inputs))
-            inputs = tasks[-1].outputs
-    began = time.process_time()
-    scheduler = Scheduler(tasks, capacity=Resources(cores=16))
-    set_up = time.process_time()
-    todo: list[Instruction] = scheduler.start()
-    for instruction in todo:  # grows while it is walked through
-        if isinstance(instruction, Start):
-            task = instruction.task
-            todo += scheduler.handle(ArtifactCommitted(task.id, task.outputs[0]))
-            todo += scheduler.handle(TaskSucceeded(task.id))
-    ended = time.process_time()
-    assert isinstance(todo[-1], Finish)
-    return set_up - began, (ended - set_up) / len(tasks) * 1e6
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> dict[str, Any]:
+    parser = arguments_of(__doc__)
     parser.add_argument("--tasks", type=int, default=400)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--finished-tasks", type=int, default=10_000)
     parser.add_argument("--executor", choices=("processes", "inline"), default="processes")
     options = parser.parse_args()
-    fresh, runner, bare = [], [], []
+    fresh, bare = [], []
     for _ in range(options.repeats):
-        executor = (
-            InlineExecutor()
-            if options.executor == "inline"
-            else ProcessExecutor(WorkerLimits(tasks_per_worker=options.tasks + 1))
-        )
+        processes = ProcessExecutor(WorkerLimits(tasks_per_worker=options.tasks + 1))
+        executor = InlineExecutor() if options.executor == "inline" else processes
+        clock = CommitClock()
         with tempfile.TemporaryDirectory() as folder, executor:
-            fresh_ms, runner_ms = dispatch_ms(Path(folder, "job"), options.tasks, options.workers, executor)
-            fresh.append(fresh_ms)
-            runner.append(runner_ms)
+            run_noops(Path(folder, "job"), options.tasks, executor, clock, workers=options.workers)
+            fresh.append(clock.task_ms())
             bare.append(bare_commit_ms(Path(folder, "bare"), options.tasks))
-    set_up_s, scheduled_us = scheduler_us()
     with tempfile.TemporaryDirectory() as folder:
         idle_s, idle_processor_s = nothing_to_do_s(Path(folder, "job"), options.finished_tasks)
-    print(
-        json.dumps(
-            {
-                "tasks": options.tasks,
-                "executor": options.executor,
-                "workers": options.workers,
-                "task_ms": round(statistics.median(fresh), 3),
-                "bare_commit_ms": round(statistics.median(bare), 3),
-                "overhead_ms": round(statistics.median(fresh) - statistics.median(bare), 3),
-                "runner_processor_ms": round(statistics.median(runner), 3),
-                "finished_tasks": options.finished_tasks,
-                "nothing_to_do_s": round(idle_s, 3),
-                "nothing_to_do_processor_s": round(idle_processor_s, 3),
-                "scheduler_set_up_s_for_100000": round(set_up_s, 3),
-                "scheduler_us_a_task": round(scheduled_us, 2),
-            },
-            indent=1,
-        )
-    )
+    task_ms, runner_ms = (statistics.median(column) for column in zip(*fresh, strict=True))
+    return {
+        "tasks": options.tasks,
+        "executor": options.executor,
+        "workers": options.workers,
+        "task_ms": round(task_ms, 3),
+        "bare_commit_ms": round(statistics.median(bare), 3),
+        "overhead_ms": round(task_ms - statistics.median(bare), 3),
+        "runner_processor_ms": round(runner_ms, 3),
+        "finished_tasks": options.finished_tasks,
+        "nothing_to_do_s": round(idle_s, 3),
+        "nothing_to_do_processor_s": round(idle_processor_s, 3),
+    }
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -12,33 +12,29 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-import os
 import statistics
-import sys
-import time
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim.domain import DomainParameters
+from benchmarks.compare import arguments_of, machine, run, spread, start_taichi, timed
+from sim.core.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
-from sim.runtime import initialize
+from sim.fluid.traits import TRAITS
 
 if TYPE_CHECKING:
-    from sim.fluid.particle_fluid import ParticleFluid
-
-SOLVERS = {"wcsph": "WCSPHSolver", "dfsph": "DFSPHSolver", "pcisph": "PCISPHSolver"}
-"""Class of each solver, in the module of its name."""
+    from sim.fluid.fluid import SPHFluid
 
 SPACING = 0.02
 EARTH = (0.0, 0.0, -9.81)
 
 
-def make_dam(solver: str, particles: int, support_in_spacings: float, **parameters: float) -> ParticleFluid:
+def make_dam(solver: str, particles: int, support_in_spacings: float, **parameters: float) -> SPHFluid:
     """A dam of about so many particles, as high as wide and deep."""
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
+    from sim.fluid.solvers import SOLVERS
+    from sim.fluid.tank import FluidStart
 
     side = max(round(particles ** (1 / 3)), 2)
     domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(2 * side * SPACING, side * SPACING, 1.5 * side * SPACING))
@@ -54,20 +50,20 @@ def make_dam(solver: str, particles: int, support_in_spacings: float, **paramete
             **parameters,
         }
     )
-    fluid: ParticleFluid = getattr(import_module(f"sim.fluid.{solver}"), SOLVERS[solver])(
-        material,
+    start = FluidStart(
+        (material,),
         domain=domain,
         gravity=EARTH,
         positions=positions,
         velocities=np.zeros_like(positions),
         boundary=BoundarySamples.of_bodies(domain_wall_samples(domain, SPACING, support_in_spacings)),
     )
-    return fluid
+    return SOLVERS[solver](start)
 
 
 def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[str, Any]:
     """One dam: steps per second, and what a step consists of."""
-    from sim.fluid.memory import IMPLICIT_PRESSURE_BYTES, estimate_bytes
+    from sim.fluid.memory import estimate_bytes
 
     tolerances = dict.fromkeys(("density_tolerance", "divergence_tolerance"), arguments.tolerance)
     fluid = make_dam(
@@ -82,21 +78,18 @@ def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[
     seconds, processor_seconds = [], []
     for _ in range(arguments.blocks):
         fluid.synchronize()
-        start, processor_start = time.perf_counter(), time.process_time()
-        for _ in range(arguments.steps):
-            fluid.substep(fluid.stable_dt())
-        fluid.synchronize()
-        seconds.append((time.perf_counter() - start) / arguments.steps)
-        processor_seconds.append((time.process_time() - processor_start) / arguments.steps)
+        wall, processor = timed(lambda: take_steps(fluid, arguments.steps))
+        seconds.append(wall / arguments.steps)
+        processor_seconds.append(processor / arguments.steps)
     if bad := fluid.first_bad_quantity():
         raise RuntimeError(f"{solver} with {particles} particles diverged: {bad}")
     state, count = fluid.diagnostics(), fluid.particle_count
     planned = estimate_bytes(
         count,
         fluid.boundary.count,
-        fluid.cell_count,
+        fluid.tank.grid.cell_count,
         support_in_spacings=arguments.support,
-        extra_bytes=0 if solver == "wcsph" else IMPLICIT_PRESSURE_BYTES,
+        extra_bytes=TRAITS[solver].extra_bytes,
     )
     return {
         "solver": solver,
@@ -104,12 +97,13 @@ def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[
         "boundary_samples": fluid.boundary.count,
         "support_in_spacings": arguments.support,
         "neighbors_per_particle": mean_neighbors(fluid),
-        "list_entries_per_particle": fluid.mean_neighbors,
+        "list_entries_per_particle": fluid.particles.neighbors.length / max(count, 1),
         "steps_per_neighbor_search": state["substeps"] / max(state["neighbor_searches"], 1.0),
         **{name: value for name, value in state.items() if "iterations" in name or name == "not_converged"},
         "dt_s": fluid.stable_dt(),
         "simulated_s": simulated,
-        "step_ms": {key: 1e3 * value for key, value in spread(seconds).items()},
+        "step_ms": spread(seconds, scale=1e3),
+        "step_processor_ms": spread(processor_seconds, scale=1e3),
         "million_particle_steps_per_s": count / statistics.median(seconds) / 1e6,
         "million_particle_steps_per_core_s": count / statistics.median(processor_seconds) / 1e6,
         "bytes_per_particle": {"planned": planned / count, "arrays": array_bytes() / count},
@@ -117,14 +111,19 @@ def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[
     }
 
 
-def spread(values: list[float]) -> dict[str, float]:
-    return {"median": statistics.median(values), "least": min(values), "most": max(values)}
+def take_steps(fluid: SPHFluid, count: int) -> None:
+    for _ in range(count):
+        fluid.substep(fluid.stable_dt())
+    fluid.synchronize()
 
 
-def mean_neighbors(fluid: ParticleFluid) -> float:
+def mean_neighbors(fluid: SPHFluid) -> float:
     """Fluid particles within the support radius of a particle, without itself, on average."""
-    particles = fluid._particles
-    return particles.neighbors.pairs_within(fluid.support_radius, particles.position, particles.count) / particles.count
+    particles = fluid.particles
+    return (
+        particles.neighbors.pairs_within(fluid.discretization.support_radius, particles.position, particles.count)
+        / particles.count
+    )
 
 
 def array_bytes() -> int:
@@ -144,9 +143,9 @@ def draw_cost(runs: list[dict[str, Any]], path: Path) -> None:
     axes = figure.add_subplot(
         xscale="log", yscale="log", xlabel="particles", ylabel="time per step [ms]", title="Dam break, median of blocks"
     )
-    for solver in dict.fromkeys(run["solver"] for run in runs):
-        own = [run for run in runs if run["solver"] == solver]
-        counts, times = [run["particles"] for run in own], [run["step_ms"]["median"] for run in own]
+    for solver in dict.fromkeys(each["solver"] for each in runs):
+        own = [each for each in runs if each["solver"] == solver]
+        counts, times = [each["particles"] for each in own], [each["step_ms"]["median"] for each in own]
         axes.plot(counts, times, "o-", label=solver)
         axes.plot(counts, [times[-1] * count / counts[-1] for count in counts], "--", color="0.6", linewidth=1.0)
     axes.plot([], [], "--", color="0.6", linewidth=1.0, label="linear")
@@ -155,32 +154,28 @@ def draw_cost(runs: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--solver", nargs="+", choices=sorted(SOLVERS), default=["wcsph"])
+def main() -> dict[str, Any]:
+    parser = arguments_of(__doc__)
+    parser.add_argument("--solver", nargs="+", choices=sorted(TRAITS), default=["wcsph"])
     parser.add_argument("--particles", type=int, nargs="+", default=[100_000], help="about how many, one run each")
     parser.add_argument("--support", type=float, default=2.0, help="support radius in particle spacings")
     parser.add_argument("--tolerance", type=float, help="of implicit pressure; at 0.1 all solves make the fewest steps")
     parser.add_argument("--steps", type=int, default=20, help="steps per block")
     parser.add_argument("--blocks", type=int, default=7, help="blocks; their median counts")
     parser.add_argument("--warm-up", type=float, default=0.1, help="simulated seconds before the first block")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int)
     parser.add_argument("--plot", type=Path, help="picture to draw of the time per step over the particles")
     parser.add_argument("--from", dest="results", type=Path, help="measure nothing: take the runs of such a JSON file")
-    arguments = parser.parse_args()
+    arguments = start_taichi(parser)
+    result: dict[str, Any]
     if arguments.results is not None:
         result = json.loads(arguments.results.read_text())
     else:
-        device = initialize(arguments.device, threads=arguments.threads)
         runs = [measure(solver, count, arguments) for solver in arguments.solver for count in arguments.particles]
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        result = {"device": device, "cores": cores, "load_average": os.getloadavg()[0], "runs": runs}
+        result = {**machine(arguments.device), "runs": runs}
     if arguments.plot is not None:
         draw_cost(result["runs"], arguments.plot)
-    json.dump(result, sys.stdout, indent=2)
-    sys.stdout.write("\n")
+    return result
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,6 +1,6 @@
-"""The gallery of the sample jobs: docs/gallery.md, with a picture and a contact sheet of each, and one of them all.
+"""The gallery of the sample jobs: docs/guide/gallery.md, a picture and a contact sheet of each, and one of them all.
 
-    python -m benchmarks.gallery renders --machine "32 cores and two NVIDIA H200" [-o docs]
+    python -m benchmarks.gallery renders --machine "32 cores and two NVIDIA H200" [-o docs/guide]
 
 Takes the frames that are there of each job of jobs/, as it was submitted, and the time that they took by its record;
 a job may be drawn in part, with `render.order = "spread"`. The frame that is shown large may be there better drawn, as
@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 from PIL import Image, ImageOps
 
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath
 from pipeline.job.loading import load_job
-from pipeline.layout import JobLayout
-from pipeline.manifest_reader import ManifestReader
-from pipeline.picture_set import picture_set
-from pipeline.task import ArtifactPath
+from pipeline.record.reader import ManifestReader
+from pipeline.show.picture_set import picture_set
 from render.sheet import contact_sheet
 
 JOBS = Path(__file__).resolve().parent.parent / "jobs"
@@ -200,7 +200,7 @@ def write_page(page: Path, sections: Mapping[str, str]) -> None:
     """All sections under one head, in the order of their names."""
     head = """# Gallery
 
-The jobs of [jobs/](../jobs), one after the other. Each can be made with `pipeline submit jobs/NAME.toml`. A section
+The jobs of [jobs/](../../jobs), one after the other. Each can be made with `pipeline submit jobs/NAME.toml`. A section
 says what it was drawn on, and stays until its job is drawn again. Seconds are what a stage's tasks took beside all
 others; what a frame takes alone is in [rendering](rendering.md#quality-presets). Where not all frames are drawn, they
 are from all over what was simulated. Written by `python -m benchmarks.gallery`.
@@ -217,7 +217,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("renders", type=Path, help="folder that holds the jobs' folders")
     parser.add_argument("--machine", required=True, help="what they ran on")
-    parser.add_argument("-o", "--output", type=Path, default=Path("docs"))
+    parser.add_argument("-o", "--output", type=Path, default=Path("docs/guide"))
     arguments = parser.parse_args()
     page, images = arguments.output / "gallery.md", arguments.output / "images"
     images.mkdir(parents=True, exist_ok=True)

@@ -12,8 +12,6 @@ stands beside them.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
 import statistics
@@ -24,15 +22,15 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.compare import arguments_of, machine, run
 from pipeline.job.loading import read_job
-from pipeline.live.loop import run
-from pipeline.live.page import LivePage
-from pipeline.live.saving import save_job
-from pipeline.live.scene import live_job
-from pipeline.live.session import Session, Status
-from pipeline.live.take import Recorder
-from pipeline.view.serving import close_server, open_server
-from sim.runtime import initialize
+from pipeline.web.live.admission import live_job
+from pipeline.web.live.loop import run as run_loop
+from pipeline.web.live.page import LivePage
+from pipeline.web.live.recording import Recorder
+from pipeline.web.live.session import Session, Status
+from pipeline.web.serving import close_server, open_server
+from sim.core.runtime import initialize
 
 JOB = """
 name = "live"
@@ -104,13 +102,15 @@ def measure(session: Session, page: Counted, seconds: float, *, drags: bool) -> 
         passed = time.perf_counter() - began
         if drags:
             angle = 2.0 * math.pi * passed / 2.0
-            session.ask(session.drag, "body", "ball", (0.2 * math.sin(angle), 0.0, 0.6 + 0.1 * math.sin(2 * angle)))
+            session.ask(
+                session.drags.move, "rigid", "ball", (0.2 * math.sin(angle), 0.0, 0.6 + 0.1 * math.sin(2 * angle))
+            )
         return passed > seconds
 
     if drags:
-        session.grab_body("ball", (0.0, 0.0, 0.6))
-    run(session, page, ends=ends)
-    session.let_go_all()
+        session.drags.grab("rigid", "ball", (0.0, 0.0, 0.6))
+    run_loop(session, page, ends=ends)
+    session.drags.release_all()
     wall = time.perf_counter() - began
     frames = session.world.frame - first
     return {
@@ -126,9 +126,8 @@ def measure(session: Session, page: Counted, seconds: float, *, drags: bool) -> 
     }
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> dict[str, Any]:
+    parser = arguments_of(__doc__)
     parser.add_argument("--nodes", type=int, default=100)
     parser.add_argument("--substeps", type=int, nargs="+", default=[20, 8, 4])
     parser.add_argument("--fps", type=int, default=60)
@@ -153,13 +152,7 @@ def main() -> None:
         session.reset()
         recorder = Recorder(loaded, session, Path(), device=device)
         server = open_server("127.0.0.1", 0)
-        page = LivePage(
-            server,
-            session,
-            recorder=recorder,
-            save=lambda loaded=loaded, session=session: save_job(loaded, session.values, Path()),
-            written=loaded.job,
-        )
+        page = LivePage(server, session, recorder, Path())
         address = f"ws://127.0.0.1:{server.get_port()}"
         viewer = None
         if not arguments.without_viewer:
@@ -178,18 +171,15 @@ def main() -> None:
             close_server(server)
         result = {"substeps": substeps, "falls": falls, "dragged": dragged}
         results.append({**result, "messages_to_viewer": len(sent), "bytes_to_viewer": sum(sent)})
-    told = {
+    return {
+        **machine(device),
         "nodes": arguments.nodes**2,
         "fps": arguments.fps,
-        "device": device,
         "cores": arguments.cores or len(os.sched_getaffinity(0)),
         "self_collision": not arguments.without_self_collision,
-        "load": os.getloadavg(),
         "results": results,
     }
-    json.dump(told, sys.stdout, indent=1)
-    print()
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,6 +1,6 @@
-"""Small pictures of looks and stages for docs/rendering.md, drawn as a job's frames are.
+"""Small pictures of looks and stages for docs/guide/rendering.md, drawn as a job's frames are.
 
-    python -m benchmarks.looks docs/images [--only wood milk window] [--quality preview] [--suffix .webp]
+    python -m benchmarks.looks docs/guide/images [--only wood milk window] [--quality preview] [--suffix .webp]
 
 Solid looks are shown on a bunny and a ball, liquids as a drop that lies on the ground and one that falls, cloths as
 sheets that lie and hang, each in its own colour, dark and light, in the stage `studio`; stages with a bunny of ceramic
@@ -21,7 +21,7 @@ from PIL import Image
 from render.blender import open_renderer
 from render.camera_path import CameraPath
 from render.meshes import write_ply
-from render.parameters import CameraParameters, MaterialParameters, RenderParameters, StageParameters
+from render.parameters import CameraParameters, MaterialParameters, RenderParameters, SetParameters
 from render.spec import Camera, MeshObject, MeshSequenceObject, RenderSpec
 from sim.shapes import build_solid
 from sim.shapes.parameters import BunnyShape, Placement, SphereShape
@@ -38,13 +38,13 @@ CLOTH_LOOKS = ("cotton", "silk", "denim")
 CLOTH_COLORS = (None, (0.02, 0.02, 0.022), (0.72, 0.70, 0.66))
 """Of a cloth's three sheets: its own, a dark and a light one."""
 STAGES = {
-    "studio": StageParameters(),
-    "outdoor": StageParameters(name="outdoor"),
-    "night": StageParameters(name="night", strength=4.0),
-    "window": StageParameters(name="window"),
-    "window-wood": StageParameters(name="window", ground="wood"),
-    "studio-stone": StageParameters(ground="stone"),
-    "plain": StageParameters(background="plain", color=(0.9, 0.9, 0.9)),
+    "studio": SetParameters(),
+    "outdoor": SetParameters(name="outdoor"),
+    "night": SetParameters(name="night", strength=4.0),
+    "window": SetParameters(name="window"),
+    "window-wood": SetParameters(name="window", ground="wood"),
+    "studio-stone": SetParameters(ground="stone"),
+    "plain": SetParameters(background="plain", color=(0.9, 0.9, 0.9)),
 }
 
 
@@ -53,7 +53,7 @@ class Scene:
     """What a picture shows, and its width [pixels]."""
 
     objects: tuple[MeshObject | MeshSequenceObject, ...]
-    stage: StageParameters = STAGES["studio"]
+    stage: SetParameters = STAGES["studio"]
     width: int = WIDTH
 
 
@@ -131,7 +131,7 @@ def draw(folder: Path, scene: Scene, options: argparse.Namespace) -> Path:
         domain_min=LOW,
         domain_max=HIGH,
         camera=Camera.on(path, f_stop=None, views=""),
-        stage=scene.stage,
+        set=scene.stage,
         objects=scene.objects,
         render=RenderParameters(resolution=(scene.width, HEIGHT), quality=options.quality, device="cpu"),
     )

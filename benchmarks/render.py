@@ -11,20 +11,18 @@ wall time and by CPU time; the first frame of each side warms up and is not coun
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.json_output import keep_output_for_json
+from benchmarks.compare import arguments_of, run, timed
 from render.blender import open_renderer
 from render.camera_path import CameraPath
 from render.meshes import write_ply
-from render.parameters import CameraParameters, MaterialParameters, RenderParameters, StageParameters, VolumeParameters
+from render.parameters import CameraParameters, MaterialParameters, RenderParameters, SetParameters, VolumeParameters
 from render.spec import Camera, MeshSequenceObject, RenderSpec, VolumeSequenceObject
 from render.volume import write_volume
 
@@ -103,7 +101,7 @@ def write_scene(folder: Path, frames: list[int], options: argparse.Namespace) ->
         domain_min=(-0.5, -0.5, 0.0),
         domain_max=(0.5, 0.5, 1.0),
         camera=Camera.on(path, f_stop=None, views=""),
-        stage=StageParameters(),
+        set=SetParameters(),
         objects=(
             MeshSequenceObject(name="water", file="water{frame}.ply", material=MaterialParameters(look="water")),
             VolumeSequenceObject(
@@ -151,22 +149,14 @@ def bare_loop(folder: Path, triangle_count: int, frames: list[int]) -> Callable[
     return draw
 
 
-def measure(call: Callable[[], None]) -> tuple[float, float]:
-    """Wall and CPU seconds of a call."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    call()
-    return time.perf_counter() - wall, time.process_time() - cpu
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def main() -> dict[str, object]:
+    parser = arguments_of(__doc__)
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--resolution", type=int, nargs=2, default=(480, 270))
     parser.add_argument("--quality", default="draft", choices=("draft", "preview", "final"))
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--triangles", type=int, default=60_000)
     options = parser.parse_args()
-    keep_output_for_json()
     with tempfile.TemporaryDirectory() as name:
         folder, frames = Path(name), list(range(options.frames + 1))
         renderer = open_renderer(write_scene(folder, frames, options), threads=options.threads, blender=None)
@@ -179,7 +169,7 @@ def main() -> None:
             ]
             # Whoever goes second finds warm caches: take turns.
             order = (0, 1) if frame % 2 else (1, 0)
-            times = {side: measure(sides[side]) for side in order}
+            times = {side: timed(sides[side]) for side in order}
             pairs.append((times[0], times[1]))
         renderer.close()
     counted = pairs[1:]
@@ -188,8 +178,8 @@ def main() -> None:
         result[f"{kind}_s_per_frame"] = round(statistics.median(ours[column] for ours, _ in counted), 3)
         result[f"{kind}_s_per_frame_bare"] = round(statistics.median(bare_[column] for _, bare_ in counted), 3)
         result[f"{kind}_ratio"] = round(statistics.median(ours[column] / bare_[column] for ours, bare_ in counted), 3)
-    print(json.dumps(result))
+    return result
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -20,27 +20,27 @@ work that a task does itself, so that dispatch costs what is left. Promised for 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import resource
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from benchmarks import dispatch
-from benchmarks.manifest import fastest, status
-from pipeline.executors.inline import InlineExecutor
-from pipeline.executors.processes import ProcessExecutor, WorkerLimits
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
-from pipeline.plan import assess, plan_job
-from pipeline.run_control import Selection
-from pipeline.runner import run_job
-from pipeline.task import Resources
+from benchmarks.compare import HERE, arguments_of, child, run, timed
+from pipeline.base.layout import JobLayout
+from pipeline.model.job import Job
+from pipeline.record.manifest import Manifest
+from pipeline.run.control import Selection
+from pipeline.run.executors.inline import InlineExecutor
+from pipeline.run.executors.processes import ProcessExecutor, WorkerLimits
+from pipeline.run.plan import assess, plan_job
 
 SIZES = (1_000, 10_000, 100_000)
 STAGES = "benchmarks.dispatch:STAGES"
@@ -56,70 +56,55 @@ def measure(folder: Path, tasks: int, dispatched: int, repeats: int) -> dict[str
 
     figures: dict[str, Any] = {"tasks": tasks, "plan": fastest(repeats, plan)}
     idle = [dispatch.nothing_to_do_s(layout.root, tasks)]
-    idle += [_timed(lambda: _run(job, layout, InlineExecutor(), dispatch.CommitClock())) for _ in range(repeats - 1)]
+    again = partial(dispatch.run_noops, layout.root, tasks, InlineExecutor(), dispatch.CommitClock())
+    idle += [timed(again) for _ in range(repeats - 1)]
     figures["nothing to do"] = [round(min(column), 3) for column in zip(*idle, strict=True)]
     figures["status"] = fastest(5 * repeats, lambda: status(layout))
     (folder / "dispatch.toml").write_text(dispatch.JOB.format(frames=tasks))
     layout.job_file.write_text(dispatch.JOB.format(frames=tasks))
     for name, arguments in (("submit", ("submit", "dispatch.toml")), ("status command", ("status", job.name))):
-        figures[name] = [round(min(column), 3) for column in zip(*(_command(folder, arguments),), strict=True)]
+        figures[name] = [round(seconds, 3) for seconds in _command(folder, arguments)]
     clock = dispatch.CommitClock()
     with ProcessExecutor(WorkerLimits(tasks_per_worker=dispatched + 1)) as executor:
-        _run(job, layout, executor, clock, Selection(frames=frozenset(range(dispatched))))
-    count = len(clock.times) - 1
-    figures["dispatch [ms]"] = [
-        round(1e3 * (times[-1] - times[0]) / count, 3) for times in (clock.times, clock.processor_times)
-    ]
+        chosen = Selection(frames=frozenset(range(dispatched)))
+        dispatch.run_noops(layout.root, tasks, executor, clock, rerun=chosen)
+    figures["dispatch [ms]"] = [round(each, 3) for each in clock.task_ms()]
     figures["bare commit [ms]"] = round(dispatch.bare_commit_ms(folder / "bare", dispatched), 3)
     figures["memory [MB]"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6, 1)
     return figures
 
 
-def _run(
-    job: Job,
-    layout: JobLayout,
-    executor: InlineExecutor | ProcessExecutor,
-    clock: dispatch.CommitClock,
-    rerun: Selection | None = None,
-) -> None:
-    run_job(
-        job,
-        layout,
-        executor=executor,
-        job_text=dispatch.JOB.format(frames=job.frame_count),
-        stages=STAGES,
-        observer=clock,
-        rerun=rerun,
-        capacity=Resources(cores=1),
-    )
+def fastest(repeats: int, work: Callable[[], object]) -> list[float]:
+    """Least wall time and least processor time of several calls [s]."""
+    gc.collect()
+    return [round(min(column), 6) for column in zip(*(timed(work) for _ in range(repeats)), strict=True)]
 
 
-def _timed(work: Callable[[], object]) -> tuple[float, float]:
-    began = time.perf_counter(), time.process_time()
-    work()
-    return time.perf_counter() - began[0], time.process_time() - began[1]
+def status(layout: JobLayout) -> None:
+    """The query behind `pipeline status`."""
+    with Manifest.open_readonly(layout.manifest) as reader:
+        reader.summary()
 
 
 def _command(folder: Path, arguments: tuple[str, ...]) -> tuple[float, float]:
     """Wall and processor time [s] of a command of the command line, over the no-op stage."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    began = time.perf_counter()
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    environment = {**os.environ, "PYTHONPATH": str(HERE)}
     module = ("benchmarks.scale", "--command") if arguments[0] == "submit" else ("pipeline",)
     command = [sys.executable, "-m", *module, *arguments]
-    subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
+    wall, _ = timed(lambda: subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True))
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.perf_counter() - began, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def run_command(arguments: list[str]) -> None:
     """The command line over the no-op stage; does not return."""
-    import pipeline.commands.turns
+    import pipeline.queue.turns
     import pipeline.stages
-    from pipeline.cli import main as command_line
+    from pipeline.cli.main import main as command_line
 
     pipeline.stages.STAGES = dispatch.STAGES  # type: ignore[assignment]
-    pipeline.commands.turns.STAGES_REFERENCE = STAGES
+    pipeline.queue.turns.STAGES_REFERENCE = STAGES
     command_line(arguments)
 
 
@@ -141,10 +126,8 @@ def plot(results: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-def main() -> None:
-    if sys.argv[1:2] == ["--command"]:
-        run_command(sys.argv[2:])
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> Any:
+    parser = arguments_of(__doc__)
     parser.add_argument("--tasks", type=int, nargs="+", default=list(SIZES))
     parser.add_argument("--dispatched", type=int, default=300, help="how many tasks are run again")
     parser.add_argument("--repeats", type=int, default=3)
@@ -153,20 +136,20 @@ def main() -> None:
     options = parser.parse_args()
     if options.measure is not None:
         [tasks] = options.tasks
-        print(json.dumps(measure(options.measure, tasks, min(options.dispatched, tasks), options.repeats)))
-        return
+        return measure(options.measure, tasks, min(options.dispatched, tasks), options.repeats)
     results = []
     for tasks in options.tasks:
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-m", "benchmarks.scale", "--measure", folder, "--tasks", str(tasks)]
+            command = ["-m", "benchmarks.scale", "--measure", folder, "--tasks", str(tasks)]
             command += ["--dispatched", str(options.dispatched), "--repeats", str(options.repeats)]
-            measured = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-            results.append(json.loads(measured.stdout))
+            results.append(child(command))
             print(json.dumps(results[-1]), file=sys.stderr, flush=True)
-    print(json.dumps(results, indent=1))
     if options.plot is not None:
         plot(results, options.plot)
+    return results
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["--command"]:
+        run_command(sys.argv[2:])
+    run(main)

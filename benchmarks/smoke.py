@@ -1,31 +1,66 @@
-"""Time and memory of a smoke step: MacCormack, confinement and projection of a developed plume.
+"""Time and memory of smoke: steps of a developed plume, and what a process takes for each cell; JSON.
 
     python -m benchmarks.smoke [--cells 64 128] [--steps 7] [--threads N] [--device cpu]
-    python -m benchmarks.smoke --iterations --cells 32 64 128 256
+    python -m benchmarks.smoke --memory [--cells 96 128] [--with gusts ball fluid cloth] [--frames 3]
 
-Prints JSON. Times are of whole substeps, after the plume has risen through the box; the fastest is the one that other
-work on the machine disturbed least, and processor time, summed over the threads, tells what contention hides.
-Iterations are of one projection to the default tolerance.
+Times are of whole substeps, after the plume has risen through the box: MacCormack, confinement and projection. The
+fastest is the one that other work on the machine disturbed least, and processor time, summed over the threads, tells
+what contention hides. Iterations are of one projection to the default tolerance.
 
-`--iterations` counts those of one projection of a jet with noise instead, as the validation's `smoke-projection` does:
-in a box whose sides are all open but the floor, or all closed, without and with a ball.
+`--memory`: each grid is simulated on a CPU by a process of its own, which writes as the stage does, in a thread beside
+the simulation; it takes a checkpoint with every frame, which is oftener than a job does. `bytes_per_cell` is how much
+the most memory of the processes grows from the first grid to the last, so that what does not grow with cells, above all
+compiled kernels, does not count. It is to be below what `check` counts (`pipeline.kinds.checks.smoke`).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import resource
 import statistics
+import tempfile
 import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from benchmarks.validation.smoke_projection import SIDES, count_iterations
-from sim.domain import DomainParameters
-from sim.runtime import initialize
+from benchmarks.compare import arguments_of, child, machine, run, start_taichi, timed
+from pipeline.kinds.checks.smoke import BYTES_PER_CELL
+from pipeline.model.job import Job
+from sim.core.domain import DomainParameters
+from sim.core.runtime import initialize
 from sim.smoke.parameters import SmokeParameters
+
+if TYPE_CHECKING:
+    from sim.core.snapshots import Snapshot
+    from sim.core.world import FrameReport
 
 BOX = DomainParameters(min=(-0.5, -0.5, 0.0), max=(0.5, 0.5, 1.0))
 DEVELOPED_S = 0.7
 """By then the cap of the plume has reached the upper half of the box."""
+
+FPS = 60
+BALL = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.15}, "position": (0.0, 0.0, 0.6)}
+WATER = {"shape": {"type": "box", "size": (0.3, 0.3, 0.2)}, "position": (0.3, 0.3, 0.1)}
+FLAG = {"name": "flag", "shape": {"type": "rectangle", "size": (0.2, 0.2), "counts": (17, 17)}}
+COMPANY: dict[str, dict[str, Any]] = {
+    "gusts": {},
+    "ball": {"rigid": [{**BALL, "velocity": (0.1, 0.0, 0.0)}]},
+    "fluid": {"fluid": [{"name": "water", "particle_radius": 0.02, "block": [WATER]}]},
+    "cloth": {"cloth": [{**FLAG, "position": (-0.3, 0.0, 0.5)}]},
+}
+"""What may be in the box, as keys of a job; gusts are a key of the smoke."""
+
+
+def job_of(cells: int, company: list[str]) -> Job:
+    """A plume in a box of 1 m, so many cells across, with what is to be in it."""
+    smoke: dict[str, Any] = {"name": "fog", "cell_size": 1.0 / cells, "min": (-0.5, -0.5, 0.0), "max": (0.5, 0.5, 1.0)}
+    smoke["source"] = [{"shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.2)}]
+    if "gusts" in company:
+        smoke["turbulence"] = {"strength": 1.0, "size": 2.0 / cells}
+    keys: dict[str, Any] = {"name": "memory", "frames": 2, "smoke": [smoke]}
+    for name in company:
+        keys |= COMPANY[name]
+    return Job.model_validate(keys)
 
 
 def measure(cells: int, steps: int) -> dict[str, object]:
@@ -34,34 +69,30 @@ def measure(cells: int, steps: int) -> dict[str, object]:
 
     from sim.smoke.solver import SmokeSolver
 
-    parameters = SmokeParameters.model_validate(
-        {
-            "name": "plume",
-            "cell_size": 1.0 / cells,
-            "source": [{"shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.15)}],
-        }
-    )
+    source = {"shape": {"type": "sphere", "radius": 0.1}, "position": (0.0, 0.0, 0.15)}
+    parameters = SmokeParameters.model_validate({"name": "plume", "cell_size": 1.0 / cells, "source": [source]})
     start = time.perf_counter()
     solver = SmokeSolver(parameters, domain=BOX, gravity=(0.0, 0.0, -9.81))
-    solver.substep(min(solver.stable_dt(), 1 / 60))
-    compiled_s = time.perf_counter() - start
-    time_s = 0.0
-    while time_s < DEVELOPED_S:
+
+    def step() -> float:
         dt = min(solver.stable_dt(), 1 / 60)
         solver.substep(dt)
-        time_s += dt
-    seconds, processor_seconds, iterations, residuals = [], [], [], []
+        ti.sync()
+        return dt
+
+    step()
+    compiled_s, time_s = time.perf_counter() - start, 0.0
+    while time_s < DEVELOPED_S:
+        time_s += step()
+    times, iterations, residuals = [], [], []
     for _ in range(steps):
         solver.begin_frame(time_s)
         ti.sync()
-        start, processor_start = time.perf_counter(), time.process_time()
-        solver.substep(min(solver.stable_dt(), 1 / 60))
-        ti.sync()
-        seconds.append(time.perf_counter() - start)
-        processor_seconds.append(time.process_time() - processor_start)
+        times.append(timed(step))
         numbers = solver.diagnostics()
         iterations.append(numbers["iterations"])
         residuals.append(numbers["residual"])
+    seconds, processor_seconds = zip(*times, strict=True)
     return {
         "cells": list(solver.grid.cells),
         "step_s_median": round(statistics.median(seconds), 4),
@@ -75,32 +106,71 @@ def measure(cells: int, steps: int) -> dict[str, object]:
     }
 
 
-def measure_iterations(cells: int) -> dict[str, object]:
-    """Of one projection in each kind of box of `cells` a side, and max|div u| h / max|u| that is left."""
-    found: dict[str, object] = {"cells": cells}
-    for sides in SIDES:
-        for ball in (False, True):
-            iterations, left = count_iterations(cells, sides, ball=ball)
-            name = f"{sides} with a ball" if ball else sides
-            found[name] = {"iterations": iterations, "divergence": float(f"{left:.3g}")}
-    return found
+def simulate(cells: int, company: list[str], frames: int, threads: int) -> int:
+    """Most memory that this process had when it had written so many frames [bytes]."""
+    from pipeline.stages.ordered_writer import OrderedWriter
+    from pipeline.store.cache import Checkpoint, read_checkpoint, validate_frame, write_checkpoint, write_frame
+    from sim.build import build_world
+
+    initialize("cpu", threads=threads)
+    world = build_world(job_of(cells, company), frames_per_second=FPS)
+    with tempfile.TemporaryDirectory() as folder:
+
+        def commit(report: FrameReport, bodies: dict[str, Snapshot]) -> None:
+            path = Path(folder, f"{report.frame}.h5")
+            write_frame(path, bodies, report, device="cpu", longest_shutter_s=1.0 / FPS)
+            validate_frame(path)
+
+        def save(frame: int, arrays: dict[str, Any]) -> None:
+            path = Path(folder, "checkpoint.h5")
+            write_checkpoint(path, Checkpoint(frame, "memory", "cpu", arrays))
+            read_checkpoint(path)
+
+        with OrderedWriter() as writer:
+            for frame in range(frames):
+                report = world.advance_frame()
+                writer.submit(partial(commit, report, world.snapshots()))
+                writer.submit(partial(save, frame, world.checkpoint()))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cells", type=int, nargs="+", default=[64, 128])
+def measure_memory(counts: list[int], company: list[str], frames: int, threads: int) -> dict[str, Any]:
+    """How the most memory of processes grows with their grids, so many cells across."""
+    peaks = {}
+    for cells in counts:
+        command = ["-m", "benchmarks.smoke", "--alone", "--cells", str(cells), "--frames", str(frames)]
+        peaks[cells] = child([*command, "--threads", str(threads), "--with", *company])["peak_bytes"]
+    first, last = counts[0], counts[-1]
+    return {
+        "with": company,
+        "peak_bytes": peaks,
+        "bytes_per_cell": round((peaks[last] - peaks[first]) / (last**3 - first**3), 1),
+        "bytes_per_cell_of_check": BYTES_PER_CELL,
+    }
+
+
+def main() -> dict[str, Any]:
+    parser = arguments_of(__doc__)
+    parser.add_argument("--cells", type=int, nargs="+")
     parser.add_argument("--steps", type=int, default=7)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--iterations", action="store_true", help="count those of one projection; nothing is timed")
+    parser.add_argument("--memory", action="store_true", help="of processes that simulate and write; nothing is timed")
+    parser.add_argument("--with", dest="company", nargs="*", choices=list(COMPANY), default=list(COMPANY))
+    parser.add_argument("--frames", type=int, default=3)
+    parser.add_argument("--alone", action="store_true", help="the memory of one such process")
+    asked, _ = parser.parse_known_args()
+    if not asked.memory and not asked.alone:
+        arguments = start_taichi(parser)
+        results = [measure(cells, arguments.steps) for cells in arguments.cells or (64, 128)]
+        return {**machine(arguments.device), "results": results}
+    parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
-    device = initialize(arguments.device, threads=arguments.threads)
-    if arguments.iterations:
-        results = [measure_iterations(cells) for cells in arguments.cells]
-    else:
-        results = [measure(cells, arguments.steps) for cells in arguments.cells]
-    print(json.dumps({"device": device, "results": results}, indent=2))
+    cells = arguments.cells or [96, 128]
+    if arguments.alone:
+        return {"peak_bytes": simulate(cells[0], arguments.company, arguments.frames, arguments.threads)}
+    if len(cells) < 2:
+        parser.error("--cells takes two numbers or more: the growth from the first to the last is told")
+    return measure_memory(cells, arguments.company, arguments.frames, arguments.threads)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

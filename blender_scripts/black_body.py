@@ -1,4 +1,4 @@
-"""How a black body looks: the colour and the brightness of what glows because it is hot."""
+"""Colour and brightness of a black body, by its temperature."""
 
 from __future__ import annotations
 

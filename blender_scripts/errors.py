@@ -1,4 +1,4 @@
-"""What can be wrong with a render's input, with texts fit for the user."""
+"""Errors of a render's input, with texts fit for the user."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _SLAB_CELLS = 32
 
 @dataclass(frozen=True)
 class Glow:
-    """What the look of a fire and its box say about its light.
+    """The light of a fire, from its look and its box.
 
     Attributes:
         extinction: per metre at density 1 [1/m].
@@ -127,7 +127,7 @@ def lamps_of_grids(density: Any, temperature: Any, glow: Glow) -> list[Lamp]:
 
 
 def _fade(position: NDArray[np.float64], glow: Glow) -> NDArray[np.float64]:
-    """What the look's fade leaves of the smoke at positions [m] (n, 3): from 0 at open faces to 1 [-], (n,)."""
+    """Share of the smoke that the look's fade leaves at positions [m] (n, 3): from 0 at open faces to 1 [-], (n,)."""
     distance = np.full(len(position), np.inf)
     for axis, name in enumerate("xyz"):
         if f"{name}-" in glow.open_faces:

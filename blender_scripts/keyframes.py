@@ -17,7 +17,7 @@ def forget_keyframes(animated: Any) -> None:
 
 
 def reach_of_motion() -> float:
-    """How far before and after a frame Cycles looks at what moves [frames]: for blur, or vectors to other frames."""
+    """Time before and after a frame that Cycles samples motion in [frames]: for blur, or vectors to other frames."""
     scene = bpy.context.scene
     if bpy.context.view_layer.use_pass_vector:
         return 1.0

@@ -1,4 +1,4 @@
-"""Stages: ground, backdrop and the lights that belong to them, and the extra lights of a job."""
+"""Sets: ground, backdrop and the lights that belong to them, and the extra lights of a job."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _HDRI_MAP_PIXELS = 1024
 """The same for an HDRI, where a sun of half a degree may be: 0.35 degrees each."""
 
 GREY: Color = (0.22, 0.25, 0.29)
-"""Of the ground and backdrop of a stage that has no colour of its own."""
+"""Of the ground and backdrop of a set that has no colour of its own."""
 _CATCHER_REACH = 2.1
-"""How far shadows are caught where there is no background, in diagonals of the domain."""
+"""Radius of the shadow catcher where there is no background, in diagonals of the domain."""
 
 _SUNLIGHT: Color = (1.0, 0.94, 0.86)
 """Of the sun outdoors at its usual height, linear RGB."""
@@ -46,8 +46,8 @@ PLASTER: Color = (0.56, 0.52, 0.46)
 
 
 @dataclass(frozen=True)
-class StageGeometry:
-    """What a stage is built around.
+class SetGeometry:
+    """Geometry that a set is built around.
 
     Attributes:
         centre: middle of the domain [m].
@@ -66,7 +66,7 @@ class StageGeometry:
     pixel_angle: float
 
     @classmethod
-    def of(cls, spec: dict[str, Any]) -> StageGeometry:
+    def of(cls, spec: dict[str, Any]) -> SetGeometry:
         """The geometry for a specification, seen from where its camera starts."""
         box_min, box_max = Vector(spec["domain_min"]), Vector(spec["domain_max"])
         centre = (box_min + box_max) / 2
@@ -86,12 +86,12 @@ class StageGeometry:
 
     @property
     def power_scale(self) -> float:
-        """Factor on powers [W] that keeps irradiance when the whole stage grows."""
+        """Factor on powers [W] that keeps irradiance when the whole set grows."""
         return (self.size / _REFERENCE_SIZE_M) ** 2
 
 
-def build_stage(spec: dict[str, Any], folder: Path) -> None:
-    """Build the stage that a specification names, and its extra lights.
+def build_set(spec: dict[str, Any], folder: Path) -> None:
+    """Build the set that a specification names, and its extra lights.
 
     Args:
         spec: the specification.
@@ -100,23 +100,23 @@ def build_stage(spec: dict[str, Any], folder: Path) -> None:
     Raises:
         RenderInputError: the picture around the scene cannot be read.
     """
-    geometry, stage = StageGeometry.of(spec), spec["stage"]
-    if stage["hdri"] is None:
-        STAGES[stage["name"]](stage, geometry)
+    geometry, parameters = SetGeometry.of(spec), spec["set"]
+    if parameters["hdri"] is None:
+        SETS[parameters["name"]](parameters, geometry)
     else:
-        _build_under_hdri(stage, geometry, folder / stage["hdri"])
+        _build_under_hdri(parameters, geometry, folder / parameters["hdri"])
     for index, light in enumerate(spec["lights"]):
         _add_extra_light(f"light {index}", light)
 
 
-def plain_background(stage: dict[str, Any]) -> Color | None:
+def plain_background(parameters: dict[str, Any]) -> Color | None:
     """The colour to lay pictures over once they are drawn, linear RGB; None for those that stay as they are."""
-    if stage["background"] != "plain":
+    if parameters["background"] != "plain":
         return None
-    return _ground_color(stage, PLASTER if stage["name"] == "window" and stage["hdri"] is None else GREY)
+    return _ground_color(parameters, PLASTER if parameters["name"] == "window" and parameters["hdri"] is None else GREY)
 
 
-def _build_studio(parameters: dict[str, Any], geometry: StageGeometry) -> None:
+def _build_studio(parameters: dict[str, Any], geometry: SetGeometry) -> None:
     """A cyclorama with a small warm key, a large cool fill and strong rims: water and smoke read by their rims."""
     backdrop = _cyclorama(geometry) if geometry.camera_circle is None else _round_cyclorama(geometry)
     _add_ground(backdrop, "cyclorama", parameters, geometry)
@@ -139,7 +139,7 @@ def _build_studio(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     bpy.context.scene.world.cycles.sampling_method = "NONE"
 
 
-def _build_outdoor(parameters: dict[str, Any], geometry: StageGeometry) -> None:
+def _build_outdoor(parameters: dict[str, Any], geometry: SetGeometry) -> None:
     """Ground to the horizon, a physical sky and a sun: at the left and behind the scene where the job does not say."""
     _add_ground(_plain(geometry), "ground", parameters, geometry)
 
@@ -188,7 +188,7 @@ def _air_mass(elevation_deg: float) -> float:
     return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
 
 
-def _build_night(parameters: dict[str, Any], geometry: StageGeometry) -> None:
+def _build_night(parameters: dict[str, Any], geometry: SetGeometry) -> None:
     """Ground to the horizon under a dark sky, for what glows; a moon from behind draws rims on what does not."""
     _add_ground(_plain(geometry), "ground", parameters, geometry)
     moon = _new_light("moon", "SUN", 0.4 * parameters["strength"], (0.66, 0.80, 1.0))
@@ -199,14 +199,14 @@ def _build_night(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     bpy.context.scene.world.cycles.sampling_method = "NONE"
 
 
-def _build_window(parameters: dict[str, Any], geometry: StageGeometry) -> None:
+def _build_window(parameters: dict[str, Any], geometry: SetGeometry) -> None:
     """A room: light falls in through a window of four panes at the left, and what the walls give back is warm.
 
     A camera that stays sees two walls of it; one that goes around, a whole room around its way.
     """
     _add_ground(_plain(geometry), "floor", parameters, geometry, own=PLASTER)
     wall = _matt("wall", _ground_color(parameters, PLASTER))
-    # In diagonals of the domain, as `StageGeometry.place` takes them: the wall with the window, and the one behind.
+    # In diagonals of the domain, as `SetGeometry.place` takes them: the wall with the window, and the one behind.
     left, behind = -_WINDOW_DISTANCE, -1.9
     corners = [(left, 1.2), (left, behind), (30.0, behind)]
     if geometry.camera_circle is not None:
@@ -227,7 +227,7 @@ def _build_window(parameters: dict[str, Any], geometry: StageGeometry) -> None:
         place = geometry.place(right=left + 0.01, towards_camera=forward, above_floor=height)
         inwards = geometry.place(right=0.0, towards_camera=forward, above_floor=height)
         window = _add_light_object(f"pane {number}", pane, place, inwards)
-        window.visible_camera = parameters["background"] == "stage"  # a window in the picture is what one expects
+        window.visible_camera = parameters["background"] == "set"  # a window in the picture is what one expects
     bounce = _new_light("bounce", "AREA", 14.0 * parameters["strength"] * geometry.power_scale, (1.0, 0.86, 0.70))
     bounce.shape, bounce.size = "SQUARE", 2.2 * geometry.size
     target = geometry.place(right=0.0, towards_camera=0.0, above_floor=0.35)
@@ -236,7 +236,7 @@ def _build_window(parameters: dict[str, Any], geometry: StageGeometry) -> None:
     bpy.context.scene.world.cycles.sampling_method = "NONE"
 
 
-def _build_under_hdri(parameters: dict[str, Any], geometry: StageGeometry, path: Path) -> None:
+def _build_under_hdri(parameters: dict[str, Any], geometry: SetGeometry, path: Path) -> None:
     """Ground to the horizon under the sky of a picture, lit by it alone."""
     _add_ground(_plain(geometry), "ground", parameters, geometry)
     try:
@@ -258,16 +258,16 @@ def _build_under_hdri(parameters: dict[str, Any], geometry: StageGeometry, path:
     settings.sampling_method, settings.sample_map_resolution = "MANUAL", _HDRI_MAP_PIXELS
 
 
-STAGES: dict[str, Callable[[dict[str, Any], StageGeometry], None]] = {
+SETS: dict[str, Callable[[dict[str, Any], SetGeometry], None]] = {
     "studio": _build_studio,
     "outdoor": _build_outdoor,
     "night": _build_night,
     "window": _build_window,
 }
-"""How each stage is built, by the name that a specification uses."""
+"""The function that builds each set, by its name in specifications."""
 
 
-def _plain(geometry: StageGeometry) -> TriangleMesh:
+def _plain(geometry: SetGeometry) -> TriangleMesh:
     """A floor as far as the eye sees."""
     half = 60.0 * geometry.size
     corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
@@ -277,7 +277,7 @@ def _plain(geometry: StageGeometry) -> TriangleMesh:
     return TriangleMesh(positions, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
 
 
-def _walls(geometry: StageGeometry, corners: list[tuple[float, float]], *, height: float) -> TriangleMesh:
+def _walls(geometry: SetGeometry, corners: list[tuple[float, float]], *, height: float) -> TriangleMesh:
     """Upright walls from corner to corner, each (right, towards the camera), in diagonals of the domain."""
     positions = [
         geometry.place(right=right, towards_camera=forward, above_floor=up)
@@ -292,7 +292,7 @@ def _walls(geometry: StageGeometry, corners: list[tuple[float, float]], *, heigh
     return TriangleMesh(np.array(positions, dtype=np.float32), triangles.astype(np.int32))
 
 
-def _cyclorama(geometry: StageGeometry) -> TriangleMesh:
+def _cyclorama(geometry: SetGeometry) -> TriangleMesh:
     """A floor that curves up into a wall behind the domain, square to the camera's direction."""
     size = geometry.size
     radius, wall_distance, height, front, half_width = 1.6 * size, 3.0 * size, 9.0 * size, 12.0 * size, 14.0 * size
@@ -314,7 +314,7 @@ def _cyclorama(geometry: StageGeometry) -> TriangleMesh:
     return TriangleMesh(positions.astype(np.float32), triangles.astype(np.int32))
 
 
-def _round_cyclorama(geometry: StageGeometry) -> TriangleMesh:
+def _round_cyclorama(geometry: SetGeometry) -> TriangleMesh:
     """A floor that curves up into a wall all round, behind wherever the camera goes."""
     assert geometry.camera_circle is not None
     size = geometry.size
@@ -349,17 +349,17 @@ def _round_cyclorama(geometry: StageGeometry) -> TriangleMesh:
 
 
 def _add_ground(
-    mesh: TriangleMesh, name: str, parameters: dict[str, Any], geometry: StageGeometry, own: Color = GREY
+    mesh: TriangleMesh, name: str, parameters: dict[str, Any], geometry: SetGeometry, own: Color = GREY
 ) -> None:
     # A hair below the domain's floor: surfaces that lie on the floor would otherwise flicker against it.
     drop = 2e-6 * float(np.ptp(mesh.positions, axis=0).max())
     ground = _add_surface(mesh, name, _ground_material(name, parameters, geometry, own), parameters)
     ground.location.z = -drop
-    if parameters["background"] != "stage":
+    if parameters["background"] != "set":
         _add_shadow_catcher(geometry, _ground_color(parameters, own), drop=0.5 * drop)
 
 
-def _ground_material(name: str, parameters: dict[str, Any], geometry: StageGeometry, own: Color) -> Any:
+def _ground_material(name: str, parameters: dict[str, Any], geometry: SetGeometry, own: Color) -> Any:
     if parameters["ground"] is None:
         return _matt(name, _ground_color(parameters, own))
     context = LookContext.of(
@@ -371,7 +371,7 @@ def _ground_material(name: str, parameters: dict[str, Any], geometry: StageGeome
     return new_material(name, parameters["ground"], context)
 
 
-def _add_shadow_catcher(geometry: StageGeometry, color: Color, *, drop: float) -> None:
+def _add_shadow_catcher(geometry: SetGeometry, color: Color, *, drop: float) -> None:
     """Ground around the domain of which pictures without a background show the shadows; seen by the camera alone.
 
     It fades out before a backdrop would begin to rise.
@@ -401,10 +401,10 @@ def _add_shadow_catcher(geometry: StageGeometry, color: Color, *, drop: float) -
 
 
 def _add_surface(mesh: TriangleMesh, name: str, material: Any, parameters: dict[str, Any]) -> Any:
-    """A surface of the stage, which light and reflections meet whatever stands behind the picture."""
+    """A surface of the set, which light and reflections meet whatever stands behind the picture."""
     surface = new_mesh_object(name, mesh)
     surface.data.materials.append(material)
-    surface.visible_camera = parameters["background"] == "stage"
+    surface.visible_camera = parameters["background"] == "set"
     # What a wall keeps from the ground is none of the scene's shadows.
     surface.is_shadow_catcher = not surface.visible_camera
     return surface

@@ -1,21 +1,18 @@
-"""Looks: what a body is made of, as a registry from names to functions that build shader nodes.
+"""Looks of surfaces: what a body is made of, each by a function that builds its shader nodes.
 
-A new look is one function here and its name in LOOKS (and in `render.parameters.Look`, which checks job files).
+`look_table` tells how to add a look. Those of volumes, weaves and wood have modules of their own.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import bpy
 
+from blender_scripts import smoke_looks, weaves, wood  # noqa: F401 - they register their looks
 from blender_scripts.geometry import WET
-from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
-from blender_scripts.smoke_looks import build_fire, build_smoke
-from blender_scripts.weaves import build_cotton, build_denim, build_silk
-from blender_scripts.wood import build_wood
+from blender_scripts.shading import LOOKS, Color, LookContext, NodeBuilder, draws, mix_shaders, or_default
 
 WATER_IOR = 1.333
 WATER_ABSORPTION_PER_M: Color = (0.30, 0.055, 0.009)
@@ -52,6 +49,7 @@ def new_material(name: str, look: str, context: LookContext) -> Any:
     return material
 
 
+@draws("water")
 def _water(builder: NodeBuilder, context: LookContext) -> None:
     """Clear water that absorbs red first, and lets light through to what lies under it."""
     _clear_surface(builder, context, ior=WATER_IOR, tint=(0.94, 0.975, 1.0))
@@ -73,6 +71,7 @@ def _clear_surface(builder: NodeBuilder, context: LookContext, *, ior: float, ti
     builder.surface(_refracting(builder, context, shader, tint=tint))
 
 
+@draws("honey")
 def _honey(builder: NodeBuilder, context: LookContext) -> None:
     """Amber that absorbs blue first, a little cloudy."""
     _clear_surface(builder, context, ior=HONEY_IOR, tint=(1.0, 0.97, 0.9))
@@ -91,6 +90,7 @@ def _honey(builder: NodeBuilder, context: LookContext) -> None:
     builder.volume(both)
 
 
+@draws("milk")
 def _milk(builder: NodeBuilder, context: LookContext) -> None:
     """White that light enters and leaves elsewhere, red the farthest, under a wet surface."""
     factor = or_default(context.density, _MILK_SIZE / context.domain_size)
@@ -108,6 +108,7 @@ def _milk(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(shader)
 
 
+@draws("glass")
 def _glass(builder: NodeBuilder, context: LookContext) -> None:
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
@@ -119,51 +120,27 @@ def _glass(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(_refracting(builder, context, shader, tint=or_default(context.color, (0.90, 0.93, 0.92))))
 
 
+@draws("rubber")
 def _rubber(builder: NodeBuilder, context: LookContext) -> None:
-    builder.surface(
-        builder.node(
-            "ShaderNodeBsdfPrincipled",
-            Base_Color=or_default(context.color, (0.95, 0.56, 0.02)),
-            Roughness=or_default(context.roughness, 0.42),
-            Specular_IOR_Level=0.45,
-        )
-    )
+    _even(builder, context, color=(0.95, 0.56, 0.02), roughness=0.42, Specular_IOR_Level=0.45)
 
 
+@draws("ceramic")
 def _ceramic(builder: NodeBuilder, context: LookContext) -> None:
-    builder.surface(
-        builder.node(
-            "ShaderNodeBsdfPrincipled",
-            Base_Color=or_default(context.color, (0.82, 0.79, 0.74)),
-            Roughness=or_default(context.roughness, 0.35),
-            Coat_Weight=0.6,
-            Coat_Roughness=0.06,
-        )
-    )
+    _even(builder, context, color=(0.82, 0.79, 0.74), roughness=0.35, Coat_Weight=0.6, Coat_Roughness=0.06)
 
 
+@draws("plastic")
 def _plastic(builder: NodeBuilder, context: LookContext) -> None:
-    builder.surface(
-        builder.node(
-            "ShaderNodeBsdfPrincipled",
-            Base_Color=or_default(context.color, (0.62, 0.06, 0.05)),
-            Roughness=or_default(context.roughness, 0.25),
-            IOR=1.46,
-        )
-    )
+    _even(builder, context, color=(0.62, 0.06, 0.05), roughness=0.25, IOR=1.46)
 
 
+@draws("metal")
 def _metal(builder: NodeBuilder, context: LookContext) -> None:
-    builder.surface(
-        builder.node(
-            "ShaderNodeBsdfPrincipled",
-            Base_Color=or_default(context.color, (0.62, 0.61, 0.60)),
-            Roughness=or_default(context.roughness, 0.28),
-            Metallic=1.0,
-        )
-    )
+    _even(builder, context, color=(0.62, 0.61, 0.60), roughness=0.28, Metallic=1.0)
 
 
+@draws("stone")
 def _stone(builder: NodeBuilder, context: LookContext) -> None:
     """Grey rock: mottled colour and a rough surface from noise in the body's own coordinates, so it does not swim."""
     base = or_default(context.color, (0.32, 0.30, 0.28))
@@ -189,6 +166,7 @@ def _stone(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(shader)
 
 
+@draws("spray")
 def _spray(builder: NodeBuilder, context: LookContext) -> None:
     """Droplets in the air: too small to refract in a picture, so they are white and let some light straight through."""
     white = _scattering(builder, or_default(context.color, (0.96, 0.98, 1.0)))
@@ -201,11 +179,13 @@ def _spray(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(mix_shaders(builder, share.outputs[0], droplet, through))
 
 
+@draws("foam")
 def _foam(builder: NodeBuilder, context: LookContext) -> None:
     """Bubbles packed at the surface, which scatter light in all directions."""
     builder.surface(_scattering(builder, or_default(context.color, (0.93, 0.95, 0.96))))
 
 
+@draws("bubbles")
 def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
     """Air in water: mirrors beyond the critical angle of 48.6°, where Fresnel's reflection is total, clear before it.
 
@@ -217,6 +197,7 @@ def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(mix_shaders(builder, fresnel.outputs[0], through, mirror))
 
 
+@draws("tank_glass")
 def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
     """Thin glass: reflects as glass does, and lets everything else straight through, so that it costs no bounces."""
     fresnel = builder.node("ShaderNodeFresnel", IOR=1.35)
@@ -230,44 +211,22 @@ def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(mix_shaders(builder, seen.outputs[0], through, reflection))
 
 
+@draws("tank_edge")
 def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
     """The cut edge of a pane, where glass shows its green."""
+    _even(builder, context, color=(0.50, 0.72, 0.66), roughness=0.15, Specular_IOR_Level=0.6)
+
+
+def _even(builder: NodeBuilder, context: LookContext, *, color: Color, roughness: float, **inputs: float) -> None:
+    """An opaque surface of one colour; other inputs of the shader by name."""
     builder.surface(
         builder.node(
             "ShaderNodeBsdfPrincipled",
-            Base_Color=or_default(context.color, (0.50, 0.72, 0.66)),
-            Roughness=or_default(context.roughness, 0.15),
-            Specular_IOR_Level=0.6,
+            Base_Color=or_default(context.color, color),
+            Roughness=or_default(context.roughness, roughness),
+            **inputs,
         )
     )
-
-
-LOOKS: dict[str, Callable[[NodeBuilder, LookContext], None]] = {
-    "water": _water,
-    "honey": _honey,
-    "milk": _milk,
-    "smoke": build_smoke,
-    "fire": build_fire,
-    "rubber": _rubber,
-    "ceramic": _ceramic,
-    "plastic": _plastic,
-    "metal": _metal,
-    "stone": _stone,
-    "wood": build_wood,
-    "glass": _glass,
-    "cotton": build_cotton,
-    "silk": build_silk,
-    "denim": build_denim,
-    "spray": _spray,
-    "foam": _foam,
-    "bubbles": _bubbles,
-    "tank_glass": _tank_glass,
-    "tank_edge": _tank_edge,
-}
-"""How each look is built, by the name that a specification uses."""
-
-REFRACTING = frozenset({"water", "honey", "glass"})
-"""Looks of what bends light that enters."""
 
 
 def _scattering(builder: NodeBuilder, color: Color) -> Any:
@@ -280,7 +239,7 @@ def _scattering(builder: NodeBuilder, color: Color) -> Any:
 
 
 def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint: Color) -> Any:
-    """What a clear body is drawn with: light passes straight where it is asked for and where a fluid wets a solid.
+    """The shader of a clear body: shadow rays pass straight, and all light does where a fluid wets a solid.
 
     Without caustics, refractive things cast black shadows: no light sampled from behind them arrives. Rays that ask
     for light therefore meet a clear, slightly tinted surface. With them, light keeps being bent on its way to what a

@@ -56,7 +56,7 @@ def read_points(path: Path, kind: str) -> Points:
     lines = content[: max(end, 0)].decode("ascii", errors="replace").split("\n")[:-1]
     count = _count(lines)
     if count is None:
-        raise RenderInputError(f"{path} is not a PLY of whitewater points (docs/formats.md)")
+        raise RenderInputError(f"{path} is not a PLY of whitewater points (docs/guide/formats.md)")
     start = end + len(marker)
     if len(content) != start + count * _ROW.itemsize:
         raise RenderInputError(

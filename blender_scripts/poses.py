@@ -24,7 +24,7 @@ _LENGTHS = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity": 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a body is and how it moves.
+    """Pose and velocity of a body.
 
     Attributes:
         position: of its mesh's origin [m], (3,).

@@ -7,7 +7,7 @@ Both forms write one line per frame to standard output, `FRAME_DONE 12 /path` or
 lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line
 (after a tab, the path of the EXR that is wanted too), after a line `PICTURES_BY_UV ["object", ...]`, see SceneRenderer,
 and a line `RENDERER_READY version device`; the process ends with its input, so it cannot outlive who started it.
-`stage 12 96x54 /path` asks for the empty stage of that frame, in so many pixels.
+`set 12 96x54 /path` asks for the empty set of that frame, at that resolution.
 """
 
 from __future__ import annotations
@@ -48,10 +48,11 @@ from blender_scripts import (
 from blender_scripts.compatibility import blender_version, require_supported_version
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
+from blender_scripts.look_table import LOOK_TABLE
 from blender_scripts.shading import LookContext, SmokeBox
 from blender_scripts.smoke_looks import glow_of
 
-SPEC_VERSION = 3
+SPEC_VERSION = 4
 EXIT_FRAME_FAILED = 1
 
 
@@ -86,17 +87,17 @@ class SceneRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
-        self._has_alpha = spec["stage"]["background"] != "stage"
+        self._has_alpha = spec["set"]["background"] != "set"
         if self._has_alpha:
             settings.leave_out_background()
-        self._behind = lights.plain_background(spec["stage"])
+        self._behind = lights.plain_background(spec["set"])
         self.device: str = gpus.choose_device(spec["render"]["device"], gpu)
         self._camera = camera.add_camera(spec["camera"])
         self._format, self._passes = spec["render"]["format"], spec["render"]["passes"]
         self._views, self._seed = spec["camera"]["views"], spec["render"]["seed"]
-        lights.build_stage(spec, self._folder)
-        panes = tank.add_tank(spec) if spec["stage"]["tank"] else None
-        self._stage = {blender_object.name for blender_object in bpy.data.objects}
+        lights.build_set(spec, self._folder)
+        panes = tank.add_tank(spec) if spec["set"]["tank"] else None
+        self._of_set = {blender_object.name for blender_object in bpy.data.objects}
         self._sequences: list[tuple[dict[str, Any], Any]] = []
         self._fires: dict[str, volumes.FireLight] = {}
         self._bodies: list[tuple[dict[str, Any], Any]] = []
@@ -149,7 +150,7 @@ class SceneRenderer:
         self._place_camera(frame)
         self._draw(frame, output_path, master_path)
 
-    def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
+    def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
         """Draw what a frame shows without any body: ground, backdrop, tank and their light, in a small size.
 
         Frames that are drawn afterwards are the same as without it.
@@ -165,7 +166,7 @@ class SceneRenderer:
         """
         self._require_current()
         self._place_camera(frame)
-        bodies = [each for each in bpy.data.objects if each.name not in self._stage and not each.hide_render]
+        bodies = [each for each in bpy.data.objects if each.name not in self._of_set and not each.hide_render]
         for body in bodies:
             body.hide_render = True
         try:
@@ -202,7 +203,8 @@ class SceneRenderer:
 
         Through the sliver between them light is bent as between the two, at all but flat angles.
         """
-        return self._has_wet and description["material"]["look"] not in looks.REFRACTING
+        look = LOOK_TABLE.get(description["material"]["look"])
+        return self._has_wet and not (look is not None and look.refracts)
 
     def _file(self, path: str, frame: int) -> Path:
         return self._folder / path.replace("{frame}", f"{frame:06d}")
@@ -286,7 +288,7 @@ class SceneRenderer:
         else:
             blender_object = volumes.new_volume_object(name)
             self._sequences.append((description, blender_object))
-            if look == "fire":
+            if look in LOOK_TABLE and LOOK_TABLE[look].glows:
                 self._fires[name] = volumes.FireLight(name, glow_of(context))
         blender_object.data.materials.append(material)
         return blender_object
@@ -364,14 +366,14 @@ def _render_and_report(
     output_path: Path,
     master_path: Path | None = None,
     *,
-    stage: tuple[int, int] | None = None,
+    empty_set: tuple[int, int] | None = None,
 ) -> bool:
-    """Draw a frame, or in so many pixels its empty stage, and say how that ended."""
+    """Draw a frame, or its empty set at a resolution, and report the result."""
     try:
-        if stage is None:
+        if empty_set is None:
             renderer.render(frame, output_path, master_path)
         else:
-            renderer.render_stage(frame, output_path, resolution=stage)
+            renderer.render_set(frame, output_path, resolution=empty_set)
     except (RenderInputError, RenderFailedError, OSError, RuntimeError, ValueError) as error:
         _report(f"FRAME_FAILED {frame} {error}")
         return False
@@ -393,10 +395,10 @@ def _serve(renderer: SceneRenderer) -> None:
     _report(f"RENDERER_READY {blender_version()} {renderer.device}")
     while True:
         request = requests.get().rstrip("\n")
-        if request.startswith("stage "):
+        if request.startswith("set "):
             _, frame, size, output_path = request.split(" ", 3)
             width, _, height = size.partition("x")
-            _render_and_report(renderer, int(frame), Path(output_path), stage=(int(width), int(height)))
+            _render_and_report(renderer, int(frame), Path(output_path), empty_set=(int(width), int(height)))
         else:
             frame, _, paths = request.partition(" ")
             output_path, _, master_path = paths.partition("\t")

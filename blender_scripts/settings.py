@@ -16,7 +16,7 @@ from blender_scripts.compatibility import set_file_format
 
 @dataclass(frozen=True)
 class QualityPreset:
-    """The knobs that trade time for quality; docs/rendering.md has what each was measured to give.
+    """The knobs that trade time for quality; docs/guide/rendering.md has what each was measured to give.
 
     Attributes:
         samples: most samples per pixel.
@@ -51,7 +51,7 @@ QUALITY_PRESETS = {
 }
 
 _CLEAN_SAMPLES = 16
-"""Of an empty stage, which is smooth: what is left of the noise after denoising is below a grey level or two."""
+"""Of an empty set, which is smooth: what is left of the noise after denoising is below a grey level or two."""
 
 _FAR_DISC = 300.0
 """Distance of what stands for a sun, in diagonals of the domain: its light falls off by 1 % across two of them."""
@@ -89,7 +89,7 @@ def apply_render_settings(parameters: dict[str, Any], *, fps: float, threads: in
 
 
 def choose_png(picture_format: str, *, with_alpha: bool) -> None:
-    """What is saved next is a PNG as the display shows it.
+    """Save the next picture as a PNG in display values.
 
     Args:
         picture_format: `render.format`; what an EXR accompanies has 8 bits.
@@ -103,7 +103,7 @@ def choose_png(picture_format: str, *, with_alpha: bool) -> None:
 
 
 def choose_exr(*, with_passes: bool, with_alpha: bool) -> None:
-    """What is saved next is an EXR of half floats; passes are in it as layers, in full precision where they are data.
+    """Save the next picture as an EXR of half floats; passes are layers in it, in full precision where they are data.
 
     DWAA is made for pictures: of normals and vectors it would change the Y alone, so passes are kept without loss.
     """
@@ -138,8 +138,8 @@ def _apply_cycles_settings(cycles: Any, parameters: dict[str, Any]) -> None:
     cycles.denoising_prefilter = preset.denoising_prefilter
     cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
     cycles.use_light_tree = preset.light_tree
-    # Unbiased tracking takes a third of the time a sample, but cuts the blur of fast smoke off (docs/rendering.md), and
-    # prepares each frame for up to a minute of processor time.
+    # Unbiased tracking takes a third of the time a sample, but cuts the blur of fast smoke off
+    # (docs/guide/rendering.md), and prepares each frame for up to a minute of processor time.
     cycles.volume_biased = True
     cycles.volume_step_rate = preset.volume_step_rate
     cycles.volume_bounces = preset.volume_bounces

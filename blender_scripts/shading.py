@@ -1,22 +1,24 @@
-"""What looks are built with: a material's node tree, and what a look may depend on."""
+"""Building blocks of looks: a material's node tree, the context of a look, and the registry of their functions."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 from blender_scripts.compatibility import node_tree_of
+from blender_scripts.look_table import LOOK_TABLE, MATERIAL_KEYS
 
 Color = tuple[float, float, float]
 Value = TypeVar("Value")
 
 SurfaceKind = Literal["body", "sheet", "ground"]
-"""What a texture hangs on, so that it does not swim: axes of a body, coordinates of a sheet at rest, or the ground."""
+"""What a texture is fixed to, so that it does not swim: a body's axes, a sheet's coordinates at rest, or the ground."""
 
 
 @dataclass(frozen=True)
 class SmokeBox:
-    """What a volume says about itself.
+    """Box and air of a volume.
 
     Attributes:
         box_min: lower corner of the smoke's grid [m].
@@ -33,7 +35,7 @@ class SmokeBox:
 
 @dataclass(frozen=True)
 class LookContext:
-    """What a look may depend on; what comes from the job is None where the job leaves it to the look.
+    """Context of a look; values from the job are None where the job leaves them to the look.
 
     Attributes:
         domain_size: diagonal of the domain [m].
@@ -96,10 +98,7 @@ class LookContext:
         )
 
 
-_FROM_THE_JOB = (
-    *("color", "roughness", "caustics", "density", "thread_spacing"),
-    *("anisotropy", "edge_fade", "emission", "flame_temperature"),
-)
+_FROM_THE_JOB = ("color", *MATERIAL_KEYS)
 
 
 class NodeBuilder:
@@ -164,6 +163,24 @@ class NodeBuilder:
     def volume(self, shader: Any) -> None:
         """Use a node's first output as the inside."""
         self.link(shader.outputs[0], self.output.inputs["Volume"])
+
+
+DrawLook = Callable[[NodeBuilder, LookContext], None]
+
+LOOKS: dict[str, DrawLook] = {}
+"""The function that builds each look, by its name."""
+
+
+def draws(name: str) -> Callable[[DrawLook], DrawLook]:
+    """Register a function as the one that builds a look, which has a row in the table."""
+    if name not in LOOK_TABLE:
+        raise KeyError(f'the look "{name}" has no row in blender_scripts/look_table.py')
+
+    def register(function: DrawLook) -> DrawLook:
+        LOOKS[name] = function
+        return function
+
+    return register
 
 
 def or_default(value: Value | None, default: Value) -> Value:

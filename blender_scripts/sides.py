@@ -1,4 +1,4 @@
-"""On which side of a closed mesh a point is, told from the point of the mesh that is nearest to it.
+"""The side of a closed mesh that a point is on, found from the nearest point of the mesh.
 
 The normal of the nearest triangle does not tell it beyond an edge or a corner, where several triangles are as near. The
 mean of their normals does, each weighed by the angle that it has there (Baerentzen & Aanaes 2005, "Signed distance
@@ -15,7 +15,7 @@ wide, as the normal of an edge tells the sides of what is right beside it, too."
 
 
 class Pseudonormals:
-    """Which way is out at every place on a closed mesh with outward triangles.
+    """Outward directions at every place on a closed mesh with outward triangles.
 
     Args:
         positions: [m], (n, 3).

@@ -6,7 +6,7 @@ from typing import Any
 
 from blender_scripts.black_body import LUMINANCE_EXPONENT_K
 from blender_scripts.flames import Glow
-from blender_scripts.shading import LookContext, NodeBuilder, SmokeBox, or_default
+from blender_scripts.shading import LookContext, NodeBuilder, SmokeBox, draws, or_default
 
 _OPTICAL_SIZE = 22.0
 """Optical depth of smoke of density 1 across the whole domain."""
@@ -20,12 +20,14 @@ DEFAULT_EMISSION = 30.0
 """Flames are thin: some tenth of this reaches the eye, a few times what white paper does in a studio."""
 
 
-def build_smoke(builder: NodeBuilder, context: LookContext) -> None:
+@draws("smoke")
+def _smoke(builder: NodeBuilder, context: LookContext) -> None:
     """Light smoke that scatters forwards a little; extinction follows the `density` grid."""
     _principled(builder, context, color=(0.86, 0.88, 0.90), anisotropy=0.3)
 
 
-def build_fire(builder: NodeBuilder, context: LookContext) -> None:
+@draws("fire")
+def _fire(builder: NodeBuilder, context: LookContext) -> None:
     """Sooty smoke that glows as a black body does, by the `temperature` grid.
 
     Emission per metre is extinction x emission x L(T) / L(T_flame) in the colour of a black body of T (Kirchhoff: what
@@ -51,7 +53,7 @@ def build_fire(builder: NodeBuilder, context: LookContext) -> None:
 
 
 def glow_of(context: LookContext) -> Glow:
-    """What the look says about the light of a fire."""
+    """The light of a fire, as its look has it."""
     box = _box(context)
     return Glow(
         extinction=_extinction(context),

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from blender_scripts.geometry import REST_UV
-from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
+from blender_scripts.shading import Color, LookContext, NodeBuilder, draws, mix_shaders, or_default
 
 
 @dataclass(frozen=True)
 class Weave:
-    """What a woven cloth looks like.
+    """Appearance of a woven cloth.
 
     Attributes:
         period: of the pattern [threads].
@@ -73,17 +73,20 @@ HALF_UNDULATION = 0.5
 """How far a thread goes up and down, in its radii."""
 
 
-def build_cotton(builder: NodeBuilder, context: LookContext) -> None:
+@draws("cotton")
+def _cotton(builder: NodeBuilder, context: LookContext) -> None:
     """Matt plain weave."""
     _build(builder, context, COTTON)
 
 
-def build_silk(builder: NodeBuilder, context: LookContext) -> None:
+@draws("silk")
+def _silk(builder: NodeBuilder, context: LookContext) -> None:
     """Shining satin."""
     _build(builder, context, SILK)
 
 
-def build_denim(builder: NodeBuilder, context: LookContext) -> None:
+@draws("denim")
+def _denim(builder: NodeBuilder, context: LookContext) -> None:
     """Coarse twill in two colours."""
     _build(builder, context, DENIM)
 
@@ -124,7 +127,7 @@ def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
 
 
 def mean_appearance(weave: Weave, *, samples: int = 64) -> tuple[float, float]:
-    """What a weave is on average over its period: the share of weft on its front, and the brightness of its threads.
+    """Mean appearance of a weave over its period: share of weft on its front, and brightness of its threads.
 
     Args:
         weave: the pattern; its unevenness has no mean effect.

@@ -1,4 +1,4 @@
-"""Where the surface of a fluid touches what it wets, computed for every vertex of every frame.
+"""Contact of a fluid's surface with what it wets, computed for every vertex of every frame.
 
 A surface made of particles ends a little short of the solid or a little inside of it, and the sliver of air between
 them would reflect like a mirror whatever meets it at more than the critical angle (48.6° in water). A liquid that wets
@@ -34,7 +34,7 @@ _DIP = 0.2
 
 @dataclass(frozen=True)
 class Touchable:
-    """What a fluid may touch, with its place: a body, a cloth or another fluid.
+    """An object that a fluid may touch, with its place: a body, a cloth or another fluid.
 
     Attributes:
         tree: its triangles, in its own axes; None without any.
@@ -101,7 +101,7 @@ class TouchedBodies:
         self._bodies.append((description, Touchable.of(mesh, is_closed=True)))
 
     def at(self, places: Mapping[str, tuple[Any, Any]], sheets: Sequence[TriangleMesh]) -> list[Touchable]:
-        """What fluids touch in a frame, but for each other.
+        """The touchable objects of a frame, other than fluids.
 
         Args:
             places: position and orientation of the bodies that move, by name.
@@ -143,7 +143,7 @@ def wetted(
 
 @dataclass
 class _Touch:
-    """What is known of the vertices so far.
+    """Contact of the vertices found so far.
 
     Attributes:
         wet: how far each touches something [-], (n,).

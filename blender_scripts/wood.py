@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from blender_scripts.geometry import REST_UV
-from blender_scripts.shading import Color, LookContext, NodeBuilder, or_default
+from blender_scripts.shading import Color, LookContext, NodeBuilder, draws, or_default
 
 OILED_OAK: Color = (0.36, 0.19, 0.085)
 _RINGS = 9.0
@@ -24,7 +24,8 @@ _SHEET_TRUNK = 0.25
 """Width of the trunk that a sheet is cut from, in diagonals of the domain."""
 
 
-def build_wood(builder: NodeBuilder, context: LookContext) -> None:
+@draws("wood")
+def _wood(builder: NodeBuilder, context: LookContext) -> None:
     """Oiled oak: late wood darker than early wood, fibres along the grain, a soft shine."""
     base = or_default(context.color, OILED_OAK)
     position, tone, joint = _boards(builder, context) if context.surface == "ground" else _trunk(builder, context)

@@ -28,7 +28,7 @@ def apply_workbench_settings(bodies: Sequence[tuple[dict[str, Any], Any]], *, pa
 
     Args:
         bodies: descriptions from the render specification, each with the object that was made of it. Not by name:
-            Blender gives a body another one if the stage has its own already, as with a body called "ground".
+            Blender gives a body another one if the set has its own already, as with a body called "ground".
         panes: the glass of the tank; None without one.
     """
     scene = bpy.context.scene

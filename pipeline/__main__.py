@@ -7,7 +7,7 @@ if _HANDLER is signal.default_int_handler:
     # Ctrl-C while the commands are loading ends the process like any other program's, not with a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-from pipeline.cli import main as commands  # noqa: E402
+from pipeline.cli.main import main as commands  # noqa: E402
 
 
 def main() -> None:

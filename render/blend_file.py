@@ -1,4 +1,4 @@
-"""What is in a .blend file, asked of Blender in a process of its own: it may be one that crashes its reader."""
+"""Contents of a .blend file, read by Blender in a child process, as a damaged file may crash its reader."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_material_names(path: Path, blender: str | None, *, tried: Sequence[str]
 
 
 def _ask(path: Path, blender: str | None, tried: Sequence[str], wanted: str) -> str:
-    """What the script says after a word."""
+    """The rest of the script's line that begins with a word."""
     argv = script_argv(blender, "blend_materials.py", [str(path), *tried])
     completed = run_script(argv, timeout_s=_TIMEOUT_S, purpose=f"read {path}")
     for line in completed.stdout.splitlines():

@@ -88,22 +88,22 @@ class Renderer(Protocol):
     """Draws frames of one RenderSpec."""
 
     device: str
-    """What Cycles renders on, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`."""
+    """The device that Cycles renders on, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`."""
     pictures_by_uv: frozenset[str]
     """Names of the objects with pictures in their material that lie by the texture coordinates of the mesh."""
 
     def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
         """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
 
-    def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
-        """Draw what the camera of a frame sees without any body, so many pixels wide and high.
+    def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
+        """Draw the view of a frame's camera without any body, at this width and height [pixels].
 
         Raises:
             FrameRenderError: it cannot be drawn.
         """
 
     def close(self) -> None:
-        """Let go of Blender; idempotent."""
+        """Close Blender; idempotent."""
 
 
 def open_renderer(spec_path: Path, *, threads: int, blender: str | None, gpu: int | None = 0) -> Renderer:
@@ -163,10 +163,10 @@ class ModuleRenderer:
         with _told_of(frame):
             self._scene.render(frame, output_path, master_path)
 
-    def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
+    def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
         """Draw what the camera of a frame sees without any body. Raises FrameRenderError."""
         with _told_of(frame):
-            self._scene.render_stage(frame, output_path, resolution=resolution)
+            self._scene.render_set(frame, output_path, resolution=resolution)
 
     def close(self) -> None:
         """Nothing to do: the module stays loaded, and the next scene replaces this one."""
@@ -219,10 +219,10 @@ class ExecutableRenderer:
         master = "" if master_path is None else f"\t{master_path.resolve()}"
         self._ask(frame, f"{frame} {output_path.resolve()}{master}")
 
-    def render_stage(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
+    def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
         """Draw what the camera of a frame sees without any body. Raises as `render` does."""
         width, height = resolution
-        self._ask(frame, f"stage {frame} {width}x{height} {output_path.resolve()}")
+        self._ask(frame, f"set {frame} {width}x{height} {output_path.resolve()}")
 
     def _ask(self, frame: int, request: str) -> None:
         stdin = self._process.stdin

@@ -1,4 +1,4 @@
-"""Where the action of a film is: how far what moves reaches in many directions, frame by frame, and all of it together.
+"""Bounds of a film's action: the reach of all that moves in many directions, per frame and over the whole film.
 
 A reach is a number for each of `DIRECTIONS`: the largest d . x of what there is. Together they bound a convex body that
 is never larger than the axes' box around it, and cuts off the corners of that which nothing gets to: what a camera
@@ -47,7 +47,7 @@ _DENSE_CELL = 8
 """Particles that make a cell of four of their spacings dense, an eighth of those that fill it: as much as the corner of
 a block has in a cell that it half reaches into. By a share of the mass alone such corners, of little mass, would go."""
 LEAST_EDGE = 0.1
-"""Shortest edge of what is framed, in diagonals of the domain [-]: the stage around it has the domain's size, too."""
+"""Shortest edge of what is framed, in diagonals of the domain [-]: the set around it has the domain's size, too."""
 
 BOUNDS_VERSION = 2
 """1: boxes along the axes."""
@@ -57,19 +57,19 @@ _SAME_PLACE = 1.0e-9
 
 
 def reach_of_points(points: ArrayLike) -> Reach:
-    """How far points (n, 3) [m] reach, n at least 1."""
+    """Reach of points (n, 3) [m], n at least 1."""
     columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
     return np.array([_along(columns, direction).max() for direction in DIRECTIONS])
 
 
 def reach_of_box(box: Box) -> Reach:
-    """How far a box reaches."""
+    """Reach of a box."""
     reach: Reach = np.maximum(DIRECTIONS * box[0], DIRECTIONS * box[1]).sum(axis=1)
     return reach
 
 
 def reach_of_particles(position: ArrayLike, radius: float) -> Reach:
-    """How far a fluid's particles reach, without the outliers.
+    """Reach of a fluid's particles, without the outliers.
 
     Along the axes it leaves `LEFT_OUT` of them out on each side. Between them it does, too, but takes in what of the
     rest is dense.
@@ -155,7 +155,7 @@ def box_of(reach: Reach) -> Box:
 
 
 def framed(action: Reach | None, *, domain: Box, world: Box) -> Reach:
-    """What the camera frames: the action, as far as it is in the world, and not smaller than the stage allows.
+    """What the camera frames: the action, as far as it is in the world, and not smaller than the set allows.
 
     Args:
         action: of all that moves or stands in the film; None if there is nothing.
@@ -205,7 +205,7 @@ def _meeting_planes() -> tuple[NDArray[np.int64], list[NDArray[np.float64]]]:
 
 
 def write_bounds(path: Path, reaches: Mapping[str, Reach]) -> None:
-    """Write reaches by name; docs/formats.md. The same reaches give the same bytes."""
+    """Write reaches by name; docs/guide/formats.md. The same reaches give the same bytes."""
     document = {"version": BOUNDS_VERSION, "reaches": {name: reach.tolist() for name, reach in reaches.items()}}
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 

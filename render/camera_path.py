@@ -1,4 +1,4 @@
-"""Where the camera is: still, along keyframes, around a point, or with a body; and how it frames a box by itself."""
+"""The camera's path: still, along keyframes, around a point, or with a body; and the automatic framing of a box."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ VIEWS_VERSION = 1
 
 @dataclass(frozen=True)
 class View:
-    """What the camera sees at one time.
+    """The camera's view at one time.
 
     Attributes:
         position: of the camera [m].
@@ -268,7 +268,7 @@ class _Interpolation:
 
 
 def write_views(path: Path, frame: int, views: Mapping[float, View]) -> None:
-    """Write where the camera is while the shutter of one frame is open; docs/formats.md.
+    """Write where the camera is while the shutter of one frame is open; docs/guide/formats.md.
 
     Args:
         path: the document; the same views give the same bytes.

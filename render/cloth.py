@@ -1,4 +1,4 @@
-"""Cloth as a surface that can be drawn: normals for smooth shading."""
+"""Cloth as a renderable surface: normals for smooth shading."""
 
 from __future__ import annotations
 

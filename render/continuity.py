@@ -1,4 +1,4 @@
-"""Whether a film runs on from frame to frame: pictures that pop up for one frame, repeat, or jump.
+"""Continuity of a film: finds pictures that pop up for one frame, repeat, or jump.
 
 How two pictures differ is the root mean square of the difference of their luma, in means over blocks: noise averages
 out, and what is as large as a block counts. Why not FLIP: docs/decisions/0030-checks-of-pictures.md.
@@ -33,7 +33,7 @@ JUMPS = 5.0
 
 @dataclass(frozen=True)
 class Break:
-    """Where a film does not run on.
+    """A break in a film's continuity.
 
     Attributes:
         kind: `pop`, `repeat` or `jump`.
@@ -92,7 +92,7 @@ class Continuity:
         self._before = [*self._before[-1:], picture]
 
     def breaks(self) -> list[Break]:
-        """Where the frames seen so far do not run on."""
+        """The breaks among the frames seen so far."""
         found = (self._break_at(frame) for frame in range(1, len(self._ones) + 1))
         return [each for each in found if each is not None]
 

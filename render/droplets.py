@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from render.meshes import SurfaceMesh
 
 DROPLET_PARTICLES = 8
-"""A part of so many particles keeps its size: it is two particles thick, and the smoothing may round it off."""
+"""A part of this many particles keeps its size: it is two particles thick, and the smoothing may round it off."""
 
 _LARGEST_DROPLET = 3.0
-"""Parts with the volume of so many times `DROPLET_PARTICLES` are none, whatever is in them: the defaults give a lone
+"""Parts larger than this many times `DROPLET_PARTICLES` are none, whatever is in them: the defaults give a lone
 particle 0.7 of its volume, and a wide smoothing length up to three times as much."""
 
 

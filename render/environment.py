@@ -18,7 +18,7 @@ _EXR_WINDOW = b"dataWindow\0box2i\0"
 
 
 def environment_pixels(path: Path) -> int | None:
-    """How many pixels a picture has by its header, which is all that is read; None where that does not say.
+    """Number of pixels of a picture, by its header alone; None where that does not say.
 
     Raises:
         OSError: it cannot be read.

@@ -1,4 +1,4 @@
-"""The GPUs that Cycles can draw on, asked of Blender in a process of its own: a driver may end who asks."""
+"""The GPUs that Cycles can draw on, probed by Blender in a child process, as a driver may crash its caller."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Gpu:
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """What asking for GPUs gave.
+    """Result of a probe for GPUs.
 
     Attributes:
         gpus: those that Cycles finds, its preferred back end first, each back end's in the driver's order.
@@ -72,7 +72,7 @@ def find_gpus(blender: str | None) -> Probe:
 
 
 def read_answer(lines: Sequence[str]) -> tuple[Gpu, ...]:
-    """The GPUs that the script's lines tell of, those of the preferred back end first. Pure."""
+    """The GPUs in the script's output, those of the preferred back end first. Pure."""
     gpus: list[Gpu] = []
     for line in lines:
         if line.startswith("GPUS "):

@@ -1,8 +1,8 @@
 """Triangle meshes as binary PLY files, written and read with numpy alone.
 
-Layout (docs/formats.md): binary little endian; vertices `x y z [nx ny nz] [vx vy vz] [s t]`, all float32; faces as a
-list of one uchar (always 3) and int32 indices, and where bodies have texture coordinates a list of one uchar (always 6)
-and the float32 u, v of each corner. A mesh without vertices is legal: a frame without fluid.
+Layout (docs/guide/formats.md): binary little endian; vertices `x y z [nx ny nz] [vx vy vz] [s t]`, all float32; faces
+as a list of one uchar (always 3) and int32 indices, and where bodies have texture coordinates a list of one uchar
+(always 6) and the float32 u, v of each corner. A mesh without vertices is legal: a frame without fluid.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def _parse_header(path: Path, content: bytes) -> _Header:
     header = _Header(elements.get("vertex", 0), elements.get("face", 0), tuple(properties), face, size)
     # Comparing with the header that we would have written refuses every other layout in one place.
     if header.text != content[:size] or [group for group, _ in _group_starts(header.properties)][:1] != ["position"]:
-        raise InvalidFileError(path, "is not a PLY of the expected layout (docs/formats.md)")
+        raise InvalidFileError(path, "is not a PLY of the expected layout (docs/guide/formats.md)")
     return header
 
 

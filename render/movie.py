@@ -50,7 +50,7 @@ memory past the end of narrow pictures, whose content is random."""
 
 @dataclass(frozen=True)
 class _Encoder:
-    """How a codec is written.
+    """Encoder settings of a codec.
 
     Attributes:
         name: of FFmpeg's encoder.
@@ -198,7 +198,7 @@ def join_segments(segments: Sequence[Path], output: Path) -> None:
             with _opened(segment) as container:
                 source = container.streams.video[0]
                 if _encoding(source) != _encoding(template):
-                    raise InvalidFileError(segment, f"was encoded otherwise than {segments[0]}")
+                    raise InvalidFileError(segment, f"was not encoded as {segments[0]}")
                 packets = _packets(segment, source)
                 start = frame_count
                 for packet in packets:
@@ -342,7 +342,7 @@ def _opened(path: Path) -> Any:
 
 
 def _encoding(stream: Any) -> tuple[object, ...]:
-    """What must be equal for packets of two files to share a track."""
+    """The properties that must be equal for packets of two files to share a track."""
     context = stream.codec_context
     return context.name, context.extradata, context.width, context.height, stream.time_base, stream.average_rate
 

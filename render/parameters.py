@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from blender_scripts.look_table import LOOK_TABLE
 
 Vector3 = tuple[float, float, float]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -13,6 +15,14 @@ Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Color = tuple[Fraction, Fraction, Fraction]
 Quality = Literal["draft", "preview", "final"]
+
+if TYPE_CHECKING:
+    Look = str
+    GroundLook = str
+else:
+    # Names of the table's rows; type checkers see texts, as a Literal of theirs can only be spelled out.
+    Look = Literal[tuple(name for name, row in LOOK_TABLE.items() if row.bodies)]
+    GroundLook = Literal[tuple(name for name, row in LOOK_TABLE.items() if row.paves)]
 
 
 class Parameters(BaseModel):
@@ -142,7 +152,7 @@ LightType = Literal["area", "point", "sun"]
 
 MOST_SUN_DEG = 180.0
 USUAL_POWER: dict[LightType, float] = {"area": 100.0, "point": 100.0, "sun": 5.0}
-"""Of a light that the job gives none [W], of a sun [W/m²]: that of the stage `outdoor` has 5.5."""
+"""Of a light that the job gives none [W], of a sun [W/m²]: that of the set `outdoor` has 5.5."""
 
 
 class LightParameters(Parameters):
@@ -175,8 +185,8 @@ class LightParameters(Parameters):
         return self
 
 
-class StageParameters(Parameters):
-    """Ground, background and the lights that come with them."""
+class SetParameters(Parameters):
+    """The set: ground, background and the lights that come with them."""
 
     name: Literal["studio", "outdoor", "night", "window"] = Field(
         default="studio",
@@ -194,15 +204,15 @@ class StageParameters(Parameters):
     )
     color: Color | None = Field(
         default=None,
-        description="Colour of the ground and backdrop, linear RGB; the stage's own if omitted, or that of the look in "
+        description="Colour of the ground and backdrop, linear RGB; the set's own if omitted, or that of the look in "
         "ground.",
     )
-    ground: Literal["rubber", "ceramic", "plastic", "metal", "stone", "wood"] | None = Field(
+    ground: GroundLook | None = Field(
         default=None, description="Look of the ground, and of a backdrop that it curves up into; matt if omitted."
     )
-    background: Literal["stage", "plain", "transparent"] = Field(
-        default="stage",
-        description="stage: as it is; plain: exactly the stage's colour behind everything; transparent: frames have an "
+    background: Literal["set", "plain", "transparent"] = Field(
+        default="set",
+        description="set: as it is; plain: exactly the set's colour behind everything; transparent: frames have an "
         "alpha channel, and the film, which can have none, is laid over black. Of the ground only the shadows on it "
         "are seen in the last two.",
     )
@@ -217,12 +227,6 @@ class StageParameters(Parameters):
     tank: bool = Field(
         default=False, description="Show the domain's walls as a glass tank; its open_faces have no pane."
     )
-
-
-Look = Literal[
-    "water", "honey", "milk", "smoke", "fire", "rubber", "ceramic", "plastic", "metal", "stone", "wood", "glass",
-    "spray", "foam", "bubbles", "cotton", "silk", "denim",
-]  # fmt: skip
 
 
 class MaterialParameters(Parameters):
@@ -247,7 +251,7 @@ class MaterialParameters(Parameters):
     caustics: bool = Field(
         default=False,
         description="Water, honey and glass: bend the light of lamps onto what lies around, instead of letting it "
-        "straight through; docs/rendering.md has what it costs.",
+        "straight through; docs/guide/rendering.md has what it costs.",
     )
     thread_spacing: Positive | None = Field(
         default=None, description="Woven cloth: distance of its threads [m]; the look's own if omitted."
@@ -372,7 +376,7 @@ class RenderParameters(Parameters):
 Codec = Literal["h264", "h265", "av1", "prores"]
 
 USUAL_CRF = {"h264": 16, "h265": 18, "av1": 20}
-"""Within 2 dB of each other on the quickstart; docs/rendering.md has the table."""
+"""Within 2 dB of each other on the quickstart; docs/guide/rendering.md has the table."""
 HIGHEST_CRF = {"h264": 51, "h265": 51, "av1": 63}
 HIGHEST_FPS: dict[Codec, float] = {"av1": 240.0}
 """Frames a second that a codec's encoder takes; the others take whatever a job may have [1/s]."""

@@ -26,11 +26,11 @@ WHITE_LEVEL = 245.0 / 255.0
 """Display value [-] from which a channel counts as burnt: the view's curve comes to 1 slowly."""
 
 VISIBLE_LEVELS = 6
-"""Grey levels of 255 by which a part of a picture differs from the empty stage if something is to be seen there; noise
+"""Grey levels of 255 by which a part of a picture differs from the empty set if something is to be seen there; noise
 of a denoised draft, in the mean of a cell of four pixels, reaches 5."""
 SHARE_THAT_SHOWS = 0.05
-"""Of the cells that bodies are in, so many must look otherwise than the empty stage: what is transparent, or coloured
-as the backdrop is, still has edges and a shadow."""
+"""Least share of the cells with bodies that must differ from the empty set: a body that is transparent, or coloured as
+the backdrop, still has edges and a shadow."""
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
@@ -40,7 +40,7 @@ _BT709_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
 
 @dataclass(frozen=True)
 class PictureStatistics:
-    """What a picture looks like in numbers; display values from 0 to 1.
+    """Statistics of a picture; display values from 0 to 1.
 
     Attributes:
         width: [pixels].
@@ -91,35 +91,37 @@ def read_picture(path: Path) -> Pixels:
 
 def read_rgb8(path: Path) -> NDArray[np.uint8]:
     """Pixels as (height, width, 3) uint8; 16-bit channels are rounded, what has alpha is laid over black."""
-    color = _rgb(path)
-    if color.dtype == np.uint16:
-        color = ((color.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    return np.ascontiguousarray(color, np.uint8)
+    return _rgb8(read_picture(path))
 
 
 def read_rgb16(path: Path) -> NDArray[np.uint16]:
     """Pixels as (height, width, 3) uint16; 8-bit channels are spread over the range, alpha is laid over black."""
-    color = _rgb(path)
+    color = _rgb(read_picture(path))
     if color.dtype == np.uint8:
         color = color.astype(np.uint16) * np.uint16(257)
     return np.ascontiguousarray(color, np.uint16)
 
 
-def read_shown(path: Path) -> NDArray[np.uint8]:
-    """What is seen over black, and how much of it is there: (height, width, 4) uint8; alpha is 255 where there is none.
+def over_black(pixels: Pixels) -> NDArray[np.uint8]:
+    """Decoded pixels over black and their alpha: (height, width, 4) uint8; alpha is 255 where there is none.
 
     A dark body before nothing differs from nothing by its alpha alone.
     """
-    pixels = read_picture(path)
     alpha = np.full(pixels.shape[:2], 255, np.uint8)
     if pixels.shape[2] in (2, 4):
         alpha = (pixels[..., -1] >> (8 * (pixels.dtype.itemsize - 1))).astype(np.uint8)
-    return np.dstack([read_rgb8(path), alpha])
+    return np.dstack([_rgb8(pixels), alpha])
 
 
-def _rgb(path: Path) -> Pixels:
+def _rgb8(pixels: Pixels) -> NDArray[np.uint8]:
+    color = _rgb(pixels)
+    if color.dtype == np.uint16:
+        color = ((color.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    return np.ascontiguousarray(color, np.uint8)
+
+
+def _rgb(pixels: Pixels) -> Pixels:
     """Colours of a picture, (height, width, 3), grey ones as well; what has alpha is laid over black."""
-    pixels = read_picture(path)
     channels, full = pixels.shape[2], np.iinfo(pixels.dtype).max
     color: Pixels = np.repeat(pixels[..., :1], 3, axis=2) if channels <= 2 else pixels[..., :3]
     if channels in (2, 4):
@@ -140,7 +142,13 @@ def validate_picture(path: Path, resolution: tuple[int, int], *, may_be_empty: b
         InvalidFileError: it is damaged, of another size, black, or of one colour only.
         OSError: it cannot be read.
     """
-    pixels = read_picture(path)
+    return check_pixels(path, read_picture(path), resolution, may_be_empty=may_be_empty)
+
+
+def check_pixels(
+    path: Path, pixels: Pixels, resolution: tuple[int, int], *, may_be_empty: bool = False
+) -> PictureStatistics:
+    """Check that the decoded pixels of a picture show something; arguments and errors as for `validate_picture`."""
     height, width, channels = pixels.shape
     if (width, height) != tuple(resolution):
         raise InvalidFileError(path, f"is {width}x{height} pixels, but {resolution[0]}x{resolution[1]} were asked for")
@@ -167,23 +175,26 @@ def validate_picture(path: Path, resolution: tuple[int, int], *, may_be_empty: b
     return statistics
 
 
-def require_more_than_stage(path: Path, stage: NDArray[np.uint8], cells: NDArray[np.bool_]) -> None:
-    """Refuse a picture that shows nothing but the empty stage where bodies should be.
+def require_more_than_set(
+    path: Path, shown: NDArray[np.uint8], empty: NDArray[np.uint8], cells: NDArray[np.bool_]
+) -> None:
+    """Refuse a picture that shows nothing but the empty set where bodies should be.
 
     Args:
         path: the picture.
-        stage: the same view without the bodies, a pixel for each of the cells, (rows, columns, 4) of `read_shown`.
+        shown: its pixels as `over_black` gives them, (height, width, 4).
+        empty: the same view without the bodies, a pixel for each of the cells, (rows, columns, 4), also `over_black`.
         cells: where bodies are, (rows, columns); some of them.
 
     Raises:
         InvalidFileError: nearly all of these cells look as they do without the bodies.
     """
     rows, columns = cells.shape
-    small = Image.fromarray(read_shown(path)).resize((columns, rows), Image.Resampling.BOX)
-    difference = np.abs(np.asarray(small, np.int16) - stage.astype(np.int16)).max(axis=2)
+    small = Image.fromarray(shown).resize((columns, rows), Image.Resampling.BOX)
+    difference = np.abs(np.asarray(small, np.int16) - empty.astype(np.int16)).max(axis=2)
     if (difference[cells] >= VISIBLE_LEVELS).mean() < SHARE_THAT_SHOWS:
         raise InvalidFileError(
-            path, f"shows the empty stage, though bodies are in {100 * cells.mean():.0f} % of it: they were not drawn"
+            path, f"shows the empty set, though bodies are in {100 * cells.mean():.0f} % of it: they were not drawn"
         )
 
 

@@ -1,7 +1,7 @@
 """Whitewater as binary PLY files of points, written and read with numpy alone.
 
-Layout (docs/formats.md): binary little endian; a comment with the number of particles that had no room; one element
-`vertex` with float32 `x y z vx vy vz radius lifetime` and uchar `kind`. No particles is legal: a frame without
+Layout (docs/guide/formats.md): binary little endian; a comment with the number of particles that had no room; one
+element `vertex` with float32 `x y z vx vy vz radius lifetime` and uchar `kind`. No particles is legal: a frame without
 whitewater.
 """
 
@@ -60,7 +60,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class PointCounts:
-    """What the header of a cloud tells.
+    """The header of a cloud.
 
     Attributes:
         points: how many there are.
@@ -154,5 +154,5 @@ def validate_point_cloud(path: Path) -> None:
 def _header(path: Path, content: bytes) -> re.Match[bytes]:
     header = _PATTERN.match(content)
     if header is None:
-        raise InvalidFileError(path, "is not a point cloud of the expected layout (docs/formats.md)")
+        raise InvalidFileError(path, "is not a point cloud of the expected layout (docs/guide/formats.md)")
     return header

@@ -1,4 +1,4 @@
-"""Poses of a frame's rigid bodies, as the JSON document that `blender_scripts/poses.py` reads; docs/formats.md."""
+"""Poses of a frame's rigid bodies, as the JSON that `blender_scripts/poses.py` reads; docs/guide/formats.md."""
 
 from __future__ import annotations
 

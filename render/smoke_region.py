@@ -1,4 +1,4 @@
-"""Where smoke may be drawn: the cells that hold some, and those that it crosses while the shutter is open."""
+"""The region where smoke may be drawn: cells that hold some, and those it crosses while the shutter is open."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def bounding_box(mask: NDArray[np.bool_]) -> Box | None:
 
 
 def blur_reach(velocity: NDArray[np.float32], mask: NDArray[np.bool_], *, shutter_s: float, cell_size: float) -> int:
-    """How many cells around the smoke a renderer looks velocities up in, max|v| shutter / 2, and one to interpolate.
+    """Cells around the smoke in which a renderer looks up velocities: max|v| shutter / 2, and one to interpolate.
 
     A frame is at the middle of the time that the shutter is open, so smoke is drawn up to half of it away.
 

@@ -19,11 +19,11 @@ from render.parameters import (
     MaterialParameters,
     Parameters,
     RenderParameters,
-    StageParameters,
+    SetParameters,
     Vector3,
 )
 
-SPEC_VERSION: Literal[3] = 3
+SPEC_VERSION: Literal[4] = 4
 
 
 def _whole(material: MaterialParameters) -> MaterialParameters:
@@ -56,7 +56,7 @@ class MovingMeshObject(Parameters):
     name: str
     file: str
     body: str = Field(description="Name of the body in the poses; parts of one body share it.")
-    poses: str = Field(description="Path with {frame} of a JSON document; see docs/formats.md.")
+    poses: str = Field(description="Path with {frame} of a JSON document; see docs/guide/formats.md.")
     material: Material
     shade_smooth_angle_deg: float = Field(default=40.0, description="Edges sharper than this stay sharp [degrees].")
 
@@ -116,7 +116,9 @@ class Camera(Parameters):
     focus_distance: float = Field(gt=0.0, description="[m]")
     f_stop: float | None = Field(default=None, gt=0.0)
     longest_focal_length_mm: float = Field(gt=0.0, description="Of all frames.")
-    views: str | None = Field(default=None, description="Path with {frame} of a JSON document; see docs/formats.md.")
+    views: str | None = Field(
+        default=None, description="Path with {frame} of a JSON document; see docs/guide/formats.md."
+    )
     distance_all_round: float | None = Field(
         default=None,
         ge=0.0,
@@ -144,7 +146,7 @@ class Camera(Parameters):
 class RenderSpec(Parameters):
     """Everything in front of the camera, and the camera."""
 
-    version: Literal[3] = SPEC_VERSION
+    version: Literal[4] = SPEC_VERSION
     fps: float = Field(gt=0.0)
     domain_min: Vector3
     domain_max: Vector3
@@ -153,7 +155,7 @@ class RenderSpec(Parameters):
         description="Sides of the domain without a wall: x-, x+, y-, y+, z-, z+; the tank has no pane there.",
     )
     camera: Camera
-    stage: StageParameters
+    set: SetParameters
     lights: tuple[LightParameters, ...] = ()
     objects: tuple[SceneObject, ...]
     render: RenderParameters
@@ -166,6 +168,10 @@ class RenderSpec(Parameters):
     def _say_their_power(cls, lights: tuple[LightParameters, ...]) -> tuple[LightParameters, ...]:
         return tuple(light.with_power() for light in lights)
 
+    def document(self) -> str:
+        """The JSON document; the same specification gives the same text."""
+        return self.model_dump_json(indent=1) + "\n"
+
     def write(self, path: Path) -> None:
-        """Write the document; the same specification gives the same bytes."""
-        path.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        """Write the document."""
+        path.write_text(self.document(), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What the OpenVDB library leaves open about its files: that they are reproducible, and that they are whole.
+"""OpenVDB files made reproducible, and checked to be whole, neither of which the library does.
 
 The library puts a random identifier into each header, ignores a full disk while it writes, and reads many a damaged
 file without complaint. Here the identifier is derived from the content, so that equal volumes are equal bytes and a

@@ -1,4 +1,4 @@
-"""What a camera sees of a scene, by geometry alone: before anything is drawn, and without what hides what."""
+"""Visibility of points and meshes to a camera, by geometry alone: before rendering, without occlusion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_TRIANGLES = 100_000
 
 
 def screen_positions(view: View, points: Array, *, aspect: float) -> Array:
-    """Where points are in the picture: (n, 2), -1 and 1 are its edges, y points up; NaN for what lies behind.
+    """Positions of points in the picture: (n, 2), -1 and 1 are its edges, y points up; NaN behind the camera.
 
     Args:
         view: of the camera.
@@ -62,7 +62,7 @@ def points_of_box(lower: Sequence[float], upper: Sequence[float]) -> Array:
 def covered_cells(
     view: View, vertices: NDArray[Any], faces: NDArray[np.int32], *, shape: tuple[int, int], aspect: float
 ) -> tuple[NDArray[np.bool_], float]:
-    """Where a mesh is in a picture of few cells, and how much of the picture it covers, about.
+    """The cells of a coarse picture that a mesh covers, and the share of the picture it covers, approximately.
 
     Args:
         view: of the camera.

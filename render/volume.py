@@ -1,8 +1,8 @@
 """Smoke volumes as OpenVDB files: `density`, `temperature` and `velocity` on one grid of cells.
 
 The OpenVDB binding is the one inside the bpy wheel; it is loaded by itself, without importing bpy. Equal arrays give
-equal bytes, and a file that was changed is noticed (`vdb_file`). Layout and conventions: docs/formats.md. Grids are
-filled column by column: beside the arrays that are written only masks, and what OpenVDB makes of them, take memory.
+equal bytes, and a file that was changed is noticed (`vdb_file`). Layout and conventions: docs/guide/formats.md. Grids
+are filled column by column: beside the arrays that are written only masks, and what OpenVDB makes of them, take memory.
 """
 
 from __future__ import annotations

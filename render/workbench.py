@@ -68,7 +68,7 @@ def draw_frames(
         folder: gets the pictures, `000042.png`.
         threads: CPU threads to draw with.
         blender: path of a Blender executable, or None for the bpy module.
-        drawn: is told each frame that is there.
+        drawn: called with each frame that is done.
 
     Returns:
         The pictures, in the order of the frames.

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.domain import DomainParameters
+from sim.core.solver import Coupling, Solver
+from sim.core.world import World
 from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
 from sim.coupling.fluid_rigid import FluidRigidCoupling
-from sim.domain import DomainParameters
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
 from sim.fluid.nozzles import nozzle_collision, pipes
 from sim.fluid.opening import Opening, obstruction
@@ -19,20 +21,23 @@ from sim.rigid.static import StaticBody
 from sim.scene import SceneParameters
 from sim.shapes.placement import build_solid
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
-from sim.solver import Coupling, Solver
-from sim.world import World
 
 if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver
     from sim.coupling.cloth_samples import ClothSamples
-    from sim.fluid.forces import SPHFluid
+    from sim.fluid.fluid import SPHFluid
     from sim.rigid.solver import RigidSolver
     from sim.shapes.solid import Solid
     from sim.smoke.solver import SmokeSolver
 
 
-def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
-    """The solvers of a scene in their initial state; `sim.runtime.initialize` must have run.
+def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Sequence[Solver] = ()) -> World:
+    """The solvers of a scene in their initial state; `sim.core.runtime.initialize` must have run.
+
+    Args:
+        scene: rigid bodies, fluids, smoke and cloth, which are coupled.
+        frames_per_second: [1/s].
+        solvers: others that share the world, and meet nobody.
 
     Raises:
         ShapeError: a shape cannot be built.
@@ -44,7 +49,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
     samples = _sample_cloths(scene, cloths)
     fluids = [_build_fluids(scene, bodies, rigid, samples)] if scene.fluid else []
     smokes = [_build_smoke(smoke, scene, bodies) for smoke in scene.smoke]
-    solvers: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
+    coupled: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
         contacts = contacts_of_cloths(cloth, scene.rigid, domain=scene.domain, rigid=rigid)
@@ -55,7 +60,7 @@ def build_world(scene: SceneParameters, *, frames_per_second: float) -> World:
 
             couplings += [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
-    return World(solvers, frames_per_second=frames_per_second, couplings=couplings, static_bodies=bodies)
+    return World([*coupled, *solvers], frames_per_second=frames_per_second, couplings=couplings, static_bodies=bodies)
 
 
 def _sample_cloths(scene: SceneParameters, cloths: Sequence[ClothSolver]) -> ClothSamples | None:
@@ -65,7 +70,7 @@ def _sample_cloths(scene: SceneParameters, cloths: Sequence[ClothSolver]) -> Clo
     if not (cloths and scene.fluid):
         return None
     fluid = scene.fluid[0]
-    return ClothSamples.of(cloths[0], 2.0 * fluid.particle_radius, fluid.support_in_spacings)
+    return ClothSamples.of(cloths[0], fluid.spacing, fluid.support_in_spacings)
 
 
 def _build_fluids(
@@ -75,14 +80,16 @@ def _build_fluids(
     from sim.coupling.body_samples import samples_of_moving_bodies
     from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
-    from sim.fluid.kernels import particle_volume
+    from sim.fluid.discretization import Discretization
     from sim.fluid.solvers import SOLVERS
+    from sim.fluid.tank import FluidStart
 
     if conflicts := shared_conflicts(scene.fluid):
         number, key, message = conflicts[0]
         raise ValueError(f'fluid "{scene.fluid[number].name}": {key} {message}')
-    spacing, support = 2.0 * scene.fluid[0].particle_radius, scene.fluid[0].support_in_spacings
-    volume = particle_volume(spacing, support)
+    spacing, support = scene.fluid[0].spacing, scene.fluid[0].support_in_spacings
+    discretization = Discretization(spacing, support)
+    volume = discretization.particle_volume
     solids = [body.solid for body in bodies]
     movers = [body for body in scene.rigid if body.kind != "static"]
     moving = [build_solid(body) for body in movers]
@@ -95,7 +102,7 @@ def _build_fluids(
     speeds += [] if cloth is None else [expected_cloth_speed(scene.cloth, cloth.start, scene.domain, scene.gravity)]
     samples = [
         sink_samples(
-            _reachable(body.surface_samples(spacing), scene.domain, support * spacing),
+            _reachable(body.surface_samples(spacing), scene.domain, discretization.support_radius),
             body.solid.signed_distance,
             spacing,
             support,
@@ -103,7 +110,7 @@ def _build_fluids(
         for body in bodies
     ]
     boundary = BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples, *around)
-    return SOLVERS[scene.fluid[0].solver](
+    start = FluidStart(
         scene.fluid,
         domain=scene.domain,
         gravity=scene.gravity,
@@ -111,12 +118,13 @@ def _build_fluids(
         velocities=filling.velocities,
         phase=filling.phase,
         boundary=boundary,
-        moving=None if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
+        moving=BoundarySamples.of_bodies() if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
         sheets=None if cloth is None else cloth.sheets,
         body_count=len(moving),
         body_speed=max(speeds, default=0.0),
         capacity=particle_capacity(scene.fluid, scene.domain, filling.count_of(len(scene.fluid)), volume),
     )
+    return SOLVERS[scene.fluid[0].solver](start)
 
 
 def _build_openings(scene: SceneParameters, solids: list[Solid], spacing: float, volume: float) -> list[Opening]:
@@ -170,8 +178,8 @@ def _build_cloths(scene: SceneParameters, frames_per_second: float) -> ClothSolv
 
 def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> SmokeSolver:
     """The solver of one smoke, with static bodies in it, and room for what will move in it."""
+    from sim.coupling.smoke_sources import with_sources_on
     from sim.smoke.solver import SmokeSolver
-    from sim.smoke.source_motion import with_sources_on
 
     moving = _meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid)
     return SmokeSolver(

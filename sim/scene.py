@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Self
 
 from pydantic import Field, model_validator
 
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
+from sim.core.parameters import Device, Parameters, Vector3
 from sim.fluid.parameters import FluidParameters
-from sim.parameters import Parameters, Vector3
 from sim.rigid.parameters import RigidBodyParameters
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
-
-Device = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 
 
 class SceneParameters(Parameters):

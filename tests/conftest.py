@@ -26,7 +26,7 @@ ORDER = ("smoke", "fluid", "validation", "cloth", "films", "rigid")
 The first three, with which CI's three processes begin, hold every test of smoke, whose kernels read fields. Taichi
 numbers the fields of a process, and looks for kept kernels by these numbers: tests that always come first, and in the
 same order, find theirs again. And a process has room for some hundred solvers with fields
-(`sim.runtime.require_room_for_fields`): they are several families for that.
+(`sim.core.runtime.require_room_for_fields`): they are several families for that.
 """
 
 

@@ -1,13 +1,12 @@
 """Which tests share a process in CI, and in which order families begin."""
 
 import runpy
-from pathlib import Path
 
 import pytest
+from places import PROJECT
 
-ROOT = Path(__file__).parents[1]
-CONFTEST = runpy.run_path(str(ROOT / "tests" / "conftest.py"))
-FILES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py"))
+CONFTEST = runpy.run_path(str(PROJECT / "tests" / "conftest.py"))
+FILES = sorted(path.relative_to(PROJECT).as_posix() for path in (PROJECT / "tests").rglob("test_*.py"))
 
 family_of, in_order_of_families = CONFTEST["family_of"], CONFTEST["in_order_of_families"]
 

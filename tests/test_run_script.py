@@ -13,9 +13,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from places import PROJECT
 
-ROOT = Path(__file__).resolve().parents[1]
-UV = shutil.which("uv") or next(ROOT.glob(".tools/uv/bin/uv"), None)
+UV = shutil.which("uv") or next(PROJECT.glob(".tools/uv/bin/uv"), None)
 
 pytestmark = pytest.mark.skipif(UV is None, reason="uv is neither on PATH nor in .tools; ./run would fetch it")
 
@@ -44,10 +44,10 @@ def project(tmp_path: Path) -> Path:
     root = tmp_path / "my project"
     (root / "pipeline").mkdir(parents=True)
     (root / "render").mkdir()
-    shutil.copy2(ROOT / "run", root / "run")
+    shutil.copy2(PROJECT / "run", root / "run")
     (root / "pipeline" / "__init__.py").touch()
     (root / "pipeline" / "__main__.py").write_text("import sys\nprint('ours', *sys.argv[1:])\n")
-    shutil.copy2(ROOT / "render" / "system_libraries.py", root / "render")
+    shutil.copy2(PROJECT / "render" / "system_libraries.py", root / "render")
     (root / "requirements.lock").write_text(wheel(tmp_path, 1))
     return root
 
@@ -139,3 +139,23 @@ def test_called_through_a_link_it_finds_its_project(project, tmp_path):
         [link, "pipeline", "x"], env=environment(with_uv=True), capture_output=True, text=True, check=False, timeout=120
     )
     assert (result.returncode, result.stdout) == (0, "ours x\n"), result.stderr
+
+
+@pytest.mark.parametrize("quoted", [False, True], ids=["a folder", "an address"])
+def test_folder_that_pip_would_look_in_and_that_is_not_there_is_no_obstacle(project, tmp_path, quoted):
+    there = tmp_path / "wheels and more" if quoted else tmp_path / "wheels"
+    there.mkdir()
+    requirement = wheel(there, 3)
+    digest = requirement.rpartition(" ")[2].strip()
+    (project / "requirements.lock").write_text(f"tiny==3.0 {digest}\n")
+    missing = tmp_path / "mounted elsewhere" if quoted else tmp_path / "missing"
+    places = [path.as_uri() if quoted else str(path) for path in (missing, there)]
+    stand_in = project / ".tools" / "uv" / "bin" / "python"  # whose pip tells its settings
+    stand_in.parent.mkdir(parents=True)
+    listed = "".join(f"\\\\n{place}" for place in places)
+    stand_in.write_text(f"#!/bin/sh\nprintf '%s\\n' \"global.find-links='{listed}'\" \"global.no-index='true'\"\n")
+    stand_in.chmod(0o755)
+    kept = {name: value for name, value in environment(with_uv=True).items() if not name.startswith("UV_")}
+    alone = {"UV_NO_INDEX": "1", "XDG_CONFIG_HOME": str(tmp_path)}
+    result = run(project, "python", "-c", "import tiny; print(tiny.VALUE)", env={**kept, **alone})
+    assert (result.returncode, result.stdout) == (0, "3\n"), result.stderr

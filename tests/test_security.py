@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from places import PROJECT
 
-ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted(
-    path for folder in ("pipeline", "render", "sim", "blender_scripts") for path in (ROOT / folder).rglob("*.py")
+    path for folder in ("pipeline", "render", "sim", "blender_scripts") for path in (PROJECT / folder).rglob("*.py")
 )
 FORBIDDEN_CALLS = {
     *("eval", "exec", "compile", "os.system", "os.popen", "subprocess.getoutput", "subprocess.getstatusoutput"),
@@ -27,7 +27,7 @@ def calls(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:
             yield ast.unparse(node.func), node
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(PROJECT).as_posix())
 def test_no_text_is_run_and_no_shell_is_started(path: Path) -> None:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for name, call in calls(tree):
@@ -43,7 +43,7 @@ def test_no_text_is_run_and_no_shell_is_started(path: Path) -> None:
 
 def test_pickles_travel_between_a_runner_and_its_own_workers_only() -> None:
     using = {
-        path.relative_to(ROOT).as_posix()
+        path.relative_to(PROJECT).as_posix()
         for path in SOURCES
         if any(
             (isinstance(node, ast.Import | ast.ImportFrom) and any("pickle" in alias.name for alias in node.names))
@@ -52,7 +52,7 @@ def test_pickles_travel_between_a_runner_and_its_own_workers_only() -> None:
         )
     }
     assert using <= {
-        "pipeline/executors/channel.py",
-        "pipeline/executors/dask_connection.py",
-        "pipeline/executors/dask_driver.py",
+        "pipeline/run/executors/channel.py",
+        "pipeline/run/executors/dask_connection.py",
+        "pipeline/run/executors/dask_driver.py",
     }

@@ -6,22 +6,22 @@ import sys
 from pathlib import Path
 
 import pytest
+from places import PROJECT
 
-ROOT = Path(__file__).resolve().parents[1]
 HEAVY = {"taichi", "bpy", "trimesh", "igl", "scipy", "av", "pysplashsurf", "openvdb", "distributed"}
 
 
 def modules_after(statement: str) -> set[str]:
     """Top-level modules that a fresh interpreter has loaded after a statement."""
     code = f"import sys; {statement}; print(*{{name.partition('.')[0] for name in sys.modules}})"
-    child = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    child = subprocess.run([sys.executable, "-c", code], cwd=PROJECT, capture_output=True, text=True, check=True)
     return set(child.stdout.split())
 
 
 @pytest.mark.parametrize(
     "statement",
     [
-        "import pipeline.cli",
+        "import pipeline.cli.main",
         "import pipeline.__main__",
         "import pipeline.stages",
         "from pipeline.job.loading import load_job",
@@ -36,28 +36,28 @@ def test_import_loads_neither_physics_nor_blender(statement):
 
 def test_help_needs_no_arrays_and_no_tables():
     """`pipeline --help` answers at once."""
-    assert modules_after("import pipeline.cli") & {"numpy", "rich", "h5py"} == set()
+    assert modules_after("import pipeline.cli.main") & {"numpy", "rich", "h5py"} == set()
 
 
 def test_import_contracts_hold():
     lint = Path(sys.executable).with_name("lint-imports")
-    child = subprocess.run([lint, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
+    child = subprocess.run([lint, "--no-cache"], cwd=PROJECT, capture_output=True, text=True, check=False)
     assert child.returncode == 0, child.stdout
 
 
 def test_only_the_entrances_to_blender_import_it():
     entrances = {"render/blender.py"}
     importing = {
-        path.relative_to(ROOT).as_posix()
+        path.relative_to(PROJECT).as_posix()
         for folder in ("pipeline", "render", "sim", "blender_scripts")
-        for path in (ROOT / folder).rglob("*.py")
+        for path in (PROJECT / folder).rglob("*.py")
         if re.search(r"^\s*(import|from) bpy\b", path.read_text(encoding="utf-8"), re.MULTILINE)
     }
     assert {path for path in importing if not path.startswith("blender_scripts/")} <= entrances
 
 
 def test_lock_pins_every_package_with_hashes_and_names_no_host():
-    lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    lock = (PROJECT / "requirements.lock").read_text(encoding="utf-8")
     assert not re.search(r"://|--(extra-)?index-url|--find-links|--trusted-host", lock)
     requirements = re.split(r"\n(?=[A-Za-z0-9])", lock)
     assert len(requirements) > 20
@@ -70,18 +70,18 @@ def test_every_direct_requirement_is_locked():
     names = {
         re.match(r"[A-Za-z0-9._-]+", line).group().lower()
         for file in ("requirements.in", "requirements-dev.in")
-        for line in (ROOT / file).read_text(encoding="utf-8").splitlines()
+        for line in (PROJECT / file).read_text(encoding="utf-8").splitlines()
         if line and not line.startswith("#")
     }
     locked = set(
-        re.findall(r"^([A-Za-z0-9._-]+)==", (ROOT / "requirements.lock").read_text(encoding="utf-8"), re.MULTILINE)
+        re.findall(r"^([A-Za-z0-9._-]+)==", (PROJECT / "requirements.lock").read_text(encoding="utf-8"), re.MULTILINE)
     )
     assert names <= {name.lower() for name in locked}
 
 
 def test_scripts_are_executable_and_valid_shell():
     for script, shell in (("run", "sh"), (".ci/run", "bash")):
-        path = ROOT / script
+        path = PROJECT / script
         assert path.stat().st_mode & 0o111
         subprocess.run([shell, "-n", path], check=True)
 
@@ -89,7 +89,7 @@ def test_scripts_are_executable_and_valid_shell():
 def test_no_two_test_files_have_one_name():
     """Pytest imports them by it, and collects only the first; each alone would pass."""
     seen: dict[str, Path] = {}
-    for path in sorted((ROOT / "tests").rglob("*.py")):
+    for path in sorted((PROJECT / "tests").rglob("*.py")):
         if path.name not in ("conftest.py", "__init__.py"):
             assert path.name not in seen, f"{path} and {seen[path.name]}"
             seen[path.name] = path

@@ -1,1 +1,1 @@
-"""What the user wrote: models, loading, presets, overrides."""
+"""The job file: loading, overrides, messages, schema, presets, checks of the whole job."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pipeline.job.models import Job
-from pipeline.job.placements import mesh_shapes
-from pipeline.job.positions import KeyPath
+from pipeline.model.job import Job
+from pipeline.model.meshes import mesh_shapes
+from pipeline.model.positions import KeyPath
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ def input_files(job: Job) -> Iterator[InputFile]:
     """Every file that the job reads, meshes first."""
     for place, shape in mesh_shapes(job):
         yield InputFile((*place, "file"), shape.file, "mesh")
-    if job.stage.hdri is not None:
-        yield InputFile(("stage", "hdri"), job.stage.hdri, "picture")
+    if job.set.hdri is not None:
+        yield InputFile(("set", "hdri"), job.set.hdri, "picture")
     for name, material in job.material.items():
         if material.blend is not None:
             file, inside = split_blend(material.blend)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from blake3 import blake3
 
-from pipeline.files import sync
+from pipeline.base.files import sync
+from pipeline.base.layout import JobLayout
 from pipeline.job.input_files import input_files
 from pipeline.job.loading import LoadedJob, changed_text, job_of_text
-from pipeline.job.models import Job
 from pipeline.job.overrides import Override
-from pipeline.layout import JobLayout
+from pipeline.model.job import Job
 
 
 def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> tuple[Job, str]:

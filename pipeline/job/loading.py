@@ -6,23 +6,28 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from pipeline.errors import JobFileError
+from pipeline.base.errors import JobFileError
 from pipeline.job.input_files import InputFile, input_files
 from pipeline.job.messages import explain
-from pipeline.job.models import Job
 from pipeline.job.overrides import Override, OverrideError, apply_overrides, parse_override
 from pipeline.job.presets import preview_overrides
-from pipeline.job.problems import JobSource
+from pipeline.kinds.table import job_type
+from pipeline.model.job import Job
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import JobSource
 
 MAX_BYTES = 16 * 2**20
 """No person writes a larger job file; a film given by mistake is refused before it is read."""
 MAX_DEPTH = 32
 """Four times what any job needs; keeps recursive code far from Python's limit."""
+MOST_JOBS = 16
+"""Validated jobs that a process keeps."""
 
 _SYNTAX_POSITION = re.compile(
     r"(?P<what>.*) \(at (?:line (?P<line>\d+), column (?P<column>\d+)|end of document)\)", re.DOTALL
@@ -66,19 +71,16 @@ def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool =
     """
     path = Path(path)
     text = _read_text(path)
-    document = _parse(path, text)
-    changes = _parse_overrides(overrides, document)
+    changes = _parse_overrides(overrides, _parse(path, text)) if overrides else []
     source = JobSource(path.name, text, {change.path: change.origin for change in changes})
     if changes:
         text = changed_text(text, changes)
-    job = _validate(_parse(path, text), source)
-    text = _with_absolute_files(text, job, path)
-    job = _validate(_parse(path, text), source)
+    job, text = _with_absolute_files(_job_of(path, text, source), text, path)
     if preview:
         preview_changes = preview_overrides(job)
         source.options.update({change.path: change.origin for change in preview_changes})
         text = changed_text(text, preview_changes)
-        job = _validate(_parse(path, text), source)
+        job = _job_of(path, text, source)
     return LoadedJob(job=job, text=text, path=path, source=source)
 
 
@@ -88,9 +90,7 @@ def job_of_text(text: str, path: Path) -> Job:
     Raises:
         JobFileError: carries every problem found.
     """
-    source = JobSource(path.name, text)
-    job = _validate(_parse(path, text), source)
-    return _validate(_parse(path, _with_absolute_files(text, job, path)), source)
+    return _with_absolute_files(_job_of(path, text, JobSource(path.name, text)), text, path)[0]
 
 
 def _read_text(path: Path) -> str:
@@ -183,10 +183,33 @@ def changed_text(text: str, changes: Sequence[Override]) -> str:
         raise JobFileError([str(error)]) from None
 
 
+_JOBS: dict[bytes, Job] = {}
+"""The jobs that this process has validated, by the hash of their text; the latest `MOST_JOBS`."""
+
+
+def _job_of(path: Path, text: str, source: JobSource) -> Job:
+    """The job that a text describes, its files as the text names them; each text is validated once a process."""
+    job = _JOBS.get(_hash(text))
+    if job is None:
+        job = _validate(_parse(path, text), source)
+        _remember(text, job)
+    return job
+
+
+def _remember(text: str, job: Job) -> None:
+    _JOBS[_hash(text)] = job
+    while len(_JOBS) > MOST_JOBS:
+        del _JOBS[next(iter(_JOBS))]
+
+
+def _hash(text: str) -> bytes:
+    return sha256(text.encode()).digest()
+
+
 def _validate(document: Mapping[str, Any], source: JobSource) -> Job:
     """Strict validation: "60" is no number, and 60.0 is no whole number."""
     try:
-        return Job.model_validate(_with_tuples(document), strict=True)
+        return job_type().model_validate(_with_tuples(document), strict=True)
     except ValidationError as error:
         raise JobFileError(source.describe_all(explain(error, document))) from None
 
@@ -198,8 +221,8 @@ def _with_tuples(value: Any) -> Any:
     return tuple(_with_tuples(child) for child in value) if isinstance(value, list) else value
 
 
-def _with_absolute_files(text: str, job: Job, path: Path) -> str:
-    """The text with the files that it names relative to its own folder named by absolute paths."""
+def _with_absolute_files(job: Job, text: str, path: Path) -> tuple[Job, str]:
+    """A job and its text with the files that they name relative to their own folder named by absolute paths."""
     files = list(input_files(job))
     if job.render.blender is not None:
         files.append(InputFile(("render", "blender"), job.render.blender, "program"))
@@ -209,4 +232,22 @@ def _with_absolute_files(text: str, job: Job, path: Path) -> str:
         for file in files
         if not Path(file.path).is_absolute()
     ]
-    return changed_text(text, changes) if changes else text
+    if not changes:
+        return job, text
+    text = changed_text(text, changes)
+    for change in changes:
+        job = _with_value(job, change.path, change.value)
+    _remember(text, job)
+    return job, text
+
+
+def _with_value(value: Any, path: KeyPath, new: object) -> Any:
+    """A model, tuple or table with another value at a path; nothing is validated."""
+    if not path:
+        return new
+    key, rest = path[0], path[1:]
+    if isinstance(value, BaseModel):
+        return value.model_copy(update={str(key): _with_value(getattr(value, str(key)), rest, new)})
+    if isinstance(value, tuple):
+        return tuple(_with_value(each, rest, new) if index == key else each for index, each in enumerate(value))
+    return {**value, key: _with_value(value[key], rest, new)}

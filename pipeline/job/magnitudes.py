@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from typing import Any
 
 from pipeline.job import schema
-from pipeline.job.models import Job
-from pipeline.job.positions import KeyPath
-from pipeline.job.problems import Findings
+from pipeline.kinds.table import KINDS
+from pipeline.model.job import Job
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
 
 SMALLEST_LENGTH = 1.0e-6
 LARGEST_LENGTH = 1.0e6
@@ -20,7 +21,7 @@ LARGEST_NUMBER = 1.0e9
 def check_magnitudes(job: Job, findings: Findings) -> bool:
     """Whether every number of the scene is of a size that can be computed with; notes those that are not."""
     ok = True
-    scene = job.model_dump(include={"domain", "gravity", "rigid", "fluid", "smoke", "cloth", "whitewater"})
+    scene = job.model_dump(include={"domain", "gravity", *KINDS, "whitewater"})
     for path, value in _numbers(scene):
         node = schema.node_at(path)
         unit = node.unit if node is not None else ""

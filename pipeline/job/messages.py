@@ -10,9 +10,9 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from pipeline.job import schema
-from pipeline.job.models import NAME_PATTERN
-from pipeline.job.positions import KeyPath
-from pipeline.job.problems import Problem, quoted_list, suggestion
+from pipeline.model.job import NAME_PATTERN
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Problem, quoted_list, suggestion
 
 _EXPECTED = {
     "float_type": "a number",
@@ -34,6 +34,10 @@ _BOUNDS = {
 }
 _BODY_NAME_RULE = 'must begin with a letter and go on with letters, digits, "_" or "-", 64 at most'
 _JOB_NAME_RULE = 'must begin with a letter or digit and go on with letters, digits, ".", "_" or "-", 100 at most'
+
+
+_RENAMED: dict[KeyPath, str] = {("stage",): "[stage] is now [set]"}
+"""Keys of earlier versions that have another name now."""
 
 
 def explain(error: ValidationError, document: Mapping[str, Any]) -> list[Problem]:
@@ -168,6 +172,8 @@ def _vector_length(path: KeyPath) -> int:
 
 
 def _unknown_key(path: KeyPath, table: object) -> str:
+    if path in _RENAMED:
+        return _RENAMED[path]
     key, parent = str(path[-1]), schema.node_at(path[:-1])
     known = parent.narrowed(table).keys if parent is not None else []
     sentence = f'unknown key "{key}"'

@@ -14,8 +14,8 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
 from pipeline.job import schema
-from pipeline.job.positions import KeyPath
-from pipeline.job.problems import format_path, suggestion
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import format_path, suggestion
 
 
 class OverrideError(ValueError):

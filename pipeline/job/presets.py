@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pipeline.job.coarser_smoke import coarser_cell_sizes
-from pipeline.job.models import Job
+from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.overrides import Override
-from sim.cloth.parameters import RectangleSheet
-from sim.smoke.parameters import CELLS_PER_EDDY
+from pipeline.kinds.table import KINDS
+from pipeline.model.job import Job
+from pipeline.model.problems import Findings
 
 PREVIEW = "--preview"
 COARSENING = 2.0
@@ -29,30 +29,9 @@ def preview_overrides(job: Job) -> list[Override]:
     ]
     if job.render.samples is not None:
         changes.append((("render", "samples"), max(1, job.render.samples // 4)))
-    for index, fluid in enumerate(job.fluid):
-        changes.append((("fluid", index, "particle_radius"), fluid.particle_radius * COARSENING))
-        if fluid.dt != "adaptive":
-            changes.append((("fluid", index, "dt"), fluid.dt * COARSENING))
-    cell_sizes = coarser_cell_sizes(job, COARSENING)
-    for index, (smoke, cell_size) in enumerate(zip(job.smoke, cell_sizes, strict=True)):
-        changes.append((("smoke", index, "cell_size"), cell_size))
-        gusts = smoke.turbulence
-        if gusts.strength > 0.0 and gusts.size < CELLS_PER_EDDY * cell_size:
-            changes.append((("smoke", index, "turbulence", "size"), CELLS_PER_EDDY * cell_size))
-    for index, cloth in enumerate(job.cloth):
-        # Pins would hold others in a coarser sheet where they name nodes by number, and others or none in a region.
-        by_place = all(pin.index is None and pin.region is None for pin in cloth.pin)
-        if isinstance(cloth.shape, RectangleSheet) and by_place:
-            changes.append(_coarser(("cloth", index, "shape"), cloth.shape))
+    can_be_built = check_magnitudes(job, Findings())  # what is wrong with them is told of the changed job
+    changes += [change for kind in KINDS.values() for change in kind.coarser(job, COARSENING, can_be_built)]
     return [Override(path, value, PREVIEW) for path, value in changes]
-
-
-def _coarser(path: tuple[str | int, ...], sheet: RectangleSheet) -> tuple[tuple[str | int, ...], object]:
-    """The key that divides a sheet, and its value for half as many cells along each side."""
-    if sheet.counts is None:
-        assert sheet.resolution is not None
-        return (*path, "resolution"), sheet.resolution * COARSENING
-    return (*path, "counts"), [max(2, round((count - 1) / COARSENING) + 1) for count in sheet.counts]
 
 
 def _half(pixels: int) -> int:

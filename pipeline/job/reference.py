@@ -1,6 +1,6 @@
-"""The reference of every key in docs/job-file.md, made from the schema.
+"""The reference of every key in docs/guide/job-file.md, made from the schema.
 
-    python -m pipeline.job.reference docs/job-file.md
+    python -m pipeline.job.reference docs/guide/job-file.md
 
 writes it between the file's two markers; a test asserts that it is current.
 """
@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.job import schema
-from pipeline.job.problems import quoted_list
+from pipeline.model.problems import quoted_list
 from sim.cloth.materials import MATERIAL_UNITS, MATERIALS, SOURCES
 
-BEGIN = "<!-- reference: begin; written by `python -m pipeline.job.reference docs/job-file.md` -->"
+BEGIN = "<!-- reference: begin; written by `python -m pipeline.job.reference docs/guide/job-file.md` -->"
 END = "<!-- reference: end -->"
 
 _KEYS_OF_TYPED = {

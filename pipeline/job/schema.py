@@ -10,18 +10,23 @@ from typing import Any
 
 from pydantic.json_schema import GenerateJsonSchema
 
-from pipeline.job.models import Job
-from pipeline.job.positions import KeyPath
+from pipeline.kinds.table import job_type
+from pipeline.model.job import Job
+from pipeline.model.positions import KeyPath
 
 Node = dict[str, Any]
 
 _UNIT = re.compile(r"\[([^\[\]]+)\]")
 
 
-@cache
 def job_schema() -> Node:
     """JSON Schema (draft 2020-12) of the job file; editors complete and check TOML with it."""
-    schema = Job.model_json_schema()
+    return _schema_of(job_type())
+
+
+@cache
+def _schema_of(model: type[Job]) -> Node:
+    schema = model.model_json_schema()
     return {
         "$schema": GenerateJsonSchema.schema_dialect,
         "title": "Job file",
@@ -86,7 +91,7 @@ class SchemaNode:
         return SchemaNode(fitting or self.alternatives, self.description)
 
     def child(self, part: str | int) -> SchemaNode | None:
-        """What stands under a key or an index, or None where the schema knows no such place."""
+        """Schema under a key or an index; None where there is no such place."""
         found = [place for node in self.alternatives if (place := _child(node, part)) is not None]
         if not found:
             return None

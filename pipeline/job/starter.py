@@ -6,12 +6,12 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from pipeline.errors import JobFileError
-from pipeline.job.models import NAME_PATTERN
+from pipeline.base.errors import JobFileError
+from pipeline.model.job import NAME_PATTERN
 
 _HEAD = """\
 # Editors complete and check this file after `pipeline schema > job.schema.json` and a first line
-# "#:schema job.schema.json" here. Lengths are in metres, z points up; docs/job-file.md lists every key.
+# "#:schema job.schema.json" here. Lengths are in metres, z points up; docs/guide/job-file.md lists every key.
 #
 #     pipeline check {file}      says what is wrong, and how large the job is
 #     pipeline submit {file} --preview
@@ -23,7 +23,7 @@ fps = 60
 """
 
 _PICTURE = """
-[stage]
+[set]
 name = "studio"                 # or "outdoor"
 
 [render]

@@ -7,11 +7,11 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from pipeline.layout import JobLayout
-from pipeline.task import ArtifactPath, Task
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath, Task
 
 if TYPE_CHECKING:
-    from pipeline.job.models import Job
+    from pipeline.model.job import Job
 
 
 class TaskContext(Protocol):
@@ -62,7 +62,7 @@ class Stage(Protocol):
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The tasks of this stage. Pure."""
 
-    def obstacles(self, job: Job) -> list[str]:
+    def preflight(self, job: Job) -> list[str]:
         """Why this machine cannot run this stage of this job, a sentence each with a remedy; empty if it can."""
 
     def run(self, context: TaskContext) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from pipeline.job.looks import parts_of
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
-from pipeline.parameter_set import ParameterSet
+from pipeline.base.content import tool_version
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import Task, TaskId
+from pipeline.kinds.table import material_of
+from pipeline.model.job import Job
+from pipeline.model.looks import parts_of
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import by_content, tool_version
-from pipeline.task import Task, TaskId
+from pipeline.stages.inputs import by_content
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.parameters import MeshShape
 
@@ -40,7 +42,7 @@ class BodiesStage:
             for body in job.rigid
         ]
 
-    def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
+    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
         """None: its packages are always there."""
         return []
 
@@ -66,4 +68,4 @@ class BodiesStage:
 
 def _is_textured(job: Job, body: RigidBodyParameters) -> bool:
     """Whether its file's texture coordinates are kept: a material of a .blend file may hang pictures on them."""
-    return isinstance(body.shape, MeshShape) and job.material_of(body.name).blend is not None
+    return isinstance(body.shape, MeshShape) and material_of(job, body.name).blend is not None

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.cache import read_frame, read_smoke_density
-from pipeline.job.looks import parts_of
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
-from pipeline.parameter_set import ParameterSet
+from pipeline.base.content import tool_version
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import Resources, Task, TaskId
+from pipeline.kinds.rigid import rest_vertices
+from pipeline.kinds.table import bodies
+from pipeline.model.job import Job
+from pipeline.model.looks import parts_of
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import count_cloth_nodes, most_particles, tool_version
-from pipeline.task import ArtifactPath, Resources, Task, TaskId
-from sim.rigid.parameters import RigidBodyParameters
+from pipeline.store.cache import open_bodies
 
 if TYPE_CHECKING:
     from render.bounds import Reach
@@ -28,11 +28,6 @@ FILM = TaskId("bounds/film")
 
 BASE_BYTES = 150_000_000
 """Interpreter, numpy, h5py and the meshes of bodies."""
-BYTES_PER_PARTICLE = 160
-"""The arrays of a snapshot, which are read together, positions in double precision, those without the outliers, and the
-cells that they are in."""
-BYTES_PER_NODE = 100
-BYTES_PER_CELL = 8
 
 
 class BoundsStage:
@@ -91,7 +86,7 @@ class BoundsStage:
         )
         return [*frames, film]
 
-    def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
+    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
         """None: its packages are always there."""
         return []
 
@@ -114,41 +109,22 @@ def read_framed(path: Path) -> NDArray[np.float64]:
 
 
 def _memory_bytes(job: Job) -> int:
-    cells = max((prod(smoke.cell_counts(job.domain)) for smoke in job.smoke), default=0)
-    particles = BYTES_PER_PARTICLE * most_particles(job)
-    return int(BASE_BYTES + particles + BYTES_PER_NODE * count_cloth_nodes(job) + BYTES_PER_CELL * cells)
+    """Bodies are read one after the other; the cells of a smoke are few bytes each, and only one smoke's at a time."""
+    return int(BASE_BYTES + sum(kind.reach_bytes * kind.elements(job, body) for _, kind, body in bodies(job)))
 
 
 def _of_frame(job: Job, layout: JobLayout, frame: int) -> dict[str, Reach]:
     """How far what there is at a frame reaches, by body."""
-    from render.bounds import box_of_smoke, reach_of_box, reach_of_particles, reach_of_points
-    from sim.rigid.rotation import rotated
-
-    cached = layout.path(layout.frame_cache(frame))
-    reaches = {}
-    for name, body in read_frame(cached, kind="fluid").bodies.items():
-        if len(body.arrays["position"]):
-            reaches[name] = reach_of_particles(body.arrays["position"], body.number("particle_radius"))
-    for name, body in read_frame(cached, kind="cloth").bodies.items():
-        reaches[name] = reach_of_points(body.arrays["position"])
-    moving = job.moving_bodies
-    for name, body in read_frame(cached, kind="rigid").bodies.items():
-        if name in moving:
-            vertices = _mesh_of(layout, next(each for each in job.rigid if each.name == name))
-            position, orientation = (np.asarray(body.arrays[key], np.float64) for key in ("position", "orientation"))
-            reaches[name] = reach_of_points(position + rotated(orientation, vertices))
-    for smoke in job.smoke:
-        density, lower, cell_size = read_smoke_density(cached, smoke.name)
-        box = box_of_smoke(density, lower, cell_size)
-        if box is not None:
-            reaches[smoke.name] = reach_of_box(box)
-    return reaches
+    with open_bodies(layout.path(layout.frame_cache(frame))) as groups:
+        there = [(kind, body, groups[body.name]) for _, kind, body in bodies(job) if body.name in groups]
+        reaches = {body.name: kind.reach(job, layout, body, group) for kind, body, group in there}
+    return {name: reach for name, reach in reaches.items() if reach is not None}
 
 
 def _of_film(context: TaskContext) -> Reach:
     """How far all frames and the bodies that stand still reach, as far as they are in the world."""
     from render.bounds import around, framed, reach_of_box, reach_of_points, read_bounds
-    from sim.rigid.rotation import from_degrees, rotated
+    from sim.core.motion.rotation import from_degrees, rotated
 
     job, layout = context.job, context.layout
     domain = np.array([job.domain.min, job.domain.max])
@@ -162,17 +138,9 @@ def _of_film(context: TaskContext) -> Reach:
     ]
     for body in job.rigid:
         if body.kind == "static":
-            turned = rotated(from_degrees(body.rotation_deg), _mesh_of(layout, body))
+            turned = rotated(from_degrees(body.rotation_deg), rest_vertices(layout, body))
             reaches.append(reach_of_points(np.array(body.position) + turned))
     if job.has_panes and reaches:
         # Its glass is seen, and walls that the picture cuts off look like a mistake.
         reaches.append(reach_of_box(np.array([domain[0], [*domain[1, :2], domain[0, 2]]])))
     return framed(around(reaches), domain=domain, world=world)
-
-
-def _mesh_of(layout: JobLayout, body: RigidBodyParameters) -> NDArray[np.float64]:
-    """Vertices of all parts of a body at rest [m], (n, 3)."""
-    from render.meshes import read_ply
-
-    files: list[ArtifactPath] = [layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
-    return np.concatenate([read_ply(layout.path(file)).vertices for file in files]).astype(np.float64)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 
+from pipeline.base.layout import JobLayout
 from pipeline.job.input_files import split_blend
-from pipeline.job.looks import BODY, parts_of
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
+from pipeline.kinds.table import material_of
+from pipeline.model.job import Job
+from pipeline.model.looks import BODY, parts_of
 from pipeline.stages.base import TaskContext
 
 FLAT_PICTURES = "flat pictures"
@@ -32,15 +33,15 @@ def warn_of_flat_pictures(context: TaskContext, pictures_by_uv: Collection[str])
 
 
 def _without_coordinates(job: Job, layout: JobLayout) -> Iterator[tuple[str, str]]:
-    """What has a material of a .blend file and no texture coordinates: names of objects, and `file.blend:Name`."""
+    """Objects with a .blend material and no texture coordinates: their names, and `file.blend:Name`."""
     from render.meshes import read_ply
 
     for body in job.rigid:
         for part in parts_of(body.shape.type):
-            material = job.material_of(body.name, part)
+            material = material_of(job, body.name, part)
             mesh = layout.path(layout.body_mesh(body.name, part))
             if material.blend is not None and read_ply(mesh).corner_uv is None:
                 yield body.name if part == BODY else f"{body.name}.{part}", material.blend
     for fluid in job.fluid:
-        if (blend := job.material_of(fluid.name).blend) is not None:
+        if (blend := material_of(job, fluid.name).blend) is not None:
             yield fluid.name, blend

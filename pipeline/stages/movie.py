@@ -5,12 +5,12 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
-from pipeline.parameter_set import ParameterSet
+from pipeline.base.content import tool_version
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import Task, TaskId
+from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import tool_version
-from pipeline.task import Task, TaskId
 from render.movie import SEGMENT_FRAMES
 
 
@@ -53,7 +53,7 @@ class MovieStage:
         )
         return [*segments, film]
 
-    def obstacles(self, job: Job) -> list[str]:
+    def preflight(self, job: Job) -> list[str]:
         """An encoder that this build of FFmpeg lacks."""
         from render.movie import missing_encoder
 

@@ -8,21 +8,24 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from pipeline.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
+from blender_scripts.look_table import LOOK_TABLE
+from pipeline.base.content import content_name
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.job.input_files import split_blend
-from pipeline.job.looks import parts_of
-from pipeline.job.models import Job
-from pipeline.job.problems import suggestion
-from pipeline.layout import JobLayout
-from pipeline.own_pictures import own_picture_bytes
-from pipeline.parameter_set import ParameterSet
+from pipeline.kinds.table import products_of
+from pipeline.model.job import Job
+from pipeline.model.looks import parts_of
+from pipeline.model.problems import suggestion
 from pipeline.stages.base import TaskContext
 from pipeline.stages.flat_pictures import warn_of_flat_pictures
-from pipeline.stages.inputs import blender_version, content_name
-from pipeline.stages.render_drawing import CPU, close_renderers, draw_until_good, may_be_empty, warm_renderer
+from pipeline.stages.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
+from pipeline.stages.inputs import blender_version
+from pipeline.stages.render_drawing import CPU, FrameDrawing, close_renderers, may_be_empty
 from pipeline.stages.render_scene import render_spec, write_motion
-from pipeline.stages.sight import bodies_at, warn_of_sight
-from pipeline.task import ArtifactPath, Resources, Task, TaskId
+from pipeline.stages.texture_memory import own_picture_bytes
+from pipeline.stages.visibility import bodies_at, warn_if_invisible
 from render.spec import RenderSpec
 
 CORES = 2
@@ -45,23 +48,21 @@ _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "r
 differently."""
 
 _LATER_KEYS: dict[str, Any] = {"format": "png", "passes": []}
-_LATER_STAGE_KEYS: dict[str, Any] = {
-    **{"ground": None, "background": "stage", "hdri": None, "rotation_deg": 0.0},
+_LATER_SET_KEYS: dict[str, Any] = {
+    **{"ground": None, "background": "set", "hdri": None, "rotation_deg": 0.0},
     **{"sun_elevation_deg": 38.0, "sun_azimuth_deg": None},
 }
 _LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None, "caustics": False}
 """Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
-_LOOK_REVISIONS = {"honey": 2, "cotton": 2, "silk": 2, "denim": 2}
-"""Looks that are drawn otherwise than in earlier versions: nothing else of a job says so."""
 _TANK_REVISION = 2
-"""The same of the glass tank."""
+"""Raised when the same keys give other pixels of the glass tank; a look's stands in its row of the table."""
 _BLEND_ON_CLOTH_REVISION = 2
 """The same of .blend materials on cloth: UV maps that they name were not found, and are the cloth's own now."""
 _SUN_REVISION = 2
 """The same of extra lights that are suns, whose size counted for nothing."""
 
 _FORMER_COLOR = [0.22, 0.25, 0.29]
-"""What stood for a stage's colour where the job gives none, in those versions."""
+"""A set's colour in the parameters of those versions, where the job gives none."""
 
 
 class RenderStage:
@@ -108,7 +109,7 @@ class RenderStage:
             for frame in range(job.frame_count)
         ]
 
-    def obstacles(self, job: Job) -> list[str]:
+    def preflight(self, job: Job) -> list[str]:
         """No Blender, one that is too old or lacks a shared library, or one without the material or GPU asked for."""
         from render.blender import BlenderUnavailableError, require_bpy, require_supported_executable
 
@@ -128,16 +129,14 @@ class RenderStage:
             InvalidArtifactError: its picture failed the checks twice.
         """
         from render.blender import BlenderDiedError
-        from render.pictures import validate_exr, validate_picture
+        from render.pictures import validate_exr
 
         task, job, layout = context.task, context.job, context.layout
         assert task.frame is not None
         poses, view = write_motion(job, layout, task.frame, attempt=context.attempt)
         bodies = list(bodies_at(job, layout, task.frame, poses))
-        warn_of_sight(context, view, bodies)
-
-        def validate(path: Path) -> None:
-            validate_picture(path, job.render.resolution, may_be_empty=may_be_empty(job))
+        warn_if_invisible(context, view, bodies)
+        drawing = FrameDrawing(context, view, bodies)
 
         def validate_master(path: Path) -> None:
             layer = COMBINED if job.render.passes else ""
@@ -145,16 +144,17 @@ class RenderStage:
 
         try:
             with ExitStack() as stack:
-                renderer = warm_renderer(context)
-                device = renderer.device
-                warn_of_flat_pictures(context, renderer.pictures_by_uv)
+                device = drawing.renderer.device
+                warn_of_flat_pictures(context, drawing.renderer.pictures_by_uv)
                 print(f"Cycles draws on {device}{'' if device == CPU else f', GPU {context.gpu}'}", flush=True)
                 masters = [
                     stack.enter_context(context.committing(output, validate_master, device=device))
                     for output in task.outputs[1:]
                 ]
-                path = stack.enter_context(context.committing(task.outputs[0], validate, device=device))
-                draw_until_good(context, [path, *masters], view, bodies)
+                picture = stack.enter_context(
+                    context.committing(task.outputs[0], drawing.require_checked, device=device)
+                )
+                drawing.draw_until_good(picture, masters)
         except BlenderDiedError:
             close_renderers()  # the next attempt, maybe in this process, needs a living one
             raise
@@ -215,7 +215,7 @@ def _missing_materials(job: Job) -> Iterator[str]:
 
 
 def _decisive(spec: RenderSpec, cloths: Collection[str]) -> dict[str, Any]:
-    """What of a specification decides pixels: files by their content, and keys of later versions only where used.
+    """The part of a specification that decides pixels: files by their content, keys of later versions only where used.
 
     Args:
         spec: the whole.
@@ -229,21 +229,21 @@ def _decisive(spec: RenderSpec, cloths: Collection[str]) -> dict[str, Any]:
     for key, usual in _LATER_KEYS.items():
         if document["render"][key] == usual:
             del document["render"][key]
-    stage = document["stage"]
-    for key, unused in _LATER_STAGE_KEYS.items():
-        if stage[key] == unused:
-            del stage[key]
-    if spec.stage.hdri is not None:
-        stage["hdri"] = content_name(spec.stage.hdri, "picture")
-        stage["name"] = None  # its light and sky are not there
+    backdrop = document["stage"] = document.pop("set")  # as fingerprints have called it from the beginning
+    for key, unused in _LATER_SET_KEYS.items():
+        if backdrop[key] == unused:
+            del backdrop[key]
+    if spec.set.hdri is not None:
+        backdrop["hdri"] = content_name(spec.set.hdri, "picture")
+        backdrop["name"] = None  # its light and sky are not there
     else:
-        stage.pop("rotation_deg", None)  # there is nothing to turn
-    if stage["color"] is None and "ground" not in stage and stage["name"] != "window":
-        stage["color"] = _FORMER_COLOR
-    if stage["tank"]:
-        stage["tank_revision"] = _TANK_REVISION
+        backdrop.pop("rotation_deg", None)  # there is nothing to turn
+    if backdrop["color"] is None and "ground" not in backdrop and backdrop["name"] != "window":
+        backdrop["color"] = _FORMER_COLOR
+    if backdrop["tank"]:
+        backdrop["tank_revision"] = _TANK_REVISION
     # Where a pane is left out; the tank has none above or below.
-    document["open_faces"] = sorted({face for face in spec.open_faces if face[0] in "xy"}) if stage["tank"] else []
+    document["open_faces"] = sorted({face for face in spec.open_faces if face[0] in "xy"}) if backdrop["tank"] else []
     if not document["open_faces"]:
         del document["open_faces"]
     for light in document["lights"]:
@@ -263,8 +263,8 @@ def _keep_decisive(drawn: dict[str, Any], *, is_cloth: bool) -> None:
     for key, unused in _LATER_MATERIAL_KEYS.items():
         if material[key] == unused:
             del material[key]
-    if material["look"] in _LOOK_REVISIONS:
-        material["look_revision"] = _LOOK_REVISIONS[material["look"]]
+    if material["look"] is not None and (revision := LOOK_TABLE[material["look"]].revision) > 1:
+        material["look_revision"] = revision
     if "blend" in material:
         file, name = split_blend(material["blend"])
         drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
@@ -273,10 +273,8 @@ def _keep_decisive(drawn: dict[str, Any], *, is_cloth: bool) -> None:
 
 
 def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:
-    surfaces = [layout.surface(fluid.name, frame) for fluid in job.fluid]
-    volumes = [layout.volume(smoke.name, frame) for smoke in job.smoke]
+    products = [path for _, _, path in products_of(job, layout, frame)]
     points = [layout.whitewater(fluid, frame) for fluid in job.whitewater]
-    cloths = [layout.cloth(cloth.name, frame) for cloth in job.cloth]
     # The cache changes with every change of the simulation, so it is an input only where something of it is drawn.
-    cached = [layout.frame_cache(frame)] if job.moving_bodies or not surfaces + cloths + volumes else []
-    return surfaces + cloths + volumes + points + cached
+    cached = [layout.frame_cache(frame)] if job.moving_bodies or not products else []
+    return products + points + cached

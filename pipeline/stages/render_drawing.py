@@ -1,4 +1,4 @@
-"""Drawing a frame: by the warm renderer of this worker process, and once more if the picture fails the checks."""
+"""The drawing of a frame: by the warm renderer of this worker process, once more if the picture fails the checks."""
 
 from __future__ import annotations
 
@@ -12,160 +12,186 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import InvalidArtifactError
-from pipeline.gpu_kernels import compiled_once
-from pipeline.job.models import Job
-from pipeline.parameter_set import digest_of
+from pipeline.base.errors import InvalidArtifactError
+from pipeline.base.parameter_set import digest_of
+from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
+from pipeline.stages.gpu_kernels import compiled_once
 from pipeline.stages.inputs import blender_version
 from pipeline.stages.render_scene import framed_points, render_spec
-from pipeline.stages.sight import BodyAtFrame, expected_cells
+from pipeline.stages.visibility import BodyAtFrame, expected_cells
 from render.camera_path import View
 
 if TYPE_CHECKING:
     from render.blender import Renderer
     from render.pictures import PictureStatistics
 
-STAGE_PIXELS = 96
-"""Along the longer side of the empty stage that pictures are held against: half a percent of it is 25 pixels."""
+SET_PIXELS = 96
+"""Along the longer side of the empty set that pictures are held against: half a percent of it is 25 pixels."""
 
 WHITE_SHARE = 0.8
-"""Of a picture that is white, from which it is warned of: 0.4 of a white studio in twice its light is."""
+"""Share of white pixels above which a picture is warned of; a white studio in twice its light has 0.4."""
 
 BAD_PICTURE = "bad picture"
 NEARLY_WHITE = "nearly white"
 NO_GPU = "no GPU"
 CPU = "CPU"
-"""What a renderer calls its device when it draws on none of the GPUs."""
+"""A renderer's name for the processor."""
 
 
-def draw_until_good(context: TaskContext, paths: list[Path], view: View, bodies: Sequence[BodyAtFrame]) -> None:
-    """Draw a frame, and once more if its picture fails the checks; a picture that fails again is kept.
+class FrameDrawing:
+    """The drawing of one frame. What Blender is given of the job is described once, when this is made.
 
     Args:
         context: of the frame's task.
-        paths: of the picture, and of the EXR if the job asks for one.
         view: of the camera at the frame.
         bodies: what is to be seen.
-
-    Raises:
-        InvalidArtifactError: it failed again.
     """
-    from render.errors import InvalidFileError
 
-    frame = context.task.frame
-    assert frame is not None
-    for once_more in (True, False):
-        try:
-            _draw(context, frame, paths)
-            statistics = _check_picture(context, frame, paths[0], view, bodies)
-        except InvalidFileError as error:
-            if once_more:
-                close_renderers()  # what went wrong in it may stay so
-                context.warn(BAD_PICTURE, f"frame {frame}: the picture {error.reason}; it is drawn once more")
-                continue
-            rejected = context.layout.rejected_picture(frame)
-            rejected.parent.mkdir(exist_ok=True)
-            shutil.copyfile(paths[0], rejected)
-            raise InvalidArtifactError(
-                f"frame {frame}: the picture {error.reason}; twice; it is kept as {rejected}"
-            ) from error
-        # What stands before white on purpose is no mistake, and light that was asked for is no failure of Blender's.
-        if statistics.white_share > WHITE_SHARE and not may_be_empty(context.job):
-            context.warn(
-                NEARLY_WHITE,
-                f"frame {frame}: {100 * statistics.white_share:.0f} % of the picture is white; see stage.strength, "
-                "the power of [[light]] and render.exposure",
+    def __init__(self, context: TaskContext, view: View, bodies: Sequence[BodyAtFrame]) -> None:
+        assert context.task.frame is not None
+        job, layout = context.job, context.layout
+        self._context, self._view, self._bodies = context, view, bodies
+        self._frame = context.task.frame
+        self._document = render_spec(job, layout, framed_points(job, layout)).document()
+        self._key = digest_of(f"{layout.root} {context.threads} {context.gpu} {self._document}")
+        self._checked: Path | None = None
+
+    @property
+    def renderer(self) -> Renderer:
+        """This process's renderer for the frame, opened where the one that is there draws something else."""
+        from render.blender import open_renderer
+
+        if self._key not in _WARM:
+            close_renderers()
+            root = self._context.layout.root
+            part = root / f".scene.json.part.{os.getpid()}"
+            part.write_text(self._document, encoding="utf-8")
+            path = part.replace(root / "scene.json")
+            blender = self._context.job.render.blender
+            _WARM[self._key] = open_renderer(
+                path, threads=self._context.threads, blender=blender, gpu=self._context.gpu
             )
-        return
+        return _WARM[self._key]
 
+    def draw_until_good(self, picture: Path, masters: Sequence[Path] = ()) -> None:
+        """Draw the frame, and once more if its picture fails the checks; a picture that fails again is kept.
 
-def _draw(context: TaskContext, frame: int, paths: list[Path]) -> None:
-    """Draw a frame; the first one of this process on a GPU takes what compiling takes."""
-    renderer = warm_renderer(context)
-    if context.gpu is not None and renderer.device == CPU:
-        context.warn(NO_GPU, f"frame {frame}: Cycles finds no GPU {context.gpu} any more; drawn on the processor")
-    if renderer.device == CPU or renderer.device in _COMPILED:
-        renderer.render(frame, *paths)
-        return
+        Args:
+            picture: gets the PNG.
+            masters: gets the EXR, if the job asks for one.
 
-    def tell(message: str) -> None:
-        context.progress(0, 1, message, preparing=True)
+        Raises:
+            InvalidArtifactError: it failed again.
+        """
+        from render.errors import InvalidFileError
 
-    with compiled_once(renderer.device, blender_version(context.job.render.blender), tell):
-        renderer.render(frame, *paths)
-    _COMPILED.add(renderer.device)
-    context.progress(0, 1)
+        context, frame = self._context, self._frame
+        for once_more in (True, False):
+            try:
+                self._draw(picture, *masters)
+                statistics = self._check(picture)
+            except InvalidFileError as error:
+                if once_more:
+                    close_renderers()  # what went wrong in it may stay so
+                    context.warn(BAD_PICTURE, f"frame {frame}: the picture {error.reason}; it is drawn once more")
+                    continue
+                rejected = context.layout.rejected_picture(frame)
+                rejected.parent.mkdir(exist_ok=True)
+                shutil.copyfile(picture, rejected)
+                raise InvalidArtifactError(
+                    f"frame {frame}: the picture {error.reason}; twice; it is kept as {rejected}"
+                ) from error
+            # What stands before white on purpose is no mistake, and light that was asked for no failure of Blender's.
+            if statistics.white_share > WHITE_SHARE and not may_be_empty(context.job):
+                context.warn(
+                    NEARLY_WHITE,
+                    f"frame {frame}: {100 * statistics.white_share:.0f} % of the picture is white; see set.strength, "
+                    "the power of [[light]] and render.exposure",
+                )
+            self._checked = picture
+            return
 
+    def require_checked(self, picture: Path) -> None:
+        """Refuse to commit a picture that `draw_until_good` has not decoded and passed; nothing is decoded twice.
 
-def _check_picture(
-    context: TaskContext, frame: int, path: Path, view: View, bodies: Sequence[BodyAtFrame]
-) -> PictureStatistics:
-    """What a picture looks like in numbers.
+        Raises:
+            InvalidArtifactError: it was not checked.
+        """
+        if picture != self._checked:
+            raise InvalidArtifactError(f"frame {self._frame}: the picture was not checked")
 
-    Raises:
-        InvalidFileError: it is damaged, black, of one colour, or shows the stage without its bodies.
-    """
-    from render.pictures import read_shown, require_more_than_stage, validate_picture
+    def _draw(self, picture: Path, *masters: Path) -> None:
+        """Draw the frame; the first one of this process on a GPU takes what compiling takes."""
+        context, renderer = self._context, self.renderer
+        if context.gpu is not None and renderer.device == CPU:
+            sentence = f"frame {self._frame}: Cycles finds no GPU {context.gpu} any more; drawn on the processor"
+            context.warn(NO_GPU, sentence)
+        if renderer.device == CPU or renderer.device in _COMPILED:
+            renderer.render(self._frame, picture, *masters)
+            return
 
-    job = context.job
-    statistics = validate_picture(path, job.render.resolution, may_be_empty=may_be_empty(job))
-    width, height = job.render.resolution
-    scale = min(1.0, STAGE_PIXELS / max(width, height))
-    columns, rows = max(4, round(scale * width)), max(4, round(scale * height))
-    cells = expected_cells(job, view, bodies, (rows, columns))
-    if cells is None:
+        def tell(message: str) -> None:
+            context.progress(0, 1, message, preparing=True)
+
+        with compiled_once(renderer.device, blender_version(context.job.render.blender), tell):
+            renderer.render(self._frame, picture, *masters)
+        _COMPILED.add(renderer.device)
+        context.progress(0, 1)
+
+    def _check(self, path: Path) -> PictureStatistics:
+        """Decode and check a picture; returns its statistics.
+
+        Raises:
+            InvalidFileError: it is damaged, black, of one colour, or shows the set without its bodies.
+        """
+        from render.pictures import check_pixels, over_black, read_picture, require_more_than_set
+
+        job = self._context.job
+        pixels = read_picture(path)
+        statistics = check_pixels(path, pixels, job.render.resolution, may_be_empty=may_be_empty(job))
+        width, height = job.render.resolution
+        scale = min(1.0, SET_PIXELS / max(width, height))
+        columns, rows = max(4, round(scale * width)), max(4, round(scale * height))
+        cells = expected_cells(job, self._view, self._bodies, (rows, columns))
+        if cells is not None:
+            require_more_than_set(path, over_black(pixels), self._empty_set(columns, rows), cells)
         return statistics
-    if job.placed_camera.moves or "still" not in _EMPTY_STAGE:
-        with tempfile.TemporaryDirectory(prefix="stage-") as folder:
-            picture = Path(folder) / "stage.png"
-            warm_renderer(context).render_stage(frame, picture, resolution=(columns, rows))
-            stage = read_shown(picture)
-        if not job.placed_camera.moves:
-            _EMPTY_STAGE["still"] = stage
-    else:
-        stage = _EMPTY_STAGE["still"]
-    require_more_than_stage(path, stage, cells)
-    return statistics
+
+    def _empty_set(self, columns: int, rows: int) -> NDArray[np.uint8]:
+        """The camera's view without any body, (rows, columns, 4); drawn once for a still camera."""
+        from render.pictures import over_black, read_picture
+
+        if _STILL_SET in _EMPTY_SETS:
+            return _EMPTY_SETS[_STILL_SET]
+        with tempfile.TemporaryDirectory(prefix="set-") as folder:
+            picture = Path(folder) / "set.png"
+            self.renderer.render_set(self._frame, picture, resolution=(columns, rows))
+            empty = over_black(read_picture(picture))
+        if not self._context.job.placed_camera.moves:
+            _EMPTY_SETS[_STILL_SET] = empty
+        return empty
 
 
 def may_be_empty(job: Job) -> bool:
     """Whether nothing is left of a picture where no body is."""
-    return job.stage.background != "stage"
+    return job.set.background != "set"
 
 
 _WARM: dict[str, Renderer] = {}
 """The renderer of this worker process, by the digest of its specification, thread count and GPU; at most one."""
 
-
-def warm_renderer(context: TaskContext) -> Renderer:
-    """This process's renderer for a task, opened where the one that there is draws something else."""
-    from render.blender import open_renderer
-
-    spec = render_spec(context.job, context.layout, framed_points(context.job, context.layout))
-    key = digest_of(f"{context.layout.root} {context.threads} {context.gpu} {spec.model_dump_json()}")
-    if key not in _WARM:
-        close_renderers()
-        path = context.layout.root / "scene.json"
-        part = context.layout.root / f".scene.json.part.{os.getpid()}"
-        spec.write(part)
-        part.replace(path)
-        blender = context.job.render.blender
-        _WARM[key] = open_renderer(path, threads=context.threads, blender=blender, gpu=context.gpu)
-    return _WARM[key]
-
-
 _COMPILED: set[str] = set()
 """The devices on which this process has drawn."""
 
-
-_EMPTY_STAGE: dict[str, NDArray[np.uint8]] = {}
-"""What the warm renderer draws without any body, (rows, columns, 3); kept for a camera that stands still."""
+_STILL_SET = "still"
+_EMPTY_SETS: dict[str, NDArray[np.uint8]] = {}
+"""The empty set as the warm renderer draws it, (rows, columns, 4); kept for a still camera."""
 
 
 def close_renderers() -> None:
-    """Let go of this process's renderer; idempotent."""
+    """Close this process's renderer; idempotent."""
     for renderer in _WARM.values():
         renderer.close()
     _WARM.clear()
-    _EMPTY_STAGE.clear()
+    _EMPTY_SETS.clear()

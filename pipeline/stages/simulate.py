@@ -10,31 +10,35 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from math import ceil, prod
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.cache import Checkpoint, read_checkpoint, read_numbers, validate_frame, write_checkpoint, write_frame
-from pipeline.errors import InvalidArtifactError, StageUnavailableError
-from pipeline.files import sync
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
-from pipeline.parameter_set import ParameterSet
-from pipeline.provenance import read_text
-from pipeline.receipts import read_receipt
+from pipeline.base.content import tool_version
+from pipeline.base.errors import InvalidArtifactError, StageUnavailableError
+from pipeline.base.files import sync
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
+from pipeline.kinds.table import KINDS, bodies
+from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import (
-    bodies_by_content,
-    count_cloth_nodes,
-    most_particles,
-    tool_version,
-)
+from pipeline.stages.inputs import bodies_by_content
 from pipeline.stages.ordered_writer import WAITING, OrderedWriter
-from pipeline.task import ArtifactPath, Resources, Task, TaskId
+from pipeline.store.cache import (
+    Checkpoint,
+    read_checkpoint,
+    read_numbers,
+    validate_frame,
+    write_checkpoint,
+    write_frame,
+)
+from pipeline.store.provenance import read_text
+from pipeline.store.receipts import read_receipt
+from sim.core.snapshots import Snapshot
+from sim.core.world import FrameReport, World
 from sim.scene import SceneParameters
-from sim.snapshots import Snapshot
-from sim.world import FrameReport, World
 
 CHECKPOINT_INTERVAL_S = 30.0
 """Wall time between checkpoints: what a crash costs at most, against well under 1 % of the time spent writing."""
@@ -46,12 +50,6 @@ SNAPSHOTS_AT_ONCE = 5 + WAITING
 that, the newest before it finds a place in the queue, and what goes into its making."""
 WORKER_BYTES = 800_000_000
 """Interpreter, compiler and the driver's share of the host's memory; an estimate, on the safe side."""
-BYTES_PER_PARTICLE = 84
-"""A checkpoint's position, velocity, number and reference position, and sorting; a frame takes 36."""
-BYTES_PER_CELL = 24
-"""Five float32 in a frame, five with ghosts in a checkpoint."""
-BYTES_PER_CLOTH_NODE = 60
-"""Position, velocity, coordinates and two triangles in a frame; a checkpoint takes 36."""
 
 
 class SimulateStage:
@@ -91,9 +89,9 @@ class SimulateStage:
         """A take was made once, by hand: no version of anything makes another one of it."""
         return ParameterSet.of(stage=self.name, version=0, tools={}, fps=job.fps, recorded=job.recorded)
 
-    def obstacles(self, job: Job) -> list[str]:
+    def preflight(self, job: Job) -> list[str]:
         """A device that does not work here."""
-        from sim.runtime import DeviceUnavailableError, resolve_device
+        from sim.core.runtime import DeviceUnavailableError, resolve_device
 
         try:
             resolve_device(job.device)
@@ -142,13 +140,15 @@ class _Simulation:
 
     def __init__(self, context: TaskContext) -> None:
         from sim.build import build_world
-        from sim.runtime import initialize
+        from sim.core.runtime import initialize
 
         self._context = context
         self._folder = context.layout.checkpoints
         self._folder.mkdir(parents=True, exist_ok=True)
         self._device = initialize(context.job.device, threads=context.threads)
-        self._world: World = build_world(context.job, frames_per_second=context.job.fps)
+        more = (kind.solvers for kind in KINDS.values() if kind.solvers is not None)
+        solvers = [solver for make in more for solver in make(context.job, context.job.fps)]
+        self._world: World = build_world(context.job, frames_per_second=context.job.fps, solvers=solvers)
         self._checkpointed_at = time.monotonic()
         self._last_checkpoint = -1
 
@@ -259,7 +259,7 @@ def _resources(job: Job) -> Resources:
 
     A device that does not work here is no matter of the plan, but an obstacle to running it.
     """
-    from sim.runtime import resolve_device
+    from sim.core.runtime import resolve_device
 
     device = resolve_device("auto") if job.device == "auto" else job.device
     memory_bytes = WORKER_BYTES + SNAPSHOTS_AT_ONCE * _snapshot_bytes(job)
@@ -268,9 +268,7 @@ def _resources(job: Job) -> Resources:
 
 def _snapshot_bytes(job: Job) -> int:
     """What a snapshot or a checkpoint takes: an upper bound."""
-    cells = sum(prod(smoke.cell_counts(job.domain)) for smoke in job.smoke)
-    nodes = count_cloth_nodes(job)
-    return ceil(most_particles(job) * BYTES_PER_PARTICLE + cells * BYTES_PER_CELL + nodes * BYTES_PER_CLOTH_NODE)
+    return ceil(sum(kind.snapshot_bytes[0] * kind.elements(job, body) for _, kind, body in bodies(job)))
 
 
 def _describe(report: FrameReport) -> str:

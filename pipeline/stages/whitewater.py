@@ -6,20 +6,22 @@ from functools import cache
 from math import ceil
 from typing import TYPE_CHECKING
 
-from pipeline.cache import read_frame
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
-from pipeline.parameter_set import ParameterSet
+from pipeline.base.content import tool_version
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
+from pipeline.kinds.fluid import most_particles
+from pipeline.model.job import Job
 from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import by_content, most_particles, tool_version
-from pipeline.task import ArtifactPath, Resources, Task, TaskId
+from pipeline.stages.inputs import by_content
+from pipeline.store.cache import read_frame
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from sim.core.snapshots import Snapshot
     from sim.shapes import LevelSet
-    from sim.snapshots import Snapshot
     from sim.whitewater.cloud import WhitewaterCloud
     from sim.whitewater.obstacles import MovingObstacle
 
@@ -62,7 +64,7 @@ class WhitewaterStage:
             for frame in range(job.frame_count)
         ]
 
-    def obstacles(self, job: Job) -> list[str]:  # noqa: ARG002
+    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
         """None: the simulation needs the same packages."""
         return []
 
@@ -106,7 +108,7 @@ def _resources(job: Job, fluid: str) -> Resources:
 def _next_cloud(context: TaskContext) -> tuple[WhitewaterCloud, int]:
     """The task's cloud, and how many particles it has not for lack of room."""
     from render.point_clouds import read_point_cloud
-    from sim.runtime import initialize
+    from sim.core.runtime import initialize
     from sim.whitewater.cloud import WhitewaterCloud
 
     task, job = context.task, context.job

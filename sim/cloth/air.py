@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Floats, Vectors
+from sim.cloth.bundles import Air, AirAtNodes
 from sim.cloth.parameters import ClothParameters, conflict_in_one_air
 from sim.cloth.sheet import triangle_areas
 from sim.cloth.state import ClothState
-from sim.launch import fast_launch
+from sim.core.arrays import Floats, Vectors
+from sim.core.launch import kernel
 
 WIND = -1
 """Source of air that is nothing but the wind of a cloth's parameters."""
@@ -63,6 +64,11 @@ class ClothAir:
         self.share = ti.ndarray(ti.f32, state.vertex_count)
         self.share.from_numpy((host.node_area / around).astype(np.float32))
 
+    @property
+    def at_nodes(self) -> AirAtNodes:
+        """The forces for kernels."""
+        return AirAtNodes(self.force, self.share, self.triangle_start, self.triangle_list)
+
     def take_parameters(self, cloths: Sequence[ClothParameters]) -> None:
         """Drag and wind as the parameters have them now; air that a coupling put there stays.
 
@@ -94,10 +100,10 @@ class ClothAir:
         state = self._state
         if self.acts:
             first, end = (int(state.host.first_triangle[number]) for number in (cloths.start, cloths.stop))
+            air = Air(self.velocity, self.inverse_mass, self._drag, self.share, self.force, self.impulse)
             blow_on_triangles(
-                state.position, state.velocity, state.inverse_mass, state.triangles, first, end, self.velocity,
-                self.inverse_mass, self._drag, self.share, gravity, dt, self.force, self.impulse,
-            )  # fmt: skip
+                state.position, state.velocity, state.inverse_mass, state.triangles, first, end, air, gravity, dt
+            )
 
 
 @ti.func
@@ -108,9 +114,14 @@ def slowed(speed: ti.f32, rate: ti.f32, dt: ti.f32) -> ti.f32:
 
 @ti.func
 def drag_along(
-    speed: ti.f32, left: ti.math.vec3, direction: ti.math.vec3, drag: ti.f32, mobility: ti.f32, air_mobility: ti.f32,
+    speed: ti.f32,
+    left: ti.math.vec3,
+    direction: ti.math.vec3,
+    drag: ti.f32,
+    mobility: ti.f32,
+    air_mobility: ti.f32,
     dt: ti.f32,
-) -> ti.f32:  # fmt: skip
+) -> ti.f32:
     """Force per area along a direction, in which the air passes at `speed`, and has `left` left after what it gave.
 
     Quadratic in the passing speed at the end of the step, and at most what brings the air that is left and the cloth
@@ -123,13 +134,18 @@ def drag_along(
     return force
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def blow_on_triangles(
-    position: Vectors, velocity: Vectors, inverse_mass: Floats, triangles: Triangles, first: ti.i32, end: ti.i32,
-    air_velocity: Vectors, air_inverse_mass: Floats, drag: Vectors, air_share: Floats, gravity: ti.math.vec3,
-    dt: ti.f32, air_force: Vectors, impulse: Vectors,
-):  # fmt: skip
+    position: Vectors,
+    velocity: Vectors,
+    inverse_mass: Floats,
+    triangles: Triangles,
+    first: ti.i32,
+    end: ti.i32,
+    air: Air,
+    gravity: ti.math.vec3,
+    dt: ti.f32,
+):
     """Force of the air on each triangle [N], normal and tangential, quadratic in the speed of the air past it.
 
         F = rho A / 2 (C_n |v_n| v_n + C_t |v_t| v_t),   v_n + v_t = air - cloth
@@ -152,25 +168,25 @@ def blow_on_triangles(
             inverse = ti.rsqrt(squared)
             area = 0.5 * squared * inverse
             normal = inverse * cross
-            mean = air_share[a] * velocity[a] + air_share[b] * velocity[b] + air_share[c] * velocity[c]
+            mean = air.share[a] * velocity[a] + air.share[b] * velocity[b] + air.share[c] * velocity[c]
             free = 0.0
             for k in ti.static(range(3)):
                 i = triangles[t][k]
-                free += ti.select(inverse_mass[i] > 0.0, air_share[i], 0.0)
-            mobility = free * area / drag[t][2]
-            air_mobility = air_inverse_mass[t]
-            past = air_velocity[t] - mean - dt * free * gravity
-            left = past - air_mobility / area * impulse[t]
+                free += ti.select(inverse_mass[i] > 0.0, air.share[i], 0.0)
+            mobility = free * area / air.drag[t][2]
+            air_mobility = air.inverse_mass[t]
+            past = air.velocity[t] - mean - dt * free * gravity
+            left = past - air_mobility / area * air.impulse[t]
             s_n = past.dot(normal)
             along = past - s_n * normal
             s_t = along.norm()
             normal *= ti.math.sign(s_n)
-            force = drag_along(ti.abs(s_n), left, normal, drag[t][0], mobility, air_mobility, dt) * normal
+            force = drag_along(ti.abs(s_n), left, normal, air.drag[t][0], mobility, air_mobility, dt) * normal
             if s_t > 0.0:
                 # With that speed, not that of the air in this direction: of air that blows straight onto the triangle,
                 # rounding leaves a trace along the normal, where the air passes much faster.
                 along /= s_t
-                force += drag_along(s_t, left, along, drag[t][1], mobility, air_mobility, dt) * along
+                force += drag_along(s_t, left, along, air.drag[t][1], mobility, air_mobility, dt) * along
             force *= area
-            impulse[t] = impulse[t] + dt * force  # += is an atomic operation
-        air_force[t] = force
+            air.impulse[t] = air.impulse[t] + dt * force  # += is an atomic operation
+        air.force[t] = force

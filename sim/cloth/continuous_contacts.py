@@ -10,21 +10,17 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cloth.continuous_response import (
-    STEPS,
-    begin_push,
-    push_on,
-    repair_crossings,
-)
+from sim.cloth.bundles import NodeSums, PatchMotion, PushedNodes
+from sim.cloth.continuous_response import STEPS, begin_push, push_on, repair_crossings
 from sim.cloth.continuous_zones import ImpactZones
 from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.loop_costs import CONTACT_NS, COPIED_NODE_NS
 from sim.cloth.proximity_contacts import ContactList
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.self_collision import SelfCollision, half_range
-from sim.host_access import copied
-from sim.reductions import LaneReduction
-from sim.short_loops import is_short
+from sim.core.host_access import copied
+from sim.core.reductions import LaneReduction
+from sim.core.scheduling import is_short
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -65,8 +61,8 @@ class NearCloth(Protocol):
     """The largest [m]."""
 
     @property
-    def motion_arrays(self) -> tuple[ti.Ndarray, ...]:
-        """Where patches are and how they move in the substep, see `PatchPairs`."""
+    def motion(self) -> PatchMotion:
+        """Of the patches in the substep."""
 
     def begin_frame(self, state: ClothState) -> None:
         """Expect of contacts what a run does that continues here."""
@@ -114,13 +110,24 @@ class ContinuousContacts:
         self.rigid.set_spacing(self._pairs.coarsest_edge)
         n = state.vertex_count
         self._contacts = ContactList(4 * n)
-        self._shares, self._touched = ti.ndarray(ti.i32, n), ti.ndarray(ti.i32, n)
-        self._counter = ti.ndarray(ti.i32, 3)
-        self._uses = ti.ndarray(ti.i32, 2 * n)
-        self._predicted, self._start, self._reached = (ti.Vector.ndarray(3, ti.f32, n) for _ in range(3))
-        self._brace, self._held_sums = ti.Vector.ndarray(3, ti.f32, n), ti.ndarray(ti.i32, 6 * n)
-        self._lever, self._presser = ti.ndarray(ti.f32, n), ti.ndarray(ti.i32, n)
-        self._brace.fill(0.0)
+        self._pushed = PushedNodes(
+            displacement=state.displacement,
+            inverse_mass=state.inverse_mass,
+            start=ti.Vector.ndarray(3, ti.f32, n),
+            reached=ti.Vector.ndarray(3, ti.f32, n),
+            touched=ti.ndarray(ti.i32, n),
+            uses=ti.ndarray(ti.i32, 2 * n),
+            support=ti.Vector.ndarray(3, ti.f32, n),
+        )
+        self._pushed.support.fill(0.0)
+        self._sums = NodeSums(
+            counter=ti.ndarray(ti.i32, 3),
+            predicted=ti.Vector.ndarray(3, ti.f32, n),
+            shares=ti.ndarray(ti.i32, n),
+            held_sums=ti.ndarray(ti.i32, 6 * n),
+            lever=ti.ndarray(ti.f32, n),
+            pressing_body=ti.ndarray(ti.i32, n),
+        )
         self._crossing, self._crossing_count = ti.ndarray(ti.i32, 4 * n), ti.ndarray(ti.i32, 1)
         self._missing, self._ends = LaneReduction(maxima=1, sums=0), LaneReduction(maxima=6, sums=0)
         self._state = state
@@ -192,7 +199,7 @@ class ContinuousContacts:
                 break
             self._push(state, found, is_first=True)
             left = self._keep_apart(state, found)
-            change, beyond = self._near.measure_changes(state, self._predicted)
+            change, beyond = self._near.measure_changes(state, self._sums.predicted)
             if not math.isfinite(change):
                 return  # as above
             # What was pushed farther than foreseen may have met what was not looked at.
@@ -209,47 +216,50 @@ class ContinuousContacts:
         recovery = min(1.0, dt / RECOVERY_TIME_S)
         while True:
             self._near.find(state, self._contacts, recovery)
-            self.rigid.find(state, self._patches, self._near.motion_arrays, self._contacts, recovery)
+            self.rigid.find(state, self._patches, self._near.motion, self._contacts, recovery)
             found = self._contacts.take_found()
             if not self._contacts.make_room_for(found):
                 return found
 
     def _push(self, state: ClothState, count: int, *, is_first: bool) -> None:
-        contacts, bodies, n = self._contacts, self.rigid.bodies, state.vertex_count
-        short = self._is_short(count)
+        contacts, short = self._contacts, self._is_short(count)
         pushing, touched, missing = begin_push(
-            _momenta_from(0), count, contacts.vertices, contacts.weights, contacts.normal, contacts.floor,
-            contacts.kind, contacts.arm, contacts.friction, contacts.mobility, contacts.impulse,
-            contacts.impulse_before, contacts.impulse_given, contacts.pushing, contacts.push, self._counter, n,
-            state.displacement, self._predicted, self._start, self._reached, state.inverse_mass, state.thickness,
-            self._shares, self._touched, *self._uses_of(contacts), self._held_sums, self._lever, self._presser,
-            int(bodies.may_move), bodies.count, bodies.motion, bodies.motion_start, bodies.motion_reached,
-            bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, bodies.impulse,
-            bodies.load, bodies.load_unit, self._impulse_unit, *self._missing.tree, is_first, short,
-        )  # fmt: skip
+            _momenta_from(0),
+            count,
+            contacts.found,
+            contacts.impulses(self._impulse_unit),
+            state.vertex_count,
+            self._pushed,
+            self._sums,
+            state.thickness,
+            self.rigid.bodies.pushed,
+            self._missing.tree,
+            is_first,
+            short,
+        )
         if not pushing:
             return
         self._iterations += STEPS
         if not np.int32(missing).view(np.float32) <= TOLERANCE:
             for first in range(0, MORE_ITERATIONS, STEPS):
-                self._push_on(state, int(pushing), int(touched), first, short=short)
+                self._push_on(int(pushing), int(touched), first, short=short)
             self._iterations += MORE_ITERATIONS
 
-    def _push_on(self, state: ClothState, count: int, touched: int, first: int, *, short: bool) -> None:
+    def _push_on(self, count: int, touched: int, first: int, *, short: bool) -> None:
         """More steps of the contact iteration, from step `first` of `MORE_ITERATIONS` on."""
-        contacts, bodies = self._contacts, self.rigid.bodies
+        contacts = self._contacts
         push_on(
-            _momenta_from(first), int(first == 0), first + STEPS >= MORE_ITERATIONS, count, contacts.pushing,
-            contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind, contacts.arm,
-            contacts.friction, contacts.mobility, contacts.impulse, contacts.impulse_before, contacts.impulse_given,
-            contacts.push, touched, self._touched, state.displacement, self._start, self._reached, state.inverse_mass,
-            *self._uses_of(contacts), bodies.count, bodies.motion, bodies.motion_start, bodies.motion_reached,
-            bodies.inverse_mass, bodies.inverse_inertia, bodies.gathered, bodies.impulse, self._impulse_unit, short,
-        )  # fmt: skip
-
-    def _uses_of(self, contacts: ContactList) -> tuple[ti.Ndarray, ...]:
-        """Which contacts push each vertex, and its brace."""
-        return self._uses, contacts.used_by, contacts.use_weight, self._brace
+            _momenta_from(first),
+            int(first == 0),
+            first + STEPS >= MORE_ITERATIONS,
+            count,
+            touched,
+            contacts.found,
+            contacts.impulses(self._impulse_unit),
+            self._pushed,
+            self.rigid.bodies.pushed,
+            short,
+        )
 
     def _keep_apart(self, state: ClothState, count: int) -> int:
         """Push, and at last tie together, until no pair can have crossed; how many pairs still may have."""
@@ -278,11 +288,19 @@ class ContinuousContacts:
             self._crossing = ti.ndarray(ti.i32, contacts.capacity)
         return int(
             repair_crossings(
-                count, contacts.vertices, contacts.weights, contacts.normal, contacts.floor, contacts.kind,
-                contacts.impulse, state.position, state.displacement, state.inverse_mass, state.thickness, LEAST_GAP,
-                self._crossing, self._crossing_count, self._is_short(count),
+                count,
+                contacts.found,
+                contacts.impulse,
+                state.position,
+                state.displacement,
+                state.inverse_mass,
+                state.thickness,
+                LEAST_GAP,
+                self._crossing,
+                self._crossing_count,
+                self._is_short(count),
             )
-        )  # fmt: skip
+        )
 
     def _is_short(self, count: int) -> bool:
         """Whether loops over so many contacts, and over all vertices, are."""

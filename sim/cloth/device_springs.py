@@ -6,12 +6,11 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers
+from sim.cloth.bundles import Nodes, SpringArrays
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.springs import Springs
-from sim.cloth.state import Lattice
-
-Laws = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
+from sim.core.arrays import Integers
+from sim.core.bundles import func
 
 COLOURS_AT_ONCE = 4
 """Colours that are loops of one kernel: a launch costs 20 us of the host, and every loop its time to compile."""
@@ -65,6 +64,11 @@ class DeviceSprings:
         self.damping: NDArray[np.float64] = np.zeros(self.count)
         self.is_damped = False
 
+    @property
+    def on_device(self) -> SpringArrays:
+        """The springs for kernels."""
+        return SpringArrays(self.nodes, self.law, self.coefficients)
+
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take stiffness and damping from the cloths' parameters."""
         for number, cloth in enumerate(cloths):
@@ -86,12 +90,12 @@ class DeviceSprings:
         return float((0.5 * self.stiffness * self.stretches(positions) ** 2).sum())
 
 
-@ti.func
-def coefficient(coefficients: Floats, s: ti.i32, arity: ti.template(), a: ti.template()) -> ti.f32:
+@func
+def coefficient(springs: SpringArrays, s: ti.i32, arity: ti.template(), a: ti.template()) -> ti.f32:
     """c_a of spring s: (1, -1), (1, -2, 1), or its own four."""
     value = 0.0
     if ti.static(arity == 4):
-        value = coefficients[4 * s + a]
+        value = springs.coefficients[4 * s + a]
     else:
         value = ti.static([1.0, -2.0, 1.0] if arity == 3 else [1.0, -1.0])[a]
     return value
@@ -101,18 +105,19 @@ def coefficient(coefficients: Floats, s: ti.i32, arity: ti.template(), a: ti.tem
 def colour_bounds(piece_of_colour: Integers, first: ti.i32) -> Bounds:
     """Where each of `COLOURS_AT_ONCE` colours begins, from `first` on, and where the last one ends."""
     return Bounds(
-        piece_of_colour[first], piece_of_colour[first + 1], piece_of_colour[first + 2], piece_of_colour[first + 3],
+        piece_of_colour[first],
+        piece_of_colour[first + 1],
+        piece_of_colour[first + 2],
+        piece_of_colour[first + 3],
         piece_of_colour[first + 4],
-    )  # fmt: skip
+    )
 
 
-@ti.func
-def separation(
-    nodes: Integers, coefficients: Floats, lattice: Lattice, quantum: ti.f32, s: ti.i32, arity: ti.template()
-) -> ti.math.vec3:
+@func
+def separation(springs: SpringArrays, nodes: Nodes, s: ti.i32, arity: ti.template()) -> ti.math.vec3:
     """sum_a c_a x_a on the lattice [m]; from differences, exact in integers, as sum_a c_a = 0."""
     d = ti.math.vec3(0.0)
-    first = lattice[nodes[arity * s]]
+    first = nodes.lattice[springs.nodes[arity * s]]
     for a in ti.static(range(1, arity)):
-        d += coefficient(coefficients, s, arity, a) * ti.cast(lattice[nodes[arity * s + a]] - first, ti.f32)
-    return quantum * d
+        d += coefficient(springs, s, arity, a) * ti.cast(nodes.lattice[springs.nodes[arity * s + a]] - first, ti.f32)
+    return nodes.quantum * d

@@ -6,14 +6,14 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Vectors
+from sim.cloth.bundles import EdgeBlocks, Quadruples, TriangleBlocks
 from sim.cloth.patches import Patches
-from sim.cloth.proximity_contacts import Quadruples
-from sim.cloth.self_collision_kernels import BLOCK, FAR, NONE, Pairs, Triples
+from sim.cloth.self_collision_kernels import BLOCK, FAR, NONE
 from sim.cloth.state import ClothState
-from sim.launch import fast_launch
-from sim.reductions import runs_on_gpu
-from sim.work_sharing import begin_sharing, next_item, workers_for
+from sim.core.arrays import Integers, Vectors
+from sim.core.launch import kernel
+from sim.core.reductions import runs_on_gpu
+from sim.core.scheduling import begin_sharing, next_item, workers_for
 
 PATCHES_AT_A_TIME = 8
 """Patches that a thread takes at a time: most of them are not needed."""
@@ -38,11 +38,18 @@ class ElementBlocks:
     def __init__(self, patches: Patches) -> None:
         self._patches = patches
         self._taken = ti.ndarray(ti.i32, 1)
-        self.edges = _blocks(patches.edges, patches.first_edge, patches.count)
-        self.triangles = _blocks(patches.triangles, patches.first_triangle, patches.count)
+        self.edges = EdgeBlocks(*_blocks(patches.edges, patches.first_edge, patches.count))
+        self.triangles = TriangleBlocks(*_blocks(patches.triangles, patches.first_triangle, patches.count))
 
-    def enclose(self, state: ClothState, searched: ti.Ndarray, count: int, found: ti.Ndarray,
-                found_edges: ti.Ndarray, needed: ti.Ndarray) -> None:  # fmt: skip
+    def enclose(
+        self,
+        state: ClothState,
+        searched: ti.Ndarray,
+        count: int,
+        found: ti.Ndarray,
+        found_edges: ti.Ndarray,
+        needed: ti.Ndarray,
+    ) -> None:
         """Note where the elements of patches are that are searched; nothing is found in their pairs yet.
 
         Args:
@@ -53,9 +60,18 @@ class ElementBlocks:
             needed: by patch, whether a pair of it is searched; 0 after.
         """
         enclose_elements(
-            self._patches.count, workers_for(self._patches.count), self._taken, needed, state.position, *self.edges,
-            *self.triangles, count, searched, found, found_edges,
-        )  # fmt: skip
+            self._patches.count,
+            workers_for(self._patches.count),
+            self._taken,
+            needed,
+            state.position,
+            self.edges,
+            self.triangles,
+            count,
+            searched,
+            found,
+            found_edges,
+        )
 
 
 def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Ndarray, ...]:
@@ -73,16 +89,20 @@ def _blocks(elements: ti.Ndarray, first: ti.Ndarray, count: int) -> tuple[ti.Nda
     return first_block, members, *(ti.ndarray(ti.f32, places) for _ in range(6))
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def enclose_elements(
-    patch_count: ti.i32, workers: ti.i32, taken: Integers, needed: Integers, position: Vectors,
-    first_edges: Integers, edges: Pairs, mid_x: Floats, mid_y: Floats, mid_z: Floats,
-    half_x: Floats, half_y: Floats, half_z: Floats,
-    first_triangles: Integers, triangles: Triples, low_x: Floats, low_y: Floats, low_z: Floats,
-    high_x: Floats, high_y: Floats, high_z: Floats,
-    count: ti.i32, searched: Integers, found: Quadruples, found_edges: Quadruples,
-):  # fmt: skip
+    patch_count: ti.i32,
+    workers: ti.i32,
+    taken: Integers,
+    needed: Integers,
+    position: Vectors,
+    of_edges: EdgeBlocks,
+    of_triangles: TriangleBlocks,
+    count: ti.i32,
+    searched: Integers,
+    found: Quadruples,
+    found_edges: Quadruples,
+):
     """Midpoints of edges and half the vectors along them, and boxes of triangles, of the patches that are needed."""
     begin_sharing(taken, 0)
     for worker in range(workers):
@@ -90,22 +110,36 @@ def enclose_elements(
         while m < patch_count:
             if needed[m] == 1:
                 needed[m] = 0
-                for place in range(first_edges[m] * BLOCK, first_edges[m + 1] * BLOCK):
+                for place in range(of_edges.first_block[m] * BLOCK, of_edges.first_block[m + 1] * BLOCK):
                     middle, half = ti.math.vec3(FAR), ti.math.vec3(0.0)
-                    if edges[place][0] != NONE:
-                        a, b = position[edges[place][0]], position[edges[place][1]]
+                    if of_edges.edges[place][0] != NONE:
+                        a, b = position[of_edges.edges[place][0]], position[of_edges.edges[place][1]]
                         middle, half = 0.5 * (a + b), 0.5 * (b - a)
-                    mid_x[place], mid_y[place], mid_z[place] = middle[0], middle[1], middle[2]
-                    half_x[place], half_y[place], half_z[place] = half[0], half[1], half[2]
-                for place in range(first_triangles[m] * BLOCK, first_triangles[m + 1] * BLOCK):
+                    of_edges.mid_x[place], of_edges.mid_y[place], of_edges.mid_z[place] = (
+                        middle[0],
+                        middle[1],
+                        middle[2],
+                    )
+                    of_edges.half_x[place], of_edges.half_y[place], of_edges.half_z[place] = half[0], half[1], half[2]
+                for place in range(of_triangles.first_block[m] * BLOCK, of_triangles.first_block[m + 1] * BLOCK):
                     low, high = ti.math.vec3(FAR), ti.math.vec3(-FAR)
-                    if triangles[place][0] != NONE:
+                    if of_triangles.triangles[place][0] != NONE:
                         a, b, c = (
-                            position[triangles[place][0]], position[triangles[place][1]], position[triangles[place][2]]
-                        )  # fmt: skip
+                            position[of_triangles.triangles[place][0]],
+                            position[of_triangles.triangles[place][1]],
+                            position[of_triangles.triangles[place][2]],
+                        )
                         low, high = ti.min(a, b, c), ti.max(a, b, c)
-                    low_x[place], low_y[place], low_z[place] = low[0], low[1], low[2]
-                    high_x[place], high_y[place], high_z[place] = high[0], high[1], high[2]
+                    of_triangles.low_x[place], of_triangles.low_y[place], of_triangles.low_z[place] = (
+                        low[0],
+                        low[1],
+                        low[2],
+                    )
+                    of_triangles.high_x[place], of_triangles.high_y[place], of_triangles.high_z[place] = (
+                        high[0],
+                        high[1],
+                        high[2],
+                    )
             m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)

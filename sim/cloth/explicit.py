@@ -6,12 +6,13 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, coefficient, separation
+from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.stable_step import longest_explicit_step
-from sim.cloth.state import ClothState, Lattice
-from sim.launch import fast_launch
+from sim.cloth.state import ClothState
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.launch import kernel
 
 
 class ExplicitSprings:
@@ -33,9 +34,11 @@ class ExplicitSprings:
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(int)
         nodes = np.concatenate([family.host.nodes.ravel() for family in springs])
         spring = np.concatenate(
-            [np.repeat(first + np.arange(family.count), family.arity)
-             for first, family in zip(self._first[:-1], springs, strict=True)]
-        )  # fmt: skip
+            [
+                np.repeat(first + np.arange(family.count), family.arity)
+                for first, family in zip(self._first[:-1], springs, strict=True)
+            ]
+        )
         coefficients = np.concatenate([family.host.coefficients.ravel() for family in springs])
         order = np.argsort(nodes, kind="stable")
         start = np.searchsorted(nodes[order], np.arange(state.vertex_count + 1))
@@ -65,9 +68,8 @@ class ExplicitSprings:
         state = self._state
         for first, springs in zip(self._first[:-1], self._springs, strict=True):
             compute_spring_forces(
-                springs.nodes, springs.law, springs.coefficients, state.lattice, state.quantum, state.carry,
-                state.velocity, int(first), springs.count, springs.arity, self._force,
-            )  # fmt: skip
+                springs.on_device, state.nodes, state.motion, int(first), springs.count, springs.arity, self._force
+            )
         gather_spring_forces(
             self._start, self._spring, self._coefficient, self._force, state.inverse_mass, dt, state.velocity
         )
@@ -82,34 +84,44 @@ def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
     return array
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def compute_spring_forces(
-    nodes: Integers, law: Laws, coefficients: Floats, lattice: Lattice, quantum: ti.f32, carry: Vectors,
-    velocity: Vectors, first: ti.i32, count: ti.i32, arity: ti.template(), force: Vectors,
-):  # fmt: skip
+    springs: SpringArrays,
+    nodes: Nodes,
+    motion: NodeMotion,
+    first: ti.i32,
+    count: ti.i32,
+    arity: ti.template(),
+    force: Vectors,
+):
     """-k (C + tau dC/dt) d/|d| of each spring [N]."""
     for s in range(count):
-        d = separation(nodes, coefficients, lattice, quantum, s, arity)
+        d = separation(springs, nodes, s, arity)
         rate = ti.math.vec3(0.0)
         for a in ti.static(range(arity)):
-            c_a = coefficient(coefficients, s, arity, a)
-            d += c_a * carry[nodes[arity * s + a]]
-            rate += c_a * velocity[nodes[arity * s + a]]
+            c_a = coefficient(springs, s, arity, a)
+            d += c_a * motion.carry[springs.nodes[arity * s + a]]
+            rate += c_a * motion.velocity[springs.nodes[arity * s + a]]
         length = d.norm()
         value = ti.math.vec3(0.0)
         if length > TINY_LENGTH:
             direction = d / length
-            value = -law[s][1] * (length - law[s][0] + law[s][2] * direction.dot(rate)) * direction
+            value = (
+                -springs.law[s][1] * (length - springs.law[s][0] + springs.law[s][2] * direction.dot(rate)) * direction
+            )
         force[first + s] = value
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def gather_spring_forces(
-    start: Integers, spring: Integers, coefficients: Floats, force: Vectors, inverse_mass: Floats, dt: ti.f32,
+    start: Integers,
+    spring: Integers,
+    coefficients: Floats,
+    force: Vectors,
+    inverse_mass: Floats,
+    dt: ti.f32,
     velocity: Vectors,
-):  # fmt: skip
+):
     """Accelerate every node by its springs."""
     for i in range(velocity.shape[0]):
         total = ti.math.vec3(0.0)

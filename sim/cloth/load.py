@@ -2,10 +2,10 @@
 
 import taichi as ti
 
-from sim.arrays import Floats, Vectors
 from sim.cloth.state import ClothState
-from sim.launch import fast_launch
-from sim.parameters import Vector3
+from sim.core.arrays import Floats, Vectors
+from sim.core.launch import kernel
+from sim.core.parameters import Vector3
 
 
 class NodeLoad:
@@ -33,12 +33,16 @@ class NodeLoad:
         state.inverse_mass.copy_from(self._own_inverse)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def put_on_load(
-    mass: Floats, impulse: Vectors, gravity: ti.math.vec3, dt: ti.f32, inverse_mass: Floats, own_inverse: Floats,
+    mass: Floats,
+    impulse: Vectors,
+    gravity: ti.math.vec3,
+    dt: ti.f32,
+    inverse_mass: Floats,
+    own_inverse: Floats,
     velocity: Vectors,
-):  # fmt: skip
+):
     """v_n += J_n/(m_n + m_load), less what gravity would do to the load, with the mass of both from then on."""
     for n in range(inverse_mass.shape[0]):
         w_n = inverse_mass[n]

@@ -1,4 +1,4 @@
-"""About how much work the loops of cloth are, by which short ones are told (`sim.short_loops`)."""
+"""About how much work the loops of cloth are, by which short ones are told (`sim.core.scheduling`)."""
 
 NODE_NS, NODE_IN_ROWS_NS, COPIED_NODE_NS = 14.0, 12.0, 4.0
 """Work a node [ns]: in sums and maxima over nodes, in one loop of springs or air in rows, in copies and tests;

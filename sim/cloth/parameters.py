@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from sim.cloth.materials import MATERIALS, Material
-from sim.parameters import NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import MeshShape
 
 Corner = Literal["x-y-", "x+y-", "x-y+", "x+y+"]

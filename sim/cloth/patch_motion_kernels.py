@@ -2,11 +2,23 @@
 
 import taichi as ti
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE, Pairs
-from sim.launch import fast_launch
-from sim.reductions import Results, reduced, runs_on_gpu
-from sim.work_sharing import begin_sharing, next_item
+from sim.cloth.bundles import (
+    BoxTree,
+    KnownPairs,
+    PatchBounds,
+    PatchBudget,
+    PatchMotion,
+    PatchNodes,
+    PatchPairArrays,
+    SubstepEnd,
+    TrackedNodes,
+)
+from sim.cloth.self_collision_kernels import NEVER, SAFETY_OF_DUE
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.core.reductions import Results, Share, reduced, runs_on_gpu
+from sim.core.scheduling import begin_sharing, next_item
 
 FAR = 1.0e30
 
@@ -31,23 +43,24 @@ SKIN_IN_MOTIONS = 2.0
 """Least skin in motions of the substep, so that a list lasts for some."""
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def look_at_patches(
-    vertex_count: ti.i32, workers: ti.i32, taken: Integers, items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
+    vertex_count: ti.i32,
+    nodes: TrackedNodes,
+    of_vertices: Share,
+    of_patches: Share,
     still: ti.f32,
-    position: Vectors, displacement: Vectors, expected: Vectors,
-    count: ti.i32, patch_items: ti.i32, patch_step: ti.i32, first_corner: Integers, corners: Integers,
-    low: Vectors, high: Vectors, centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
-    motion: Floats, more: Floats, spent: Floats, reach: Floats, way: Floats, partial: Floats, lanes: ti.i32,
-    nodes: Floats, is_short: ti.template(),
-) -> Results:  # fmt: skip
+    corners: PatchNodes,
+    patches: PatchBounds,
+    budget: PatchBudget,
+    workers: ti.i32,
+    taken: Integers,
+    is_short: ti.template(),
+) -> Results:
     """Where patches are, and how they move in this substep.
 
-    A rigid motion c + w x (x - centre) is fitted to the displacements of each patch, by least squares. `rest` gets the
-    largest displacement that is left of it [m], `radius` the largest distance from the centre [m]. The fit decides how
-    small the rest is, not whether it is a bound. `motion` gets how far vertices get from the middle of all
-    displacements at most [m], `way` that with what it has spent and what contacts may add.
+    A rigid motion c + w x (x - centre) is fitted to the displacements of each patch, by least squares. The fit decides
+    how small the rest is, not whether it is a bound.
 
     Returns the largest components of displacements [m], then those of their negatives; how far a vertex is at most from
     where its last displacement should have led it; and how far the motion of a patch, with what was spent before
@@ -56,62 +69,63 @@ def look_at_patches(
     workers_end = workers
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for lane in range(lanes):
+    for lane in range(of_vertices.tree.lanes):
         most, least, off = ti.math.vec3(-FAR), ti.math.vec3(FAR), 0.0
-        for k in range(items):
-            i = lane * lane_step + k * item_step
+        for k in range(of_vertices.items):
+            i = lane * of_vertices.lane_step + k * of_vertices.item_step
             if i < vertex_count:
-                u = displacement[i]
+                u = nodes.displacement[i]
                 most, least = ti.max(most, u), ti.min(least, u)
-                off = ti.max(off, (position[i] - expected[i]).norm_sqr())
+                off = ti.max(off, (nodes.position[i] - nodes.expected[i]).norm_sqr())
         for axis in ti.static(range(3)):
-            partial[axis * lanes + lane], partial[(3 + axis) * lanes + lane] = most[axis], -least[axis]
-        partial[6 * lanes + lane] = off
-    ends = reduced(partial, lanes, 7, 7, nodes)
+            (
+                of_vertices.tree.partial[axis * of_vertices.tree.lanes + lane],
+                of_vertices.tree.partial[(3 + axis) * of_vertices.tree.lanes + lane],
+            ) = most[axis], -least[axis]
+        of_vertices.tree.partial[6 * of_vertices.tree.lanes + lane] = off
+    ends = reduced(of_vertices.tree.partial, of_vertices.tree.lanes, 7, 7, of_vertices.tree.nodes)
     middle = 0.5 * ti.math.vec3(ends[0] - ends[3], ends[1] - ends[4], ends[2] - ends[5])
     astray = ti.sqrt(ends[6])
     begin_sharing(taken, 0)
     for worker in range(workers_end):
         lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
-        while lane < lanes:
+        while lane < of_vertices.tree.lanes:
             beyond = -FAR
-            for k in range(patch_items):
-                m = lane * patch_step + k * item_step
-                if m < count:
-                    fit_motion(
-                        m, still, first_corner, corners, position, displacement, low, high, centre, shift, turn, radius,
-                        rest,
-                    )  # fmt: skip
-                    motion[m] = (1.0 + SAFETY) * ((shift[m] - middle).norm() + turn[m].norm() * radius[m] + rest[m])
-                    way[m] = spent[m] + astray + motion[m] + more[m]
-                    beyond = ti.max(beyond, way[m] - reach[m])
-            partial[lane] = beyond
+            for k in range(of_patches.items):
+                m = lane * of_patches.lane_step + k * of_vertices.item_step
+                if m < corners.count:
+                    fit_motion(m, still, corners, nodes, patches)
+                    budget.moves[m] = (1.0 + SAFETY) * (
+                        (patches.motion.shift[m] - middle).norm()
+                        + patches.motion.turn[m].norm() * patches.motion.radius[m]
+                        + patches.motion.rest[m]
+                    )
+                    budget.travel[m] = budget.spent[m] + astray + budget.moves[m] + budget.more[m]
+                    beyond = ti.max(beyond, budget.travel[m] - budget.reach[m])
+            of_vertices.tree.partial[lane] = beyond
             lane = next_item(lane, worker, taken, 0, LANES_AT_A_TIME)
-    worst = reduced(partial, lanes, 1, 1, nodes)
+    worst = reduced(of_vertices.tree.partial, of_vertices.tree.lanes, 1, 1, of_vertices.tree.nodes)
     return Results(ends[0], ends[1], ends[2], ends[3], ends[4], ends[5], astray, worst[0])
 
 
-@ti.func
-def fit_motion(
-    m: ti.i32, still: ti.f32, first_corner: Integers, corners: Integers, position: Vectors, displacement: Vectors,
-    low: Vectors, high: Vectors, centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
-):  # fmt: skip
+@func
+def fit_motion(m: ti.i32, still: ti.f32, corners: PatchNodes, nodes: TrackedNodes, patches: PatchBounds):
     """The box and the motion of a patch; displacements within `still` [m] of each other are not fitted any closer."""
-    first, last = first_corner[m], first_corner[m + 1]
-    origin, u_first = position[corners[first]], displacement[corners[first]]
+    first, last = corners.first[m], corners.first[m + 1]
+    origin, u_first = nodes.position[corners.nodes[first]], nodes.displacement[corners.nodes[first]]
     least, most, u_least, u_most = origin, origin, u_first, u_first
     # Sums about the first corner: what is subtracted for the mean is of their own size.
     r_sum, u_sum, moment = ti.math.vec3(0.0), ti.math.vec3(0.0), ti.math.vec3(0.0)
     squares, products = ti.math.vec3(0.0), ti.math.vec3(0.0)
     for place in range(first, last):
-        i = corners[place]
-        x, u = position[i], displacement[i]
+        i = corners.nodes[place]
+        x, u = nodes.position[i], nodes.displacement[i]
         least, most = ti.min(least, x), ti.max(most, x)
         u_least, u_most = ti.min(u_least, u), ti.max(u_most, u)
         r, v = x - origin, u - u_first
         r_sum, u_sum, moment = r_sum + r, u_sum + v, moment + r.cross(v)
         squares, products = squares + r * r, products + r * r.yzx
-    low[m], high[m] = least, most
+    patches.low[m], patches.high[m] = least, most
     x_0, u_0, w = 0.5 * (least + most), 0.5 * (u_least + u_most), ti.math.vec3(0.0)
     left, largest = (0.5 * (u_most - u_least)).norm_sqr(), (0.5 * (most - least)).norm_sqr()
     if left > still * still:
@@ -126,39 +140,50 @@ def fit_motion(
         w = inertia.inverse() @ moment
         left, largest = 0.0, 0.0
         for place in range(first, last):
-            i = corners[place]
-            r = position[i] - x_0
-            left = ti.max(left, (displacement[i] - u_0 - w.cross(r)).norm_sqr())
+            i = corners.nodes[place]
+            r = nodes.position[i] - x_0
+            left = ti.max(left, (nodes.displacement[i] - u_0 - w.cross(r)).norm_sqr())
             largest = ti.max(largest, r.norm_sqr())
-    centre[m], shift[m], turn[m], radius[m], rest[m] = x_0, u_0, w, ti.sqrt(largest), ti.sqrt(left)
+    (
+        patches.motion.centre[m],
+        patches.motion.shift[m],
+        patches.motion.turn[m],
+        patches.motion.radius[m],
+        patches.motion.rest[m],
+    ) = x_0, u_0, w, ti.sqrt(largest), ti.sqrt(left)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def place_leaves(
-    count: ti.i32, leaves: ti.i32, low: Vectors, high: Vectors, motion: Floats, change: Floats, more: Floats,
-    fewest: ti.f32, most: ti.f32, enough: ti.f32, least: ti.f32, half_thickness: ti.f32, reach: Floats, spent: Floats,
-    tree_low: Vectors, tree_high: Vectors,
-):  # fmt: skip
+    count: ti.i32,
+    low: Vectors,
+    high: Vectors,
+    budget: PatchBudget,
+    fewest: ti.f32,
+    most: ti.f32,
+    enough: ti.f32,
+    least: ti.f32,
+    half_thickness: ti.f32,
+    tree: BoxTree,
+):
     """Leaves of a complete binary tree: boxes around the patches, then empty ones; leaf k is node `leaves` + k.
 
     Boxes are larger than the patches by half a thickness and by as much as these may move, their `reach`: in `fewest`
     to `most` substeps like this one, as many as take them `enough` [m], and by `least` [m] besides.
     """
-    for leaf in range(leaves):
+    for leaf in range(tree.leaves):
         lowest, highest = ti.math.vec3(FAR), ti.math.vec3(-FAR)
         if leaf < count:
-            spent[leaf] = 0.0
-            moves = motion[leaf] + change[leaf]
-            reach[leaf] = ti.math.clamp(enough, fewest * moves, most * moves) + least + more[leaf]
-            lowest = low[leaf] - reach[leaf] - half_thickness
-            highest = high[leaf] + reach[leaf] + half_thickness
-        tree_low[leaves + leaf], tree_high[leaves + leaf] = lowest, highest
+            budget.spent[leaf] = 0.0
+            moves = budget.moves[leaf] + budget.change[leaf]
+            budget.reach[leaf] = ti.math.clamp(enough, fewest * moves, most * moves) + least + budget.more[leaf]
+            lowest = low[leaf] - budget.reach[leaf] - half_thickness
+            highest = high[leaf] + budget.reach[leaf] + half_thickness
+        tree.low[tree.leaves + leaf], tree.high[tree.leaves + leaf] = lowest, highest
 
 
-@fast_launch
-@ti.kernel
-def merge_boxes(first: ti.i32, tree_low: Vectors, tree_high: Vectors):
+@kernel
+def merge_boxes(first: ti.i32, tree: BoxTree):
     """Boxes of a level, of the nodes `first` to 2 `first` - 1: 2 k and 2 k + 1 are below k, and 1 is the root.
 
     On a CPU serial: half a million nodes of cloth have 65,000 patches, whose level takes 0.2 ms now and then.
@@ -166,44 +191,42 @@ def merge_boxes(first: ti.i32, tree_low: Vectors, tree_high: Vectors):
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for node in range(first, 2 * first):
-        tree_low[node] = ti.min(tree_low[2 * node], tree_low[2 * node + 1])
-        tree_high[node] = ti.max(tree_high[2 * node], tree_high[2 * node + 1])
+        tree.low[node] = ti.min(tree.low[2 * node], tree.low[2 * node + 1])
+        tree.high[node] = ti.max(tree.high[2 * node], tree.high[2 * node + 1])
 
 
-@fast_launch
-@ti.kernel
-def sort_known(
-    count: ti.i32, pairs: Pairs, slack: Floats, patch_count: ti.i32, first: Integers, known: Integers,
-    counter: Integers,
-):  # fmt: skip
-    """List the pairs of patches of whose elements something is known, `slack` being positive, by their first patch.
-
-    Numbers of the pairs of patch m are `known` from `first[2 m]` to `first[2 m + 1]`.
-    """
+@kernel
+def sort_known(count: ti.i32, patch_count: ti.i32, known: KnownPairs, counter: Integers):
+    """List the pairs of patches of whose elements something is known, `slack` being positive, by their first patch."""
     pairs_end, patches_end = count, patch_count
     counter[0] = 0
     for m in range(patches_end):
-        first[2 * m], first[2 * m + 1] = 0, 0
+        known.first[2 * m], known.first[2 * m + 1] = 0, 0
     for p in range(pairs_end):
-        if slack[p] > 0.0:
-            ti.atomic_add(first[2 * pairs[p][0] + 1], 1)
+        if known.slack[p] > 0.0:
+            ti.atomic_add(known.first[2 * known.pairs[p][0] + 1], 1)
     for m in range(patches_end):
-        start = ti.atomic_add(counter[0], first[2 * m + 1])
-        first[2 * m], first[2 * m + 1] = start, start
+        start = ti.atomic_add(counter[0], known.first[2 * m + 1])
+        known.first[2 * m], known.first[2 * m + 1] = start, start
     for p in range(pairs_end):
-        if slack[p] > 0.0:
-            known[ti.atomic_add(first[2 * pairs[p][0] + 1], 1)] = p
+        if known.slack[p] > 0.0:
+            known.known[ti.atomic_add(known.first[2 * known.pairs[p][0] + 1], 1)] = p
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def pair_patches(
-    count: ti.i32, workers: ti.i32, taken: Integers, leaves: ti.i32, tree_low: Vectors, tree_high: Vectors,
-    cloth: Integers, collides: Integers, first_known: Integers, known: Integers, pairs_before: Pairs,
-    slack_before: Floats,
-    pairs: Pairs, carried: Integers, wake: Floats, slack: Floats, left: Floats, approach: Floats, allowed: Floats,
-    counter: Integers, capacity: ti.i32,
-) -> ti.i32:  # fmt: skip
+    count: ti.i32,
+    workers: ti.i32,
+    taken: Integers,
+    tree: BoxTree,
+    cloth: Integers,
+    collides: Integers,
+    known: KnownPairs,
+    now: PatchPairArrays,
+    carried: Integers,
+    counter: Integers,
+    capacity: ti.i32,
+) -> ti.i32:
     """List the patches whose boxes in the tree meet, each pair once, and each patch with itself; returns how many
     there are.
 
@@ -214,30 +237,30 @@ def pair_patches(
     for worker in range(workers):
         m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while m < count:
-            least, most = tree_low[leaves + m], tree_high[leaves + m]
+            least, most = tree.low[tree.leaves + m], tree.high[tree.leaves + m]
             node = 1
             while node > 0:
                 # The last leaf below a node: pairs are listed by the smaller of their numbers.
                 last = node
-                while last < leaves:
+                while last < tree.leaves:
                     last = 2 * last + 1
-                is_near = (tree_low[node] <= most).all() and (tree_high[node] >= least).all()
-                if is_near and last - leaves >= m and node < leaves:
+                is_near = (tree.low[node] <= most).all() and (tree.high[node] >= least).all()
+                if is_near and last - tree.leaves >= m and node < tree.leaves:
                     node = 2 * node
                 else:
-                    other = node - leaves
+                    other = node - tree.leaves
                     if is_near and other >= m and (cloth[m] != cloth[other] or collides[cloth[m]] == 1):
                         slot = ti.atomic_add(counter[0], 1)
                         if slot < capacity:
                             before = -1
-                            for place in range(first_known[2 * m], first_known[2 * m + 1]):
-                                if pairs_before[known[place]][1] == other:
-                                    before = known[place]
-                            pairs[slot], carried[slot] = ti.Vector([m, other]), before
-                            wake[slot], left[slot], approach[slot], allowed[slot] = -1.0, FAR, 0.0, 0.0
-                            slack[slot] = -1.0
+                            for place in range(known.first[2 * m], known.first[2 * m + 1]):
+                                if known.pairs[known.known[place]][1] == other:
+                                    before = known.known[place]
+                            now.pairs[slot], carried[slot] = ti.Vector([m, other]), before
+                            now.wake[slot], now.left[slot], now.approach[slot], now.allowed[slot] = -1.0, FAR, 0.0, 0.0
+                            now.slack[slot] = -1.0
                             if before >= 0:
-                                slack[slot] = slack_before[before]
+                                now.slack[slot] = known.slack[before]
                     # On to the next node that is not below this one; 0 after the last.
                     while node % 2 == 1:
                         node = node // 2
@@ -253,93 +276,105 @@ def gap_of_boxes(m: ti.i32, other: ti.i32, low: Vectors, high: Vectors) -> ti.f3
     return between.norm()
 
 
-@ti.func
-def approach_of(
-    m: ti.i32, other: ti.i32, centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats
-) -> ti.f32:
+@func
+def approach_of(m: ti.i32, other: ti.i32, motion: PatchMotion) -> ti.f32:
     """How much nearer points of two patches come at most [m].
 
     With w and c of the first patch, points P and Q go to P + c + w x P + d and Q + c + w x Q + d', where d and d' are
     what is left. P - Q + w x (P - Q) is never shorter than P - Q, so that distances shrink by |d| + |d'| at most.
     """
-    between = centre[other] - centre[m]
-    turned = (turn[other] - turn[m]).norm() * radius[other] if m != other else 0.0
-    shifted = (shift[other] - shift[m] - turn[m].cross(between)).norm() if m != other else 0.0
-    return rest[m] + rest[other] + turned + shifted + SAFETY * (rest[m] + rest[other] + turned + shifted)
+    between = motion.centre[other] - motion.centre[m]
+    turned = (motion.turn[other] - motion.turn[m]).norm() * motion.radius[other] if m != other else 0.0
+    shifted = (motion.shift[other] - motion.shift[m] - motion.turn[m].cross(between)).norm() if m != other else 0.0
+    return (
+        motion.rest[m]
+        + motion.rest[other]
+        + turned
+        + shifted
+        + SAFETY * (motion.rest[m] + motion.rest[other] + turned + shifted)
+    )
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def age_pairs(
-    count: ti.i32, workers: ti.i32, taken: Integers, pairs: Pairs, low: Vectors, high: Vectors, centre: Vectors,
-    shift: Vectors, turn: Vectors, radius: Floats, rest: Floats, motion: Floats, margin: Floats, more: Floats,
-    spent: Floats,
-    way: Floats, thickness: ti.f32, least_skin: ti.f32, astray: ti.f32, wake: Floats, slack: Floats, left: Floats,
-    approach: Floats, allowed: Floats, reach: Floats, first_due: Floats, first_due_of_edges: Floats,
-    due: Integers, expired: Integers, needed: Integers, counter: Integers,
-) -> ti.math.ivec2:  # fmt: skip
+    met: PatchPairArrays,
+    workers: ti.i32,
+    taken: Integers,
+    patches: PatchBounds,
+    budget: PatchBudget,
+    thickness: ti.f32,
+    least_skin: ti.f32,
+    astray: ti.f32,
+    first_due: Floats,
+    first_due_of_edges: Floats,
+    needed: Integers,
+    counter: Integers,
+) -> ti.math.ivec2:
     """List the pairs of patches whose elements have to be searched before this substep, and those of whose elements
     some are due; returns how many there are.
 
     Pairs far apart sleep until their patches' motion can have closed the gap between their boxes.
 
     Args:
-        motion: how far vertices of a patch get from the middle of all displacements at most [m]; `spent` is the sum of
-            the substeps before, `way` all that with `more`.
-        margin: how far contacts may displace them beyond that [m]; `more` what of it is beyond half a thickness.
+        met: the pairs, with `slack`: how much nearer elements that are not listed may come, and be a thickness apart;
+            and `left`: what of it elements that are listed may use up until they are looked at: one that was d apart
+            when the slack was s is due when `left` is below s - d.
+        workers, taken: see `sim.core.scheduling`.
+        patches, budget: their motion in this substep.
         thickness: the largest [m].
         least_skin: how far beyond to search at least [m].
-        astray: how far vertices are from where they were left at most [m].
-        wake: what their patches spend until a pair wakes [m].
-        slack: how much nearer the elements of a pair may come, that are not listed, and be a thickness apart [m].
-        left: what of the slack elements may use up, that are listed, until they are looked at [m]: an element that was
-            d apart when the slack was s is due when `left` is below s - d.
-        first_due, first_due_of_edges: the largest of these numbers of a pair of patches; `NEVER` after this where it is
-            due, as those that are looked at get other ones.
-        approach: what this substep uses of it; 0 where a pair sleeps; `allowed` the margins of both, likewise.
+        astray: largest distance of a vertex from where it was left [m].
+        first_due, first_due_of_edges: the largest number that is due of a pair of patches; `NEVER` after this where it
+            is due, as those that are looked at get other ones.
         needed: gets 1 for patches of pairs that are searched.
-        reach: how far to search for elements, so that the list lasts for some substeps [m].
+        counter: two integers to count with.
     """
     counter[0], counter[1] = 0, 0
     begin_sharing(taken, 0)
     for worker in range(workers):
         p = next_item(-1, worker, taken, 0, PAIRS_AT_A_TIME)
-        while p < count:
-            m, other = pairs[p][0], pairs[p][1]
-            if way[m] + way[other] > wake[p]:
-                whole, besides = motion[m] + motion[other], more[m] + more[other]
-                nearer = ti.min(approach_of(m, other, centre, shift, turn, radius, rest), whole)
-                approach[p], allowed[p] = nearer, margin[m] + margin[other]
-                slack[p] -= 2.0 * astray
+        while p < met.count:
+            m, other = met.pairs[p][0], met.pairs[p][1]
+            if budget.travel[m] + budget.travel[other] > met.wake[p]:
+                whole, besides = budget.moves[m] + budget.moves[other], budget.more[m] + budget.more[other]
+                nearer = ti.min(approach_of(m, other, patches.motion), whole)
+                met.approach[p], met.allowed[p] = nearer, budget.margin[m] + budget.margin[other]
+                met.slack[p] -= 2.0 * astray
                 is_searched = False
-                if slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
-                    gap = gap_of_boxes(m, other, low, high) - (1.0 + SAFETY_OF_DUE) * thickness
+                if met.slack[p] < nearer + besides + SAFETY_OF_DUE * thickness:
+                    gap = gap_of_boxes(m, other, patches.low, patches.high) - (1.0 + SAFETY_OF_DUE) * thickness
                     if gap > whole + besides:
-                        wake[p], slack[p] = spent[m] + spent[other] + 2.0 * astray + gap, -1.0
-                        approach[p], allowed[p], left[p] = 0.0, 0.0, FAR
+                        met.wake[p], met.slack[p] = budget.spent[m] + budget.spent[other] + 2.0 * astray + gap, -1.0
+                        met.approach[p], met.allowed[p], met.left[p] = 0.0, 0.0, FAR
                     else:
                         skin = ti.max(least_skin, SKIN_IN_MOTIONS * nearer) + 2.0 * besides + SAFETY_OF_DUE * thickness
-                        wake[p], slack[p], reach[p] = -1.0, skin, thickness + skin
+                        met.wake[p], met.slack[p], met.reach[p] = -1.0, skin, thickness + skin
                         is_searched = True
-                        expired[ti.atomic_add(counter[0], 1)] = p
+                        met.expired[ti.atomic_add(counter[0], 1)] = p
                         needed[m], needed[other] = 1, 1
-                if wake[p] < 0.0:
-                    left[p] = slack[p] - ti.max(thickness, nearer + allowed[p]) - SAFETY_OF_DUE * thickness
-                    if is_searched or first_due[p] >= left[p] or first_due_of_edges[p] >= left[p]:
-                        due[ti.atomic_add(counter[1], 1)] = p
+                if met.wake[p] < 0.0:
+                    met.left[p] = met.slack[p] - ti.max(thickness, nearer + met.allowed[p]) - SAFETY_OF_DUE * thickness
+                    if is_searched or first_due[p] >= met.left[p] or first_due_of_edges[p] >= met.left[p]:
+                        met.due[ti.atomic_add(counter[1], 1)] = p
                         first_due[p], first_due_of_edges[p] = NEVER, NEVER
             p = next_item(p, worker, taken, 0, PAIRS_AT_A_TIME)
     return ti.math.ivec2(counter[0], counter[1])
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def measure_changes(
-    count: ti.i32, workers: ti.i32, taken: Integers, items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
-    first_corner: Integers, corners: Integers, displacement: Vectors, predicted: Vectors, half_thickness: ti.f32,
-    change: Floats, margin: Floats, more: Floats,
-    partial: Floats, lanes: ti.i32, nodes: Floats, is_short: ti.template(),
-) -> ti.math.vec2:  # fmt: skip
+    share: Share,
+    workers: ti.i32,
+    taken: Integers,
+    corners: PatchNodes,
+    displacement: Vectors,
+    predicted: Vectors,
+    half_thickness: ti.f32,
+    change: Floats,
+    margin: Floats,
+    more: Floats,
+    is_short: ti.template(),
+) -> ti.math.vec2:
     """How far contacts displaced the vertices of each patch, `change` [m]; where that is beyond the `margin` that was
     allowed for, half as much again is from now on.
 
@@ -350,14 +385,14 @@ def measure_changes(
         ti.loop_config(serialize=True)
     for worker in range(workers):
         lane = next_item(-1, worker, taken, 0, LANES_AT_A_TIME)
-        while lane < lanes:
+        while lane < share.tree.lanes:
             largest, largest_beyond = 0.0, 0.0
-            for k in range(items):
-                m = lane * lane_step + k * item_step
-                if m < count:
+            for k in range(share.items):
+                m = lane * share.lane_step + k * share.item_step
+                if m < corners.count:
                     squared = 0.0
-                    for place in range(first_corner[m], first_corner[m + 1]):
-                        i = corners[place]
+                    for place in range(corners.first[m], corners.first[m + 1]):
+                        i = corners.nodes[place]
                         squared = ti.max(squared, (displacement[i] - predicted[i]).norm_sqr())
                     change[m] = ti.sqrt(squared)
                     largest = ti.max(largest, change[m])
@@ -365,60 +400,60 @@ def measure_changes(
                         largest_beyond = ti.max(largest_beyond, change[m])
                         margin[m] = 1.5 * change[m]
                         more[m] = margin[m] - half_thickness
-            partial[lane], partial[lanes + lane] = largest, largest_beyond
+            share.tree.partial[lane], share.tree.partial[share.tree.lanes + lane] = largest, largest_beyond
             lane = next_item(lane, worker, taken, 0, LANES_AT_A_TIME)
-    results = reduced(partial, lanes, 2, 2, nodes)
+    results = reduced(share.tree.partial, share.tree.lanes, 2, 2, share.tree.nodes)
     return ti.math.vec2(results[0], results[1])
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def finish_patches(
-    vertex_count: ti.i32, still: ti.f32, position: Vectors, displacement: Vectors, expected: Vectors,
-    count: ti.i32, patch_workers: ti.i32, pair_workers: ti.i32, taken: Integers, first_corner: Integers,
-    corners: Integers, low: Vectors, high: Vectors,
-    centre: Vectors, shift: Vectors, turn: Vectors, radius: Floats, rest: Floats,
-    motion: Floats, change: Floats, is_changed: ti.i32, astray: ti.f32, negligible: ti.f32, least_margin: ti.f32,
-    half_thickness: ti.f32, margin: Floats, more: Floats, spent: Floats,
-    pair_count: ti.i32, pairs: Pairs, approach: Floats, slack: Floats, is_short: ti.template(),
-):  # fmt: skip
+    vertex_count: ti.i32,
+    nodes: TrackedNodes,
+    corners: PatchNodes,
+    patches: PatchBounds,
+    budget: PatchBudget,
+    end: SubstepEnd,
+    patch_workers: ti.i32,
+    pair_workers: ti.i32,
+    taken: Integers,
+    met: PatchPairArrays,
+    is_short: ti.template(),
+):
     """The displacements of a substep are final: note where they lead, and what of the lists they use up.
 
     Patches that contacts changed by more than `negligible` [m] are fitted anew. Margins for the next substep are
     `WIDENED` times what contacts did in this one, and `least_margin` at least [m].
     """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    vertices_end, patches_end, pairs_end = vertex_count, count, pair_count
+    vertices_end, patches_end, pairs_end = vertex_count, corners.count, met.count
     first_end, second_end = patch_workers, pair_workers
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for i in range(vertices_end):
-        expected[i] = position[i] + displacement[i]
+        nodes.expected[i] = nodes.position[i] + nodes.displacement[i]
     begin_sharing(taken, 0)
     for worker in range(first_end):
         m = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
         while m < patches_end:
-            change[m] = ti.select(is_changed == 1, change[m], 0.0)
-            spent[m] += motion[m] + change[m] + astray
-            margin[m] = ti.max(least_margin, WIDENED * change[m])
-            more[m] = ti.max(margin[m] - half_thickness, 0.0)
-            if change[m] > negligible:
-                fit_motion(
-                    m, still, first_corner, corners, position, displacement, low, high, centre, shift, turn, radius,
-                    rest,
-                )  # fmt: skip
+            budget.change[m] = ti.select(end.is_changed == 1, budget.change[m], 0.0)
+            budget.spent[m] += budget.moves[m] + budget.change[m] + end.astray
+            budget.margin[m] = ti.max(end.least_margin, WIDENED * budget.change[m])
+            budget.more[m] = ti.max(budget.margin[m] - end.half_thickness, 0.0)
+            if budget.change[m] > end.negligible:
+                fit_motion(m, end.still, corners, nodes, patches)
             m = next_item(m, worker, taken, 0, PATCHES_AT_A_TIME)
     begin_sharing(taken, 1)
     for worker in range(second_end):
         p = next_item(-1, worker, taken, 1, PAIRS_AT_A_TIME)
         while p < pairs_end:
-            if slack[p] > 0.0:
-                m, other = pairs[p][0], pairs[p][1]
-                nearer = approach[p] + change[m] + change[other]
-                if ti.max(change[m], change[other]) > negligible:
-                    nearer = approach_of(m, other, centre, shift, turn, radius, rest)
+            if met.slack[p] > 0.0:
+                m, other = met.pairs[p][0], met.pairs[p][1]
+                nearer = met.approach[p] + budget.change[m] + budget.change[other]
+                if ti.max(budget.change[m], budget.change[other]) > end.negligible:
+                    nearer = approach_of(m, other, patches.motion)
                     # A patch that was not fitted anew moves as noted, but for its change.
-                    nearer += ti.select(change[m] > negligible, 0.0, change[m])
-                    nearer += ti.select(change[other] > negligible, 0.0, change[other])
-                slack[p] -= nearer
+                    nearer += ti.select(budget.change[m] > end.negligible, 0.0, budget.change[m])
+                    nearer += ti.select(budget.change[other] > end.negligible, 0.0, budget.change[other])
+                met.slack[p] -= nearer
             p = next_item(p, worker, taken, 1, PAIRS_AT_A_TIME)

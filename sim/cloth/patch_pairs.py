@@ -8,6 +8,18 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.cloth.bundles import (
+    BoxTree,
+    KnownPairs,
+    PairPieces,
+    PatchBounds,
+    PatchBudget,
+    PatchMotion,
+    PatchPairArrays,
+    PieceRoom,
+    SubstepEnd,
+    TrackedNodes,
+)
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_motion_kernels import (
     age_pairs,
@@ -21,9 +33,8 @@ from sim.cloth.patch_motion_kernels import (
 )
 from sim.cloth.patches import Patches
 from sim.cloth.self_collision_kernels import LANES, NEVER, carry_pieces
-from sim.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
-from sim.short_loops import is_short
-from sim.work_sharing import workers_for
+from sim.core.reductions import MAX_QUANTITIES, LaneReduction, runs_on_gpu
+from sim.core.scheduling import is_short, workers_for
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -58,7 +69,7 @@ class PairList:
         due: they are looked at when `PatchPairs.left` is not above it [m], (capacity,).
         pieces: first place of each piece, places, and how many of them are taken, (pairs of patches,) ivec4.
         piece_due: the largest `due` of each piece [m]; `NEVER` where nothing is listed.
-        taken: see `sim.work_sharing`.
+        taken: see `sim.core.scheduling`.
         again: numbers of the pieces that `make_room` found too short.
 
     Args:
@@ -73,9 +84,14 @@ class PairList:
         self.set_pieces(pieces)
 
     @property
-    def arrays(self) -> tuple[ti.Ndarray, ...]:
-        """What a kernel takes that looks at the pairs: pieces, when they are due, and `_listed`."""
-        return self.pieces, self.piece_due, *self._listed
+    def on_device(self) -> PairPieces:
+        """The list for kernels."""
+        return PairPieces(self.pieces, self.piece_due, *self._listed)
+
+    @property
+    def room(self) -> PieceRoom:
+        """The pieces for `make_room`."""
+        return PieceRoom(self.pieces, self._end, self.again)
 
     @property
     def _listed(self) -> tuple[ti.Ndarray, ...]:
@@ -97,6 +113,7 @@ class PairList:
             capacity: most of them.
         """
         # Two sets of arrays in turn: new ones would have all launches prepared anew.
+        before = self.on_device
         pieces, listed = (self.pieces, self.piece_due, self.again), self._listed
         if self._spare_pieces[0].shape[0] < capacity:
             self._spare_pieces = _room_for_pieces(capacity)
@@ -105,17 +122,7 @@ class PairList:
         self.pieces, self.piece_due, self.again = self._spare_pieces
         self.vertices, self.wanted, self.due = self._spare
         self._spare_pieces, self._spare = pieces, listed
-        self.end = int(
-            carry_pieces(
-                count, workers_for(count), self.taken, carried, *pieces[:2], *listed, self.pieces, self.piece_due,
-                *self._listed, self._end,
-            )
-        )  # fmt: skip
-
-    @property
-    def room_arrays(self) -> tuple[ti.Ndarray, ...]:
-        """What `make_room` takes: pieces, the end, and numbers of pieces to be searched again."""
-        return self.pieces, self._end, self.again
+        self.end = int(carry_pieces(count, workers_for(count), self.taken, carried, before, self.on_device, self._end))
 
     def reach_to(self, end: int) -> None:
         """There are pieces up to this place now.
@@ -150,12 +157,10 @@ def _room_for_pairs(capacity: int) -> tuple[ti.Ndarray, ...]:
 
 def _room_for_pieces(capacity: int) -> tuple[ti.Ndarray, ...]:
     """Arrays of `PairList`: pieces, all empty, when they are due, numbers of those that are searched again."""
-    pieces, piece_due, again = (
-        ti.Vector.ndarray(4, ti.i32, capacity), ti.ndarray(ti.f32, capacity), ti.ndarray(ti.i32, capacity)
-    )  # fmt: skip
+    pieces, piece_due = ti.Vector.ndarray(4, ti.i32, capacity), ti.ndarray(ti.f32, capacity)
     pieces.fill(0)
     piece_due.fill(NEVER)
-    return pieces, piece_due, again
+    return pieces, piece_due, ti.ndarray(ti.i32, capacity)
 
 
 def _room_for_patch_pairs(capacity: int) -> tuple[ti.Ndarray, ti.Ndarray]:
@@ -169,9 +174,7 @@ class PatchPairs:
     Attributes:
         count: number of pairs of patches.
         pairs: their numbers, the smaller first, (count,) ivec2.
-        low, high: boxes around patches at the last `look` [m], (m,) vec3.
-        motion_arrays: the rigid motion of each patch in the substep: centre [m], shift [m], turn [rad], (m,) vec3;
-            distance of its corners from the centre, and of their displacements from that motion, at most [m], (m,).
+        bounds: boxes around patches at the last `look`, and the rigid motion of each in the substep.
         expired: numbers of the pairs to be searched; `needed` is 1 for their patches, (m,).
         due: numbers of the pairs of which elements have to be looked at, `due_count` of them.
         approach: how much nearer points of a pair come at most in this substep [m], (count,); `allowed` how much
@@ -188,20 +191,11 @@ class PatchPairs:
     def __init__(self, patches: Patches) -> None:
         self.patches = patches
         m = max(patches.count, 1)
-        self.low, self.high, self._centre, self._shift, self._turn = (ti.Vector.ndarray(3, ti.f32, m) for _ in range(5))
-        (
-            self._radius,
-            self._rest,
-            self._motion,
-            self._change,
-            self._margin,
-            self._more,
-            self._spent,
-            self._reach,
-            self._way,
-        ) = (ti.ndarray(ti.f32, m) for _ in range(9))
+        low, high, *fitted = (ti.Vector.ndarray(3, ti.f32, m) for _ in range(5))
+        self.bounds = PatchBounds(low, high, PatchMotion(*fitted, *(ti.ndarray(ti.f32, m) for _ in range(2))))
+        self._budget = PatchBudget(*(ti.ndarray(ti.f32, m) for _ in PatchBudget._fields))
         self._expected = ti.Vector.ndarray(3, ti.f32, patches.vertex_count)
-        self._tree_low, self._tree_high = (ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2))
+        self._tree = BoxTree(patches.leaves, *(ti.Vector.ndarray(3, ti.f32, 2 * patches.leaves) for _ in range(2)))
         self._counter, self._taken = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, 2)
         self._first_known = ti.ndarray(ti.i32, 2 * m)
         self.needed = ti.ndarray(ti.i32, m)
@@ -222,19 +216,29 @@ class PatchPairs:
         )
 
     @property
-    def motion_arrays(self) -> tuple[ti.Ndarray, ...]:
-        """See above."""
-        return self._centre, self._shift, self._turn, self._radius, self._rest
+    def on_device(self) -> PatchPairArrays:
+        """The pairs for kernels."""
+        return PatchPairArrays(
+            count=self.count,
+            pairs=self.pairs,
+            slack=self.slack,
+            wake=self._wake,
+            left=self.left,
+            approach=self.approach,
+            allowed=self.allowed,
+            reach=self.reach,
+            due=self.due,
+            expired=self.expired,
+        )
 
-    @property
-    def _fitted(self) -> tuple[ti.Ndarray, ...]:
-        return self.low, self.high, *self.motion_arrays
+    def _tracked(self, state: ClothState) -> TrackedNodes:
+        return TrackedNodes(state.position, state.displacement, self._expected)
 
     def set_margin(self, thickness: float) -> None:
         """Allow contacts to displace vertices by half a thickness [m], whatever they did before."""
         self._half_thickness, self._still = 0.5 * thickness, STILL * thickness
-        self._margin.fill(MARGIN * thickness)
-        self._more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
+        self._budget.margin.fill(MARGIN * thickness)
+        self._budget.more.fill(max(MARGIN * thickness - self._half_thickness, 0.0))
 
     def look(self, state: ClothState) -> tuple[NDArray[np.float64], bool]:
         """Note where patches are and how they move in this substep.
@@ -242,15 +246,20 @@ class PatchPairs:
         Returns the largest components of the displacements [m], then those of their negatives, (6,); and whether the
         pairs of patches hold for this substep, if they held before.
         """
-        patches, lanes, n = self.patches, self._maxima.lanes, self.patches.vertex_count
-        partial, lane_count, *_, nodes = self._maxima.tree
+        patches, n = self.patches, self.patches.vertex_count
         *ends, self._astray, beyond = look_at_patches(
-            n, workers_for(lanes.count), self._taken, lanes.items(n), lanes.lane_step(n), lanes.item_step(),
-            self._still, state.position, state.displacement, self._expected, patches.count,
-            lanes.items(patches.count), lanes.lane_step(patches.count), patches.first_corner, patches.corners,
-            *self._fitted, self._motion,
-            self._more, self._spent, self._reach, self._way, partial, lane_count, nodes, self._is_short,
-        )  # fmt: skip
+            n,
+            self._tracked(state),
+            self._maxima.over(n),
+            self._maxima.over(patches.count),
+            self._still,
+            patches.corner_lists,
+            self.bounds,
+            self._budget,
+            workers_for(self._maxima.lanes.count),
+            self._taken,
+            self._is_short,
+        )
         return np.array(ends, dtype=np.float64), beyond <= 0.0
 
     def meet(self, thickness: float, edge: float, collides: ti.Ndarray, *, keeps: bool = False) -> bool:
@@ -264,30 +273,43 @@ class PatchPairs:
             collides: which cloths do with themselves, (b,).
             keeps: whether what is known about pairs would hold, as far as this object knows.
         """
-        patches = self.patches
+        patches, tree = self.patches, self._tree
         keeps = keeps and self._astray < thickness  # else cloth was put elsewhere, and nothing would be left of it
         if not keeps:
             self.count, self._astray = 0, 0.0
-        tree = self._tree_low, self._tree_high
         place_leaves(
-            patches.count, patches.leaves, self.low, self.high, self._motion, self._change, self._more,
-            *SUBSTEPS_OF_PATCHES, PATCH_REACH_IN_EDGES * edge, 0.5 * edge, 0.5 * thickness, self._reach, self._spent,
-            *tree,
-        )  # fmt: skip
+            patches.count,
+            self.bounds.low,
+            self.bounds.high,
+            self._budget,
+            *SUBSTEPS_OF_PATCHES,
+            PATCH_REACH_IN_EDGES * edge,
+            0.5 * edge,
+            0.5 * thickness,
+            tree,
+        )
         first = patches.leaves
         while first := first // 2:
-            merge_boxes(first, *tree)
-        known, before = (self._first_known, self._known), (self.pairs, self.slack)
-        sort_known(self.count, *before, patches.count, *known, self._counter)
+            merge_boxes(first, tree)
+        before = self.pairs, self.slack
+        known = KnownPairs(self._first_known, self._known, *before)
+        sort_known(self.count, patches.count, known, self._counter)
         self.pairs, self.slack = self._spare
         self._spare = before
         while True:
             found = pair_patches(
-                patches.count, workers_for(patches.count), self._taken, patches.leaves, *tree, patches.cloth,
-                collides, *known, *before, self.pairs, self.carried, self._wake, self.slack, self.left, self.approach,
-                self.allowed, self._counter,
+                patches.count,
+                workers_for(patches.count),
+                self._taken,
+                tree,
+                patches.cloth,
+                collides,
+                known,
+                self.on_device,
+                self.carried,
+                self._counter,
                 self.capacity,
-            )  # fmt: skip
+            )
             if found < 0 or found > MAX_PAIRS:
                 raise OverflowError(TOO_MANY)
             if found <= self.capacity:
@@ -305,10 +327,18 @@ class PatchPairs:
             first_due: `PairList.piece_due` of both lists; `NEVER` after this where a pair is due.
         """
         expired, due = age_pairs(
-            self.count, workers_for(self.count), self._taken, self.pairs, *self._fitted, self._motion, self._margin,
-            self._more, self._spent, self._way, thickness, least_skin, self._astray, self._wake, self.slack, self.left,
-            self.approach, self.allowed, self.reach, *first_due, self.due, self.expired, self.needed, self._counter,
-        )[:2]  # fmt: skip
+            self.on_device,
+            workers_for(self.count),
+            self._taken,
+            self.bounds,
+            self._budget,
+            thickness,
+            least_skin,
+            self._astray,
+            *first_due,
+            self.needed,
+            self._counter,
+        )[:2]
         self.due_count = int(due)
         return int(expired)
 
@@ -317,14 +347,20 @@ class PatchPairs:
 
         Where they did, they may displace half as much again from now on.
         """
-        patches, lanes = self.patches, self._maxima.lanes
-        partial, lane_count, *_, nodes = self._maxima.tree
+        patches, budget = self.patches, self._budget
         largest, beyond = measure_changes(
-            patches.count, workers_for(lanes.count), self._taken, lanes.items(patches.count),
-            lanes.lane_step(patches.count), lanes.item_step(), patches.first_corner, patches.corners,
-            state.displacement, predicted,
-            self._half_thickness, self._change, self._margin, self._more, partial, lane_count, nodes, self._is_short,
-        )  # fmt: skip
+            self._maxima.over(patches.count),
+            workers_for(self._maxima.lanes.count),
+            self._taken,
+            patches.corner_lists,
+            state.displacement,
+            predicted,
+            self._half_thickness,
+            budget.change,
+            budget.margin,
+            budget.more,
+            self._is_short,
+        )
         return float(largest), float(beyond)
 
     def finish(self, state: ClothState, negligible: float, *, is_changed: bool) -> None:
@@ -336,11 +372,24 @@ class PatchPairs:
             is_changed: whether `measure_changes` was asked in this substep.
         """
         patches = self.patches
+        end = SubstepEnd(
+            is_changed=int(is_changed),
+            astray=self._astray,
+            still=self._still,
+            negligible=negligible,
+            least_margin=MARGIN * 2.0 * self._half_thickness,
+            half_thickness=self._half_thickness,
+        )
         finish_patches(
-            patches.vertex_count, self._still, state.position, state.displacement, self._expected,
-            patches.count, workers_for(patches.count), workers_for(self.count), self._taken, patches.first_corner,
-            patches.corners, *self._fitted, self._motion, self._change, int(is_changed), self._astray, negligible,
-            MARGIN * 2.0 * self._half_thickness, self._half_thickness, self._margin, self._more, self._spent,
-            self.count, self.pairs, self.approach, self.slack,
+            patches.vertex_count,
+            self._tracked(state),
+            patches.corner_lists,
+            self.bounds,
+            self._budget,
+            end,
+            workers_for(patches.count),
+            workers_for(self.count),
+            self._taken,
+            self.on_device,
             self._is_short,
-        )  # fmt: skip
+        )

@@ -8,6 +8,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.cloth.bundles import PatchElements, PatchNodes
+
 if TYPE_CHECKING:
     from sim.cloth.state import HostCloths
 
@@ -29,6 +31,7 @@ class Patches:
         first_triangle, first_edge, first_vertex: of each patch, (m + 1,).
         triangles: in the order of the patches, (k,) ivec3 of vertices; edges (e,) ivec2; vertices (n,).
         first_corner, corners: all vertices of a patch's triangles, which its edges end at, its own and others, (c,).
+        corner_lists, vertex_lists, elements: these for kernels.
         cloth: of each patch, (m,).
 
     Args:
@@ -64,6 +67,9 @@ class Patches:
         self.edges = ti.Vector.ndarray(2, ti.i32, max(len(edges), 1))
         self.edges.from_numpy(edges[np.argsort(edge_owner, kind="stable")])
         self.cloth = _array(host.body[triangles[order[_starts(patch, self.count)[:-1]], 0]])
+        self.corner_lists = PatchNodes(self.count, self.first_corner, self.corners)
+        self.vertex_lists = PatchNodes(self.count, self.first_vertex, self.vertices)
+        self.elements = PatchElements(self.count, self.first_edge, self.edges, self.first_triangle, self.triangles)
 
 
 def _patch_of_triangles(host: HostCloths) -> NDArray[np.int64]:

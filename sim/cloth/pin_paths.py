@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from sim.cloth.parameters import PinParameters
-from sim.rigid import rotation
-from sim.rigid.keyframes import KeyframePath
+from sim.core.motion import rotation
+from sim.core.motion.paths import KeyframePath
 
 
 def path_of_pin(pin: PinParameters) -> KeyframePath:

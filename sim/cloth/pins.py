@@ -12,9 +12,9 @@ from sim.cloth.pin_paths import path_of_pin
 from sim.cloth.sheet import RestSheet
 from sim.cloth.start import pinned_nodes
 from sim.cloth.state import ClothState
-from sim.parameters import Vector3
-from sim.rigid import rotation
-from sim.rigid.keyframes import KeyframePath
+from sim.core.motion import rotation
+from sim.core.motion.paths import KeyframePath
+from sim.core.parameters import Vector3
 
 Floats = NDArray[np.float64]
 

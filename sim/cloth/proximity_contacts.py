@@ -2,11 +2,9 @@
 
 import taichi as ti
 
-from sim.arrays import Integers
-from sim.launch import fast_launch
-
-Quadruples = ti.types.ndarray(dtype=ti.types.vector(4, ti.i32), ndim=1)
-Weights = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
+from sim.cloth.bundles import Contacts, Impulses
+from sim.core.arrays import Integers
+from sim.core.launch import kernel
 
 VERTEX_TRIANGLE, EDGE_EDGE, WALL = -1, -2, -3
 """What a contact is between; from 0 on it is the number of the body that the cloth touches."""
@@ -37,6 +35,7 @@ class ContactList:
         pushing: numbers of the contacts that push, (capacity,); `push` is what they give in a step of the iteration, in
             its units, in the same order.
         used_by, use_weight: places of contacts in that order, and weights, vertex by vertex, (4 capacity,).
+        found: what finding contacts writes, for kernels.
         counter: number of contacts found, also those beyond the capacity, (1,).
     """
 
@@ -56,13 +55,19 @@ class ContactList:
         self._allocate(int(GROWTH * found))
         return True
 
-    @property
-    def found_arrays(self) -> tuple[ti.Ndarray, ...]:
-        """What a kernel writes that finds contacts."""
-        return (
-            self.vertices, self.weights, self.normal, self.floor, self.kind, self.arm, self.friction, self.counter,
-            self.capacity,
-        )  # fmt: skip
+    def impulses(self, unit: float) -> Impulses:
+        """The impulses for kernels, which are summed up in a unit [kg m]."""
+        return Impulses(
+            self.mobility,
+            self.impulse,
+            self.impulse_before,
+            self.impulse_given,
+            self.pushing,
+            self.push,
+            self.used_by,
+            self.use_weight,
+            unit,
+        )
 
     def _allocate(self, capacity: int) -> None:
         self.capacity = max(capacity, 1)
@@ -80,10 +85,20 @@ class ContactList:
         self.pushing = ti.ndarray(ti.i32, self.capacity)
         self.push = ti.Vector.ndarray(3, ti.f32, self.capacity)
         self.used_by, self.use_weight = ti.ndarray(ti.i32, 4 * self.capacity), ti.ndarray(ti.f32, 4 * self.capacity)
+        self.found = Contacts(
+            vertices=self.vertices,
+            weights=self.weights,
+            normal=self.normal,
+            floor=self.floor,
+            kind=self.kind,
+            arm=self.arm,
+            friction=self.friction,
+            counter=self.counter,
+            capacity=self.capacity,
+        )
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def take_count(counter: Integers) -> ti.i32:
     """The first of some integers, which is zero then."""
     count = counter[0]

@@ -4,17 +4,18 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.cloth.bundles import Lines
 from sim.cloth.loop_costs import NODE_IN_ROWS_NS
-from sim.cloth.overlong import count_overlong_in_lines
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.row_blocks import LANES, load_blocks, row_blocks, store_blocks, strips_of
+from sim.cloth.row_blocks import LANES, load_blocks, rectangle_of, row_blocks, store_blocks, strips_of
 from sim.cloth.row_springs import bend_lines, solve_diagonals
 from sim.cloth.row_threads import solve_lines, straighten_lines
 from sim.cloth.sheet import Grid
+from sim.cloth.spring_convergence import count_unconverged_in_lines
 from sim.cloth.springs import bend_share, diagonal_share, line_widths
 from sim.cloth.state import ClothState, HostCloths
-from sim.reductions import runs_on_gpu
-from sim.short_loops import is_short
+from sim.core.reductions import runs_on_gpu
+from sim.core.scheduling import is_short
 
 ALONG_Y, ALONG_X = 0, 1
 """Directions of lines: upright blocks, then turned ones."""
@@ -40,10 +41,14 @@ class RectangleSprings:
     """
 
     def __init__(self, state: ClothState, grid: Grid, first_node: int) -> None:
-        self._state, self._grid, self._first = state, grid, first_node
+        self._state, self._grid = state, grid
         self._blocks = row_blocks(grid.columns, grid.rows)
         self._strips = (strips_of(grid.columns), strips_of(grid.rows))
-        self._lengths = (grid.rows, grid.columns)
+        self._rectangle = rectangle_of(grid, first_node)
+        lengths = (grid.rows, grid.columns)
+        self._lines = tuple(
+            Lines(axis, lengths[axis], self._strips[axis], self._strips[1 - axis]) for axis in (ALONG_Y, ALONG_X)
+        )
         self._steps = (grid.step_y, grid.step_x)
         self._thread_stiffness, self._bend_stiffness = (
             tuple(ti.ndarray(ti.f32, strips * LANES) for strips in self._strips) for _ in range(2)
@@ -66,49 +71,67 @@ class RectangleSprings:
     def displace(self, dt: float, iterations: int) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go."""
         state, grid, blocks, short = self._state, self._grid, self._blocks, self._is_short
-        load_blocks(
-            blocks, state.lattice, state.displacement, state.inverse_mass, self._first, grid.columns, grid.rows,
-            *self._strips, short,
-        )  # fmt: skip
+        load_blocks(blocks, state.nodes, self._rectangle, short)
         for axis in (ALONG_X, ALONG_Y):
             bend_lines(
-                blocks, *self._lines(axis), self._bend_stiffness[axis], state.quantum, dt * dt, self._bend_damping / dt,
+                blocks,
+                self._lines[axis],
+                self._bend_stiffness[axis],
+                state.quantum,
+                dt * dt,
+                self._bend_damping / dt,
                 short,
-            )  # fmt: skip
+            )
         for iteration in range(iterations):
             is_first = int(iteration == 0)
             for parity in range(2):
                 solve_diagonals(
-                    blocks, parity, grid.columns, grid.rows, self._strips[ALONG_Y], self._diagonal_stiffness,
-                    float(np.hypot(grid.step_x, grid.step_y)), state.quantum, dt * dt, is_first, short,
-                )  # fmt: skip
+                    blocks,
+                    parity,
+                    self._rectangle,
+                    self._diagonal_stiffness,
+                    float(np.hypot(grid.step_x, grid.step_y)),
+                    state.quantum,
+                    dt * dt,
+                    is_first,
+                    short,
+                )
             for axis in (ALONG_X, ALONG_Y):
                 solve_lines(
-                    blocks, *self._lines(axis), self._thread_stiffness[axis], self._steps[axis], state.quantum,
-                    dt * dt, is_first, short,
-                )  # fmt: skip
+                    blocks,
+                    self._lines[axis],
+                    self._thread_stiffness[axis],
+                    self._steps[axis],
+                    state.quantum,
+                    dt * dt,
+                    is_first,
+                    short,
+                )
         for axis in (ALONG_X, ALONG_Y):
-            straighten_lines(blocks, *self._lines(axis), short)
-        store_blocks(blocks, self._first, grid.columns, grid.rows, self._strips[ALONG_Y], state.displacement, short)
+            straighten_lines(blocks, self._lines[axis], short)
+        store_blocks(blocks, state.nodes, self._rectangle, short)
 
-    def count_overlong(self, dt: float) -> int:
-        """Right after `displace`: how many springs are much longer than their tension makes them, see `overlong`."""
+    def count_unconverged(self, dt: float) -> int:
+        """Number of springs that have not converged right after `displace` (`spring_convergence`)."""
         state, columns, rows = self._state, self._grid.columns, self._grid.rows
         across = {ALONG_Y: (columns, columns, 1), ALONG_X: (rows, 1, columns)}
         return sum(
             int(
-                count_overlong_in_lines(
-                    self._blocks, axis, self._lengths[axis], self._strips[axis], lines, self._first, node_step,
-                    line_step, self._thread_stiffness[axis], self._steps[axis], state.lattice, state.quantum,
-                    state.inverse_mass, dt * dt, state.displacement,
+                count_unconverged_in_lines(
+                    self._blocks,
+                    self._lines[axis],
+                    lines,
+                    self._rectangle.first,
+                    node_step,
+                    line_step,
+                    self._thread_stiffness[axis],
+                    self._steps[axis],
+                    state.nodes,
+                    dt * dt,
                 )
             )
             for axis, (lines, node_step, line_step) in across.items()
-        )  # fmt: skip
-
-    def _lines(self, axis: int) -> tuple[int, int, int, int]:
-        """Whether lines are turned, how many nodes one has, their strips, and those of the other direction."""
-        return axis, self._lengths[axis], self._strips[axis], self._strips[1 - axis]
+        )
 
 
 def _fill(array: ti.Ndarray, values: NDArray[np.float64], padding: NDArray[np.float64]) -> None:

@@ -8,25 +8,25 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Matrices, Vectors
+from sim.cloth.bundles import CollidingBodies, Contacts, Four, PatchElements, PatchMotion, PatchNodes, Surface, Walls
 from sim.cloth.loop_costs import NODE_AT_BODIES_NS, PATCH_AT_BODY_NS, PATCH_AT_WALLS_NS
 from sim.cloth.patches import Patches
 from sim.cloth.proximity import unit_or
-from sim.cloth.proximity_contacts import WALL, ContactList, Quadruples, Weights, least_displacement
+from sim.cloth.proximity_contacts import WALL, ContactList, least_displacement
 from sim.cloth.rigid_contact_bodies import CollisionBodies
-from sim.cloth.self_collision_kernels import LANES, Four, Pairs, Triples
+from sim.cloth.self_collision_kernels import LANES
 from sim.cloth.state import ClothState
-from sim.launch import fast_launch
-from sim.reductions import runs_on_gpu
-from sim.rigid.contacts import Poses
-from sim.rigid.geometry import BodyGeometry
-from sim.rigid.shape_distances import CountTriples, distance_at
-from sim.rigid.walls import Wall
-from sim.short_loops import is_short
-from sim.work_sharing import begin_sharing, next_item, workers_for
+from sim.core.arrays import Integers
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.core.motion.poses import Poses
+from sim.core.reductions import runs_on_gpu
+from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
+from sim.core.walls import Wall
+from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.device_distances import distance_to
 
 Array = NDArray[np.float64]
-Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
 
 PATCHES_AT_A_TIME = 4
 """Patches that a thread takes at a time: those that touch a body take some microseconds each."""
@@ -88,12 +88,9 @@ class RigidContact:
         self._has_edges = bool(self.bodies.has_edges.to_numpy()[: self.bodies.count].any())
         self._spacing, self._largest_half = 0.0, 0.0
         self._taken = ti.ndarray(ti.i32, 1)
-        self._wall_count = len(walls)
         room = max(len(walls), 1)
-        self._wall_plane = ti.Vector.ndarray(4, ti.f32, room)
-        self._wall_low, self._wall_high, self._joined_low, self._joined_high = (
-            ti.Vector.ndarray(3, ti.f32, room) for _ in range(4)
-        )
+        corners = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(4))
+        self._walls = Walls(len(walls), ti.Vector.ndarray(4, ti.f32, room), *corners)
         if walls:
             low, high = np.full((room, 3), -np.inf), np.full((room, 3), np.inf)
             joined = {side: np.zeros((room, 3)) for side in (1.0, -1.0)}
@@ -104,11 +101,11 @@ class RigidContact:
                     if other.axis != wall.axis:
                         joined[other.side][number, other.axis] = 1.0
             planes = np.array([[*wall.normal, wall.side * wall.offset] for wall in walls])
-            self._wall_plane.from_numpy(planes.astype(np.float32))
-            self._wall_low.from_numpy(low.astype(np.float32))
-            self._wall_high.from_numpy(high.astype(np.float32))
-            self._joined_low.from_numpy(joined[1.0].astype(np.float32))
-            self._joined_high.from_numpy(joined[-1.0].astype(np.float32))
+            self._walls.plane.from_numpy(planes.astype(np.float32))
+            self._walls.low.from_numpy(low.astype(np.float32))
+            self._walls.high.from_numpy(high.astype(np.float32))
+            self._walls.joined_low.from_numpy(joined[1.0].astype(np.float32))
+            self._walls.joined_high.from_numpy(joined[-1.0].astype(np.float32))
 
     def set_spacing(self, mean_edge: float) -> None:
         """Say how far vertices of the coarsest cloth are apart [m]: what is small, and how deep walls hold."""
@@ -155,7 +152,7 @@ class RigidContact:
         self,
         state: ClothState,
         patches: Patches,
-        motion_arrays: tuple[ti.Ndarray, ...],
+        motion: PatchMotion,
         contacts: ContactList,
         recovery: float,
     ) -> None:
@@ -164,52 +161,70 @@ class RigidContact:
         Args:
             state: at the start of a substep.
             patches: of the cloths.
-            motion_arrays: where they are and how they move in it, see `sim.cloth.patch_pairs.PatchPairs`.
+            motion: of them in it.
             contacts: the list.
             recovery: share of a missing distance that the substep gives back [-].
         """
         lanes = LANES if runs_on_gpu() else 1
-        own = (patches.count, lanes, patches.first_vertex, patches.vertices, *motion_arrays)
-        cloth = (state.position, state.displacement, state.thickness, state.friction)
-        if self._wall_count:
+        if self._walls.count:
             find_wall_contacts(
-                *own, self._largest_half, *cloth, self._wall_count, self._wall_plane, self._wall_low, self._wall_high,
-                self._joined_low, self._joined_high, self._spacing, recovery, *contacts.found_arrays,
+                patches.vertex_lists,
+                lanes,
+                motion,
+                self._largest_half,
+                state.surface,
+                self._walls,
+                self._spacing,
+                recovery,
+                contacts.found,
                 is_short(patches.count, PATCH_AT_WALLS_NS),
-            )  # fmt: skip
+            )
         if not self.bodies.count:
             return
-        each = self.bodies
-        bodies = (
-            each.count, each.kind, each.size, each.has_edges, each.centre_of_mass, each.radius, each.step,
-            each.friction, each.grid_values, each.grid_first, each.grid_origin, each.grid_spacing, each.grid_shape,
-            each.position, each.rotation, each.motion,
-        )  # fmt: skip
-        workers = workers_for(patches.count * lanes), self._taken
-        few_bodies = is_short(patches.count * each.count, PATCH_AT_BODY_NS)
+        workers, bodies = workers_for(patches.count * lanes), self.bodies.colliding
+        few_bodies = is_short(patches.count * bodies.count, PATCH_AT_BODY_NS)
         find_body_contacts_of_vertices(
-            *own[:2], *workers, *own[2:], self._largest_half, *cloth, *bodies, recovery, *contacts.found_arrays,
+            patches.vertex_lists,
+            lanes,
+            workers,
+            self._taken,
+            motion,
+            self._largest_half,
+            state.surface,
+            bodies,
+            recovery,
+            contacts.found,
             few_bodies and is_short(patches.vertex_count, NODE_AT_BODIES_NS),
-        )  # fmt: skip
+        )
         if self._has_edges:
             find_body_contacts_between_vertices(
-                patches.count, lanes, *workers, patches.first_edge, patches.edges, patches.first_triangle,
-                patches.triangles, *motion_arrays, self._largest_half, *cloth, *bodies, recovery,
-                *contacts.found_arrays, few_bodies and is_short(patches.between_count, NODE_AT_BODIES_NS),
-            )  # fmt: skip
+                patches.elements,
+                lanes,
+                workers,
+                self._taken,
+                motion,
+                self._largest_half,
+                state.surface,
+                bodies,
+                recovery,
+                contacts.found,
+                few_bodies and is_short(patches.between_count, NODE_AT_BODIES_NS),
+            )
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def find_wall_contacts(
-    patch_count: ti.i32, lanes: ti.i32, first_vertex: Integers, patch_vertices: Integers,
-    centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats, largest_half: ti.f32,
-    position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
-    wall_count: ti.i32, plane: Planes, low: Vectors, high: Vectors, joined_low: Vectors, joined_high: Vectors,
-    spacing: ti.f32, recovery: ti.f32,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32, is_short: ti.template(),
-):  # fmt: skip
+    listed: PatchNodes,
+    lanes: ti.i32,
+    motion: PatchMotion,
+    largest_half: ti.f32,
+    surface: Surface,
+    walls: Walls,
+    spacing: ti.f32,
+    recovery: ti.f32,
+    contacts: Contacts,
+    is_short: ti.template(),
+):
     """Append the vertices that reach a wall, of the patches that may; walls are flat, so that vertices are enough.
 
     Walls hold down to a depth, and where another wall joins them as far beyond it: what is behind two is led back by
@@ -217,194 +232,196 @@ def find_wall_contacts(
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for item in range(patch_count * lanes):
+    for item in range(listed.count * lanes):
         m = item // lanes
-        reach = shift[m].norm() + (1.0 + turn[m].norm()) * patch_radius[m] + rest[m] + largest_half
-        for w in range(wall_count):
-            is_near = plane[w].xyz.dot(centre[m]) - plane[w].w < WITH_ROUNDING * reach
-            place = ti.select(is_near, first_vertex[m], first_vertex[m + 1])
+        reach = (
+            motion.shift[m].norm() + (1.0 + motion.turn[m].norm()) * motion.radius[m] + motion.rest[m] + largest_half
+        )
+        for w in range(walls.count):
+            is_near = walls.plane[w].xyz.dot(motion.centre[m]) - walls.plane[w].w < WITH_ROUNDING * reach
+            place = ti.select(is_near, listed.first[m], listed.first[m + 1])
             place += item % lanes
-            while place < first_vertex[m + 1]:
-                touch_wall(
-                    patch_vertices[place], w, position, displacement, thickness, vertex_friction, plane, low, high,
-                    joined_low, joined_high, spacing, recovery, vertices, weights, normal, floor, kind, arm, friction,
-                    counter, capacity,
-                )  # fmt: skip
+            while place < listed.first[m + 1]:
+                touch_wall(listed.nodes[place], w, surface, walls, spacing, recovery, contacts)
                 place += lanes
 
 
-@ti.func
+@func
 def touch_wall(
-    i: ti.i32, w: ti.i32, position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
-    plane: Planes, low: Vectors, high: Vectors, joined_low: Vectors, joined_high: Vectors,
-    spacing: ti.f32, recovery: ti.f32,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
-):  # fmt: skip
+    i: ti.i32, w: ti.i32, surface: Surface, walls: Walls, spacing: ti.f32, recovery: ti.f32, contacts: Contacts
+):
     """Append a vertex if it reaches a wall."""
-    x, half, n = position[i], 0.5 * thickness[i], plane[w].xyz
-    distance = n.dot(x) - plane[w].w
+    x, half, n = surface.position[i], 0.5 * surface.thickness[i], walls.plane[w].xyz
+    distance = n.dot(x) - walls.plane[w].w
     least = least_displacement(distance, half, recovery)
-    if distance < half or n.dot(displacement[i]) < least:
-        depth = ti.max(2.0 * WALL_DEPTH * half, spacing, displacement[i].norm())
-        is_above = (x >= low[w] - depth * joined_low[w]).all()
-        is_below = (x <= high[w] + depth * joined_high[w]).all()
-        slot = capacity
+    if distance < half or n.dot(surface.displacement[i]) < least:
+        depth = ti.max(2.0 * WALL_DEPTH * half, spacing, surface.displacement[i].norm())
+        is_above = (x >= walls.low[w] - depth * walls.joined_low[w]).all()
+        is_below = (x <= walls.high[w] + depth * walls.joined_high[w]).all()
+        slot = contacts.capacity
         if is_above and is_below and distance > -depth:
-            slot = ti.atomic_add(counter[0], 1)
-        if slot < capacity:
-            vertices[slot], weights[slot] = Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0)
-            normal[slot], floor[slot], kind[slot] = n, least, WALL
-            arm[slot], friction[slot] = ti.math.vec3(0.0), vertex_friction[i]
+            slot = ti.atomic_add(contacts.counter[0], 1)
+        if slot < contacts.capacity:
+            contacts.vertices[slot], contacts.weights[slot] = Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0)
+            contacts.normal[slot], contacts.floor[slot], contacts.kind[slot] = n, least, WALL
+            contacts.arm[slot], contacts.friction[slot] = ti.math.vec3(0.0), surface.friction[i]
 
 
-@ti.func
-def may_touch_bodies(
-    m: ti.i32, centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats,
-    largest_half: ti.f32, body_count: ti.i32, radius: Floats, body_position: Vectors, motion: Vectors,
-) -> ti.i32:  # fmt: skip
+@func
+def may_touch_bodies(m: ti.i32, patch: PatchMotion, largest_half: ti.f32, bodies: CollidingBodies) -> ti.i32:
     """Whether points of a patch may come as near to a body's sphere as `touch_bodies` asks for."""
     may = 0
-    for b in range(body_count):
-        r = centre[m] - body_position[b]
-        spin = motion[2 * b + 1]
-        relative = (shift[m] - motion[2 * b] - spin.cross(r)).norm()
-        relative += (turn[m].norm() + spin.norm()) * patch_radius[m] + rest[m]
-        reach = WITH_ROUNDING * (radius[b] + patch_radius[m] + largest_half + relative)
+    for b in range(bodies.count):
+        r = patch.centre[m] - bodies.position[b]
+        spin = bodies.motion[2 * b + 1]
+        relative = (patch.shift[m] - bodies.motion[2 * b] - spin.cross(r)).norm()
+        relative += (patch.turn[m].norm() + spin.norm()) * patch.radius[m] + patch.rest[m]
+        reach = WITH_ROUNDING * (bodies.radius[b] + patch.radius[m] + largest_half + relative)
         if r.norm_sqr() < reach * reach:
             may = 1
     return may
 
 
-@ti.func
+@func
 def touch_bodies(
-    x: ti.math.vec3, u: ti.math.vec3, half: ti.f32, own_friction: ti.f32, corners: Four, weight: ti.math.vec4,
-    only_edged: ti.template(), recovery: ti.f32,
-    body_count: ti.i32, shape_kind: Integers, size: Vectors, has_edges: Integers, centre_of_mass: Vectors,
-    radius: Floats, step: Floats, body_friction: Floats, grid_values: Floats, grid_first: Integers,
-    grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
-    body_position: Vectors, rotation: Matrices, motion: Vectors,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
-):  # fmt: skip
+    x: ti.math.vec3,
+    u: ti.math.vec3,
+    half: ti.f32,
+    own_friction: ti.f32,
+    corners: Four,
+    weight: ti.math.vec4,
+    only_edged: ti.template(),
+    recovery: ti.f32,
+    bodies: CollidingBodies,
+    contacts: Contacts,
+):
     """Append the bodies that a point of the cloth, at x with displacement u, comes nearer than half its thickness."""
-    for b in range(body_count):
-        r = x - body_position[b]
-        relative = u - motion[2 * b] - motion[2 * b + 1].cross(r)
-        reach = radius[b] + half + relative.norm()
-        looked_at = 1 if ti.static(not only_edged) else has_edges[b]
+    for b in range(bodies.count):
+        r = x - bodies.position[b]
+        relative = u - bodies.motion[2 * b] - bodies.motion[2 * b + 1].cross(r)
+        reach = bodies.radius[b] + half + relative.norm()
+        looked_at = 1 if ti.static(not only_edged) else bodies.has_edges[b]
         if looked_at == 1 and r.norm_sqr() < reach * reach:
-            turned = rotation[b]
-            y = turned.transpose() @ r + centre_of_mass[b]
-            distance = distance_at(
-                y, b, shape_kind, size, grid_values, grid_first, grid_origin, grid_spacing, grid_shape
-            )
+            turned = bodies.rotation[b]
+            y = turned.transpose() @ r + bodies.centre_of_mass[b]
+            distance = distance_to(y, b, bodies.shapes)
             if distance < half + relative.norm():
                 gradient = ti.math.vec3(0.0)
                 for axis in ti.static(range(3)):
                     ahead = ti.math.vec3(0.0)
-                    ahead[axis] = step[b]
-                    gradient[axis] = distance_at(
-                        y + ahead, b, shape_kind, size, grid_values, grid_first, grid_origin, grid_spacing, grid_shape
-                    ) - distance_at(
-                        y - ahead, b, shape_kind, size, grid_values, grid_first, grid_origin, grid_spacing, grid_shape
-                    )
+                    ahead[axis] = bodies.step[b]
+                    gradient[axis] = distance_to(y + ahead, b, bodies.shapes) - distance_to(y - ahead, b, bodies.shapes)
                 n = turned @ unit_or(gradient, y)
                 least = least_displacement(distance, half, recovery)
                 if distance < half or n.dot(relative) < least:
-                    slot = ti.atomic_add(counter[0], 1)
-                    if slot < capacity:
-                        vertices[slot], weights[slot], normal[slot], floor[slot] = corners, weight, n, least
-                        kind[slot], arm[slot] = b, r
-                        friction[slot] = ti.sqrt(own_friction * body_friction[b])
+                    slot = ti.atomic_add(contacts.counter[0], 1)
+                    if slot < contacts.capacity:
+                        contacts.vertices[slot], contacts.weights[slot], contacts.normal[slot], contacts.floor[slot] = (
+                            corners,
+                            weight,
+                            n,
+                            least,
+                        )
+                        contacts.kind[slot], contacts.arm[slot] = b, r
+                        contacts.friction[slot] = ti.sqrt(own_friction * bodies.friction[b])
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def find_body_contacts_of_vertices(
-    patch_count: ti.i32, lanes: ti.i32, workers: ti.i32, taken: Integers, first_vertex: Integers,
-    patch_vertices: Integers, centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats,
+    listed: PatchNodes,
+    lanes: ti.i32,
+    workers: ti.i32,
+    taken: Integers,
+    motion: PatchMotion,
     largest_half: ti.f32,
-    position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
-    body_count: ti.i32, shape_kind: Integers, size: Vectors, has_edges: Integers, centre_of_mass: Vectors,
-    radius: Floats, step: Floats, body_friction: Floats, grid_values: Floats, grid_first: Integers,
-    grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
-    body_position: Vectors, rotation: Matrices, motion: Vectors, recovery: ti.f32,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32, is_short: ti.template(),
-):  # fmt: skip
+    surface: Surface,
+    bodies: CollidingBodies,
+    recovery: ti.f32,
+    contacts: Contacts,
+    is_short: ti.template(),
+):
     """Append the contacts of vertices with bodies."""
     begin_sharing(taken, 0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while item < patch_count * lanes:
+        while item < listed.count * lanes:
             m = item // lanes
-            may_touch = may_touch_bodies(
-                m, centre, shift, turn, patch_radius, rest, largest_half, body_count, radius, body_position, motion
-            )
-            place = ti.select(may_touch == 1, first_vertex[m], first_vertex[m + 1]) + item % lanes
-            while place < first_vertex[m + 1]:
-                i = patch_vertices[place]
+            may_touch = may_touch_bodies(m, motion, largest_half, bodies)
+            place = ti.select(may_touch == 1, listed.first[m], listed.first[m + 1]) + item % lanes
+            while place < listed.first[m + 1]:
+                i = listed.nodes[place]
                 touch_bodies(
-                    position[i], displacement[i], 0.5 * thickness[i], vertex_friction[i],
-                    Four(i), ti.math.vec4(1.0, 0.0, 0.0, 0.0), False, recovery,
-                    body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-                    grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-                    vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-                )  # fmt: skip
+                    surface.position[i],
+                    surface.displacement[i],
+                    0.5 * surface.thickness[i],
+                    surface.friction[i],
+                    Four(i),
+                    ti.math.vec4(1.0, 0.0, 0.0, 0.0),
+                    False,
+                    recovery,
+                    bodies,
+                    contacts,
+                )
                 place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def find_body_contacts_between_vertices(
-    patch_count: ti.i32, lanes: ti.i32, workers: ti.i32, taken: Integers, first_edge: Integers,
-    edges: Pairs, first_triangle: Integers, triangles: Triples,
-    centre: Vectors, shift: Vectors, turn: Vectors, patch_radius: Floats, rest: Floats, largest_half: ti.f32,
-    position: Vectors, displacement: Vectors, thickness: Floats, vertex_friction: Floats,
-    body_count: ti.i32, shape_kind: Integers, size: Vectors, has_edges: Integers, centre_of_mass: Vectors,
-    radius: Floats, step: Floats, body_friction: Floats, grid_values: Floats, grid_first: Integers,
-    grid_origin: Vectors, grid_spacing: Floats, grid_shape: CountTriples,
-    body_position: Vectors, rotation: Matrices, motion: Vectors, recovery: ti.f32,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32, is_short: ti.template(),
-):  # fmt: skip
+    elements: PatchElements,
+    lanes: ti.i32,
+    workers: ti.i32,
+    taken: Integers,
+    motion: PatchMotion,
+    largest_half: ti.f32,
+    surface: Surface,
+    bodies: CollidingBodies,
+    recovery: ti.f32,
+    contacts: Contacts,
+    is_short: ti.template(),
+):
     """Append the contacts of midpoints of edges and triangles with bodies that have edges of their own."""
     begin_sharing(taken, 0)
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, PATCHES_AT_A_TIME)
-        while item < patch_count * lanes:
+        while item < elements.count * lanes:
             m = item // lanes
-            may_touch = may_touch_bodies(
-                m, centre, shift, turn, patch_radius, rest, largest_half, body_count, radius, body_position, motion
-            )
-            place = ti.select(may_touch == 1, first_edge[m], first_edge[m + 1]) + item % lanes
-            while place < first_edge[m + 1]:
-                a, b = edges[place][0], edges[place][1]
+            may_touch = may_touch_bodies(m, motion, largest_half, bodies)
+            place = ti.select(may_touch == 1, elements.first_edge[m], elements.first_edge[m + 1]) + item % lanes
+            while place < elements.first_edge[m + 1]:
+                a, b = elements.edges[place][0], elements.edges[place][1]
                 touch_bodies(
-                    0.5 * (position[a] + position[b]), 0.5 * (displacement[a] + displacement[b]), 0.5 * thickness[a],
-                    vertex_friction[a], Four(a, b, a, a), ti.math.vec4(0.5, 0.5, 0.0, 0.0), True, recovery,
-                    body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-                    grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-                    vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-                )  # fmt: skip
+                    0.5 * (surface.position[a] + surface.position[b]),
+                    0.5 * (surface.displacement[a] + surface.displacement[b]),
+                    0.5 * surface.thickness[a],
+                    surface.friction[a],
+                    Four(a, b, a, a),
+                    ti.math.vec4(0.5, 0.5, 0.0, 0.0),
+                    True,
+                    recovery,
+                    bodies,
+                    contacts,
+                )
                 place += lanes
-            place = ti.select(may_touch == 1, first_triangle[m], first_triangle[m + 1]) + item % lanes
-            while place < first_triangle[m + 1]:
-                a, b, c = triangles[place][0], triangles[place][1], triangles[place][2]
+            place = ti.select(may_touch == 1, elements.first_triangle[m], elements.first_triangle[m + 1]) + item % lanes
+            while place < elements.first_triangle[m + 1]:
+                a, b, c = elements.triangles[place][0], elements.triangles[place][1], elements.triangles[place][2]
                 third = 1.0 / 3.0
                 touch_bodies(
-                    third * (position[a] + position[b] + position[c]),
-                    third * (displacement[a] + displacement[b] + displacement[c]), 0.5 * thickness[a],
-                    vertex_friction[a], Four(a, b, c, a), ti.math.vec4(third, third, third, 0.0), True, recovery,
-                    body_count, shape_kind, size, has_edges, centre_of_mass, radius, step, body_friction, grid_values,
-                    grid_first, grid_origin, grid_spacing, grid_shape, body_position, rotation, motion,
-                    vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-                )  # fmt: skip
+                    third * (surface.position[a] + surface.position[b] + surface.position[c]),
+                    third * (surface.displacement[a] + surface.displacement[b] + surface.displacement[c]),
+                    0.5 * surface.thickness[a],
+                    surface.friction[a],
+                    Four(a, b, c, a),
+                    ti.math.vec4(third, third, third, 0.0),
+                    True,
+                    recovery,
+                    bodies,
+                    contacts,
+                )
                 place += lanes
             item = next_item(item, worker, taken, 0, PATCHES_AT_A_TIME)

@@ -8,11 +8,12 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.host_access import put, take
-from sim.rigid.contacts import Poses
-from sim.rigid.device_shapes import DeviceShapes
-from sim.rigid.geometry import BodyGeometry
-from sim.rigid.shape_distances import CAPSULE, SPHERE, TORUS
+from sim.cloth.bundles import CollidingBodies, PushedBodies
+from sim.core.host_access import put, take
+from sim.core.motion.poses import Poses
+from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.device_distances import CAPSULE, SPHERE, TORUS
+from sim.shapes.device_shapes import DeviceShapes
 
 Array = NDArray[np.float64]
 
@@ -63,6 +64,39 @@ class CollisionBodies(DeviceShapes):
         if self.count:
             self.set_friction(np.asarray(friction, dtype=np.float64))
             self.look_between_vertices(0.0)
+
+    @property
+    def colliding(self) -> CollidingBodies:
+        """The bodies for kernels that find contacts."""
+        return CollidingBodies(
+            count=self.count,
+            shapes=self.on_device,
+            has_edges=self.has_edges,
+            centre_of_mass=self.centre_of_mass,
+            radius=self.radius,
+            step=self.step,
+            friction=self.friction,
+            position=self.position,
+            rotation=self.rotation,
+            motion=self.motion,
+        )
+
+    @property
+    def pushed(self) -> PushedBodies:
+        """The bodies for kernels that push them."""
+        return PushedBodies(
+            may_move=int(self.may_move),
+            count=self.count,
+            motion=self.motion,
+            motion_start=self.motion_start,
+            motion_reached=self.motion_reached,
+            inverse_mass=self.inverse_mass,
+            inverse_inertia=self.inverse_inertia,
+            gathered=self.gathered,
+            impulse=self.impulse,
+            load=self.load,
+            load_unit=self.load_unit,
+        )
 
     def set_friction(self, friction: Array) -> None:
         """Say how rough the bodies are: Coulomb's coefficients [-], (b,)."""

@@ -2,15 +2,17 @@
 
 import taichi as ti
 
-from sim.arrays import Floats, Vectors
 from sim.cloth.air import slowed
+from sim.cloth.bundles import NodeMotion, Nodes, Rectangle, Wind
 from sim.cloth.loop_costs import NODE_IN_ROWS_NS
 from sim.cloth.parameters import ClothParameters
-from sim.cloth.row_blocks import LANES, Block, row_blocks, strips_of, two_blocks
+from sim.cloth.row_blocks import LANES, Block, rectangle_of, row_blocks, two_blocks
 from sim.cloth.sheet import Grid
 from sim.cloth.state import ClothState
-from sim.launch import fast_launch
-from sim.short_loops import is_short
+from sim.core.arrays import Floats, Vectors
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.core.scheduling import is_short
 
 LEAST_SQUARE = 1.0e-30
 """Smaller squares, of twice the area of a triangle [m^4] or a speed [m²/s²], have no direction."""
@@ -27,58 +29,70 @@ class RectangleAir:
     """
 
     def __init__(self, state: ClothState, grid: Grid, first_node: int, share: ti.Ndarray) -> None:
-        self._state, self._grid, self._first, self._share = state, grid, first_node, share
+        self._state, self._grid, self._share = state, grid, share
         self._blocks = row_blocks(grid.columns, grid.rows)
-        self._strips = strips_of(grid.columns)
-        self._drag = self._skin_drag = self._mass = 0.0
-        self._wind = ti.math.vec3(0.0)
+        self._rectangle = rectangle_of(grid, first_node)
+        self._wind = Wind(ti.math.vec3(0.0), 0.0, 0.0, 0.0)
         self._is_short = is_short(grid.columns * grid.rows, NODE_IN_ROWS_NS)
 
     def take_parameters(self, cloth: ClothParameters) -> None:
         """Drag and wind as they are now."""
-        self._drag = 0.5 * cloth.air_density * cloth.drag
-        self._skin_drag = 0.5 * cloth.air_density * cloth.skin_drag
-        self._mass = cloth.mass_per_area * 0.5 * self._grid.step_x * self._grid.step_y
-        self._wind = ti.math.vec3(*cloth.wind)
+        self._wind = Wind(
+            velocity=ti.math.vec3(*cloth.wind),
+            drag=0.5 * cloth.air_density * cloth.drag,
+            skin_drag=0.5 * cloth.air_density * cloth.skin_drag,
+            mass=cloth.mass_per_area * 0.5 * self._grid.step_x * self._grid.step_y,
+        )
 
     def predict(self, gravity: ti.math.vec3, dt: float) -> None:
         """Accelerate the nodes by gravity [m/s²] and air for dt [s]; displacements become where that leads."""
-        state, grid = self._state, self._grid
+        state = self._state
         predict_in_wind(
-            self._blocks, state.position, state.velocity, state.carry, state.inverse_mass, self._share, self._first,
-            grid.columns, grid.rows, self._strips, self._drag, self._skin_drag, self._mass, self._wind, gravity, dt,
-            state.displacement, self._is_short,
-        )  # fmt: skip
+            self._blocks,
+            state.nodes,
+            state.motion,
+            state.position,
+            self._share,
+            self._rectangle,
+            self._wind,
+            gravity,
+            dt,
+            self._is_short,
+        )
 
 
-@ti.func
-def force_on_triangle(
-    x_a, x_b, x_c, mean, free, wind, drag: ti.f32, skin_drag: ti.f32, mass: ti.f32, gravity, dt: ti.f32
-) -> ti.math.vec3:  # fmt: skip
+@func
+def force_on_triangle(x_a, x_b, x_c, mean, free, wind: Wind, gravity, dt: ti.f32) -> ti.math.vec3:
     """`blow_on_triangles` without branches, for air that is given; `mean` is the velocity of the nodes."""
     cross = (x_b - x_a).cross(x_c - x_a)
     squared = cross.dot(cross)
     inverse = 1.0 / ti.sqrt(ti.max(squared, LEAST_SQUARE))
     area = 0.5 * squared * inverse
     normal = inverse * cross
-    past = wind - mean - dt * free * gravity
+    past = wind.velocity - mean - dt * free * gravity
     s_n = past.dot(normal)
     along = past - s_n * normal
     s_t = ti.sqrt(ti.max(along.dot(along), LEAST_SQUARE))
-    mobility = free * area / mass
-    end_n = slowed(ti.abs(s_n), drag * mobility, dt)
-    end_t = slowed(s_t, skin_drag * mobility, dt)
-    push = ti.select(s_n < 0.0, -drag, drag) * end_n * end_n
-    return area * (push * normal + (skin_drag * end_t * end_t / s_t) * along)
+    mobility = free * area / wind.mass
+    end_n = slowed(ti.abs(s_n), wind.drag * mobility, dt)
+    end_t = slowed(s_t, wind.skin_drag * mobility, dt)
+    push = ti.select(s_n < 0.0, -wind.drag, wind.drag) * end_n * end_n
+    return area * (push * normal + (wind.skin_drag * end_t * end_t / s_t) * along)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def predict_in_wind(
-    blocks: ti.template(), position: Vectors, velocity: Vectors, carry: Vectors, inverse_mass: Floats, share: Floats,
-    first: ti.i32, columns: ti.i32, rows: ti.i32, strips: ti.i32, drag: ti.f32, skin_drag: ti.f32, mass: ti.f32,
-    wind: ti.math.vec3, gravity: ti.math.vec3, dt: ti.f32, displacement: Vectors, is_short: ti.template(),
-):  # fmt: skip
+    blocks: ti.template(),
+    nodes: Nodes,
+    motion: NodeMotion,
+    position: Vectors,
+    share: Floats,
+    grid: Rectangle,
+    wind: Wind,
+    gravity: ti.math.vec3,
+    dt: ti.f32,
+    is_short: ti.template(),
+):
     """Forces on both triangles of every cell, then what the nodes around them make of these.
 
     Cells whose two numbers add up to something even have the diagonal from their first node a to c, the others that
@@ -86,27 +100,27 @@ def predict_in_wind(
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for j in range(rows):
-        for k in range(strips):
-            q = j * strips + k
+    for j in range(grid.rows):
+        for k in range(grid.strips):
+            q = j * grid.strips + k
             x, y, z = Block(0.0), Block(0.0), Block(0.0)
             v_x, v_y, v_z = Block(0.0), Block(0.0), Block(0.0)
             shares, free = Block(0.0), Block(0.0)
-            for at in range(ti.min(LANES, columns - k * LANES)):
-                i = first + j * columns + k * LANES + at
+            for at in range(ti.min(LANES, grid.columns - k * LANES)):
+                i = grid.first + j * grid.columns + k * LANES + at
                 x[at], y[at], z[at] = position[i].x, position[i].y, position[i].z
-                v_x[at], v_y[at], v_z[at] = velocity[i].x, velocity[i].y, velocity[i].z
+                v_x[at], v_y[at], v_z[at] = motion.velocity[i].x, motion.velocity[i].y, motion.velocity[i].z
                 shares[at] = share[i]
-                free[at] = ti.select(inverse_mass[i] > 0.0, share[i], 0.0)
+                free[at] = ti.select(nodes.inverse_mass[i] > 0.0, share[i], 0.0)
             blocks.u_x[q], blocks.u_y[q], blocks.u_z[q] = x, y, z
             blocks.v_x[q], blocks.v_y[q], blocks.v_z[q] = v_x, v_y, v_z
             blocks.share[q], blocks.free_share[q] = shares, free
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for j in range(rows - 1):
-        for k in range(strips):
-            q = j * strips + k
-            p = q + strips
+    for j in range(grid.rows - 1):
+        for k in range(grid.strips):
+            q = j * grid.strips + k
+            p = q + grid.strips
             x_0, y_0, z_0 = (
                 two_blocks(blocks.u_x, q, q + 1),
                 two_blocks(blocks.u_y, q, q + 1),
@@ -131,7 +145,7 @@ def predict_in_wind(
             f_0, f_1 = two_blocks(blocks.free_share, q, q + 1), two_blocks(blocks.free_share, p, p + 1)
             lower_x, lower_y, lower_z = Block(0.0), Block(0.0), Block(0.0)
             upper_x, upper_y, upper_z = Block(0.0), Block(0.0), Block(0.0)
-            cells = columns - 1 - k * LANES
+            cells = grid.columns - 1 - k * LANES
             for at in range(LANES):
                 rises = (at + j) % 2 == 0
                 x_a, x_b = ti.math.vec3(x_0[at], y_0[at], z_0[at]), ti.math.vec3(x_0[at + 1], y_0[at + 1], z_0[at + 1])
@@ -143,13 +157,25 @@ def predict_in_wind(
                 lower_free = f_0[at] + f_0[at + 1] + ti.select(rises, f_1[at + 1], f_1[at])
                 upper_free = ti.select(rises, f_0[at], f_0[at + 1]) + f_1[at + 1] + f_1[at]
                 lower = force_on_triangle(
-                    x_a, x_b, ti.select(rises, x_c, x_d), v_a + v_b + ti.select(rises, v_c, v_d), lower_free, wind,
-                    drag, skin_drag, mass, gravity, dt,
-                )  # fmt: skip
+                    x_a,
+                    x_b,
+                    ti.select(rises, x_c, x_d),
+                    v_a + v_b + ti.select(rises, v_c, v_d),
+                    lower_free,
+                    wind,
+                    gravity,
+                    dt,
+                )
                 upper = force_on_triangle(
-                    ti.select(rises, x_a, x_b), x_c, x_d, ti.select(rises, v_a, v_b) + v_c + v_d, upper_free, wind,
-                    drag, skin_drag, mass, gravity, dt,
-                )  # fmt: skip
+                    ti.select(rises, x_a, x_b),
+                    x_c,
+                    x_d,
+                    ti.select(rises, v_a, v_b) + v_c + v_d,
+                    upper_free,
+                    wind,
+                    gravity,
+                    dt,
+                )
                 is_cell = at < cells
                 lower_x[at] = ti.select(is_cell, lower.x, 0.0)
                 lower_y[at] = ti.select(is_cell, lower.y, 0.0)
@@ -161,22 +187,22 @@ def predict_in_wind(
             blocks.upper_x[q], blocks.upper_y[q], blocks.upper_z[q] = upper_x, upper_y, upper_z
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for j in range(rows):
-        for k in range(strips):
-            q = j * strips + k
-            force_x = force_around(blocks.lower_x, blocks.upper_x, j, k, rows, strips)
-            force_y = force_around(blocks.lower_y, blocks.upper_y, j, k, rows, strips)
-            force_z = force_around(blocks.lower_z, blocks.upper_z, j, k, rows, strips)
-            for at in range(ti.min(LANES, columns - k * LANES)):
-                i = first + j * columns + k * LANES + at
-                w_i = inverse_mass[i]
+    for j in range(grid.rows):
+        for k in range(grid.strips):
+            q = j * grid.strips + k
+            force_x = force_around(blocks.lower_x, blocks.upper_x, j, k, grid.rows, grid.strips)
+            force_y = force_around(blocks.lower_y, blocks.upper_y, j, k, grid.rows, grid.strips)
+            force_z = force_around(blocks.lower_z, blocks.upper_z, j, k, grid.rows, grid.strips)
+            for at in range(ti.min(LANES, grid.columns - k * LANES)):
+                i = grid.first + j * grid.columns + k * LANES + at
+                w_i = nodes.inverse_mass[i]
                 if w_i > 0.0:
                     force = ti.math.vec3(force_x[at], force_y[at], force_z[at])
-                    v_i = velocity[i] + dt * gravity + dt * w_i * share[i] * force
-                    velocity[i] = v_i
-                    displacement[i] = carry[i] + dt * v_i
+                    v_i = motion.velocity[i] + dt * gravity + dt * w_i * share[i] * force
+                    motion.velocity[i] = v_i
+                    nodes.displacement[i] = motion.carry[i] + dt * v_i
                 else:
-                    displacement[i] = carry[i]
+                    nodes.displacement[i] = motion.carry[i]
 
 
 @ti.func

@@ -14,9 +14,9 @@ import functools
 
 import taichi as ti
 
-from sim.arrays import Floats, Vectors
-from sim.cloth.state import Lattice
-from sim.launch import fast_launch
+from sim.cloth.bundles import Nodes, Rectangle
+from sim.cloth.sheet import Grid
+from sim.core.launch import kernel
 
 LANES = 8
 """Numbers of a block: what a vector unit of 256 bits holds. Twice as many are not faster, and take thrice as long to
@@ -88,8 +88,13 @@ def row_blocks(columns: int, rows: int) -> RowBlocks:
 
 @functools.cache
 def _workspace(blocks: int) -> RowBlocks:
-    """Kept for good: Taichi is started once a process (`sim.runtime`), and its fields live as long."""
+    """Kept for good: Taichi is started once a process (`sim.core.runtime`), and its fields live as long."""
     return RowBlocks(blocks)
+
+
+def rectangle_of(grid: Grid, first_node: int) -> Rectangle:
+    """A rectangle for kernels."""
+    return Rectangle(first_node, grid.columns, grid.rows, strips_of(grid.columns), strips_of(grid.rows))
 
 
 def strips_of(lines: int) -> int:
@@ -144,48 +149,46 @@ def turn_displacements_back(blocks: ti.template(), strip, strips, turned_strips)
         turn_strip_back(values, blocks.turned, strip, strips, turned_strips)
 
 
-@fast_launch
-@ti.kernel
-def load_blocks(
-    blocks: ti.template(), lattice: Lattice, displacement: Vectors, inverse_mass: Floats, first: ti.i32,
-    columns: ti.i32, rows: ti.i32, strips: ti.i32, turned_strips: ti.i32, is_short: ti.template(),
-):  # fmt: skip
+@kernel
+def load_blocks(blocks: ti.template(), nodes: Nodes, grid: Rectangle, is_short: ti.template()):
     """Fill upright and turned blocks with a cloth whose first node is `first`."""
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for strip in range(turned_strips):
+    for strip in range(grid.turned_strips):
         for r in range(LANES):
             j = strip * LANES + r
-            for b in range(strips):
+            for b in range(grid.strips):
                 x, y, z, w = Block(0.0), Block(0.0), Block(0.0), Block(0.0)
                 l_x, l_y, l_z = IntegerBlock(0), IntegerBlock(0), IntegerBlock(0)
-                if j < rows:
-                    for lane in range(ti.min(LANES, columns - b * LANES)):
-                        i = first + j * columns + b * LANES + lane
-                        x[lane], y[lane], z[lane] = displacement[i].x, displacement[i].y, displacement[i].z
-                        l_x[lane], l_y[lane], l_z[lane] = lattice[i].x, lattice[i].y, lattice[i].z
-                        w[lane] = inverse_mass[i]
-                q = j * strips + b
+                if j < grid.rows:
+                    for lane in range(ti.min(LANES, grid.columns - b * LANES)):
+                        i = grid.first + j * grid.columns + b * LANES + lane
+                        x[lane], y[lane], z[lane] = (
+                            nodes.displacement[i].x,
+                            nodes.displacement[i].y,
+                            nodes.displacement[i].z,
+                        )
+                        l_x[lane], l_y[lane], l_z[lane] = nodes.lattice[i].x, nodes.lattice[i].y, nodes.lattice[i].z
+                        w[lane] = nodes.inverse_mass[i]
+                q = j * grid.strips + b
                 blocks.u_x[q], blocks.u_y[q], blocks.u_z[q] = x, y, z
                 blocks.predicted_x[q], blocks.predicted_y[q], blocks.predicted_z[q] = x, y, z
                 blocks.lattice_x[q], blocks.lattice_y[q], blocks.lattice_z[q] = l_x, l_y, l_z
                 blocks.inverse_mass[q] = w
         for values in ti.static((blocks.lattice_x, blocks.lattice_y, blocks.lattice_z, blocks.inverse_mass)):
-            turn_strip(values, blocks.turned, strip, strips, turned_strips)
+            turn_strip(values, blocks.turned, strip, grid.strips, grid.turned_strips)
 
 
-@fast_launch
-@ti.kernel
-def store_blocks(
-    blocks: ti.template(), first: ti.i32, columns: ti.i32, rows: ti.i32, strips: ti.i32, displacement: Vectors,
-    is_short: ti.template(),
-):  # fmt: skip
+@kernel
+def store_blocks(blocks: ti.template(), nodes: Nodes, grid: Rectangle, is_short: ti.template()):
     """Write the displacements of the upright blocks to the nodes of the cloth."""
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for j in range(rows):
-        for b in range(strips):
-            q = j * strips + b
+    for j in range(grid.rows):
+        for b in range(grid.strips):
+            q = j * grid.strips + b
             x, y, z = blocks.u_x[q], blocks.u_y[q], blocks.u_z[q]
-            for lane in range(ti.min(LANES, columns - b * LANES)):
-                displacement[first + j * columns + b * LANES + lane] = ti.math.vec3(x[lane], y[lane], z[lane])
+            for lane in range(ti.min(LANES, grid.columns - b * LANES)):
+                nodes.displacement[grid.first + j * grid.columns + b * LANES + lane] = ti.math.vec3(
+                    x[lane], y[lane], z[lane]
+                )

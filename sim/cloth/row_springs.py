@@ -2,49 +2,51 @@
 
 import taichi as ti
 
-from sim.arrays import Floats
+from sim.cloth.bundles import Lines, Rectangle
 from sim.cloth.device_springs import TINY_LENGTH
 from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, two_blocks
-from sim.launch import fast_launch
+from sim.core.arrays import Floats
+from sim.core.launch import kernel
 
 BEND_COLOURS = 3
 """Bend springs along a line that share no node: every third one."""
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def bend_lines(
-    blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32, stiffness: Floats,
-    quantum: ti.f32, dt_squared: ti.f32, gamma: ti.f32, is_short: ti.template(),
-):  # fmt: skip
+    blocks: ti.template(),
+    along: Lines,
+    stiffness: Floats,
+    quantum: ti.f32,
+    dt_squared: ti.f32,
+    gamma: ti.f32,
+    is_short: ti.template(),
+):
     """The bend springs of all lines along one direction, colour by colour; `solve_bend` has the formula.
 
     Args:
         blocks: workspace.
-        is_turned: whether lines run along x.
-        length: nodes of a line.
-        strips: blocks beside each other, LANES lines each.
-        other_strips: those of the other direction.
+        along: the lines.
         stiffness: of the springs of each line [N/m], (strips * LANES,).
         quantum: unit of the lattice [m].
         dt_squared: [s²].
         gamma: damping over stiffness and dt [-].
-        is_short: see `short_loops`.
+        is_short: see `sim.core.scheduling`.
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for strip in range(strips):
+    for strip in range(along.strips):
         first = 0
-        if is_turned:
+        if along.is_turned:
             first = blocks.turned
-            turn_displacements(blocks, strip, other_strips, strips)
+            turn_displacements(blocks, strip, along.other_strips, along.strips)
         strength = Block(0.0)
         for at in range(LANES):
             strength[at] = dt_squared * stiffness[strip * LANES + at]
         for colour in range(BEND_COLOURS):
-            for m in range((length - colour) // BEND_COLOURS):
-                a = first + (colour + BEND_COLOURS * m) * strips + strip
-                b, c = a + strips, a + 2 * strips
+            for m in range((along.length - colour) // BEND_COLOURS):
+                a = first + (colour + BEND_COLOURS * m) * along.strips + strip
+                b, c = a + along.strips, a + 2 * along.strips
                 a_x, a_y, a_z, w_a = blocks.u_x[a], blocks.u_y[a], blocks.u_z[a], blocks.inverse_mass[a]
                 b_x, b_y, b_z, w_b = blocks.u_x[b], blocks.u_y[b], blocks.u_z[b], blocks.inverse_mass[b]
                 c_x, c_y, c_z, w_c = blocks.u_x[c], blocks.u_y[c], blocks.u_z[c], blocks.inverse_mass[c]
@@ -75,8 +77,8 @@ def bend_lines(
                 blocks.u_x[a], blocks.u_y[a], blocks.u_z[a] = a_x, a_y, a_z
                 blocks.u_x[b], blocks.u_y[b], blocks.u_z[b] = b_x, b_y, b_z
                 blocks.u_x[c], blocks.u_y[c], blocks.u_z[c] = c_x, c_y, c_z
-        if is_turned:
-            turn_displacements_back(blocks, strip, other_strips, strips)
+        if along.is_turned:
+            turn_displacements_back(blocks, strip, along.other_strips, along.strips)
 
 
 @ti.func
@@ -91,12 +93,18 @@ def keep_two_blocks(values: ti.template(), block, pair, keeps_both):
         values[block + 1] = next_one
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def solve_diagonals(
-    blocks: ti.template(), parity: ti.i32, columns: ti.i32, rows: ti.i32, strips: ti.i32, stiffness: ti.f32,
-    rest: ti.f32, quantum: ti.f32, dt_squared: ti.f32, is_first: ti.i32, is_short: ti.template(),
-):  # fmt: skip
+    blocks: ti.template(),
+    parity: ti.i32,
+    grid: Rectangle,
+    stiffness: ti.f32,
+    rest: ti.f32,
+    quantum: ti.f32,
+    dt_squared: ti.f32,
+    is_first: ti.i32,
+    is_short: ti.template(),
+):
     """Both diagonals of all cells in every second row of cells, from row `parity` on; `solve_pairs` has the formula.
 
     In each row first those that lead from node i of the lower line to node i + 1 of the upper one, then the others:
@@ -104,12 +112,12 @@ def solve_diagonals(
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for pair in range((rows - parity) // 2):
-        lower = (2 * pair + parity) * strips
+    for pair in range((grid.rows - parity) // 2):
+        lower = (2 * pair + parity) * grid.strips
         strength = stiffness * dt_squared
         for way in range(2):
-            for k in range(strips):
-                a, b = lower + way * strips + k, lower + (1 - way) * strips + k
+            for k in range(grid.strips):
+                a, b = lower + way * grid.strips + k, lower + (1 - way) * grid.strips + k
                 m = way * blocks.turned + lower + k
                 a_x, a_y, a_z, w_a = blocks.u_x[a], blocks.u_y[a], blocks.u_z[a], blocks.inverse_mass[a]
                 p_x, p_y, p_z = blocks.lattice_x[a], blocks.lattice_y[a], blocks.lattice_z[a]
@@ -121,7 +129,7 @@ def solve_diagonals(
                 q_x, q_y = two_blocks(blocks.lattice_x, b, b + 1), two_blocks(blocks.lattice_y, b, b + 1)
                 q_z, w_b = two_blocks(blocks.lattice_z, b, b + 1), two_blocks(blocks.inverse_mass, b, b + 1)
                 multiplier = blocks.diagonal_multiplier[m]
-                cells = columns - 1 - k * LANES
+                cells = grid.columns - 1 - k * LANES
                 for at in range(LANES):
                     d_x = quantum * ti.cast(p_x[at] - q_x[at + 1], ti.f32) + (a_x[at] - b_x[at + 1])
                     d_y = quantum * ti.cast(p_y[at] - q_y[at + 1], ti.f32) + (a_y[at] - b_y[at + 1])
@@ -139,6 +147,6 @@ def solve_diagonals(
                     b_z[at + 1] -= w_b[at + 1] * f * d_z
                 blocks.diagonal_multiplier[m] = multiplier
                 blocks.u_x[a], blocks.u_y[a], blocks.u_z[a] = a_x, a_y, a_z
-                keep_two_blocks(blocks.u_x, b, b_x, k + 1 < strips)
-                keep_two_blocks(blocks.u_y, b, b_y, k + 1 < strips)
-                keep_two_blocks(blocks.u_z, b, b_z, k + 1 < strips)
+                keep_two_blocks(blocks.u_x, b, b_x, k + 1 < grid.strips)
+                keep_two_blocks(blocks.u_y, b, b_y, k + 1 < grid.strips)
+                keep_two_blocks(blocks.u_z, b, b_z, k + 1 < grid.strips)

@@ -2,12 +2,13 @@
 
 import taichi as ti
 
-from sim.arrays import Floats
+from sim.cloth.bundles import Lines
 from sim.cloth.device_springs import TINY_LENGTH
 from sim.cloth.row_blocks import LANES, Block, turn_displacements, turn_displacements_back, turn_strip
 from sim.cloth.springs import SEGMENT_LENGTH
 from sim.cloth.threads import TURNED_EXPLICITLY
-from sim.launch import fast_launch
+from sim.core.arrays import Floats
+from sim.core.launch import kernel
 
 LEAST_WEIGHT = 1.0e-20
 """Inverse masses [1/kg] of two nodes that both are held are taken for this, in divisions."""
@@ -19,44 +20,55 @@ def piece_count(length):
     return (length - 1 + SEGMENT_LENGTH - 1) // SEGMENT_LENGTH
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def solve_lines(
-    blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32, stiffness: Floats,
-    rest: ti.f32, quantum: ti.f32, dt_squared: ti.f32, is_first: ti.i32, is_short: ti.template(),
-):  # fmt: skip
+    blocks: ti.template(),
+    along: Lines,
+    stiffness: Floats,
+    rest: ti.f32,
+    quantum: ti.f32,
+    dt_squared: ti.f32,
+    is_first: ti.i32,
+    is_short: ti.template(),
+):
     """The threads along one direction, piece by piece, even pieces first; arguments as of `bend_lines`.
 
     `rest` is the length of a spring [m]; multipliers start at 0 if `is_first`.
     """
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for strip in range(strips):
+    for strip in range(along.strips):
         first = 0
-        if is_turned:
+        if along.is_turned:
             first = blocks.turned
-            turn_displacements(blocks, strip, other_strips, strips)
+            turn_displacements(blocks, strip, along.other_strips, along.strips)
         compliance = Block(0.0)
         for at in range(LANES):
             compliance[at] = 1.0 / (dt_squared * stiffness[strip * LANES + at])
-        pieces = piece_count(length)
+        pieces = piece_count(along.length)
         for parity in range(2):
             for half in range((pieces + 1 - parity) // 2):
                 piece = 2 * half + parity
                 start = piece * SEGMENT_LENGTH
-                stop = ti.min(start + SEGMENT_LENGTH, length - 1)
+                stop = ti.min(start + SEGMENT_LENGTH, along.length - 1)
                 solve_pieces(
-                    blocks, first + strip, strips, start, stop, compliance, rest, quantum, is_first,
+                    blocks,
+                    first + strip,
+                    along.strips,
+                    start,
+                    stop,
+                    compliance,
+                    rest,
+                    quantum,
+                    is_first,
                     first + strip * pieces + piece,
-                )  # fmt: skip
-        if is_turned:
-            turn_displacements_back(blocks, strip, other_strips, strips)
+                )
+        if along.is_turned:
+            turn_displacements_back(blocks, strip, along.other_strips, along.strips)
 
 
 @ti.func
-def solve_pieces(
-    blocks: ti.template(), line, strips, start, stop, compliance, rest, quantum, is_first, number
-):  # fmt: skip
+def solve_pieces(blocks: ti.template(), line, strips, start, stop, compliance, rest, quantum, is_first, number):
     """One piece of LANES threads exactly: the Thomas algorithm forth, then back, where nodes move."""
     n_x, n_y, n_z = Block(0.0), Block(0.0), Block(0.0)
     inverse_pivot, solved = Block(0.0), Block(0.0)
@@ -129,37 +141,33 @@ def solve_pieces(
     blocks.is_taut[number] = ti.cast(largest.max() > 0.0, ti.i32)
 
 
-@fast_launch
-@ti.kernel
-def straighten_lines(
-    blocks: ti.template(), is_turned: ti.i32, length: ti.i32, strips: ti.i32, other_strips: ti.i32,
-    is_short: ti.template(),
-):  # fmt: skip
+@kernel
+def straighten_lines(blocks: ti.template(), along: Lines, is_short: ti.template()):
     """Let tension turn with the threads along one direction, where any piece of a strip has too much of it."""
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for strip in range(strips):
+    for strip in range(along.strips):
         first = 0
-        if is_turned:
+        if along.is_turned:
             first = blocks.turned
-        pieces = piece_count(length)
+        pieces = piece_count(along.length)
         taut = 0
         for piece in range(pieces):
             taut += blocks.is_taut[first + strip * pieces + piece]
         if taut > 0:
-            if is_turned:
-                turn_displacements(blocks, strip, other_strips, strips)
+            if along.is_turned:
+                turn_displacements(blocks, strip, along.other_strips, along.strips)
                 for values in ti.static((blocks.predicted_x, blocks.predicted_y, blocks.predicted_z)):
-                    turn_strip(values, blocks.turned, strip, other_strips, strips)
+                    turn_strip(values, blocks.turned, strip, along.other_strips, along.strips)
             for parity in range(2):
                 for half in range((pieces + 1 - parity) // 2):
                     piece = 2 * half + parity
                     start = piece * SEGMENT_LENGTH
-                    stop = ti.min(start + SEGMENT_LENGTH, length - 1)
+                    stop = ti.min(start + SEGMENT_LENGTH, along.length - 1)
                     if blocks.is_taut[first + strip * pieces + piece]:
-                        straighten_pieces(blocks, first + strip, strips, start, stop)
-            if is_turned:
-                turn_displacements_back(blocks, strip, other_strips, strips)
+                        straighten_pieces(blocks, first + strip, along.strips, start, stop)
+            if along.is_turned:
+                turn_displacements_back(blocks, strip, along.other_strips, along.strips)
 
 
 @ti.func

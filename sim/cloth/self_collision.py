@@ -7,21 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
+from sim.cloth.bundles import PatchMotion, Searches
 from sim.cloth.element_blocks import ElementBlocks
 from sim.cloth.loop_costs import NODE_NS
 from sim.cloth.patch_pairs import PairList, PatchPairs
 from sim.cloth.patches import Patches
 from sim.cloth.proximity_contacts import ContactList
-from sim.cloth.self_collision_kernels import (
-    find_near_pairs,
-    make_room,
-    range_of_vectors,
-    search_patches,
-)
-from sim.host_access import copied
-from sim.reductions import LaneReduction
-from sim.short_loops import is_short
-from sim.work_sharing import workers_for
+from sim.cloth.self_collision_kernels import find_near_pairs, make_room, range_of_vectors, search_patches
+from sim.core.host_access import copied
+from sim.core.reductions import LaneReduction
+from sim.core.scheduling import is_short, workers_for
 
 if TYPE_CHECKING:
     from sim.cloth.state import ClothState
@@ -149,16 +144,24 @@ class SelfCollision:
         if met.due_count:
             count, lanes = met.due_count, self.with_triangles.lanes
             find_near_pairs(
-                count, lanes, workers_for(2 * count * lanes), self.with_triangles.taken, met.due,
-                *self.with_triangles.arrays, *self.of_edges.arrays, met.slack, met.left, met.approach, met.allowed,
-                state.position, state.displacement, self._rest, state.body, state.thickness, state.friction, recovery,
-                *contacts.found_arrays,
-            )  # fmt: skip
+                count,
+                lanes,
+                workers_for(2 * count * lanes),
+                self.with_triangles.taken,
+                met.on_device,
+                self.with_triangles.on_device,
+                self.of_edges.on_device,
+                state.surface,
+                state.body,
+                self._rest,
+                recovery,
+                contacts.found,
+            )
 
     @property
-    def motion_arrays(self) -> tuple[ti.Ndarray, ...]:
-        """See `PatchPairs`."""
-        return self._met.motion_arrays
+    def motion(self) -> PatchMotion:
+        """Of the patches in the substep."""
+        return self._met.bounds.motion
 
     @property
     def patches(self) -> Patches:
@@ -177,7 +180,7 @@ class SelfCollision:
         self._blocks.enclose(state, met.expired, count, self.with_triangles.pieces, self.of_edges.pieces, met.needed)
         self._list(state, count, met.expired, count, met.expired)
         short, end, short_edges, end_of_edges = make_room(
-            count, met.expired, *self.with_triangles.room_arrays, *self.of_edges.room_arrays
+            count, met.expired, self.with_triangles.room, self.of_edges.room
         )
         self.with_triangles.reach_to(int(end))
         self.of_edges.reach_to(int(end_of_edges))
@@ -189,12 +192,21 @@ class SelfCollision:
     ) -> None:
         """List the elements of some pairs of patches in empty pieces, vertices and edges; all other pieces stay."""
         met, patches, lanes = self._met, self._patches, self.with_triangles.lanes
+        searches = Searches(count, searched, edge_count, edge_searched, lanes)
         search_patches(
-            count, searched, edge_count, edge_searched, lanes, workers_for((count + edge_count) * lanes),
-            self.with_triangles.taken, met.pairs, met.low, met.high, met.reach, state.position, patches.first_vertex,
-            patches.vertices, *self._blocks.triangles, *self._blocks.edges, met.slack, *self.with_triangles.arrays,
-            *self.of_edges.arrays,
-        )  # fmt: skip
+            searches,
+            workers_for((count + edge_count) * lanes),
+            self.with_triangles.taken,
+            met.on_device,
+            met.bounds.low,
+            met.bounds.high,
+            state.position,
+            patches.vertex_lists,
+            self._blocks.triangles,
+            self._blocks.edges,
+            self.with_triangles.on_device,
+            self.of_edges.on_device,
+        )
 
 
 def half_range(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple[float, float]:
@@ -207,11 +219,7 @@ def half_range(vectors: ti.Ndarray, count: int, ends_of: LaneReduction) -> tuple
         count: at least 1.
         ends_of: of six maxima.
     """
-    lanes = ends_of.lanes
-    numbers = range_of_vectors(
-        vectors, count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), *ends_of.tree,
-        is_short(count, NODE_NS),
-    )  # fmt: skip
+    numbers = range_of_vectors(vectors, count, ends_of.over(count), is_short(count, NODE_NS))
     ends = ends_of.unpack(numbers).astype(np.float64)
     half = 0.5 * np.linalg.norm(ends[:3] + ends[3:])
     return float(half), float(np.linalg.norm(np.maximum(np.abs(ends[:3]), np.abs(ends[3:]))))

@@ -2,23 +2,27 @@
 
 import taichi as ti
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.proximity import (
-    closest_on_edges,
-    closest_on_triangle,
-    distance_of_edges,
-    distance_to_triangle,
-    unit_or,
+from sim.cloth.bundles import (
+    Contacts,
+    EdgeBlocks,
+    Four,
+    PairPieces,
+    PatchNodes,
+    PatchPairArrays,
+    PieceRoom,
+    Quadruples,
+    Searches,
+    Surface,
+    TriangleBlocks,
+    Two,
 )
-from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, Quadruples, Weights, least_displacement
-from sim.launch import fast_launch
-from sim.reductions import Results, reduced, runs_on_gpu
-from sim.work_sharing import begin_sharing, next_item
-
-Pairs = ti.types.ndarray(dtype=ti.types.vector(2, ti.i32), ndim=1)
-Triples = ti.types.ndarray(dtype=ti.types.vector(3, ti.i32), ndim=1)
-Two = ti.types.vector(2, ti.i32)
-Four = ti.types.vector(4, ti.i32)
+from sim.cloth.proximity import closest_on_edges, closest_on_triangle, distance_of_edges, distance_to_triangle, unit_or
+from sim.cloth.proximity_contacts import EDGE_EDGE, INACTIVE, VERTEX_TRIANGLE, least_displacement
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.core.reductions import Results, Share, reduced, runs_on_gpu
+from sim.core.scheduling import begin_sharing, next_item
 
 OF_REST_DISTANCE = 0.7
 """Elements that are nearer than their thickness when the cloth is flat keep this part of their distance there."""
@@ -64,10 +68,10 @@ def share_no_vertex(e: Two, f: Two) -> ti.i32:
     return ti.cast(nearest > 0, ti.i32)
 
 
-@ti.func
-def pair_thickness(a: ti.i32, b: ti.i32, cloth: Integers, thickness: Floats, at_rest: ti.f32) -> ti.f32:
+@func
+def pair_thickness(a: ti.i32, b: ti.i32, cloth: Integers, surface: Surface, at_rest: ti.f32) -> ti.f32:
     """Distance that two elements keep [m]: between different cloths, or within one, where it is shorter at rest."""
-    wanted = 0.5 * (thickness[a] + thickness[b])
+    wanted = 0.5 * (surface.thickness[a] + surface.thickness[b])
     return ti.select(cloth[a] == cloth[b], ti.min(wanted, OF_REST_DISTANCE * at_rest), wanted)
 
 
@@ -77,129 +81,156 @@ def lowest_bit(bits: ti.i32) -> ti.i32:
     return (ti.bit_cast(ti.cast(bits & -bits, ti.f32), ti.i32) >> 23) - 127
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def search_patches(
-    count: ti.i32, searched: Integers, edge_count: ti.i32, edge_searched: Integers, lanes: ti.i32, workers: ti.i32,
-    taken: Integers, patches: Pairs, low: Vectors, high: Vectors, reach: Floats, position: Vectors,
-    first_vertex: Integers, vertices: Integers, first_triangle: Integers, triangles: Triples,
-    low_x: Floats, low_y: Floats, low_z: Floats, high_x: Floats, high_y: Floats, high_z: Floats,
-    first_edge: Integers, edges: Pairs,
-    mid_x: Floats, mid_y: Floats, mid_z: Floats, half_x: Floats, half_y: Floats, half_z: Floats, slack: Floats,
-    pieces: Quadruples, piece_due: Floats, pairs: Quadruples, wanted: Floats, due: Floats,
-    edge_pieces: Quadruples, edge_piece_due: Floats, edge_pairs: Quadruples, edge_wanted: Floats, edge_due: Floats,
-):  # fmt: skip
+    searches: Searches,
+    workers: ti.i32,
+    taken: Integers,
+    met: PatchPairArrays,
+    low: Vectors,
+    high: Vectors,
+    position: Vectors,
+    vertices: PatchNodes,
+    blocks: TriangleBlocks,
+    edge_blocks: EdgeBlocks,
+    found: PairPieces,
+    found_edges: PairPieces,
+):
     """List the vertices of each of two patches with the triangles of the other within `reach` [m] of them, and the
     edges of both within that of each other.
 
     Args:
-        count: number of pairs of patches whose vertices are searched; their numbers are `searched`; `edge_count` and
-            `edge_searched` likewise for edges.
-        lanes: threads that share a pair.
-        workers, taken: see `sim.work_sharing`.
-        first_triangle to high_z: see `ElementBlocks.triangles`; `first_edge` to `half_z` `ElementBlocks.edges`.
-        slack: how much nearer pairs may come that are not listed [m].
-        pieces to due: of vertices with triangles, see `PairList`; `edge_pieces` to `edge_due` of edges.
+        searches: which pairs of patches.
+        workers, taken: see `sim.core.scheduling`.
+        met: all pairs of patches.
+        low, high: boxes of the patches [m].
+        position: of all nodes [m].
+        vertices, blocks, edge_blocks: elements of the patches.
+        found, found_edges: lists of vertices with triangles, and of edges.
     """
     begin_sharing(taken, 0)
     for worker in range(workers):
         item = next_item(-1, worker, taken, 0, SEARCHED_AT_A_TIME)
-        while item < (count + edge_count) * lanes:
-            if item < count * lanes:
+        while item < (searches.count + searches.edge_count) * searches.lanes:
+            if item < searches.count * searches.lanes:
                 pair_vertices_with_triangles(
-                    searched[item // lanes], item % lanes, lanes, patches, low, high, reach, position, first_vertex,
-                    vertices, first_triangle, triangles, low_x, low_y, low_z, high_x, high_y, high_z, slack, pieces,
-                    piece_due, pairs, wanted, due,
-                )  # fmt: skip
+                    searches.numbers[item // searches.lanes],
+                    item % searches.lanes,
+                    searches.lanes,
+                    met,
+                    low,
+                    high,
+                    position,
+                    vertices,
+                    blocks,
+                    found,
+                )
             else:
                 pair_edges(
-                    edge_searched[item // lanes - count], item % lanes, lanes, patches, low, high, reach, first_edge,
-                    edges, mid_x, mid_y, mid_z, half_x, half_y, half_z, slack, edge_pieces, edge_piece_due, edge_pairs,
-                    edge_wanted, edge_due,
-                )  # fmt: skip
+                    searches.edge_numbers[item // searches.lanes - searches.count],
+                    item % searches.lanes,
+                    searches.lanes,
+                    met,
+                    low,
+                    high,
+                    edge_blocks,
+                    found_edges,
+                )
             item = next_item(item, worker, taken, 0, SEARCHED_AT_A_TIME)
 
 
-@ti.func
+@func
 def pair_vertices_with_triangles(
-    p: ti.i32, lane: ti.i32, lanes: ti.i32, patches: Pairs, low: Vectors, high: Vectors, reach: Floats,
-    position: Vectors, first_vertex: Integers, vertices: Integers, first_block: Integers, triangles: Triples,
-    low_x: Floats, low_y: Floats, low_z: Floats, high_x: Floats, high_y: Floats, high_z: Floats,
-    slack: Floats, pieces: Quadruples, piece_due: Floats, pairs: Quadruples, wanted: Floats, due: Floats,
-):  # fmt: skip
+    p: ti.i32,
+    lane: ti.i32,
+    lanes: ti.i32,
+    met: PatchPairArrays,
+    low: Vectors,
+    high: Vectors,
+    position: Vectors,
+    vertices: PatchNodes,
+    blocks: TriangleBlocks,
+    found: PairPieces,
+):
     """List the vertices of each of two patches that are near triangles of the other, as one of several threads."""
     soonest = NEVER
     for side in range(2):
-        m, other = patches[p][side], patches[p][1 - side]
-        place = first_vertex[m] + lane
-        least, most = low[other] - reach[p], high[other] + reach[p]
+        m, other = met.pairs[p][side], met.pairs[p][1 - side]
+        place = vertices.first[m] + lane
+        least, most = low[other] - met.reach[p], high[other] + met.reach[p]
         if side == 1 and m == other:
-            place = first_vertex[m + 1]
-        while place < first_vertex[m + 1]:
-            v = vertices[place]
+            place = vertices.first[m + 1]
+        while place < vertices.first[m + 1]:
+            v = vertices.nodes[place]
             place += lanes
             x = position[v]
             if (x >= least).all() and (x <= most).all():
-                below, above = x - reach[p], x + reach[p]
-                for block in range(first_block[other], first_block[other + 1]):
+                below, above = x - met.reach[p], x + met.reach[p]
+                for block in range(blocks.first_block[other], blocks.first_block[other + 1]):
                     near = 0
                     for k in range(BLOCK):
                         t = block * BLOCK + k
-                        is_beside = low_x[t] < above[0] and high_x[t] > below[0]
-                        is_beside = is_beside and low_y[t] < above[1] and high_y[t] > below[1]
-                        is_beside = is_beside and low_z[t] < above[2] and high_z[t] > below[2]
+                        is_beside = blocks.low_x[t] < above[0] and blocks.high_x[t] > below[0]
+                        is_beside = is_beside and blocks.low_y[t] < above[1] and blocks.high_y[t] > below[1]
+                        is_beside = is_beside and blocks.low_z[t] < above[2] and blocks.high_z[t] > below[2]
                         near |= ti.cast(is_beside, ti.i32) << k
                     while near != 0:
                         t = block * BLOCK + lowest_bit(near)
                         near &= near - 1
-                        corners = triangles[t]
+                        corners = blocks.triangles[t]
                         own = ti.cast(v == corners[0] or v == corners[1] or v == corners[2], ti.i32)
                         if own == 0:
                             a, b = position[corners[0]] - x, position[corners[1]] - x
                             c = position[corners[2]] - x
                             apart = distance_to_triangle(ti.math.vec3(0.0), a, b, c)
-                            if apart < reach[p]:
-                                slot = ti.atomic_add(pieces[p][2], 1)
-                                if slot < pieces[p][1]:
-                                    there = pieces[p][0] + slot
-                                    pairs[there] = Four(v, corners[0], corners[1], corners[2])
-                                    wanted[there], due[there] = UNKNOWN, slack[p] - apart
-                                    soonest = ti.max(soonest, slack[p] - apart)
-    ti.atomic_max(piece_due[p], soonest)
+                            if apart < met.reach[p]:
+                                slot = ti.atomic_add(found.pieces[p][2], 1)
+                                if slot < found.pieces[p][1]:
+                                    there = found.pieces[p][0] + slot
+                                    found.pairs[there] = Four(v, corners[0], corners[1], corners[2])
+                                    found.wanted[there], found.due[there] = UNKNOWN, met.slack[p] - apart
+                                    soonest = ti.max(soonest, met.slack[p] - apart)
+    ti.atomic_max(found.piece_due[p], soonest)
 
 
-@ti.func
+@func
 def pair_edges(
-    p: ti.i32, lane: ti.i32, lanes: ti.i32, patches: Pairs, low: Vectors, high: Vectors, reach: Floats,
-    first_block: Integers, edges: Pairs,
-    mid_x: Floats, mid_y: Floats, mid_z: Floats, half_x: Floats, half_y: Floats, half_z: Floats,
-    slack: Floats, pieces: Quadruples, piece_due: Floats, pairs: Quadruples, wanted: Floats, due: Floats,
-):  # fmt: skip
+    p: ti.i32,
+    lane: ti.i32,
+    lanes: ti.i32,
+    met: PatchPairArrays,
+    low: Vectors,
+    high: Vectors,
+    blocks: EdgeBlocks,
+    found: PairPieces,
+):
     """List the edges of two patches that are near each other and share no vertex, as one of several threads.
 
     Edges are first told apart by their shadows on the line through their midpoints, which are disjoint for most
     neighbours in flat cloth; spheres around them do not.
     """
     soonest = NEVER
-    m, other = patches[p][0], patches[p][1]
-    within = reach[p] * reach[p]
-    least, most = low[other] - reach[p], high[other] + reach[p]
-    place = first_block[m] * BLOCK + lane
-    while place < first_block[m + 1] * BLOCK:
-        e, own = edges[place], place
-        x, y, z = mid_x[place], mid_y[place], mid_z[place]
-        g, h, i = half_x[place], half_y[place], half_z[place]
+    m, other = met.pairs[p][0], met.pairs[p][1]
+    within = met.reach[p] * met.reach[p]
+    least, most = low[other] - met.reach[p], high[other] + met.reach[p]
+    place = blocks.first_block[m] * BLOCK + lane
+    while place < blocks.first_block[m + 1] * BLOCK:
+        e, own = blocks.edges[place], place
+        x, y, z = blocks.mid_x[place], blocks.mid_y[place], blocks.mid_z[place]
+        g, h, i = blocks.half_x[place], blocks.half_y[place], blocks.half_z[place]
         place += lanes
         middle, half = ti.math.vec3(x, y, z), ti.math.vec3(g, h, i)
         if (middle + ti.abs(half) >= least).all() and (middle - ti.abs(half) <= most).all():
-            for block in range(ti.select(m == other, own // BLOCK, first_block[other]), first_block[other + 1]):
+            for block in range(
+                ti.select(m == other, own // BLOCK, blocks.first_block[other]), blocks.first_block[other + 1]
+            ):
                 near = 0
                 for k in range(BLOCK):
                     f = block * BLOCK + k
-                    dx, dy, dz = mid_x[f] - x, mid_y[f] - y, mid_z[f] - z
+                    dx, dy, dz = blocks.mid_x[f] - x, blocks.mid_y[f] - y, blocks.mid_z[f] - z
                     squared = dx * dx + dy * dy + dz * dz
                     shadows = ti.abs(g * dx + h * dy + i * dz)
-                    shadows += ti.abs(half_x[f] * dx + half_y[f] * dy + half_z[f] * dz)
+                    shadows += ti.abs(blocks.half_x[f] * dx + blocks.half_y[f] * dy + blocks.half_z[f] * dz)
                     beyond = ti.max(squared - shadows, 0.0)
                     near |= ti.select(beyond * beyond <= within * squared, 1, 0) << k
                 if m == other and block == own // BLOCK:
@@ -208,63 +239,61 @@ def pair_edges(
                 while near != 0:
                     there = block * BLOCK + lowest_bit(near)
                     near &= near - 1
-                    f = edges[there]
+                    f = blocks.edges[there]
                     if share_no_vertex(e, f) == 1:
-                        between = ti.math.vec3(mid_x[there], mid_y[there], mid_z[there]) - middle
-                        far_half = ti.math.vec3(half_x[there], half_y[there], half_z[there])
+                        between = ti.math.vec3(blocks.mid_x[there], blocks.mid_y[there], blocks.mid_z[there]) - middle
+                        far_half = ti.math.vec3(blocks.half_x[there], blocks.half_y[there], blocks.half_z[there])
                         apart = distance_of_edges(-half, half, between - far_half, between + far_half)
-                        if apart < reach[p]:
-                            slot = ti.atomic_add(pieces[p][2], 1)
-                            if slot < pieces[p][1]:
-                                place_of_pair = pieces[p][0] + slot
+                        if apart < met.reach[p]:
+                            slot = ti.atomic_add(found.pieces[p][2], 1)
+                            if slot < found.pieces[p][1]:
+                                place_of_pair = found.pieces[p][0] + slot
                                 # In this order, so that rounding does not depend on that of the patches.
-                                pairs[place_of_pair] = ti.select(
+                                found.pairs[place_of_pair] = ti.select(
                                     f[0] < e[0], Four(f[0], f[1], e[0], e[1]), Four(e[0], e[1], f[0], f[1])
                                 )
-                                wanted[place_of_pair], due[place_of_pair] = UNKNOWN, slack[p] - apart
-                                soonest = ti.max(soonest, slack[p] - apart)
-    ti.atomic_max(piece_due[p], soonest)
+                                found.wanted[place_of_pair], found.due[place_of_pair] = UNKNOWN, met.slack[p] - apart
+                                soonest = ti.max(soonest, met.slack[p] - apart)
+    ti.atomic_max(found.piece_due[p], soonest)
 
 
-@fast_launch
-@ti.kernel
-def make_room(
-    count: ti.i32, searched: Integers, pieces: Quadruples, end: Integers, again: Integers,
-    edge_pieces: Quadruples, edge_end: Integers, edge_again: Integers,
-) -> ti.math.ivec4:  # fmt: skip
+@kernel
+def make_room(count: ti.i32, searched: Integers, room: PieceRoom, edge_room: PieceRoom) -> ti.math.ivec4:
     """After a search: pieces that were too short move to the end, empty.
 
     Returns how many of these there are, and where the end is now, of both lists. Their numbers are `again`; `end` has
     the end, then how many there are.
     """
     searched_end = count
-    end[1], edge_end[1] = 0, 0
+    room.end[1], edge_room.end[1] = 0, 0
     if ti.static(not runs_on_gpu()):
         ti.loop_config(serialize=True)
     for k in range(searched_end):
-        lengthen(searched[k], pieces, end, again)
-        lengthen(searched[k], edge_pieces, edge_end, edge_again)
-    return ti.math.ivec4(end[1], end[0], edge_end[1], edge_end[0])
+        lengthen(searched[k], room)
+        lengthen(searched[k], edge_room)
+    return ti.math.ivec4(room.end[1], room.end[0], edge_room.end[1], edge_room.end[0])
 
 
-@ti.func
-def lengthen(p: ti.i32, pieces: Quadruples, end: Integers, again: Integers):
+@func
+def lengthen(p: ti.i32, room: PieceRoom):
     """Move a piece to the end if more was found than it has room for."""
-    found = pieces[p][2]
-    if found > pieces[p][1]:
-        room = found + found // 2
-        pieces[p] = Four(ti.atomic_add(end[0], room), room, 0, 0)
-        again[ti.atomic_add(end[1], 1)] = p
+    found = room.pieces[p][2]
+    if found > room.pieces[p][1]:
+        places = found + found // 2
+        room.pieces[p] = Four(ti.atomic_add(room.end[0], places), places, 0, 0)
+        room.again[ti.atomic_add(room.end[1], 1)] = p
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def carry_pieces(
-    count: ti.i32, workers: ti.i32, taken: Integers, carried: Integers, pieces_before: Quadruples,
-    piece_due_before: Floats, before: Quadruples, wanted_before: Floats, due_before: Floats, pieces: Quadruples,
-    piece_due: Floats, pairs: Quadruples,
-    wanted: Floats, due: Floats, end: Integers,
-) -> ti.i32:  # fmt: skip
+    count: ti.i32,
+    workers: ti.i32,
+    taken: Integers,
+    carried: Integers,
+    before: PairPieces,
+    now: PairPieces,
+    end: Integers,
+) -> ti.i32:
     """Pieces of the pairs of patches that were listed before, at the places of their numbers now; returns the end.
 
     Args:
@@ -275,30 +304,33 @@ def carry_pieces(
     for worker in range(workers):
         p = next_item(-1, worker, taken, 0, CARRIED_AT_A_TIME)
         while p < count:
-            pieces[p], piece_due[p] = Four(0), NEVER
+            now.pieces[p], now.piece_due[p] = Four(0), NEVER
             if carried[p] >= 0:
-                first, found = pieces_before[carried[p]][0], pieces_before[carried[p]][2]
+                first, found = before.pieces[carried[p]][0], before.pieces[carried[p]][2]
                 start = ti.atomic_add(end[0], found)
-                pieces[p], piece_due[p] = Four(start, found, found, 0), piece_due_before[carried[p]]
+                now.pieces[p], now.piece_due[p] = Four(start, found, found, 0), before.piece_due[carried[p]]
                 for k in range(found):
-                    pairs[start + k] = before[first + k]
-                    wanted[start + k], due[start + k] = wanted_before[first + k], due_before[first + k]
+                    now.pairs[start + k] = before.pairs[first + k]
+                    now.wanted[start + k], now.due[start + k] = before.wanted[first + k], before.due[first + k]
             p = next_item(p, worker, taken, 0, CARRIED_AT_A_TIME)
     return end[0]
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def find_near_pairs(
-    count: ti.i32, lanes: ti.i32, workers: ti.i32, taken: Integers, due_pairs: Integers,
-    pieces: Quadruples, piece_due: Floats, pairs: Quadruples, wanted: Floats, due: Floats,
-    edge_pieces: Quadruples, edge_piece_due: Floats, edge_pairs: Quadruples, edge_wanted: Floats, edge_due: Floats,
-    slack: Floats, left: Floats, approach: Floats, allowed: Floats,
-    position: Vectors, displacement: Vectors, rest: Vectors, cloth: Integers,
-    thickness: Floats, vertex_friction: Floats, recovery: ti.f32,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
-):  # fmt: skip
+    count: ti.i32,
+    lanes: ti.i32,
+    workers: ti.i32,
+    taken: Integers,
+    met: PatchPairArrays,
+    listed: PairPieces,
+    listed_edges: PairPieces,
+    surface: Surface,
+    cloth: Integers,
+    rest: Vectors,
+    recovery: ti.f32,
+    contacts: Contacts,
+):
     """Append the pairs that are nearer than they shall be, or get there, and those that might cross.
 
     The displacement along the line of shortest distance counts. A pair might cross when its vertices, displaced as
@@ -307,9 +339,14 @@ def find_near_pairs(
     much more [m]. Pairs that have been farther off than their patches have approached since are not even looked at.
 
     Args:
-        count: number of pairs of patches that are looked at, `due_pairs`; `lanes` threads share one.
-        workers, taken: see `sim.work_sharing`; twice as many items, as edges of a pair of patches are one of their own.
-        pieces to due: of vertices with triangles, see `PairList`; `edge_pieces` to `edge_due` of edges.
+        count: of the pairs of patches that are due; `lanes` threads share one.
+        workers, taken: see `sim.core.scheduling`; twice as many items: a pair's vertices and its edges.
+        met: all pairs of patches.
+        listed, listed_edges: lists of vertices with triangles, and of edges.
+        surface, cloth: of all nodes.
+        rest: positions of all nodes at rest [m].
+        recovery: share of a missing distance that the substep gives back [-].
+        contacts: the list.
     """
     begin_sharing(taken, 0)
     for worker in range(workers):
@@ -317,56 +354,92 @@ def find_near_pairs(
         while item < 2 * count * lanes:
             if item < count * lanes:
                 look_at_piece(
-                    due_pairs[item // lanes], item % lanes, lanes, pieces, piece_due, pairs, wanted, due, slack, left,
-                    approach, allowed, False, position, displacement, rest, cloth, thickness, vertex_friction,
-                    recovery, vertices, weights, normal, floor, kind, arm, friction, counter, capacity,
-                )  # fmt: skip
+                    met.due[item // lanes],
+                    item % lanes,
+                    lanes,
+                    listed,
+                    met,
+                    False,
+                    surface,
+                    cloth,
+                    rest,
+                    recovery,
+                    contacts,
+                )
             else:
                 look_at_piece(
-                    due_pairs[item // lanes - count], item % lanes, lanes, edge_pieces, edge_piece_due, edge_pairs,
-                    edge_wanted, edge_due, slack, left, approach, allowed, True, position, displacement, rest, cloth,
-                    thickness, vertex_friction, recovery, vertices, weights, normal, floor, kind, arm, friction,
-                    counter, capacity,
-                )  # fmt: skip
+                    met.due[item // lanes - count],
+                    item % lanes,
+                    lanes,
+                    listed_edges,
+                    met,
+                    True,
+                    surface,
+                    cloth,
+                    rest,
+                    recovery,
+                    contacts,
+                )
             item = next_item(item, worker, taken, 0, DUE_AT_A_TIME)
 
 
-@ti.func
+@func
 def look_at_piece(
-    both: ti.i32, lane: ti.i32, lanes: ti.i32, pieces: Quadruples, piece_due: Floats, pairs: Quadruples,
-    wanted: Floats, due: Floats, slack: Floats, left: Floats, approach: Floats, allowed: Floats,
-    are_edges: ti.template(), position: Vectors, displacement: Vectors, rest: Vectors, cloth: Integers,
-    thickness: Floats, vertex_friction: Floats, recovery: ti.f32,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
-):  # fmt: skip
+    both: ti.i32,
+    lane: ti.i32,
+    lanes: ti.i32,
+    listed: PairPieces,
+    met: PatchPairArrays,
+    are_edges: ti.template(),
+    surface: Surface,
+    cloth: Integers,
+    rest: Vectors,
+    recovery: ti.f32,
+    contacts: Contacts,
+):
     """Look at the pairs of elements of one pair of patches that are due, as one of several threads."""
-    soonest, is_left = NEVER, left[both]
-    place, end = pieces[both][0] + lane, pieces[both][0] + pieces[both][2]
+    soonest, is_left = NEVER, met.left[both]
+    place, end = listed.pieces[both][0] + lane, listed.pieces[both][0] + listed.pieces[both][2]
     while place < end:
-        if due[place] >= is_left:
-            due[place] = look_at_pair(
-                place, pairs, wanted, slack[both], approach[both], allowed[both], are_edges, position, displacement,
-                rest, cloth, thickness, vertex_friction, recovery, vertices, weights, normal, floor, kind, arm,
-                friction, counter, capacity,
-            )  # fmt: skip
-        soonest = ti.max(soonest, due[place])
+        if listed.due[place] >= is_left:
+            listed.due[place] = look_at_pair(
+                place,
+                listed.pairs,
+                listed.wanted,
+                met.slack[both],
+                met.approach[both],
+                met.allowed[both],
+                are_edges,
+                surface,
+                cloth,
+                rest,
+                recovery,
+                contacts,
+            )
+        soonest = ti.max(soonest, listed.due[place])
         place += lanes
-    ti.atomic_max(piece_due[both], soonest)
+    ti.atomic_max(listed.piece_due[both], soonest)
 
 
-@ti.func
+@func
 def look_at_pair(
-    p: ti.i32, pairs: Quadruples, wanted: Floats, slack: ti.f32, approach: ti.f32, allowed: ti.f32,
-    are_edges: ti.template(), position: Vectors, displacement: Vectors, rest: Vectors, cloth: Integers,
-    thickness: Floats, vertex_friction: Floats, recovery: ti.f32,
-    vertices: Quadruples, weights: Weights, normal: Vectors, floor: Floats, kind: Integers, arm: Vectors,
-    friction: Floats, counter: Integers, capacity: ti.i32,
-) -> ti.f32:  # fmt: skip
+    p: ti.i32,
+    pairs: Quadruples,
+    wanted: Floats,
+    slack: ti.f32,
+    approach: ti.f32,
+    allowed: ti.f32,
+    are_edges: ti.template(),
+    surface: Surface,
+    cloth: Integers,
+    rest: Vectors,
+    recovery: ti.f32,
+    contacts: Contacts,
+) -> ti.f32:
     """Append a pair if it has to be; returns when it is due [m]."""
     v = pairs[p]
-    x, u = position[v[0]], displacement[v[0]]
-    x1, x2, x3 = position[v[1]] - x, position[v[2]] - x, position[v[3]] - x
+    x, u = surface.position[v[0]], surface.displacement[v[0]]
+    x1, x2, x3 = surface.position[v[1]] - x, surface.position[v[2]] - x, surface.position[v[3]] - x
     zero = ti.math.vec3(0.0)
     weight = ti.math.vec4(0.0)
     part = 1.0
@@ -380,45 +453,44 @@ def look_at_pair(
         weight = ti.math.vec4(1.0, -shares[0], -shares[1], -shares[2])
     apart = weight[1] * x1 + weight[2] * x2 + weight[3] * x3
     distance = apart.norm()
-    if distance < ti.max(0.5 * (thickness[v[0]] + thickness[v[2]]), approach + allowed):
-        u1, u2, u3 = displacement[v[1]] - u, displacement[v[2]] - u, displacement[v[3]] - u
+    if distance < ti.max(0.5 * (surface.thickness[v[0]] + surface.thickness[v[2]]), approach + allowed):
+        u1, u2, u3 = surface.displacement[v[1]] - u, surface.displacement[v[2]] - u, surface.displacement[v[3]] - u
         mean = 0.25 * (u1 + u2 + u3)
         motion = ti.max(mean.norm(), (u1 - mean).norm(), (u2 - mean).norm(), (u3 - mean).norm())
         if wanted[p] == UNKNOWN:
             a, b, c, d = rest[v[0]], rest[v[1]], rest[v[2]], rest[v[3]]
             at_rest = distance_of_edges(a, b, c, d) if ti.static(are_edges) else distance_to_triangle(a, b, c, d)
-            wanted[p] = pair_thickness(v[0], v[2], cloth, thickness, at_rest)
+            wanted[p] = pair_thickness(v[0], v[2], cloth, surface, at_rest)
         keeps = part * wanted[p]
         if distance < ti.max(keeps, ti.min(2.0 * motion, approach) + allowed):
             across = x1.cross(x3 - x2) if ti.static(are_edges) else (x2 - x1).cross(x3 - x1)
             n = unit_or(apart, across)
             least = least_displacement(distance, keeps, recovery)
-            slot = ti.atomic_add(counter[0], 1)
-            if slot < capacity:
+            slot = ti.atomic_add(contacts.counter[0], 1)
+            if slot < contacts.capacity:
                 pushes = distance < keeps or n.dot(weight[1] * u1 + weight[2] * u2 + weight[3] * u3) < least
-                vertices[slot], weights[slot], normal[slot] = v, weight, n
-                floor[slot] = ti.select(pushes and keeps > 0.0, least, INACTIVE)
-                kind[slot] = EDGE_EDGE if ti.static(are_edges) else VERTEX_TRIANGLE
-                arm[slot] = zero
-                friction[slot] = ti.sqrt(vertex_friction[v[0]] * vertex_friction[v[2]])
+                contacts.vertices[slot], contacts.weights[slot], contacts.normal[slot] = v, weight, n
+                contacts.floor[slot] = ti.select(pushes and keeps > 0.0, least, INACTIVE)
+                contacts.kind[slot] = EDGE_EDGE if ti.static(are_edges) else VERTEX_TRIANGLE
+                contacts.arm[slot] = zero
+                contacts.friction[slot] = ti.sqrt(surface.friction[v[0]] * surface.friction[v[2]])
     return slack - distance
 
 
-@fast_launch
-@ti.kernel
-def range_of_vectors(
-    vectors: Vectors, count: ti.i32, items: ti.i32, lane_step: ti.i32, item_step: ti.i32, partial: Floats,
-    lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats, is_short: ti.template(),
-) -> Results:  # fmt: skip
+@kernel
+def range_of_vectors(vectors: Vectors, count: ti.i32, share: Share, is_short: ti.template()) -> Results:
     """Largest components, then those of the negative vectors, six maxima."""
     if ti.static(is_short):
         ti.loop_config(serialize=True)
-    for lane in range(lanes):
+    for lane in range(share.tree.lanes):
         most, least = ti.math.vec3(-FAR), ti.math.vec3(FAR)
-        for k in range(items):
-            i = lane * lane_step + k * item_step
+        for k in range(share.items):
+            i = lane * share.lane_step + k * share.item_step
             if i < count:
                 most, least = ti.max(most, vectors[i]), ti.min(least, vectors[i])
         for axis in ti.static(range(3)):
-            partial[axis * lanes + lane], partial[(3 + axis) * lanes + lane] = most[axis], -least[axis]
-    return reduced(partial, lanes, quantities, maxima, nodes)
+            (
+                share.tree.partial[axis * share.tree.lanes + lane],
+                share.tree.partial[(3 + axis) * share.tree.lanes + lane],
+            ) = most[axis], -least[axis]
+    return reduced(share.tree.partial, share.tree.lanes, share.tree.quantities, share.tree.maxima, share.tree.nodes)

@@ -24,11 +24,11 @@ from sim.cloth.stable_step import ACCURATE_SHARE, too_few_substeps
 from sim.cloth.state import ClothState, HostCloths
 from sim.cloth.totals import ClothTotals
 from sim.cloth.xpbd import XPBDSprings
-from sim.domain import DomainParameters
-from sim.parameters import Vector3
-from sim.short_loops import is_short
-from sim.snapshots import Snapshot
-from sim.solver import Arrays, Diagnostics, Remedies
+from sim.core.domain import DomainParameters
+from sim.core.parameters import Vector3
+from sim.core.scheduling import is_short
+from sim.core.snapshots import Snapshot
+from sim.core.solver import Arrays, Diagnostics, Remedies
 
 SOLVER_NAME = "cloth"
 
@@ -38,9 +38,22 @@ LOST_DISTANCE = 10.0
 """Cloth stops this far out, in diagonals of the domain: it fell out of sight."""
 
 LIVE_KEYS = frozenset(
-    ("mass_per_area", "stretch_stiffness", "shear_stiffness", "bend_stiffness", "damping", "bend_damping", "thickness",
-     "friction", "self_collision", "wind", "air_density", "drag", "skin_drag")
-)  # fmt: skip
+    (
+        "mass_per_area",
+        "stretch_stiffness",
+        "shear_stiffness",
+        "bend_stiffness",
+        "damping",
+        "bend_damping",
+        "thickness",
+        "friction",
+        "self_collision",
+        "wind",
+        "air_density",
+        "drag",
+        "skin_drag",
+    )
+)
 """What may change between frames."""
 
 
@@ -210,10 +223,7 @@ class ClothSolver:
         for contacts in self.contacts:
             contacts.resolve(self.state, dt)
         state = self.state
-        finish_step(
-            state.displacement, state.quantum, state.limit, dt, state.lattice, state.position, state.carry,
-            state.velocity, self._is_short,
-        )  # fmt: skip
+        finish_step(state.nodes, state.motion, state.position, state.limit, dt, self._is_short)
         if self.load is not None:
             self.load.take_off(state)
         self._time_s += dt
@@ -239,10 +249,7 @@ class ClothSolver:
         for cloths in _runs_without(in_rows, len(self.parameters)):
             air.blow(cloths, gravity, dt)
             first, end = (int(state.host.first_node[number]) for number in (cloths.start, cloths.stop))
-            predict_displacement(
-                state.velocity, state.carry, state.inverse_mass, air.force, air.share, air.triangle_start,
-                air.triangle_list, int(air.acts), first, end, gravity, dt, state.displacement,
-            )  # fmt: skip
+            predict_displacement(state.nodes, state.motion, air.at_nodes, int(air.acts), first, end, gravity, dt)
 
     def _hold_pins(self) -> None:
         if self._pins.hold(self._time_s):

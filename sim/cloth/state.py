@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sim.arrays import Vectors
+from sim.cloth.bundles import NodeMotion, Nodes, Surface
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import Grid, RestSheet
 from sim.cloth.springs import edges_of
 from sim.cloth.start import start_positions
-from sim.launch import fast_launch
-
-Lattice = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
+from sim.core.arrays import Vectors
+from sim.core.launch import kernel
 
 LATTICE_BITS = 30
 """Positions are whole multiples of a quantum, up to 2^30 of them within reach; twice that is all an int32 holds."""
@@ -118,6 +117,7 @@ class ClothState:
         body: cloth of a node, (n,) int32.
         triangles: (k,) ivec3.
         edges: (e,) ivec2.
+        nodes, motion, surface: some of these arrays for kernels.
         names: of the cloths.
         self_collision: of each cloth: whether it collides with itself.
         is_free: of each cloth: whether it is one piece, and no pin holds any of its nodes.
@@ -148,6 +148,9 @@ class ClothState:
         self.body = ti.ndarray(ti.i32, n)
         self.triangles = ti.Vector.ndarray(3, ti.i32, len(host.triangles))
         self.edges = ti.Vector.ndarray(2, ti.i32, len(host.edges))
+        self.nodes = Nodes(self.lattice, self.quantum, self.inverse_mass, self.displacement)
+        self.motion = NodeMotion(self.carry, self.velocity)
+        self.surface = Surface(self.position, self.displacement, self.thickness, self.friction)
         self.self_collision: tuple[bool, ...] = ()
         self.is_free: tuple[bool, ...] = ()
         self.body.from_numpy(host.body)
@@ -191,7 +194,7 @@ class ClothState:
 
     def place_displaced(self) -> None:
         """Follow the lattice with what is derived from it: float32 positions, and displacements of nothing yet."""
-        round_positions(self.lattice, self.carry, self.quantum, self.position, self.displacement)
+        round_positions(self.nodes, self.carry, self.position)
 
     def set_material(self, cloths: Sequence[ClothParameters]) -> None:
         """Take mass, thickness, friction and whether they collide with themselves from the cloths' parameters."""
@@ -211,10 +214,9 @@ class ClothState:
         self.inverse_mass.from_numpy(np.where(is_pinned, 0.0, 1.0 / mass).astype(np.float32))
 
 
-@fast_launch
-@ti.kernel
-def round_positions(lattice: Lattice, carry: Vectors, quantum: ti.f32, position: Vectors, displacement: Vectors):
+@kernel
+def round_positions(nodes: Nodes, carry: Vectors, position: Vectors):
     """float32 positions from the lattice; displacements that hold what it lacks."""
-    for i in range(lattice.shape[0]):
-        position[i] = ti.cast(lattice[i], ti.f32) * quantum
-        displacement[i] = carry[i]
+    for i in range(nodes.lattice.shape[0]):
+        position[i] = ti.cast(nodes.lattice[i], ti.f32) * nodes.quantum
+        nodes.displacement[i] = carry[i]

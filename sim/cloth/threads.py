@@ -3,11 +3,12 @@
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, colour_bounds
-from sim.cloth.overlong import count_overlong
-from sim.cloth.state import ClothState, Lattice
-from sim.launch import fast_launch
+from sim.cloth.bundles import NodeMotion, Nodes, Pieces, SpringArrays, ThreadWork
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, colour_bounds
+from sim.cloth.spring_convergence import count_unconverged
+from sim.cloth.state import ClothState
+from sim.core.bundles import func
+from sim.core.launch import kernel
 
 TURNED_EXPLICITLY = 0.15
 """Tension, as dt² T (w_i + w_j) / |d| of a spring, up to which its direction may be that of the prediction. With fixed
@@ -33,26 +34,23 @@ class ThreadSolver:
     def __init__(self, springs: DeviceSprings) -> None:
         self._springs = springs
         starts = springs.segment_start.to_numpy()
-        self._piece = ti.ndarray(ti.i32, springs.count)
-        self._piece.from_numpy(np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts)))
-        self._is_taut = ti.ndarray(ti.i32, len(starts) - 1)
-        self._direction, self._solved = (ti.Vector.ndarray(3, ti.f32, springs.count) for _ in range(2))
-        self._lower, self._diagonal, self._change, self._multiplier, self._tension = (
-            ti.ndarray(ti.f32, springs.count) for _ in range(5)
+        direction, solved = (ti.Vector.ndarray(3, ti.f32, springs.count) for _ in range(2))
+        self._work = ThreadWork(direction, *(ti.ndarray(ti.f32, springs.count) for _ in range(5)), solved)
+        self._pieces = Pieces(
+            springs.segment_start,
+            springs.piece_of_colour,
+            ti.ndarray(ti.i32, springs.count),
+            ti.ndarray(ti.i32, springs.piece_of_colour.shape[0]),
+            ti.ndarray(ti.i32, len(starts) - 1),
         )
-        self._spring_of_colour = ti.ndarray(ti.i32, springs.piece_of_colour.shape[0])
-        self._spring_of_colour.from_numpy(starts[springs.piece_of_colour.to_numpy()])
+        self._pieces.piece.from_numpy(np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts)))
+        self._pieces.spring_of_colour.from_numpy(starts[springs.piece_of_colour.to_numpy()])
 
     def displace(self, state: ClothState, dt: float, *, is_first: bool) -> None:
         """Bring the displacements of a step of dt [s] to where the threads let them go; multipliers start at 0."""
         springs = self._springs
         for colour in springs.first_colours:
-            solve_threads(
-                springs.nodes, springs.law, springs.segment_start, self._piece, self._spring_of_colour,
-                springs.piece_of_colour, colour, state.lattice, state.quantum, state.inverse_mass, dt, int(is_first),
-                self._direction, self._lower, self._diagonal, self._change, self._multiplier, self._tension,
-                self._is_taut, state.displacement,
-            )  # fmt: skip
+            solve_threads(springs.on_device, self._pieces, colour, state.nodes, dt, int(is_first), self._work)
 
     def straighten(self, state: ClothState, dt: float) -> None:
         """Let tension turn with its springs, where it is too strong for directions of the prediction.
@@ -63,31 +61,18 @@ class ThreadSolver:
         """
         springs = self._springs
         for colour in springs.first_colours:
-            straighten_threads(
-                springs.nodes, springs.segment_start, self._piece, self._spring_of_colour, springs.piece_of_colour,
-                colour, self._is_taut, self._tension, state.inverse_mass, state.carry, state.velocity, dt, self._lower,
-                self._diagonal, self._solved, state.displacement,
-            )  # fmt: skip
+            straighten_threads(springs.on_device, self._pieces, colour, state.nodes, state.motion, dt, self._work)
 
-    def count_overlong(self, state: ClothState, dt: float) -> int:
-        """After `straighten`: how many springs are much longer than their tension makes them, see `overlong`."""
+    def count_unconverged(self, state: ClothState, dt: float) -> int:
+        """Number of springs that have not converged right after `straighten` (`spring_convergence`)."""
         springs = self._springs
-        return int(
-            count_overlong(
-                springs.nodes, springs.law, springs.count, self._multiplier, state.lattice, state.quantum,
-                state.inverse_mass, dt * dt, state.displacement,
-            )
-        )  # fmt: skip
+        return int(count_unconverged(springs.on_device, springs.count, self._work.multiplier, state.nodes, dt * dt))
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def solve_threads(
-    nodes: Integers, law: Laws, segment_start: Integers, piece: Integers, spring_of_colour: Integers,
-    piece_of_colour: Integers, first: ti.i32, lattice: Lattice, quantum: ti.f32, inverse_mass: Floats, dt: ti.f32,
-    is_first: ti.i32, direction: Vectors, lower: Floats, diagonal: Floats, change: Floats, multiplier: Floats,
-    tension: Floats, is_taut: Integers, displacement: Vectors,
-):  # fmt: skip
+    springs: SpringArrays, pieces: Pieces, first: ti.i32, nodes: Nodes, dt: ti.f32, is_first: ti.i32, work: ThreadWork
+):
     """Some colours, from `first` on; each piece exactly:
 
         (w_s + w_s+1 + a) D_s - w_s n_s-1.n_s D_s-1 - w_s+1 n_s.n_s+1 D_s+1 = -C_s - a l_s,   a = 1/(k dt²)
@@ -96,126 +81,123 @@ def solve_threads(
     of that. `tension` becomes what is too much of -l_s / |d|, `is_taut` whether a piece has any.
     """
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, first)
-    p0, p1, p2, p3, p4 = colour_bounds(piece_of_colour, first)
+    s0, s1, s2, s3, s4 = colour_bounds(pieces.spring_of_colour, first)
+    p0, p1, p2, p3, p4 = colour_bounds(pieces.piece_of_colour, first)
     for first_spring, end_spring, first_piece, end_piece in ti.static(
         ((s0, s1, p0, p1), (s1, s2, p1, p2), (s2, s3, p2, p3), (s3, s4, p3, p4))
     ):
         for s in range(first_spring, end_spring):
-            i, j = nodes[2 * s], nodes[2 * s + 1]
-            d = quantum * ti.cast(lattice[i] - lattice[j], ti.f32) + (displacement[i] - displacement[j])
+            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+            d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
+                nodes.displacement[i] - nodes.displacement[j]
+            )
             length = ti.max(d.norm(), TINY_LENGTH)
-            compliance = 1.0 / (law[s][1] * dt * dt)
+            compliance = 1.0 / (springs.law[s][1] * dt * dt)
             if is_first:
-                multiplier[s] = 0.0
-            tension[s] = 1.0 / length
-            direction[s] = tension[s] * d
-            change[s] = law[s][0] - length - compliance * multiplier[s]
-            lower[s] = -inverse_mass[i]
-            diagonal[s] = inverse_mass[i] + inverse_mass[j] + compliance
+                work.multiplier[s] = 0.0
+            work.tension[s] = 1.0 / length
+            work.direction[s] = work.tension[s] * d
+            work.change[s] = springs.law[s][0] - length - compliance * work.multiplier[s]
+            work.lower[s] = -nodes.inverse_mass[i]
+            work.diagonal[s] = nodes.inverse_mass[i] + nodes.inverse_mass[j] + compliance
         for p in range(first_piece, end_piece):
-            start, stop = segment_start[p], segment_start[p + 1]
+            start, stop = pieces.segment_start[p], pieces.segment_start[p + 1]
             inverse_pivot = 0.0
             solved = 0.0
             n_before = ti.math.vec3(0.0)
             for s in range(start, stop):
-                n_s = direction[s]
-                coupling = lower[s] * n_before.dot(n_s)
+                n_s = work.direction[s]
+                coupling = work.lower[s] * n_before.dot(n_s)
                 factor = coupling * inverse_pivot
-                inverse_pivot = 1.0 / (diagonal[s] - coupling * factor)
-                solved = (change[s] - coupling * solved) * inverse_pivot
-                lower[s] = factor
-                change[s] = solved
+                inverse_pivot = 1.0 / (work.diagonal[s] - coupling * factor)
+                solved = (work.change[s] - coupling * solved) * inverse_pivot
+                work.lower[s] = factor
+                work.change[s] = solved
                 n_before = n_s
             factor = 0.0
             for m in range(stop - start):
                 s = stop - 1 - m
-                solved = change[s] - factor * solved
-                change[s] = solved
-                factor = lower[s]
-            is_taut[p] = 0
+                solved = work.change[s] - factor * solved
+                work.change[s] = solved
+                factor = work.lower[s]
+            pieces.is_taut[p] = 0
         for s in range(first_spring, end_spring):
-            i, j = nodes[2 * s], nodes[2 * s + 1]
-            push = change[s] * direction[s]
+            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+            push = work.change[s] * work.direction[s]
             moved = -push  # of the node that the spring leads to, which the next one leads from
-            if s + 1 < piece.shape[0] and piece[s + 1] == piece[s]:
-                moved += change[s + 1] * direction[s + 1]
-            displacement[j] = displacement[j] + inverse_mass[j] * moved
-            if s == 0 or piece[s - 1] != piece[s]:
-                displacement[i] = displacement[i] + inverse_mass[i] * push
-            multiplier[s] = multiplier[s] + change[s]
-            stress = -multiplier[s] * tension[s]
-            weight = inverse_mass[i] + inverse_mass[j]
+            if s + 1 < pieces.piece.shape[0] and pieces.piece[s + 1] == pieces.piece[s]:
+                moved += work.change[s + 1] * work.direction[s + 1]
+            nodes.displacement[j] = nodes.displacement[j] + nodes.inverse_mass[j] * moved
+            if s == 0 or pieces.piece[s - 1] != pieces.piece[s]:
+                nodes.displacement[i] = nodes.displacement[i] + nodes.inverse_mass[i] * push
+            work.multiplier[s] = work.multiplier[s] + work.change[s]
+            stress = -work.multiplier[s] * work.tension[s]
+            weight = nodes.inverse_mass[i] + nodes.inverse_mass[j]
             excess = 0.0
             if stress * weight > TURNED_EXPLICITLY:
                 excess = stress - TURNED_EXPLICITLY / weight
-                is_taut[piece[s]] = 1
-            tension[s] = excess
+                pieces.is_taut[pieces.piece[s]] = 1
+            work.tension[s] = excess
 
 
-@ti.func
-def corrected(
-    i: ti.i32, inverse_mass: Floats, carry: Vectors, velocity: Vectors, dt: ti.f32, displacement: Vectors
-) -> ti.math.vec3:
+@func
+def corrected(i: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32) -> ti.math.vec3:
     """By how much springs have changed the displacement of a node so far; by nothing if it is pinned."""
     change = ti.math.vec3(0.0)
-    if inverse_mass[i] > 0.0:
-        change = displacement[i] - (carry[i] + dt * velocity[i])
+    if nodes.inverse_mass[i] > 0.0:
+        change = nodes.displacement[i] - (motion.carry[i] + dt * motion.velocity[i])
     return change
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def straighten_threads(
-    nodes: Integers, segment_start: Integers, piece: Integers, spring_of_colour: Integers, piece_of_colour: Integers,
-    first: ti.i32, is_taut: Integers, tension: Floats, inverse_mass: Floats, carry: Vectors, velocity: Vectors,
-    dt: ti.f32, factor: Floats, weight: Floats, solved: Vectors, displacement: Vectors,
-):  # fmt: skip
+    springs: SpringArrays, pieces: Pieces, first: ti.i32, nodes: Nodes, motion: NodeMotion, dt: ti.f32, work: ThreadWork
+):
     """Solve (1 + w_i (t_i-1 + t_i)) e_i - w_i t_i-1 e_i-1 - w_i t_i e_i+1 = e~_i in each taut piece of some colours.
 
     e~ is by how much springs have changed the displacements, e by how much they shall have; t_i is the tension of the
     spring from node i on. What is stored for a spring is of the node that it leads to.
     """
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
-    s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, first)
-    p0, p1, p2, p3, p4 = colour_bounds(piece_of_colour, first)
+    s0, s1, s2, s3, s4 = colour_bounds(pieces.spring_of_colour, first)
+    p0, p1, p2, p3, p4 = colour_bounds(pieces.piece_of_colour, first)
     for first_spring, end_spring, first_piece, end_piece in ti.static(
         ((s0, s1, p0, p1), (s1, s2, p1, p2), (s2, s3, p2, p3), (s3, s4, p3, p4))
     ):
         for s in range(first_spring, end_spring):
-            if is_taut[piece[s]]:
-                j = nodes[2 * s + 1]
-                weight[s] = inverse_mass[j]
-                solved[s] = corrected(j, inverse_mass, carry, velocity, dt, displacement)
+            if pieces.is_taut[pieces.piece[s]]:
+                j = springs.nodes[2 * s + 1]
+                work.diagonal[s] = nodes.inverse_mass[j]
+                work.solved[s] = corrected(j, nodes, motion, dt)
         for p in range(first_piece, end_piece):
-            if is_taut[p]:
-                start, stop = segment_start[p], segment_start[p + 1]
-                head = nodes[2 * start]
-                change = corrected(head, inverse_mass, carry, velocity, dt, displacement)
-                t_after = tension[start]
-                pull = inverse_mass[head] * t_after
+            if pieces.is_taut[p]:
+                start, stop = pieces.segment_start[p], pieces.segment_start[p + 1]
+                head = springs.nodes[2 * start]
+                change = corrected(head, nodes, motion, dt)
+                t_after = work.tension[start]
+                pull = nodes.inverse_mass[head] * t_after
                 e_head = change / (1.0 + pull)
                 share_of_head = pull / (1.0 + pull)
                 e_i = e_head
                 share = share_of_head  # of the next node in this one
                 for s in range(start, stop):
-                    pull = weight[s] * t_after
+                    pull = work.diagonal[s] * t_after
                     t_after = 0.0
                     if s + 1 < stop:
-                        t_after = tension[s + 1]
-                    onward = weight[s] * t_after
+                        t_after = work.tension[s + 1]
+                    onward = work.diagonal[s] * t_after
                     pivot = 1.0 / (1.0 + onward + pull * (1.0 - share))
-                    e_i = pivot * (solved[s] + pull * e_i)
+                    e_i = pivot * (work.solved[s] + pull * e_i)
                     share = pivot * onward
-                    factor[s] = share
-                    solved[s] = e_i
+                    work.lower[s] = share
+                    work.solved[s] = e_i
                 for m in range(1, stop - start):
                     s = stop - 1 - m
-                    e_i = solved[s] + factor[s] * e_i
-                    solved[s] = e_i
-                displacement[head] = displacement[head] + (e_head + share_of_head * e_i - change)
+                    e_i = work.solved[s] + work.lower[s] * e_i
+                    work.solved[s] = e_i
+                nodes.displacement[head] = nodes.displacement[head] + (e_head + share_of_head * e_i - change)
         for s in range(first_spring, end_spring):
-            if is_taut[piece[s]]:
-                j = nodes[2 * s + 1]
-                change_j = solved[s] - corrected(j, inverse_mass, carry, velocity, dt, displacement)
-                displacement[j] = displacement[j] + change_j
+            if pieces.is_taut[pieces.piece[s]]:
+                j = springs.nodes[2 * s + 1]
+                change_j = work.solved[s] - corrected(j, nodes, motion, dt)
+                nodes.displacement[j] = nodes.displacement[j] + change_j

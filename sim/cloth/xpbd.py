@@ -4,14 +4,16 @@ from collections.abc import Mapping, Sequence
 
 import taichi as ti
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, Laws, coefficient, colour_bounds, separation
-from sim.cloth.free_spin import FreeSpin
+from sim.cloth.angular_momentum import AngularMomentumCorrection
+from sim.cloth.bundles import NodeMotion, Nodes, SpringArrays
+from sim.cloth.device_springs import TINY_LENGTH, DeviceSprings, coefficient, colour_bounds, separation
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.rectangles import RectangleSprings, rectangles_in_rows
-from sim.cloth.state import ClothState, Lattice
+from sim.cloth.state import ClothState
 from sim.cloth.threads import ThreadSolver
-from sim.launch import fast_launch
+from sim.core.arrays import Floats, Integers
+from sim.core.bundles import func
+from sim.core.launch import kernel
 
 PAIR, BEND_OF_GRID = 2, 3
 """Nodes of springs: of an ordinary one, and of one over a node of a rectangle, which is flat at rest."""
@@ -22,8 +24,8 @@ class XPBDSprings:
 
     Nodes that a spring moves in a colour belong to no other spring of it, so the result is the same whatever the number
     of threads. Momentum of free cloth is kept to rounding. Springs push along their predicted direction rather than
-    that of the start, as implicit Euler does, and so have a torque; `FreeSpin` takes it back from cloths that no pin
-    holds.
+    that of the start, as implicit Euler does, and so have a torque; `AngularMomentumCorrection` takes it back
+    from cloths that no pin holds.
 
     Approximate: one sweep a step does not let a stiff spring know of all that hangs on it. A spring alone, of a colour
     that comes early, stretches by 2 n g dt² more than it should if n nodes hang on it, whatever its stiffness; the last
@@ -38,8 +40,8 @@ class XPBDSprings:
 
     def __init__(self, state: ClothState, springs: Sequence[DeviceSprings], *, iterations: int) -> None:
         self._state, self._springs, self._iterations = state, springs, iterations
-        self._spin = FreeSpin(state)
-        self._overlong, self._is_counted = 0, True
+        self._momentum = AngularMomentumCorrection(state)
+        self._unconverged, self._is_counted = 0, True
         self._rectangles = {
             number: RectangleSprings(state, grid, int(state.host.first_node[number]))
             for number, grid in rectangles_in_rows(state.host).items()
@@ -59,12 +61,12 @@ class XPBDSprings:
             rectangle.take_parameters(cloths[number])
 
     def begin_frame(self) -> None:
-        """Count overlong springs in the next step; once a frame, as it costs a good part of a sweep."""
-        self._overlong, self._is_counted = 0, False
+        """Count springs that have not converged in the next step; once a frame, as it costs a good part of a sweep."""
+        self._unconverged, self._is_counted = 0, False
 
     def diagnostics(self) -> Mapping[str, float]:
         """`overlong_springs`: at the start of the frame, along the threads of rectangles and the edges of meshes."""
-        return {"overlong_springs": float(self._overlong)}
+        return {"overlong_springs": float(self._unconverged)}
 
     def stable_dt(self) -> float:
         """Any step is stable [s]."""
@@ -83,10 +85,15 @@ class XPBDSprings:
                 continue
             for colour in springs.first_colours:
                 damp_springs(
-                    springs.nodes, springs.law, springs.coefficients, springs.segment_start, springs.piece_of_colour,
-                    colour, state.lattice, state.quantum, state.carry, state.inverse_mass, dt, springs.arity,
-                    state.velocity,
-                )  # fmt: skip
+                    springs.on_device,
+                    springs.segment_start,
+                    springs.piece_of_colour,
+                    colour,
+                    state.nodes,
+                    state.motion,
+                    dt,
+                    springs.arity,
+                )
 
     def displace(self, dt: float) -> None:
         """Bring the displacements of a step of dt [s] to where the springs let them go."""
@@ -100,36 +107,31 @@ class XPBDSprings:
         for threads in self._threads:
             threads.straighten(self._state, dt)
             if not self._is_counted:
-                self._overlong += threads.count_overlong(self._state, dt)
+                self._unconverged += threads.count_unconverged(self._state, dt)
         for rectangle in self._rectangles.values():
             rectangle.displace(dt, self._iterations)
             if not self._is_counted:
-                self._overlong += rectangle.count_overlong(dt)
+                self._unconverged += rectangle.count_unconverged(dt)
         self._is_counted = True
-        self._spin.restore(dt)
+        self._momentum.restore(dt)
 
     def _solve_bends(self, springs: DeviceSprings, dt: float) -> None:
         state = self._state
         for colour in springs.first_colours:
             solve_bends(
-                springs.nodes, springs.law, springs.coefficients, springs.piece_of_colour, colour, state.lattice,
-                state.quantum, state.inverse_mass, dt * dt, 1.0 / dt, springs.arity, state.displacement,
-            )  # fmt: skip
+                springs.on_device, springs.piece_of_colour, colour, state.nodes, dt * dt, 1.0 / dt, springs.arity
+            )
 
     def _solve_pairs(self, springs: DeviceSprings, multiplier: ti.Ndarray, dt: float, *, is_first: bool) -> None:
         state = self._state
         for colour in springs.first_colours:
             solve_pairs(
-                springs.nodes, springs.law, springs.piece_of_colour, colour, state.lattice, state.quantum,
-                state.inverse_mass, dt * dt, int(is_first), multiplier, state.displacement,
-            )  # fmt: skip
+                springs.on_device, springs.piece_of_colour, colour, state.nodes, dt * dt, int(is_first), multiplier
+            )
 
 
-@ti.func
-def solve_bend(
-    s: ti.i32, nodes: Integers, law: Laws, coefficients: Floats, lattice: Lattice, quantum: ti.f32,
-    inverse_mass: Floats, dt_squared: ti.f32, rate: ti.f32, arity: ti.template(), displacement: Vectors,
-):  # fmt: skip
+@func
+def solve_bend(s: ti.i32, springs: SpringArrays, nodes: Nodes, dt_squared: ti.f32, rate: ti.f32, arity: ti.template()):
     """Macklin, Müller & Chentanez 2016, eq. 26, from a multiplier of 0:
 
         Delta lambda = -(C + gamma dC) / ((1 + gamma) sum_a w_a c_a² + 1/(k dt²)),   gamma = tau / dt
@@ -137,51 +139,58 @@ def solve_bend(
     multiplied through by k dt² |d|, so that springs without stiffness do nothing, and one division does. `law` is
     (rest, k, tau); over a node of a rectangle the rest length is 0.
     """
-    d = separation(nodes, coefficients, lattice, quantum, s, arity)
+    d = separation(springs, nodes, s, arity)
     moved = ti.math.vec3(0.0)
     weight = 0.0
     for a in ti.static(range(arity)):
-        c_a = coefficient(coefficients, s, arity, a)
-        i = nodes[arity * s + a]
-        moved += c_a * displacement[i]
-        weight += c_a * c_a * inverse_mass[i]
+        c_a = coefficient(springs, s, arity, a)
+        i = springs.nodes[arity * s + a]
+        moved += c_a * nodes.displacement[i]
+        weight += c_a * c_a * nodes.inverse_mass[i]
     d += moved
     squared = d.dot(d)
     if squared > TINY_LENGTH * TINY_LENGTH:
-        strength = law[s][1] * dt_squared
-        gamma = law[s][2] * rate
+        strength = springs.law[s][1] * dt_squared
+        gamma = springs.law[s][2] * rate
         error = squared + gamma * d.dot(moved)  # times |d|
         if ti.static(arity != BEND_OF_GRID):
-            error -= law[s][0] * ti.sqrt(squared)
+            error -= springs.law[s][0] * ti.sqrt(squared)
         impulse = -strength * error / (squared * (strength * weight * (1.0 + gamma) + 1.0)) * d
         for a in ti.static(range(arity)):
-            i = nodes[arity * s + a]
-            displacement[i] = displacement[i] + inverse_mass[i] * coefficient(coefficients, s, arity, a) * impulse
+            i = springs.nodes[arity * s + a]
+            nodes.displacement[i] = (
+                nodes.displacement[i] + nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
+            )
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def solve_bends(
-    nodes: Integers, law: Laws, coefficients: Floats, spring_of_colour: Integers, colour: ti.i32, lattice: Lattice,
-    quantum: ti.f32, inverse_mass: Floats, dt_squared: ti.f32, rate: ti.f32, arity: ti.template(),
-    displacement: Vectors,
-):  # fmt: skip
+    springs: SpringArrays,
+    spring_of_colour: Integers,
+    colour: ti.i32,
+    nodes: Nodes,
+    dt_squared: ti.f32,
+    rate: ti.f32,
+    arity: ti.template(),
+):
     """The bend springs of some colours, from `colour` on, one colour after the other; `rate` is 1/dt."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
     s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, colour)
     for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
         for s in range(start, stop):
-            solve_bend(
-                s, nodes, law, coefficients, lattice, quantum, inverse_mass, dt_squared, rate, arity, displacement
-            )
+            solve_bend(s, springs, nodes, dt_squared, rate, arity)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def solve_pairs(
-    nodes: Integers, law: Laws, spring_of_colour: Integers, colour: ti.i32, lattice: Lattice, quantum: ti.f32,
-    inverse_mass: Floats, dt_squared: ti.f32, is_first: ti.i32, multiplier: Floats, displacement: Vectors,
-):  # fmt: skip
+    springs: SpringArrays,
+    spring_of_colour: Integers,
+    colour: ti.i32,
+    nodes: Nodes,
+    dt_squared: ti.f32,
+    is_first: ti.i32,
+    multiplier: Floats,
+):
     """The springs between two nodes of some colours, one colour after the other.
 
     Macklin, Müller & Chentanez 2016, eq. 18, Delta lambda = -(C + a lambda) / (w_i + w_j + a) with a = 1/(k dt²),
@@ -191,55 +200,62 @@ def solve_pairs(
     s0, s1, s2, s3, s4 = colour_bounds(spring_of_colour, colour)
     for start, stop in ti.static(((s0, s1), (s1, s2), (s2, s3), (s3, s4))):
         for s in range(start, stop):
-            i, j = nodes[2 * s], nodes[2 * s + 1]
-            w_i, w_j = inverse_mass[i], inverse_mass[j]
-            d = quantum * ti.cast(lattice[i] - lattice[j], ti.f32) + (displacement[i] - displacement[j])
+            i, j = springs.nodes[2 * s], springs.nodes[2 * s + 1]
+            w_i, w_j = nodes.inverse_mass[i], nodes.inverse_mass[j]
+            d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
+                nodes.displacement[i] - nodes.displacement[j]
+            )
             length = ti.max(d.norm(), TINY_LENGTH)
-            strength = law[s][1] * dt_squared
+            strength = springs.law[s][1] * dt_squared
             before = 0.0
             if not is_first:
                 before = multiplier[s]
-            change = -(strength * (length - law[s][0]) + before) / (length * (strength * (w_i + w_j) + 1.0))  # over |d|
+            change = -(strength * (length - springs.law[s][0]) + before) / (
+                length * (strength * (w_i + w_j) + 1.0)
+            )  # over |d|
             multiplier[s] = before + length * change
-            displacement[i] = displacement[i] + w_i * change * d
-            displacement[j] = displacement[j] - w_j * change * d
+            nodes.displacement[i] = nodes.displacement[i] + w_i * change * d
+            nodes.displacement[j] = nodes.displacement[j] - w_j * change * d
 
 
-@ti.func
-def damp_spring(
-    s: ti.i32, nodes: Integers, law: Laws, coefficients: Floats, lattice: Lattice, quantum: ti.f32, carry: Vectors,
-    inverse_mass: Floats, dt: ti.f32, arity: ti.template(), velocity: Vectors,
-):  # fmt: skip
+@func
+def damp_spring(s: ti.i32, springs: SpringArrays, nodes: Nodes, motion: NodeMotion, dt: ti.f32, arity: ti.template()):
     """Implicit Euler of the force -tau k dC/dt along a spring."""
-    strength = law[s][1] * law[s][2] * dt
-    d = separation(nodes, coefficients, lattice, quantum, s, arity)
+    strength = springs.law[s][1] * springs.law[s][2] * dt
+    d = separation(springs, nodes, s, arity)
     rate = ti.math.vec3(0.0)
     weight = 0.0
     for a in ti.static(range(arity)):
-        c_a = coefficient(coefficients, s, arity, a)
-        i = nodes[arity * s + a]
-        d += c_a * carry[i]
-        rate += c_a * velocity[i]
-        weight += c_a * c_a * inverse_mass[i]
+        c_a = coefficient(springs, s, arity, a)
+        i = springs.nodes[arity * s + a]
+        d += c_a * motion.carry[i]
+        rate += c_a * motion.velocity[i]
+        weight += c_a * c_a * nodes.inverse_mass[i]
     squared = d.dot(d)
     if squared > TINY_LENGTH * TINY_LENGTH:
         impulse = -strength / (strength * weight + 1.0) * d.dot(rate) / squared * d
         for a in ti.static(range(arity)):
-            i = nodes[arity * s + a]
-            velocity[i] = velocity[i] + inverse_mass[i] * coefficient(coefficients, s, arity, a) * impulse
+            i = springs.nodes[arity * s + a]
+            motion.velocity[i] = (
+                motion.velocity[i] + nodes.inverse_mass[i] * coefficient(springs, s, arity, a) * impulse
+            )
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def damp_springs(
-    nodes: Integers, law: Laws, coefficients: Floats, segment_start: Integers, piece_of_colour: Integers,
-    colour: ti.i32, lattice: Lattice, quantum: ti.f32, carry: Vectors, inverse_mass: Floats, dt: ti.f32,
-    arity: ti.template(), velocity: Vectors,
-):  # fmt: skip
+    springs: SpringArrays,
+    segment_start: Integers,
+    piece_of_colour: Integers,
+    colour: ti.i32,
+    nodes: Nodes,
+    motion: NodeMotion,
+    dt: ti.f32,
+    arity: ti.template(),
+):
     """The springs of some colours, one colour after the other, and one by one within a piece."""
     # Bounds before the first loop: each that is read between two loops would be a launch of its own on a GPU.
     p0, p1, p2, p3, p4 = colour_bounds(piece_of_colour, colour)
     for start, stop in ti.static(((p0, p1), (p1, p2), (p2, p3), (p3, p4))):
         for piece in range(start, stop):
             for s in range(segment_start[piece], segment_start[piece + 1]):
-                damp_spring(s, nodes, law, coefficients, lattice, quantum, carry, inverse_mass, dt, arity, velocity)
+                damp_spring(s, springs, nodes, motion, dt, arity)

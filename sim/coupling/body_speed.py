@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.pin_paths import path_of_pin
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
+from sim.core.motion import rotation
+from sim.core.parameters import Vector3
 from sim.fluid.expected_speed import square_of_fall_speed
-from sim.parameters import Vector3
-from sim.rigid import rotation
-from sim.rigid.geometry import BodyGeometry
-from sim.rigid.keyframes import path_of
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.paths import path_of
+from sim.shapes.body_geometry import BodyGeometry
 
 
 def expected_body_speed(

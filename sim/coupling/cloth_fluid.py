@@ -1,20 +1,59 @@
 """Two-way coupling of cloths and the particle fluid that they are in."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.load import NodeLoad
 from sim.cloth.solver import ClothSolver
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
+from sim.core.reductions import LaneReduction, Results, Share, reduced_tree
 from sim.coupling.cloth_samples import ClothSamples
-from sim.fluid.forces import SPHFluid
-from sim.launch import fast_launch
-from sim.reductions import LaneReduction, Results, reduced
+from sim.fluid.boundary import Samples, Sheets
+from sim.fluid.fluid import SPHFluid
 
 MAXIMA = 3
+
+Corners = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
+
+
+@bundle
+class SampleNodes(NamedTuple):
+    """Samples as fixed points of triangles, (m,) each."""
+
+    nodes: Corners  # corners of the triangle of each
+    weights: Vectors  # its barycentric coordinates there
+
+
+@bundle
+class Nodes(NamedTuple):
+    """Nodes of the cloths, (n,) each."""
+
+    position: Vectors  # [m], without the carry
+    carry: Vectors  # rounded off from the position [m]
+    velocity: Vectors  # [m/s]
+
+
+@bundle
+class Entries(NamedTuple):
+    """Samples that each node is a corner of: `sample_corner[start[n] : start[n + 1]]`."""
+
+    start: Integers  # (n + 1,)
+    sample_corner: Integers  # 3 b + c for corner c of sample b
+
+
+@bundle
+class Felt(NamedTuple):
+    """What samples felt in the fluid's step, (m,) each."""
+
+    mass: Floats  # of the fluid that touched [kg]
+    impulse: Vectors  # of the fluid [N s]
+    push: Vectors  # u_b - v_b [m/s]
 
 
 class ClothFluidCoupling:
@@ -49,13 +88,12 @@ class ClothFluidCoupling:
         self.bodies = (fluid.name, cloth.name)
         self._fluid, self._cloth, self._sheets = fluid, cloth, sheets
         count, node_count = len(samples.nodes), cloth.state.vertex_count
-        self._nodes = ti.Vector.ndarray(3, ti.i32, count)
-        self._nodes.from_numpy(samples.nodes)
-        self._weights = ti.Vector.ndarray(3, ti.f32, count)
-        self._weights.from_numpy(samples.weights.astype(np.float32))
+        self._samples = SampleNodes(ti.Vector.ndarray(3, ti.i32, count), ti.Vector.ndarray(3, ti.f32, count))
+        self._samples.nodes.from_numpy(samples.nodes)
+        self._samples.weights.from_numpy(samples.weights.astype(np.float32))
         order = np.argsort(samples.nodes.ravel(), kind="stable")
         start = np.searchsorted(samples.nodes.ravel()[order], np.arange(node_count + 1))
-        self._start, self._entries = _integers(start), _integers(order)
+        self._entries = Entries(_integers(start), _integers(order))
         self._change = ti.Vector.ndarray(3, ti.f32, count)
         self._reduction = LaneReduction(maxima=MAXIMA, sums=0)
         self._load = NodeLoad(node_count)
@@ -71,28 +109,20 @@ class ClothFluidCoupling:
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Lay the fluid's impulses of its substep, and the fluid that touches, onto the nodes."""
-        gather_loads(
-            self._start, self._entries, self._weights, self._sheets.mass, self._sheets.impulse, self._sheets.push,
-            self._load.mass, self._load.impulse,
-        )  # fmt: skip
+        felt = Felt(self._sheets.mass, self._sheets.impulse, self._sheets.push)
+        gather_loads(self._entries, self._samples.weights, felt, self._load.mass, self._load.impulse)
 
     def follow(self, dt: float) -> None:
         """Let the touching fluid move along, and put the samples where the cloths are; dt [s] is 0 at the start."""
-        state, boundary, reduction = self._cloth.state, self._fluid.boundary, self._reduction
-        lanes, count = reduction.lanes, boundary.sheet_count
-        results = measure_sheets(
-            self._nodes, self._weights, state.position, state.carry, state.velocity, boundary.position,
-            boundary.velocity, boundary.first_sheet, count, self._change,
-            lanes.items(count), lanes.lane_step(count), lanes.item_step(), *reduction.tree,
-        )  # fmt: skip
-        change, way, speed = (math.sqrt(value) for value in reduction.unpack(results)[:MAXIMA].tolist())
+        state, boundary = self._cloth.state, self._fluid.boundary
+        nodes = Nodes(state.position, state.carry, state.velocity)
+        share = self._reduction.over(boundary.sheet_count)
+        results = measure_sheets(self._samples, nodes, boundary.samples, boundary.sheets, self._change, share)
+        change, distance, speed = (math.sqrt(value) for value in self._reduction.unpack(results)[:MAXIMA].tolist())
         if dt > 0.0:
-            self._fluid.take_sheet_motion(self._change, change, dt)
-        place_sheets(
-            self._nodes, self._weights, state.position, state.carry, state.velocity, boundary.first_sheet, count,
-            boundary.position, boundary.velocity,
-        )  # fmt: skip
-        self._fluid.sheets_moved(way, speed, elapsed_s=dt)
+            self._fluid.tank.take_sheet_motion(self._change, change, dt)
+        place_sheets(self._samples, nodes, boundary.samples, boundary.sheets)
+        self._fluid.tank.sheets_moved(distance, speed, elapsed_s=dt)
 
     def resume(self) -> None:
         """Nothing to make up for: the fluid saves where the samples are, and what it expects of them."""
@@ -104,67 +134,53 @@ def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
     return array
 
 
-Corners = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
-
-
-@ti.func
-def mixed(nodes: Corners, weights: Vectors, s: ti.i32, of_nodes: Vectors) -> ti.math.vec3:
+@func
+def mixed(samples: SampleNodes, s: ti.i32, of_nodes: Vectors) -> ti.math.vec3:
     """Value at a sample of what nodes have."""
-    n, beta = nodes[s], weights[s]
+    n, beta = samples.nodes[s], samples.weights[s]
     return beta[0] * of_nodes[n[0]] + beta[1] * of_nodes[n[1]] + beta[2] * of_nodes[n[2]]
 
 
-@fast_launch
-@ti.kernel
-def gather_loads(
-    start: Integers, entries: Integers, weights: Vectors, sample_mass: Floats, sample_impulse: Vectors,
-    sample_push: Vectors, mass: Floats, impulse: Vectors,
-):  # fmt: skip
-    """m_a,n = sum_b beta_bn m_b, and sum_b beta_bn (J_b + m_b (u_b - v_b)); entry 3 b + c is corner c of sample b."""
+@kernel
+def gather_loads(entries: Entries, weights: Vectors, felt: Felt, mass: Floats, impulse: Vectors):
+    """m_a,n = sum_b beta_bn m_b, and sum_b beta_bn (J_b + m_b (u_b - v_b))."""
     for n in range(mass.shape[0]):
         total_mass = 0.0
         total = ti.math.vec3(0.0)
-        for k in range(start[n], start[n + 1]):
-            b = entries[k] // 3
-            beta = weights[b][entries[k] % 3]
-            total_mass += beta * sample_mass[b]
-            total += beta * (sample_impulse[b] + sample_mass[b] * sample_push[b])
+        for k in range(entries.start[n], entries.start[n + 1]):
+            b = entries.sample_corner[k] // 3
+            beta = weights[b][entries.sample_corner[k] % 3]
+            total_mass += beta * felt.mass[b]
+            total += beta * (felt.impulse[b] + felt.mass[b] * felt.push[b])
         mass[n] = total_mass
         impulse[n] = total
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def measure_sheets(
-    nodes: Corners, weights: Vectors, node_position: Vectors, node_carry: Vectors, node_velocity: Vectors,
-    position: Vectors, velocity: Vectors, first: ti.i32, count: ti.i32, change: Vectors,
-    items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
-    partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, tree: Floats,
-) -> Results:  # fmt: skip
-    """Change of each sample's velocity; the largest squares of that, of the way to its new place, and of its speed."""
-    for lane in range(lanes):
+    sample_nodes: SampleNodes, nodes: Nodes, samples: Samples, sheets: Sheets, change: Vectors, share: Share
+) -> Results:
+    """Change of each sample's velocity; the largest squares of that, of its displacement, and of its speed."""
+    for lane in range(share.tree.lanes):
         largest = ti.math.vec3(0.0)
-        for k in range(items):
-            s = lane * lane_step + k * item_step
-            if s < count:
-                v_b = mixed(nodes, weights, s, node_velocity)
-                x_b = mixed(nodes, weights, s, node_position) + mixed(nodes, weights, s, node_carry)
-                dv_b = v_b - velocity[first + s]
+        for k in range(share.items):
+            s = lane * share.lane_step + k * share.item_step
+            if s < sheets.count:
+                v_b = mixed(sample_nodes, s, nodes.velocity)
+                x_b = mixed(sample_nodes, s, nodes.position) + mixed(sample_nodes, s, nodes.carry)
+                dv_b = v_b - samples.velocity[sheets.first + s]
                 change[s] = dv_b
-                way = (x_b - position[first + s]).norm_sqr()
-                largest = ti.max(largest, ti.math.vec3(dv_b.norm_sqr(), way, v_b.norm_sqr()))
+                moved = (x_b - samples.position[sheets.first + s]).norm_sqr()
+                largest = ti.max(largest, ti.math.vec3(dv_b.norm_sqr(), moved, v_b.norm_sqr()))
         for q in ti.static(range(3)):
-            partial[q * lanes + lane] = largest[q]
-    return reduced(partial, lanes, quantities, maxima, tree)
+            share.tree.partial[q * share.tree.lanes + lane] = largest[q]
+    return reduced_tree(share.tree)
 
 
-@fast_launch
-@ti.kernel
-def place_sheets(
-    nodes: Corners, weights: Vectors, node_position: Vectors, node_carry: Vectors, node_velocity: Vectors,
-    first: ti.i32, count: ti.i32, position: Vectors, velocity: Vectors,
-):  # fmt: skip
+@kernel
+def place_sheets(sample_nodes: SampleNodes, nodes: Nodes, samples: Samples, sheets: Sheets):
     """Samples where their nodes are, as fast as these."""
-    for s in range(count):
-        position[first + s] = mixed(nodes, weights, s, node_position) + mixed(nodes, weights, s, node_carry)
-        velocity[first + s] = mixed(nodes, weights, s, node_velocity)
+    for s in range(sheets.count):
+        x_b = mixed(sample_nodes, s, nodes.position) + mixed(sample_nodes, s, nodes.carry)
+        samples.position[sheets.first + s] = x_b
+        samples.velocity[sheets.first + s] = mixed(sample_nodes, s, nodes.velocity)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.domain import DomainParameters
-from sim.rigid import rotation
-from sim.rigid.contacts import Poses
-from sim.rigid.geometry import BodyGeometry
+from sim.core.domain import DomainParameters
+from sim.core.motion import rotation
+from sim.core.motion.poses import Poses
+from sim.core.walls import walls_of
 from sim.rigid.parameters import RigidBodyParameters
-from sim.rigid.walls import walls_of
+from sim.shapes.body_geometry import BodyGeometry
 
 if TYPE_CHECKING:
     from sim.cloth.continuous_contacts import ContinuousContacts

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from sim.fluid.forces import SPHFluid
+    from sim.fluid.fluid import SPHFluid
     from sim.rigid.solver import RigidSolver
 
 
@@ -45,13 +45,13 @@ class FluidRigidCoupling:
     def follow(self, dt: float) -> None:
         """Put the fluid's samples where the bodies are after a substep of dt [s]; 0 before the first."""
         bodies = self._rigid.bodies
-        self._fluid.move_bodies(
+        self._fluid.tank.move_bodies(
             bodies.position, bodies.rotation(), bodies.velocity, bodies.angular_velocity, elapsed_s=dt
         )
         self._tell_mobility()
 
     def resume(self) -> None:
-        """Tell the restored fluid how easily the restored bodies move; where they are it has saved itself."""
+        """Hand the inverse masses of the restored bodies to the restored fluid, which has saved where they are."""
         self._tell_mobility()
 
     def _tell_mobility(self) -> None:

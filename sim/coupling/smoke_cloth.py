@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Floats, Integers, Vectors
 from sim.cloth.air import WIND, Triangles
+from sim.core.arrays import Floats, Integers, Vectors
 from sim.smoke.obstacles import time_of_travel
 
 if TYPE_CHECKING:

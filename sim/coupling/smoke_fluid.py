@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Vectors
+from sim.core.arrays import Vectors
+from sim.core.domain import DomainParameters
 from sim.coupling.water_room import room_for_water
-from sim.domain import DomainParameters
 
 if TYPE_CHECKING:
-    from sim.fluid.forces import SPHFluid
+    from sim.fluid.fluid import SPHFluid
     from sim.smoke.solver import SmokeSolver
 
 REACH_IN_SPACINGS = 2.0

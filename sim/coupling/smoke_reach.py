@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.domain import DomainParameters
-from sim.parameters import Vector3
-from sim.rigid.geometry import BodyGeometry
-from sim.rigid.keyframes import path_of
+from sim.core.domain import DomainParameters
+from sim.core.parameters import Vector3
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.paths import path_of
+from sim.shapes.body_geometry import BodyGeometry
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 
 

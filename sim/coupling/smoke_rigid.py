@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Floats, Integers, Matrices, Vectors
-from sim.rigid.device_shapes import DeviceShapes
-from sim.rigid.keyframes import Path
-from sim.rigid.shape_distances import CountTriples, distance_at
-from sim.rigid.ways import Way
+from sim.core.arrays import Floats, Integers, Matrices, Vectors
+from sim.core.motion.arc_length import ArcLength
+from sim.core.motion.paths import Path
+from sim.shapes.device_distances import CountTriples, distance_at
+from sim.shapes.device_shapes import DeviceShapes
 from sim.smoke.obstacles import time_of_travel
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class SmokeRigidCoupling:
         self._shapes = DeviceShapes(rigid.solids)
         self._position, self._velocity, self._spin = (ti.Vector.ndarray(3, ti.f32, len(rigid.solids)) for _ in range(3))
         self._rotation = ti.Matrix.ndarray(3, 3, ti.f32, len(rigid.solids))
-        self._ways: dict[int, tuple[Path, Way]] = {}
+        self._ways: dict[int, tuple[Path, ArcLength]] = {}
         smoke.obstacles.movers.append(self)
 
     def stable_dt(self) -> float:
@@ -67,13 +67,13 @@ class SmokeRigidCoupling:
         ]
         return min(times, default=math.inf)
 
-    def _way_of(self, number: int, path: Path) -> Way:
+    def _way_of(self, number: int, path: Path) -> ArcLength:
         """Of a kinematic body on its path, which is another one once the body has been led live."""
         known = self._ways.get(number)
         if known is None or known[0] is not path:
             geometry = self._rigid.solids[number]
             reach = float(np.linalg.norm(geometry.centre_of_mass)) + geometry.radius
-            known = self._ways[number] = (path, path.way(reach))
+            known = self._ways[number] = (path, path.arc_length(reach))
         return known[1]
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)

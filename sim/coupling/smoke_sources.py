@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim.rigid import rotation
-from sim.rigid.keyframes import Motion
+from sim.core.motion import rotation
+from sim.core.motion.paths import Motion
 from sim.smoke.source_motion import BodyMotion
 
 if TYPE_CHECKING:
+    from sim.rigid.parameters import RigidBodyParameters
     from sim.rigid.solver import RigidSolver
+    from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
     from sim.smoke.solver import SmokeSolver
 
 
@@ -63,3 +66,33 @@ class SmokeSourcesOnBodies:
             bodies.velocity[number] + np.cross(spin, arm),
             spin,
         )
+
+
+def with_sources_on(smoke: SmokeParameters, bodies: Sequence[RigidBodyParameters]) -> SmokeParameters:
+    """The smoke with its sources on static bodies where these stand; only those on bodies that move still follow.
+
+    Raises:
+        ValueError: a source follows a body that is not there.
+    """
+    by_name = {body.name: body for body in bodies}
+    sources = []
+    for number, source in enumerate(smoke.source):
+        if source.follow is not None and source.follow not in by_name:
+            raise ValueError(f'smoke "{smoke.name}", source {number}: no rigid body is named "{source.follow}"')
+        body = None if source.follow is None else by_name[source.follow]
+        sources.append(placed_on(source, body) if body is not None and body.kind == "static" else source)
+    return smoke.model_copy(update={"source": tuple(sources)})
+
+
+def placed_on(source: SmokeSourceParameters, body: RigidBodyParameters) -> SmokeSourceParameters:
+    """The source where it is in the world at the start; one with a velocity blows along the world's axes there."""
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_euler("xyz", body.rotation_deg, degrees=True)
+    own = Rotation.from_euler("xyz", source.rotation_deg, degrees=True)
+    x, y, z = (np.asarray(body.position) + turned.apply(source.position)).tolist()
+    a, b, c = (turned * own).as_euler("xyz", degrees=True).tolist()
+    velocity = None if source.velocity is None else tuple(turned.apply(source.velocity).tolist())
+    return source.model_copy(
+        update={"position": (x, y, z), "rotation_deg": (a, b, c), "velocity": velocity, "follow": None}
+    )

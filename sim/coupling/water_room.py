@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.smoke.grid import SmokeGrid
 
 BEYOND = 1.0e9

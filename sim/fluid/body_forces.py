@@ -1,26 +1,50 @@
-"""The reaction of a particle fluid on the bodies and sheets that move in it."""
+"""Reaction of a particle fluid on the bodies and sheets that move in it."""
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.cells import CellGrid, Cells, SortedPoints, cell_of_point, row_of_cell
-from sim.fluid.body_response import BodyResponse, weigh_errors
-from sim.fluid.boundary import Boundary
-from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle, func
+from sim.core.cells import CellGrid, Grid, SortedPoints, cell_of_point, row_of_cell
+from sim.core.launch import kernel
+from sim.core.neighbors import GROWTH, ROUNDING_MARGIN
+from sim.fluid.body_response import BodyResponse, SolveError, weigh_errors
+from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples
 from sim.fluid.kernels import TINY_DISTANCE, spline_slope
+from sim.fluid.particles import Particles
+from sim.fluid.phases import Materials
 from sim.fluid.sheet_forces import SheetForces
-from sim.fluid.viscosity import LAPLACIAN_FACTOR, viscous_factor
-from sim.launch import fast_launch
-from sim.neighbor_kernels import ROUNDING_MARGIN
+from sim.fluid.viscosity import LAPLACIAN_FACTOR, Viscosity, viscous_factor
 
 CHUNK = 64
 """Samples of a body that one node of the sum takes together."""
 
-GROWTH = 1.25
+
+@bundle
+class Exerted(NamedTuple):
+    """Forces of the fluid on moving samples, by pressure, by friction or by both."""
+
+    particles: Particles
+    pressure_term: Floats  # P_i [Pa]
+    materials: Materials
+    volume_gradient_factor: ti.f32  # V sigma/h [1/m]
+    inverse_support: ti.f32  # 1/h [1/m]
+    viscosity: Viscosity
+    with_pressure: ti.template()
+    with_friction: ti.template()
+
+
+@bundle
+class Chunks(NamedTuple):
+    """Runs of samples of one body, the leaves of the sum over a body."""
+
+    count: ti.i32
+    start: Integers  # first moving sample of each chunk, (chunks + 1,)
+    of_body: Integers  # first chunk of each body, (bodies + 1,)
+    wrench: Floats  # force [N] and torque [N m] of each chunk, (chunks * 6,)
 
 
 class BodyForces:
@@ -37,8 +61,9 @@ class BodyForces:
     are summed in a tree of fixed shape: the same bits whatever the number of threads.
 
     Attributes:
-        response: lets the bodies' samples answer to forces within the step; None where they wait for its end.
-        sheets: takes the forces on the samples of sheets; None where there are none.
+        near: particles near each moving sample.
+        response: answer of the bodies' samples to forces within the step; None where they wait for its end.
+        sheets: forces on the samples of sheets; None where there are none.
     """
 
     def __init__(self, boundary: Boundary, grid: CellGrid, search_radius: float) -> None:
@@ -56,15 +81,21 @@ class BodyForces:
             for first, last in zip(boundary.body_start[:-1], boundary.body_start[1:], strict=True)
         ]
         chunk_of_body = np.concatenate([[0], np.cumsum([len(each) for each in chunks])]).astype(np.int32)
-        self._chunk_count = int(chunk_of_body[-1])
-        starts = np.concatenate([*chunks, [boundary.body_sample_count]]).astype(np.int32)
-        self._chunk_start = _integers(starts)
-        self._chunk_of_body = _integers(chunk_of_body)
-        self._near_start = ti.ndarray(ti.i32, samples + 1)
-        self._near_count = ti.ndarray(ti.i32, samples)
-        self._near = ti.ndarray(ti.i32, 1)
+        count = int(chunk_of_body[-1])
+        self._chunks = Chunks(
+            count=count,
+            start=_integers(np.concatenate([*chunks, [boundary.body_sample_count]])),
+            of_body=_integers(chunk_of_body),
+            wrench=ti.ndarray(ti.f32, max(count, 1) * WRENCH_WIDTH),
+        )
+        self.near = NearParticles(
+            first=boundary.fixed_count,
+            sample_count=boundary.moving_count,
+            start=ti.ndarray(ti.i32, samples + 1),
+            count=ti.ndarray(ti.i32, samples),
+            particles=ti.ndarray(ti.i32, 1),
+        )
         self._force = ti.Vector.ndarray(3, ti.f32, samples)
-        self._partial = ti.ndarray(ti.f32, max(self._chunk_count, 1) * WRENCH_WIDTH)
         self._wrench = ti.ndarray(ti.f32, bodies * WRENCH_WIDTH)
         self._impulse: NDArray[np.float64] = np.zeros((boundary.body_count, WRENCH_WIDTH))
         self.response: BodyResponse | None = None
@@ -77,28 +108,18 @@ class BodyForces:
             self.sheets is not None and self.sheets.answers
         )
 
-    @property
-    def near(self) -> tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray]:
-        """Particles near each moving sample, `count[b]` entries from `start[b]` on: start, count, list."""
-        return self._near_start, self._near_count, self._near
-
     def find_particles(self, points: SortedPoints) -> None:
         """List the particles near each sample; particles and samples are where they are at a neighbour search."""
-        boundary, grid = self._boundary, self._grid
-        if boundary.moving_count == 0:
+        if self._boundary.moving_count == 0:
             return
-        search = (
-            boundary.position, boundary.fixed_count, boundary.moving_count, *points.coordinates, points.cell_start,
-            ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape), grid.reach, self._search_radius**2,
-            self._near_count,
-        )  # fmt: skip
-        count_particles_near_samples(*search)
-        starts = np.zeros(boundary.moving_count + 1, dtype=np.int32)
-        np.cumsum(self._near_count.to_numpy(), out=starts[1:])
-        self._near_start.from_numpy(starts)
-        if starts[-1] > self._near.shape[0]:
-            self._near = ti.ndarray(ti.i32, int(starts[-1] * GROWTH))
-        list_particles_near_samples(*search, self._near_start, self._near)
+        samples, grid, radius_squared = self._boundary.samples, self._grid.on_device, self._search_radius**2
+        count_particles_near_samples(samples, self.near, points, grid, radius_squared)
+        starts = np.zeros(self._boundary.moving_count + 1, dtype=np.int32)
+        np.cumsum(self.near.count.to_numpy(), out=starts[1:])
+        self.near.start.from_numpy(starts)
+        if starts[-1] > self.near.particles.shape[0]:
+            self.near = self.near._replace(particles=ti.ndarray(ti.i32, int(starts[-1] * GROWTH)))
+        list_particles_near_samples(samples, self.near, points, grid, radius_squared)
 
     def let_bodies_respond(self, gravity: tuple[float, float, float], spacing: float) -> None:
         """From now on the bodies' samples, if there are any, answer to forces within the step.
@@ -110,17 +131,17 @@ class BodyForces:
         if self._boundary.moving_count > 0 and self.response is None:
             self.response = BodyResponse(self._boundary, gravity, spacing)
 
-    def gather(self, *terms: Any, dt: float, sample_velocity: ti.Ndarray | None = None) -> None:
+    def gather(self, exerted: Exerted, dt: float, *, sample_velocity: ti.Ndarray | None = None) -> None:
         """Add the impulses of a step, from forces that the fluid has just felt.
 
         Args:
-            terms: what `gather_sample_forces` takes of the fluid, from `position` on.
+            exerted: the forces.
             dt: the step [s].
             sample_velocity: of the boundary samples, as the fluid felt them [m/s]; their present ones if omitted.
         """
         if self._boundary.moving_count == 0:
             return
-        self._gather(self._boundary.velocity if sample_velocity is None else sample_velocity, terms)
+        self._gather(exerted, sample_velocity)
         if self._boundary.body_count:
             self._impulse += dt * self._host_wrenches()
         if self.response is not None:
@@ -128,45 +149,37 @@ class BodyForces:
         if self.sheets is not None:
             self.sheets.count_forces(self._force, dt)
 
-    def respond(self, *terms: Any) -> ti.Ndarray:
-        """Acceleration of each boundary sample by forces that are only tried [m/s²]; their impulses do not count.
-
-        Args:
-            terms: as for `gather`.
-        """
+    def respond(self, exerted: Exerted) -> ti.Ndarray:
+        """Acceleration of each boundary sample by forces that are only tried [m/s²]; their impulses do not count."""
         assert self.response is not None
-        self._gather(self._boundary.velocity, terms)
+        self._gather(exerted, None)
         acceleration = self.response.accelerate_samples(self._wrench)
         if self.sheets is not None and self.sheets.answers:
             self.sheets.accelerate(self._force, acceleration)
         return acceleration
 
-    def measure(self, sample_velocity: ti.Ndarray, *terms: Any) -> NDArray[np.float64]:
+    def measure(self, exerted: Exerted, sample_velocity: ti.Ndarray) -> NDArray[np.float64]:
         """Forces [N] and torques [N m] on each body that are only tried, (bodies, 6).
 
         Args:
+            exerted: the forces.
             sample_velocity: of the boundary samples [m/s].
-            terms: as for `gather`.
         """
-        self._gather(sample_velocity, terms)
+        self._gather(exerted, sample_velocity)
         return self._host_wrenches()
 
-    def worst_mean_near_bodies(self, remaining: ti.Ndarray, pressure: ti.Ndarray, *terms: Any) -> float:
+    def worst_mean_near_bodies(self, particles: Particles, error: SolveError, inverse_support: float) -> float:
         """Mean error of a pressure solve among the particles near a body, weighted by its kernel; the largest of all.
 
         Args:
-            remaining: compression that is left of each particle [-].
-            pressure: P of each particle [Pa].
-            terms: what `weigh_errors` takes after them, up to `inverse_support`.
+            particles: of the fluid.
+            error: what the solve leaves of each of them.
+            inverse_support: 1/h [1/m].
         """
-        boundary = self._boundary
-        weigh_errors(
-            boundary.position, boundary.volume, boundary.fixed_count, boundary.moving_count, *self.near,
-            remaining, pressure, *terms, self._force,
-        )  # fmt: skip
+        weigh_errors(self._boundary.samples, self.near, particles, error, inverse_support, self._force)
         self._sum_over_bodies()
-        error, weight = self._host_wrenches()[:, :2].T
-        return float(np.divide(error, weight, out=np.zeros_like(error), where=weight > 0.0).max(initial=0.0))
+        total, weight = self._host_wrenches()[:, :2].T
+        return float(np.divide(total, weight, out=np.zeros_like(total), where=weight > 0.0).max(initial=0.0))
 
     def take_impulses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The impulses on the bodies since they were taken last, linear [N s] and about the centres of mass [N m s].
@@ -176,12 +189,11 @@ class BodyForces:
         taken, self._impulse = self._impulse, np.zeros_like(self._impulse)
         return taken[:, :3], taken[:, 3:]
 
-    def _gather(self, sample_velocity: ti.Ndarray, terms: tuple[Any, ...]) -> None:
-        boundary = self._boundary
-        gather_sample_forces(
-            boundary.position, sample_velocity, boundary.volume, boundary.fixed_count, boundary.moving_count,
-            *self.near, *terms, self._force,
-        )  # fmt: skip
+    def _gather(self, exerted: Exerted, sample_velocity: ti.Ndarray | None) -> None:
+        samples = self._boundary.samples
+        if sample_velocity is not None:
+            samples = samples._replace(velocity=sample_velocity)
+        gather_sample_forces(samples, self.near, exerted, self._force)
         self._sum_over_bodies()
 
     def _host_wrenches(self) -> NDArray[np.float64]:
@@ -189,12 +201,7 @@ class BodyForces:
         return self._wrench.to_numpy()[:entries].astype(np.float64).reshape(-1, WRENCH_WIDTH)
 
     def _sum_over_bodies(self) -> None:
-        boundary = self._boundary
-        sum_sample_forces(
-            boundary.position, boundary.fixed_count, self._force, boundary.body, boundary.states,
-            self._chunk_start, self._chunk_count, self._chunk_of_body, boundary.body_count,
-            self._partial, self._wrench,
-        )  # fmt: skip
+        sum_sample_forces(self._boundary.samples, self._boundary.bodies, self._force, self._chunks, self._wrench)
 
 
 def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
@@ -203,110 +210,93 @@ def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
     return array
 
 
-@ti.kernel
+@kernel
 def count_particles_near_samples(
-    sample_position: Vectors, first: ti.i32, sample_count: ti.i32, x: Floats, y: Floats, z: Floats,
-    cell_start: Integers, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, reach: ti.i32,
-    radius_squared: ti.f32, near_count: Integers,
-):  # fmt: skip
-    """How many particles may be within the radius of each sample; a distance may be rounded differently later."""
-    for b in range(sample_count):
-        x_b = sample_position[first + b]
-        cell = cell_of_point(x_b, origin, inverse_cell_size, shape, reach)
+    samples: Samples, near: NearParticles, points: SortedPoints, grid: Grid, radius_squared: ti.f32
+):
+    """Bound on the number of particles near each sample; a distance may be rounded differently later."""
+    for b in range(near.sample_count):
+        x_b = samples.position[near.first + b]
+        cell = cell_of_point(x_b, grid)
         found = 0
-        for dz in range(-reach, reach + 1):
-            for dy in range(-reach, reach + 1):
-                row = row_of_cell(cell, dy, dz, shape)
-                for i in range(cell_start[row - reach], cell_start[row + reach + 1]):
-                    if is_near(x_b, x[i], y[i], z[i], radius_squared * (1.0 + ROUNDING_MARGIN)):
+        for dz in range(-grid.reach, grid.reach + 1):
+            for dy in range(-grid.reach, grid.reach + 1):
+                row = row_of_cell(cell, dy, dz, grid)
+                for i in range(points.cell_start[row - grid.reach], points.cell_start[row + grid.reach + 1]):
+                    if is_near(x_b, points, i, radius_squared * (1.0 + ROUNDING_MARGIN)):
                         found += 1
-        near_count[b] = found
+        near.count[b] = found
 
 
-@ti.kernel
+@kernel
 def list_particles_near_samples(
-    sample_position: Vectors, first: ti.i32, sample_count: ti.i32, x: Floats, y: Floats, z: Floats,
-    cell_start: Integers, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, reach: ti.i32,
-    radius_squared: ti.f32, near_count: Integers, near_start: Integers, near: Integers,
-):  # fmt: skip
-    """Write the particles near each moving sample, in their order; there is room for as many as were counted."""
-    for b in range(sample_count):
-        x_b = sample_position[first + b]
-        cell = cell_of_point(x_b, origin, inverse_cell_size, shape, reach)
-        place = near_start[b]
-        for dz in range(-reach, reach + 1):
-            for dy in range(-reach, reach + 1):
-                row = row_of_cell(cell, dy, dz, shape)
-                for i in range(cell_start[row - reach], cell_start[row + reach + 1]):
-                    if is_near(x_b, x[i], y[i], z[i], radius_squared):
-                        near[place] = i
+    samples: Samples, near: NearParticles, points: SortedPoints, grid: Grid, radius_squared: ti.f32
+):
+    """The particles near each moving sample, in their order; there is room for as many as were counted."""
+    for b in range(near.sample_count):
+        x_b = samples.position[near.first + b]
+        cell = cell_of_point(x_b, grid)
+        place = near.start[b]
+        for dz in range(-grid.reach, grid.reach + 1):
+            for dy in range(-grid.reach, grid.reach + 1):
+                row = row_of_cell(cell, dy, dz, grid)
+                for i in range(points.cell_start[row - grid.reach], points.cell_start[row + grid.reach + 1]):
+                    if is_near(x_b, points, i, radius_squared):
+                        near.particles[place] = i
                         place += 1
-        near_count[b] = place - near_start[b]
+        near.count[b] = place - near.start[b]
 
 
-@ti.func
-def is_near(x_b: ti.math.vec3, x: ti.f32, y: ti.f32, z: ti.f32, radius_squared: ti.f32) -> ti.i32:
+@func
+def is_near(x_b: ti.math.vec3, points: SortedPoints, i: ti.i32, radius_squared: ti.f32) -> ti.i32:
     """Whether a particle is within the radius of a sample."""
-    return ti.cast((x_b - ti.math.vec3(x, y, z)).norm_sqr() < radius_squared, ti.i32)
+    return ti.cast((x_b - ti.math.vec3(points.x[i], points.y[i], points.z[i])).norm_sqr() < radius_squared, ti.i32)
 
 
-@fast_launch
-@ti.kernel
-def gather_sample_forces(
-    sample_position: Vectors, sample_velocity: Vectors, sample_volume: Floats, first: ti.i32, sample_count: ti.i32,
-    near_start: Integers, near_count: Integers, near: Integers,
-    position: Vectors, velocity: Vectors, phase: Integers, density: Floats, pressure_term: Floats,
-    rest_density: Floats, dynamic_viscosity: Floats, volume_gradient_factor: ti.f32, inverse_support: ti.f32,
-    softening: ti.f32, artificial: ti.f32, wall_friction: ti.f32,
-    with_pressure: ti.template(), with_wall_friction: ti.template(), force: Vectors,
-):  # fmt: skip
-    """The opposite of what each moving sample does to its particles [N]; terms as in the fluid's own sum.
-
-    `dynamic_viscosity` is mu without its 2 (d + 2), `artificial` is alpha c_s h/2, `volume_gradient_factor` V sigma/h.
-    """
-    for b in range(sample_count):
-        x_b, v_b = sample_position[first + b], sample_velocity[first + b]
+@kernel
+def gather_sample_forces(samples: Samples, near: NearParticles, exerted: Exerted, force: Vectors):
+    """The opposite of what each moving sample does to its particles [N]; terms as in the fluid's own sum."""
+    for b in range(near.sample_count):
+        x_b, v_b = samples.position[near.first + b], samples.velocity[near.first + b]
         total = ti.math.vec3(0.0)
-        for k in range(near_start[b], near_start[b] + near_count[b]):
-            i = near[k]
-            x_ib = position[i] - x_b
+        for k in range(near.start[b], near.start[b] + near.count[b]):
+            i = near.particles[k]
+            x_ib = exerted.particles.position[i] - x_b
             r_squared = x_ib.norm_sqr()
             r = ti.sqrt(r_squared)
             scale = 0.0
-            if ti.static(with_pressure):
-                scale += pressure_term[i]
-            if ti.static(with_wall_friction):
-                own = phase[i]
-                mu, rho0 = LAPLACIAN_FACTOR * dynamic_viscosity[own], rest_density[own]
-                v_dot_x = (velocity[i] - v_b).dot(x_ib)
-                viscous = viscous_factor(v_dot_x, r_squared, softening, mu, artificial * rho0)
-                scale -= wall_friction * viscous / density[i]
-            total += scale * spline_slope(r * inverse_support) / (r + TINY_DISTANCE) * x_ib
-        force[b] = volume_gradient_factor * sample_volume[first + b] * total
+            if ti.static(exerted.with_pressure):
+                scale += exerted.pressure_term[i]
+            if ti.static(exerted.with_friction):
+                own = exerted.particles.phase[i]
+                rho0 = exerted.materials.rest_density[own]
+                mu = LAPLACIAN_FACTOR * exerted.materials.dynamic_viscosity[own]
+                v_dot_x = (exerted.particles.velocity[i] - v_b).dot(x_ib)
+                viscous = viscous_factor(
+                    v_dot_x, r_squared, exerted.viscosity.softening, mu, exerted.viscosity.artificial * rho0
+                )
+                scale -= exerted.viscosity.wall_friction * viscous / exerted.particles.density[i]
+            total += scale * spline_slope(r * exerted.inverse_support) / (r + TINY_DISTANCE) * x_ib
+        force[b] = exerted.volume_gradient_factor * samples.volume[near.first + b] * total
 
 
-@fast_launch
-@ti.kernel
-def sum_sample_forces(
-    sample_position: Vectors, first: ti.i32, force: Vectors, body: Integers, states: Floats,
-    chunk_start: Integers, chunk_count: ti.i32, chunk_of_body: Integers, body_count: ti.i32,
-    partial: Floats, wrench: Floats,
-):  # fmt: skip
+@kernel
+def sum_sample_forces(samples: Samples, bodies: Bodies, force: Vectors, chunks: Chunks, wrench: Floats):
     """Force and torque about the centre of mass of each body, chunk by chunk, always in the same order."""
-    for chunk in range(chunk_count):
-        s = body[chunk_start[chunk]] * STATE_WIDTH
-        centre = ti.math.vec3(states[s], states[s + 1], states[s + 2])
+    for chunk in range(chunks.count):
+        s = bodies.body[chunks.start[chunk]] * STATE_WIDTH
+        centre = ti.math.vec3(bodies.states[s], bodies.states[s + 1], bodies.states[s + 2])
         total = ti.math.vec3(0.0)
         torque = ti.math.vec3(0.0)
-        for b in range(chunk_start[chunk], chunk_start[chunk + 1]):
+        for b in range(chunks.start[chunk], chunks.start[chunk + 1]):
             total += force[b]
-            torque += (sample_position[first + b] - centre).cross(force[b])
+            torque += (samples.position[bodies.first + b] - centre).cross(force[b])
         for axis in ti.static(range(3)):
-            partial[chunk * WRENCH_WIDTH + axis] = total[axis]
-            partial[chunk * WRENCH_WIDTH + 3 + axis] = torque[axis]
-    for entry in range(body_count * WRENCH_WIDTH):
+            chunks.wrench[chunk * WRENCH_WIDTH + axis] = total[axis]
+            chunks.wrench[chunk * WRENCH_WIDTH + 3 + axis] = torque[axis]
+    for entry in range(bodies.count * WRENCH_WIDTH):
         of_body = entry // WRENCH_WIDTH
         total = 0.0
-        for chunk in range(chunk_of_body[of_body], chunk_of_body[of_body + 1]):
-            total += partial[chunk * WRENCH_WIDTH + entry % WRENCH_WIDTH]
+        for chunk in range(chunks.of_body[of_body], chunks.of_body[of_body + 1]):
+            total += chunks.wrench[chunk * WRENCH_WIDTH + entry % WRENCH_WIDTH]
         wrench[entry] = total

@@ -6,11 +6,10 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Vectors
+from sim.core.launch import kernel
 from sim.fluid.body_response import BodyResponse
-from sim.fluid.boundary import Boundary
-from sim.fluid.boundary_kernels import STATE_WIDTH, WRENCH_WIDTH
-from sim.launch import fast_launch
+from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, Samples
 
 Friction = Callable[[ti.Ndarray, ti.Ndarray], NDArray[np.float64]]
 """Forces and torques on the bodies [N], [N m], (bodies, 6), by the friction between particles and boundary samples of
@@ -52,9 +51,15 @@ class BodyFriction:
         return self._response is not None and self._response.is_needed
 
     def prepare(
-        self, friction: Friction, velocity: ti.Ndarray, nothing: ti.Ndarray, *, volume: float, rest_density: float,
+        self,
+        friction: Friction,
+        velocity: ti.Ndarray,
+        nothing: ti.Ndarray,
+        *,
+        volume: float,
+        rest_density: float,
         dt: float,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Find the blocks of the matrix and the right-hand side of a step.
 
         Args:
@@ -79,7 +84,7 @@ class BodyFriction:
         self._inverse = np.zeros_like(blocks)
         # Both halves are rounded sums of the same numbers.
         self._inverse[is_free] = np.linalg.inv(0.5 * (blocks + blocks.transpose(0, 2, 1))[is_free])
-        self._given = self._projected(weight * friction(velocity, self._boundary.velocity))
+        self._given = self._projected(weight * friction(velocity, self._boundary.samples.velocity))
 
     def guess(self, change: ti.Ndarray) -> None:
         """Begin with the change of the bodies at which their own rows hold, for this one of the particles [m/s]."""
@@ -134,21 +139,17 @@ class BodyFriction:
     def found_velocity(self) -> ti.Ndarray:
         """Velocity of each boundary sample with the change found [m/s]."""
         if not self.are_free:
-            return self._boundary.velocity
+            return self._boundary.samples.velocity
         self.spread(self._change)
-        add_vectors(self._boundary.velocity, self.changes, self._boundary.count, self._found)
+        add_vectors(self._boundary.samples.velocity, self.changes, self._boundary.count, self._found)
         return self._found
 
     def spread(self, twists: NDArray[np.float64]) -> None:
         """Fill `changes` with J_b u for the changes u of the bodies, (bodies, 6)."""
-        boundary = self._boundary
-        if boundary.body_count == 0:
+        if self._boundary.body_count == 0:
             return
         self._twists.from_numpy(np.ascontiguousarray(twists, dtype=np.float32).ravel())
-        spread_twists(
-            boundary.position, boundary.fixed_count, boundary.body_sample_count, boundary.body, boundary.states,
-            self._twists, self.changes,
-        )  # fmt: skip
+        spread_twists(self._boundary.samples, self._boundary.bodies, self._twists, self.changes)
 
     def _multiplied(self, twists: NDArray[np.float64], vector: ti.Ndarray) -> NDArray[np.float64]:
         friction = self._friction(vector, self.changes)
@@ -171,22 +172,18 @@ def _dot(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float((one * other).sum())
 
 
-@fast_launch
-@ti.kernel
-def spread_twists(
-    sample_position: Vectors, first: ti.i32, count: ti.i32, body: Integers, states: Floats, twists: Floats,
-    velocity: Vectors,
-):  # fmt: skip
+@kernel
+def spread_twists(samples: Samples, bodies: Bodies, twists: Floats, velocity: Vectors):
     """J_b u = dv + domega x r_b of each moving sample."""
-    for b in range(count):
-        s, t = body[b] * STATE_WIDTH, body[b] * WRENCH_WIDTH
-        arm = sample_position[first + b] - ti.math.vec3(states[s], states[s + 1], states[s + 2])
+    for b in range(bodies.sample_count):
+        s, t = bodies.body[b] * STATE_WIDTH, bodies.body[b] * WRENCH_WIDTH
+        centre = ti.math.vec3(bodies.states[s], bodies.states[s + 1], bodies.states[s + 2])
+        arm = samples.position[bodies.first + b] - centre
         spin = ti.math.vec3(twists[t + 3], twists[t + 4], twists[t + 5])
-        velocity[first + b] = ti.math.vec3(twists[t], twists[t + 1], twists[t + 2]) + spin.cross(arm)
+        velocity[bodies.first + b] = ti.math.vec3(twists[t], twists[t + 1], twists[t + 2]) + spin.cross(arm)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def add_vectors(one: Vectors, other: Vectors, count: ti.i32, total: Vectors):
     """total_i = one_i + other_i."""
     for i in range(count):

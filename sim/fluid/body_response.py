@@ -1,17 +1,20 @@
-"""How moving bodies answer to the fluid's forces within a step: strong coupling for implicit pressure."""
+"""Answer of moving bodies to the fluid's forces within a step: strong coupling for implicit pressure."""
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.fluid.boundary import Boundary
-from sim.fluid.boundary_kernels import NO_BODY, STATE_WIDTH, WRENCH_WIDTH
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
+from sim.core.neighbors import Neighbors
+from sim.core.reductions import is_finite
+from sim.fluid.boundary import NO_BODY, STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples
+from sim.fluid.discretization import Discretization
 from sim.fluid.kernels import TINY_DISTANCE, spline, spline_slope
-from sim.fluid.pressure_kernels import error_left
-from sim.launch import fast_launch
+from sim.fluid.particles import Particles
 
 MOBILITY_WIDTH = 10
 """Numbers of a body's mobility: inverse mass, then the inverse inertia tensor row by row, in world axes."""
@@ -24,6 +27,29 @@ PARTICLES_PER_SAMPLE = 8
 
 LARGEST_PUSH = 6.0
 """|sum_b V_b grad W_ib| of a particle that is pressed onto samples, over 1/d; it is 0.9 at rest beside them."""
+
+NOT_FINITE = 1.0e30
+"""Stands for an error that is infinite or not a number, which the larger of two numbers would hide."""
+
+
+@bundle
+class Mobility(NamedTuple):
+    """Inverse masses of the bodies, and their bounds on the pressure matrix, (bodies,) each."""
+
+    inverse_mass: Floats  # inverse mass [1/kg] and inertia tensor [1/(kg m²)], 10 numbers a body
+    cap: Floats  # largest |n_i| of a particle that counts
+    share_scale: Floats  # units of the integer sums over 1 of |n_j|
+    share: Integers  # sum of |n_j| in these units
+
+
+@bundle
+class SolveError(NamedTuple):
+    """Result of a pressure solve, (capacity,) each."""
+
+    remaining: Floats  # compression that is left of each particle [-]
+    pressure: Floats  # with which it is left, P [Pa]
+    inverse_diagonal: Floats  # 1/A_ii [kg/m]
+    dt_squared: ti.f32  # of the step [s²]; 0 for what is left where no pressure has acted yet
 
 
 class BodyResponse:
@@ -55,12 +81,15 @@ class BodyResponse:
         """
         self._boundary, self._gravity, self._spacing = boundary, ti.math.vec3(*gravity), spacing
         bodies = max(boundary.body_count, 1)
-        self._mobility = ti.ndarray(ti.f32, bodies * MOBILITY_WIDTH)
-        self._mobility.fill(0.0)
+        self._mobility = Mobility(
+            ti.ndarray(ti.f32, bodies * MOBILITY_WIDTH),
+            ti.ndarray(ti.f32, bodies),
+            ti.ndarray(ti.f32, bodies),
+            ti.ndarray(ti.i32, bodies),
+        )
+        self._mobility.inverse_mass.fill(0.0)
         self._no_wrench = ti.ndarray(ti.f32, bodies * WRENCH_WIDTH)
         self._no_wrench.fill(0.0)
-        self._share = ti.ndarray(ti.i32, bodies)
-        self._cap, self._share_scale = ti.ndarray(ti.f32, bodies), ti.ndarray(ti.f32, bodies)
         self._acceleration = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
         self._acceleration.fill(0.0)
         self.is_needed = False
@@ -81,13 +110,13 @@ class BodyResponse:
         self.inverse_masses[:, 3:, 3:] = inverse_inertia
         if not len(rows):
             return
-        self._mobility.from_numpy(np.ascontiguousarray(rows, dtype=np.float32).ravel())
+        self._mobility.inverse_mass.from_numpy(np.ascontiguousarray(rows, dtype=np.float32).ravel())
         turning = np.trace(inverse_inertia, axis1=1, axis2=2) * self._boundary.reach**2
         cap = LARGEST_PUSH / self._spacing * np.sqrt(inverse_mass + turning)
         particles = PARTICLES_PER_SAMPLE * (np.diff(self._boundary.body_start) + PARTICLES_PER_SAMPLE)
         scale = np.divide(LARGEST_SHARE, particles * cap, out=np.zeros_like(cap), where=cap > 0.0)
-        self._cap.from_numpy(cap.astype(np.float32))
-        self._share_scale.from_numpy(scale.astype(np.float32))
+        self._mobility.cap.from_numpy(cap.astype(np.float32))
+        self._mobility.share_scale.from_numpy(scale.astype(np.float32))
 
     def fall(self, dt: float) -> None:
         """Let gravity act on the samples' velocities for dt [s]."""
@@ -100,16 +129,17 @@ class BodyResponse:
     def accelerate_samples(self, wrench: ti.Ndarray) -> ti.Ndarray:
         """Accelerations of all boundary samples by forces and torques on the bodies [m/s²]; 0 for the fixed ones."""
         boundary = self._boundary
-        accelerate_samples(
-            boundary.position, boundary.fixed_count, boundary.body_sample_count, boundary.body, boundary.states,
-            wrench, self._mobility, self._acceleration,
-        )  # fmt: skip
+        accelerate_samples(boundary.samples, boundary.bodies, wrench, self._mobility.inverse_mass, self._acceleration)
         return self._acceleration
 
     def add_to_diagonal(
-        self, position: ti.Ndarray, count: int, neighbor_list: tuple[Any, ...], *,
-        volume: float, gradient_factor: float, inverse_support: float, relaxation: float, inverse_diagonal: ti.Ndarray,
-    ) -> None:  # fmt: skip
+        self,
+        particles: Particles,
+        near: Neighbors,
+        discretization: Discretization,
+        relaxation: float,
+        inverse_diagonal: ti.Ndarray,
+    ) -> None:
         """Add the bodies' share in A to its diagonal, such that relaxation by the diagonal converges.
 
         The bodies' part of A, B_ij = V n_i . M^-1 n_j, couples all particles around a body, so that its own diagonal
@@ -118,31 +148,39 @@ class BodyResponse:
         <= V sum_j |n_j| sum_i |n_i| x_i²: the diagonal matrix of V |n_i| sum_j |n_j| bounds B.
 
         Args:
-            position: of the particles [m].
-            count: number of particles.
-            neighbor_list: as the kernels take it.
-            volume: V [m³].
-            gradient_factor: sigma/h of the kernel [1/m⁴].
-            inverse_support: 1/h [1/m].
+            particles: of the fluid.
+            near: their neighbours.
+            discretization: of the fluid.
             relaxation: omega that multiplies the inverse diagonal in the solve; the bound needs none.
             inverse_diagonal: 1/A_ii [kg/m]; becomes 1/(A_ii + omega times the bound). A particle that has 0 keeps it.
         """
         boundary = self._boundary
         add_bodies_to_diagonal(
-            position, count, *neighbor_list, boundary.position, boundary.volume, boundary.fixed_count,
-            boundary.body, boundary.body_count, boundary.states, self._mobility, self._cap, self._share_scale,
-            gradient_factor, inverse_support, relaxation * volume, self._share, inverse_diagonal,
-        )  # fmt: skip
+            particles,
+            near,
+            boundary.samples,
+            boundary.bodies,
+            self._mobility,
+            discretization.gradient_factor,
+            1.0 / discretization.support_radius,
+            relaxation * discretization.particle_volume,
+            inverse_diagonal,
+        )
 
     def _push(self, wrench: ti.Ndarray, dt: float, gravity_share: float) -> None:
-        boundary = self._boundary
-        push_samples(
-            boundary.position, boundary.fixed_count, boundary.body_sample_count, boundary.body, boundary.states,
-            wrench, self._mobility, gravity_share * self._gravity, dt, boundary.velocity,
-        )  # fmt: skip
+        gravity = gravity_share * self._gravity
+        push_samples(self._boundary.samples, self._boundary.bodies, wrench, self._mobility.inverse_mass, gravity, dt)
 
 
-@ti.func
+@func
+def error_left(error: SolveError, i: ti.i32) -> ti.f32:
+    """|compression left|; where that is negative, no more of it than taking P_i away would change."""
+    left, pressure = error.remaining[i], error.pressure[i]
+    most = ti.abs(ti.max(left, -pressure * error.dt_squared / error.inverse_diagonal[i]))
+    return ti.select(is_finite(left) & is_finite(pressure), most, NOT_FINITE)
+
+
+@func
 def acceleration_at(x_b: ti.math.vec3, body: ti.i32, states: Floats, wrench: Floats, mobility: Floats) -> ti.math.vec3:
     """Acceleration of a point of a body by a force and torque on the body; the centripetal part does not count."""
     s, w, m = body * STATE_WIDTH, body * WRENCH_WIDTH, body * MOBILITY_WIDTH
@@ -152,7 +190,7 @@ def acceleration_at(x_b: ti.math.vec3, body: ti.i32, states: Floats, wrench: Flo
     return mobility[m] * force + times_inverse_inertia(m, mobility, torque).cross(arm)
 
 
-@ti.func
+@func
 def times_inverse_inertia(m: ti.i32, mobility: Floats, vector: ti.math.vec3) -> ti.math.vec3:
     """I^-1 times a vector, of the body whose mobility begins at m."""
     product = ti.math.vec3(0.0)
@@ -162,122 +200,143 @@ def times_inverse_inertia(m: ti.i32, mobility: Floats, vector: ti.math.vec3) -> 
     return product
 
 
-@fast_launch
-@ti.kernel
-def push_samples(
-    sample_position: Vectors, first: ti.i32, count: ti.i32, body: Integers, states: Floats, wrench: Floats,
-    mobility: Floats, gravity: ti.math.vec3, dt: ti.f32, sample_velocity: Vectors,
-):  # fmt: skip
+@kernel
+def push_samples(samples: Samples, bodies: Bodies, wrench: Floats, mobility: Floats, gravity: ti.math.vec3, dt: ti.f32):
     """v_b += dt (g + F/m + (I^-1 M) x r_b) for free bodies."""
-    for b in range(count):
-        a_b = acceleration_at(sample_position[first + b], body[b], states, wrench, mobility)
-        if mobility[body[b] * MOBILITY_WIDTH] > 0.0:
+    for b in range(bodies.sample_count):
+        a_b = acceleration_at(samples.position[bodies.first + b], bodies.body[b], bodies.states, wrench, mobility)
+        if mobility[bodies.body[b] * MOBILITY_WIDTH] > 0.0:
             a_b += gravity
-        sample_velocity[first + b] += dt * a_b
+        samples.velocity[bodies.first + b] += dt * a_b
 
 
-@fast_launch
-@ti.kernel
-def accelerate_samples(
-    sample_position: Vectors, first: ti.i32, count: ti.i32, body: Integers, states: Floats, wrench: Floats,
-    mobility: Floats, acceleration: Vectors,
-):  # fmt: skip
+@kernel
+def accelerate_samples(samples: Samples, bodies: Bodies, wrench: Floats, mobility: Floats, acceleration: Vectors):
     """a_b = F/m + (I^-1 M) x r_b."""
-    for b in range(count):
-        acceleration[first + b] = acceleration_at(sample_position[first + b], body[b], states, wrench, mobility)
+    for b in range(bodies.sample_count):
+        acceleration[bodies.first + b] = acceleration_at(
+            samples.position[bodies.first + b], bodies.body[b], bodies.states, wrench, mobility
+        )
 
 
-@ti.func
-def next_body(
-    last: ti.i32, first: ti.i32, count: ti.i32, neighbors: Integers, stride: ti.template(), fixed_count: ti.i32,
-    body: Integers,
-) -> ti.i32:  # fmt: skip
+@func
+def next_body(last: ti.i32, first: ti.i32, count: ti.i32, near: Neighbors, bodies: Bodies) -> ti.i32:
     """Lowest number above `last` of the bodies with a sample among these neighbours, or a huge one."""
     found = NO_BODY
     for k in range(count):
-        b = neighbors[first + k * stride]
-        if b >= fixed_count:
-            own = body[b - fixed_count]
+        b = near.indices[first + k * near.stride]
+        if b >= bodies.first:
+            own = bodies.body[b - bodies.first]
             if own > last:
                 found = ti.min(found, own)
     return found
 
 
-@ti.func
+@func
 def wrench_norm(
-    x_i: ti.math.vec3, first: ti.i32, count: ti.i32, neighbors: Integers, stride: ti.template(),
-    sample_position: Vectors, sample_volume: Floats, fixed_count: ti.i32, body: Integers, wanted: ti.i32,
-    states: Floats, mobility: Floats, gradient_factor: ti.f32, inverse_support: ti.f32,
-) -> ti.f32:  # fmt: skip
+    x_i: ti.math.vec3,
+    first: ti.i32,
+    count: ti.i32,
+    wanted: ti.i32,
+    near: Neighbors,
+    samples: Samples,
+    bodies: Bodies,
+    mobility: Floats,
+    gradient_factor: ti.f32,
+    inverse_support: ti.f32,
+) -> ti.f32:
     """|n_i| = sqrt(n_i . M^-1 n_i) for the body `wanted`."""
     s, m = wanted * STATE_WIDTH, wanted * MOBILITY_WIDTH
-    centre = ti.math.vec3(states[s], states[s + 1], states[s + 2])
+    centre = ti.math.vec3(bodies.states[s], bodies.states[s + 1], bodies.states[s + 2])
     force = ti.math.vec3(0.0)
     torque = ti.math.vec3(0.0)
     for k in range(count):
-        b = neighbors[first + k * stride]
-        if b >= fixed_count and body[b - fixed_count] == wanted:
-            x_ib = x_i - sample_position[b]
+        b = near.indices[first + k * near.stride]
+        if b >= bodies.first and bodies.body[b - bodies.first] == wanted:
+            x_ib = x_i - samples.position[b]
             r = x_ib.norm()
-            f = sample_volume[b] * spline_slope(r * inverse_support) / (r + TINY_DISTANCE) * x_ib
+            f = samples.volume[b] * spline_slope(r * inverse_support) / (r + TINY_DISTANCE) * x_ib
             force += f
-            torque += (sample_position[b] - centre).cross(f)
+            torque += (samples.position[b] - centre).cross(f)
     squared = mobility[m] * force.norm_sqr() + torque.dot(times_inverse_inertia(m, mobility, torque))
     return gradient_factor * ti.sqrt(ti.max(squared, 0.0))
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def add_bodies_to_diagonal(
-    position: Vectors, particle_count: ti.i32,
-    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
-    sample_position: Vectors, sample_volume: Floats, fixed_count: ti.i32, body: Integers, body_count: ti.i32,
-    states: Floats, mobility: Floats, cap: Floats, share_scale: Floats, gradient_factor: ti.f32,
-    inverse_support: ti.f32, weight: ti.f32, share: Integers, inverse_diagonal: Floats,
-):  # fmt: skip
+    particles: Particles,
+    near: Neighbors,
+    samples: Samples,
+    bodies: Bodies,
+    mobility: Mobility,
+    gradient_factor: ti.f32,
+    inverse_support: ti.f32,
+    weight: ti.f32,
+    inverse_diagonal: Floats,
+):
     """1/A_ii becomes 1/(A_ii + weight sum over bodies of |n_i| sum_j |n_j|); the sums over j are of integers."""
-    for k in range(body_count):
-        share[k] = 0
-    for i in range(particle_count):
-        first = start[i] + fluid_count[i] * stride
-        own = next_body(-1, first, boundary_count[i], neighbors, stride, fixed_count, body)
+    for k in range(bodies.count):
+        mobility.share[k] = 0
+    for i in range(particles.count):
+        first = near.start[i] + near.fluid_count[i] * near.stride
+        count = near.boundary_count[i]
+        own = next_body(-1, first, count, near, bodies)
         while own < NO_BODY:
             norm = wrench_norm(
-                position[i], first, boundary_count[i], neighbors, stride, sample_position, sample_volume, fixed_count,
-                body, own, states, mobility, gradient_factor, inverse_support,
-            )  # fmt: skip
-            ti.atomic_add(share[own], ti.cast(ti.ceil(ti.min(norm, cap[own]) * share_scale[own]), ti.i32))
-            own = next_body(own, first, boundary_count[i], neighbors, stride, fixed_count, body)
-    for i in range(particle_count):
-        first = start[i] + fluid_count[i] * stride
-        own = next_body(-1, first, boundary_count[i], neighbors, stride, fixed_count, body)
+                particles.position[i],
+                first,
+                count,
+                own,
+                near,
+                samples,
+                bodies,
+                mobility.inverse_mass,
+                gradient_factor,
+                inverse_support,
+            )
+            units = ti.ceil(ti.min(norm, mobility.cap[own]) * mobility.share_scale[own])
+            ti.atomic_add(mobility.share[own], ti.cast(units, ti.i32))
+            own = next_body(own, first, count, near, bodies)
+    for i in range(particles.count):
+        first = near.start[i] + near.fluid_count[i] * near.stride
+        count = near.boundary_count[i]
+        own = next_body(-1, first, count, near, bodies)
         bound = 0.0
         while own < NO_BODY:
             norm = wrench_norm(
-                position[i], first, boundary_count[i], neighbors, stride, sample_position, sample_volume, fixed_count,
-                body, own, states, mobility, gradient_factor, inverse_support,
-            )  # fmt: skip
-            if share_scale[own] > 0.0:
-                bound += norm * ti.cast(share[own], ti.f32) / share_scale[own]
-            own = next_body(own, first, boundary_count[i], neighbors, stride, fixed_count, body)
+                particles.position[i],
+                first,
+                count,
+                own,
+                near,
+                samples,
+                bodies,
+                mobility.inverse_mass,
+                gradient_factor,
+                inverse_support,
+            )
+            if mobility.share_scale[own] > 0.0:
+                bound += norm * ti.cast(mobility.share[own], ti.f32) / mobility.share_scale[own]
+            own = next_body(own, first, count, near, bodies)
         inverse = inverse_diagonal[i]
         inverse_diagonal[i] = inverse / (1.0 + weight * bound * inverse)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def weigh_errors(
-    sample_position: Vectors, sample_volume: Floats, first: ti.i32, sample_count: ti.i32,
-    near_start: Integers, near_count: Integers, near: Integers, remaining: Floats, pressure: Floats,
-    position: Vectors, inverse_diagonal: Floats, dt_squared: ti.f32, inverse_support: ti.f32, weighed: Vectors,
-):  # fmt: skip
+    samples: Samples,
+    near: NearParticles,
+    particles: Particles,
+    error: SolveError,
+    inverse_support: ti.f32,
+    weighed: Vectors,
+):
     """Errors of the particles near each sample as a pressure solve counts them, and their weights, V_b w_ib each."""
-    for b in range(sample_count):
+    for b in range(near.sample_count):
         total = ti.math.vec3(0.0)
-        for k in range(near_start[b], near_start[b] + near_count[b]):
-            i = near[k]
-            if inverse_diagonal[i] > 0.0:
-                weight = spline((position[i] - sample_position[first + b]).norm() * inverse_support)
-                error = error_left(remaining[i], pressure[i], inverse_diagonal[i], dt_squared)
-                total += weight * ti.math.vec3(error, 1.0, 0.0)
-        weighed[b] = sample_volume[first + b] * total
+        for k in range(near.start[b], near.start[b] + near.count[b]):
+            i = near.particles[k]
+            if error.inverse_diagonal[i] > 0.0:
+                weight = spline((particles.position[i] - samples.position[near.first + b]).norm() * inverse_support)
+                total += weight * ti.math.vec3(error_left(error, i), 1.0, 0.0)
+        weighed[b] = samples.volume[near.first + b] * total

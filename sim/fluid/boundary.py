@@ -1,24 +1,74 @@
 """Boundary samples on the device: of walls and static bodies, then of bodies that move, then of sheets."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
-from sim.cells import CellGrid, CellSort, SortedPoints
-from sim.fluid.boundary_kernels import NO_BODY, STATE_WIDTH, order_samples, place_samples, take_samples
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from sim.fluid.boundary_akinci2012 import BoundarySamples
-    from sim.solver import Arrays
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle
+from sim.core.cells import CellGrid, CellSort, SortedPoints
+from sim.core.launch import kernel
+from sim.core.solver import Arrays
+from sim.fluid.boundary_akinci2012 import BoundarySamples
+from sim.fluid.discretization import Discretization
 
 EVERYWHERE = 1.0e30
 """Stands for "no limit" where samples are sorted [m]."""
+
+
+STATE_WIDTH = 18
+"""Numbers of a body's state: centre of mass, rotation row by row, velocity, angular velocity."""
+
+NO_BODY = 2**31 - 1
+"""Stands for the number of a body where there is none."""
+
+WRENCH_WIDTH = 6
+"""Numbers of a force with its torque."""
+
+
+@bundle
+class Samples(NamedTuple):
+    """Boundary samples as sums over neighbours read them: fixed ones by cell, those of bodies, those of sheets."""
+
+    position: Vectors  # [m], (m,)
+    velocity: Vectors  # [m/s], (m,); 0 for the fixed ones
+    volume: Floats  # V_b [m³], (m,)
+    friction_volume: Floats  # V_b as friction counts it [m³], 0 for samples without friction, (m,)
+    with_moving: ti.template()  # whether any sample moves
+
+
+@bundle
+class Bodies(NamedTuple):
+    """Moving bodies and their samples, which are numbered from 0 here."""
+
+    first: ti.i32  # index of the first sample of a body among all samples
+    sample_count: ti.i32  # samples of all bodies
+    body: Integers  # number of the body of each moving sample, `NO_BODY` for those of sheets, (moving,)
+    count: ti.i32  # bodies
+    states: Floats  # centre of mass, rotation, velocity and angular velocity of the first, then of the next body
+
+
+@bundle
+class Sheets(NamedTuple):
+    """Samples of sheets, which are numbered from 0 here."""
+
+    first: ti.i32  # index of the first of them among all samples
+    skipped: ti.i32  # and among the moving ones: as many as bodies have
+    count: ti.i32
+
+
+@bundle
+class NearParticles(NamedTuple):
+    """Particles near each moving sample b: `particles[start[b] : start[b] + count[b]]`."""
+
+    first: ti.i32  # index of the first moving sample among all samples
+    sample_count: ti.i32  # moving samples
+    start: Integers  # (moving + 1,)
+    count: Integers  # (moving,)
+    particles: Integers  # in the order of the sorted particles
 
 
 class Boundary:
@@ -34,17 +84,13 @@ class Boundary:
         body_sample_count: number of those of moving bodies.
         sheet_count: number of those of sheets.
         body_count: number of moving bodies.
-        position: (fixed + moving,) of 3-vectors [m].
-        velocity: (fixed + moving,) of 3-vectors [m/s], 0 for the fixed ones.
-        volume: V_b of each sample [m³], (fixed + moving,).
-        friction_volume: V_b as friction counts it [m³], 0 for samples without friction, (fixed + moving,).
+        samples: all samples on the device.
+        bodies: the moving bodies on the device.
+        sheets: which samples are those of sheets.
         index: row in the fixed samples given of each fixed sample here, (fixed,), on the host.
-        offset: moving samples relative to the centre of mass of their body, in its axes [m], (moving,) of 3-vectors.
-        body: number of the body of each moving sample, `NO_BODY` for those of sheets, (moving,), int32.
         body_start: first moving sample of each body, (bodies + 1,), on the host.
         reach: largest distance of a sample from the centre of mass of its body [m], (bodies,), on the host.
-        states: of the bodies, as `place` takes them: centre of mass, rotation, velocity and angular velocity of the
-            first, then of the next, float32 (`boundary_kernels.STATE_WIDTH`).
+        moving_index: index of each of the sorted moving samples, (moving,), on the device.
     """
 
     def __init__(
@@ -56,8 +102,7 @@ class Boundary:
         sheets: BoundarySamples,
         body_count: int,
         grid: CellGrid,
-        spacing: float,
-        support_in_spacings: float,
+        discretization: Discretization,
     ) -> None:
         """Sort and weigh samples; those of the fixed ones that are smooth, (m,), exert no friction."""
         if (np.diff(moving.body) < 0).any() or moving.body.max(initial=-1) >= body_count:
@@ -74,36 +119,42 @@ class Boundary:
         cells.sort(_device_array(fixed.positions[near]), ids, self.fixed_count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3)
         self.index: NDArray[np.int64] = near[cells.order.to_numpy()[: self.fixed_count]]
         fixed_positions = fixed.positions[self.index]
-        self.fixed_points = SortedPoints(_coordinates(fixed_positions), cells.cell_start)
+        self.fixed_points = _sorted_points(fixed_positions, cells)
 
-        volumes = np.concatenate(
-            [
-                fixed.volumes(spacing, support_in_spacings)[self.index],
-                *(each.volumes(spacing, support_in_spacings) for each in (moving, sheets)),
-            ]
+        fixed_volumes, *others = (
+            each.volumes(discretization.spacing, discretization.support_in_spacings) for each in (fixed, moving, sheets)
         )
+        volumes = np.concatenate([fixed_volumes[self.index], *others])
         moving_positions = np.concatenate([moving.positions, sheets.positions])
-        self.position = _device_array(np.concatenate([fixed_positions, moving_positions]))
-        self.velocity = _device_array(np.zeros((self.fixed_count + self.moving_count, 3), dtype=np.float32))
-        self.volume = _device_array(volumes.astype(np.float32))
-        volumes[: self.fixed_count][is_smooth[self.index]] = 0.0
-        self.friction_volume = _device_array(volumes.astype(np.float32))
-
+        frictional = volumes.copy()
+        frictional[: self.fixed_count][is_smooth[self.index]] = 0.0
+        self.samples = Samples(
+            position=_device_array(np.concatenate([fixed_positions, moving_positions])),
+            velocity=_device_array(np.zeros((self.fixed_count + self.moving_count, 3), dtype=np.float32)),
+            volume=_device_array(volumes.astype(np.float32)),
+            friction_volume=_device_array(frictional.astype(np.float32)),
+            with_moving=self.moving_count > 0,
+        )
         no_body = np.full(self.sheet_count, NO_BODY, dtype=np.int32)
-        self.offset, self.body = _device_array(moving.positions), _device_array(np.concatenate([moving.body, no_body]))
+        self.bodies = Bodies(
+            first=self.fixed_count,
+            sample_count=self.body_sample_count,
+            body=_device_array(np.concatenate([moving.body, no_body])),
+            count=body_count,
+            states=ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH),
+        )
+        self.sheets = Sheets(self.fixed_count + self.body_sample_count, self.body_sample_count, self.sheet_count)
+        self._offset = _device_array(moving.positions)
         self.body_start: NDArray[np.int64] = np.searchsorted(moving.body, np.arange(body_count + 1))
         distance = np.linalg.norm(moving.positions.astype(np.float64), axis=1)
         self.reach: NDArray[np.float64] = np.array(
             [distance[moving.body == body].max(initial=0.0) for body in range(body_count)]
         )
-        self.states = ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH)
-        self._host_states = self._reference_states = self.states.to_numpy()
+        self._host_states = self._reference_states = self.bodies.states.to_numpy()
         self._moving_cells = CellSort(grid, self.moving_count) if self.moving_count else None
         self._moving_ids = _device_array(np.arange(self.moving_count, dtype=np.int32))
         self._moving_position = ti.Vector.ndarray(3, ti.f32, max(self.moving_count, 1))
-        self._moving_points = (
-            SortedPoints(_coordinates(moving_positions), self._moving_cells.cell_start) if self._moving_cells else None
-        )
+        self._moving_points = _sorted_points(moving_positions, self._moving_cells) if self._moving_cells else None
         self._reference_sheets = _device_array(sheets.positions)
         self.moving_index = _device_array(np.zeros(self.moving_count, dtype=np.int32))
 
@@ -111,11 +162,6 @@ class Boundary:
     def count(self) -> int:
         """Samples of walls, of all bodies and of sheets."""
         return self.fixed_count + self.moving_count
-
-    @property
-    def first_sheet(self) -> int:
-        """Index of the first sample of sheets among all samples."""
-        return self.fixed_count + self.body_sample_count
 
     def place(
         self,
@@ -148,11 +194,11 @@ class Boundary:
 
     def checkpoint(self) -> dict[str, NDArray[np.float32]]:
         """Where the bodies and sheets are, and where they were when the moving samples were sorted last."""
-        arrays = {"body_states": self.states.to_numpy(), "reference_body_states": self._reference_states.copy()}
+        arrays = {"body_states": self.bodies.states.to_numpy(), "reference_body_states": self._reference_states.copy()}
         if self.sheet_count:
-            own = slice(self.first_sheet, self.count)
-            arrays["sheet_position"] = self.position.to_numpy()[own].copy()
-            arrays["sheet_velocity"] = self.velocity.to_numpy()[own].copy()
+            own = slice(self.sheets.first, self.count)
+            arrays["sheet_position"] = self.samples.position.to_numpy()[own].copy()
+            arrays["sheet_velocity"] = self.samples.velocity.to_numpy()[own].copy()
             arrays["reference_sheet_position"] = self._reference_sheets.to_numpy()
         return arrays
 
@@ -160,49 +206,43 @@ class Boundary:
         """Put bodies and sheets where they were when the moving samples were sorted before the checkpoint."""
         self._place(arrays["reference_body_states"])
         if self.sheet_count:
-            self._put_sheets(self.position, arrays["reference_sheet_position"])
+            self._put_sheets(self.samples.position, arrays["reference_sheet_position"])
 
     def restore(self, arrays: Arrays) -> None:
         """Put bodies and sheets where they were at the checkpoint."""
         self._place(arrays["body_states"])
         if self.sheet_count:
-            self._put_sheets(self.position, arrays["sheet_position"])
-            self._put_sheets(self.velocity, arrays["sheet_velocity"])
+            self._put_sheets(self.samples.position, arrays["sheet_position"])
+            self._put_sheets(self.samples.velocity, arrays["sheet_velocity"])
 
     def _put_sheets(self, array: ti.Ndarray, rows: NDArray[np.generic]) -> None:
         values = array.to_numpy()
-        values[self.first_sheet : self.count] = rows
+        values[self.sheets.first : self.count] = rows
         array.from_numpy(values)
 
     def _place(self, states: NDArray[np.generic]) -> None:
         self._host_states = np.ascontiguousarray(states)
-        self.states.from_numpy(self._host_states)
-        place_samples(
-            self.offset, self.body, self.body_sample_count, self.fixed_count, self.states, self.position, self.velocity
-        )
+        self.bodies.states.from_numpy(self._host_states)
+        place_samples(self._offset, self.bodies, self.samples)
 
     def sort_moving(self) -> SortedPoints | None:
-        """Sort the moving samples by cell, where they are now; None where there are none.
-
-        `moving_index` then tells the index of each of the sorted.
-        """
+        """Sort the moving samples by cell, where they are now, into `moving_index` too; None where there are none."""
         if self._moving_cells is None or self._moving_points is None:
             return None
-        self._reference_states = self.states.to_numpy()
+        self._reference_states = self.bodies.states.to_numpy()
         count, first = self.moving_count, self.fixed_count
-        take_samples(self.position, first, count, self._moving_position)
-        take_samples(self.position, self.first_sheet, self.sheet_count, self._reference_sheets)
+        take_samples(self.samples.position, first, count, self._moving_position)
+        take_samples(self.samples.position, self.sheets.first, self.sheet_count, self._reference_sheets)
         self._moving_cells.sort(self._moving_position, self._moving_ids, count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3)
         order_samples(
-            self._moving_position, self._moving_cells.order, count, first,
-            *self._moving_points.coordinates, self.moving_index,
-        )  # fmt: skip
+            self._moving_position, self._moving_cells.order, count, first, self._moving_points, self.moving_index
+        )
         return self._moving_points
 
 
-def _coordinates(positions: NDArray[np.float32]) -> tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray]:
+def _sorted_points(positions: NDArray[np.float32], cells: CellSort) -> SortedPoints:
     x, y, z = (_device_array(np.ascontiguousarray(positions[:, axis])) for axis in range(3))
-    return x, y, z
+    return SortedPoints(x, y, z, cells.cell_start)
 
 
 def _device_array(values: NDArray[np.generic]) -> ti.Ndarray:
@@ -212,3 +252,43 @@ def _device_array(values: NDArray[np.generic]) -> ti.Ndarray:
     array = ti.ndarray(dtype, len(rows)) if rows.ndim == 1 else ti.Vector.ndarray(3, dtype, len(rows))
     array.from_numpy(np.ascontiguousarray(rows))
     return array
+
+
+@kernel
+def place_samples(offset: Vectors, bodies: Bodies, samples: Samples):
+    """x_b = x_com + R r_b, v_b = v + omega x R r_b."""
+    for b in range(bodies.sample_count):
+        s = bodies.body[b] * STATE_WIDTH
+        r = offset[b]
+        arm = ti.math.vec3(0.0)
+        for row in ti.static(range(3)):
+            arm[row] = (
+                bodies.states[s + 3 + 3 * row] * r[0]
+                + bodies.states[s + 4 + 3 * row] * r[1]
+                + bodies.states[s + 5 + 3 * row] * r[2]
+            )
+        centre = ti.math.vec3(bodies.states[s], bodies.states[s + 1], bodies.states[s + 2])
+        speed = ti.math.vec3(bodies.states[s + 12], bodies.states[s + 13], bodies.states[s + 14])
+        spin = ti.math.vec3(bodies.states[s + 15], bodies.states[s + 16], bodies.states[s + 17])
+        samples.position[bodies.first + b] = centre + arm
+        samples.velocity[bodies.first + b] = speed + spin.cross(arm)
+
+
+@kernel
+def take_samples(position: Vectors, first: ti.i32, count: ti.i32, taken: Vectors):
+    """Copy of so many samples from `first` on."""
+    for b in range(count):
+        taken[b] = position[first + b]
+
+
+@kernel
+def order_samples(
+    position: Vectors, order: Integers, count: ti.i32, first: ti.i32, points: SortedPoints, index: Integers
+):
+    """Coordinates of the moving samples as they are sorted, and the index of each among all samples."""
+    for k in range(count):
+        x_b = position[order[k]]
+        points.x[k] = x_b[0]
+        points.y[k] = x_b[1]
+        points.z[k] = x_b[2]
+        index[k] = first + order[k]

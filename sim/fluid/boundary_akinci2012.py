@@ -31,7 +31,7 @@ from sim.fluid.kernels import (
 )
 
 if TYPE_CHECKING:
-    from sim.domain import DomainParameters
+    from sim.core.domain import DomainParameters
 
 SignedDistance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 

@@ -10,8 +10,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sim.domain import DomainParameters
-    from sim.parameters import Vector3
+    from sim.core.domain import DomainParameters
+    from sim.core.parameters import Vector3
 
 UNLIMITED = 1.0e30
 """Coordinate that no particle reaches [m]."""

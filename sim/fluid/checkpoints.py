@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sim.solver import Arrays
+    from sim.core.solver import Arrays
 
 CHECKPOINT_ARRAYS = {
     "position": ("float32", "vector"),
@@ -33,9 +33,14 @@ SHEET_ARRAYS = ("sheet_position", "sheet_velocity", "reference_sheet_position", 
 
 
 def check_checkpoint(
-    arrays: Arrays, fluid: str, *, capacity: int, carried: tuple[str, ...], body_states: tuple[int, ...],
+    arrays: Arrays,
+    fluid: str,
+    *,
+    capacity: int,
+    carried: tuple[str, ...],
+    body_states: tuple[int, ...],
     sheet_samples: int = 0,
-) -> None:  # fmt: skip
+) -> None:
     """Raise ValueError for arrays that are no checkpoint of a particle fluid.
 
     Args:
@@ -56,9 +61,13 @@ def check_checkpoint(
     if count > capacity:
         raise ValueError(f'the checkpoint has {count} particles, "{fluid}" has room for {capacity}')
     shapes = {
-        "vector": (count, 3), "scalar": (count,), "number": (1,), "pair": (2,), "bodies": body_states,
+        "vector": (count, 3),
+        "scalar": (count,),
+        "number": (1,),
+        "pair": (2,),
+        "bodies": body_states,
         "sheets": (sheet_samples, 3),
-    }  # fmt: skip
+    }
     for name, (dtype, width) in expected.items():
         found = arrays[name]
         if found.shape != shapes[width] or found.dtype != dtype:

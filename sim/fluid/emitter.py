@@ -2,24 +2,41 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Integers, Vectors
-from sim.cells import CellGrid, Cells, cell_of_point, row_of_cell
+from sim.core.arrays import Integers, Vectors
+from sim.core.bundles import bundle
+from sim.core.cells import CellGrid, Grid, cell_of_point, row_of_cell
+from sim.core.launch import kernel
+from sim.core.scan import exclusive_scan, scan_scratch_length
+from sim.fluid.discretization import Discretization
 from sim.fluid.opening import Opening
 from sim.fluid.parameters import FluidParameters
-from sim.fluid.particles import ParticleSet
-from sim.launch import fast_launch
-from sim.scan import exclusive_scan, scan_scratch_length
+from sim.fluid.particles import Layer, Particles, ParticleSet
 
 EDGE_IN_SPACINGS = 0.1
 """How much wider than its opening a nozzle is: the outermost places of a layer may lie on its edge."""
 
 BLOCKED_IN_SPACINGS = 0.9
 """No particle is put nearer to another one than this share of a spacing, or of the distance of layers if less."""
+
+
+@bundle
+class Nozzle(NamedTuple):
+    """Space in which particles move at the speed of the inflow, whatever pushes."""
+
+    centre: ti.math.vec3  # of the opening [m]
+    inflow: ti.math.vec3  # velocity [m/s]
+    first: ti.math.vec3  # unit vectors along the sides of the opening
+    second: ti.math.vec3
+    half_first: ti.f32  # half the lengths of these sides, or the radius of a disc twice [m]
+    half_second: ti.f32
+    is_round: ti.i32  # whether it is a disc
+    reach: ti.f32  # depth times speed [m²/s]
 
 
 class Emission:
@@ -37,9 +54,7 @@ class Emission:
         capped: particles not emitted in this frame as there are too many.
     """
 
-    def __init__(
-        self, fluids: Sequence[FluidParameters], *, spacing: float, particle_volume: float, grid: CellGrid
-    ) -> None:
+    def __init__(self, fluids: Sequence[FluidParameters], discretization: Discretization, grid: CellGrid) -> None:
         """Take the emitters of these fluids.
 
         Raises:
@@ -47,13 +62,15 @@ class Emission:
         """
         self.time_s = 0.0
         self.emitted = self.blocked = self.capped = 0
-        self._fluids, self._spacing, self._grid = tuple(fluids), spacing, grid
+        self._fluids, self._grid = tuple(fluids), grid
+        spacing = self._spacing = discretization.spacing
         self._phase = [number for number, fluid in enumerate(fluids) for _ in fluid.emitter]
         self.openings = [
-            Opening.of(emitter, spacing, particle_volume, fluid.support_in_spacings)
+            Opening.of(emitter, spacing, discretization.particle_volume, fluid.support_in_spacings)
             for fluid in fluids
             for emitter in fluid.emitter
         ]
+        self._nozzles = [_nozzle(opening, EDGE_IN_SPACINGS * spacing) for opening in self.openings]
         self._places = [_device_points(opening.points) for opening in self.openings]
         self._layers = np.zeros(len(self.openings), dtype=np.int64)
         most = max((len(opening.points) for opening in self.openings), default=1)
@@ -71,23 +88,17 @@ class Emission:
         flowing = [opening.speed for opening in self.openings if opening.start_s <= self.time_s < opening.end_s]
         return max(flowing, default=0.0)
 
-    def longest_step(self, way: float) -> float:
-        """Longest step [s] in which no layer of an emitter that begins goes farther than a way [m] from its opening."""
+    def longest_step(self, distance: float) -> float:
+        """Longest step [s] in which no layer of an emitter that begins gets farther than that from its opening [m]."""
         waiting = [opening for opening in self.openings if self.time_s < opening.start_s]
-        return min((opening.start_s - self.time_s + way / opening.speed for opening in waiting), default=math.inf)
+        return min((opening.start_s - self.time_s + distance / opening.speed for opening in waiting), default=math.inf)
 
     def drive(self, particles: ParticleSet, acceleration: ti.Ndarray) -> None:
         """Give all particles in a nozzle the velocity of its inflow, and no acceleration."""
         # Where emitters share a nozzle, the newest rules.
-        for opening in sorted(self.openings, key=lambda each: each.start_s):
+        for opening, nozzle in sorted(zip(self.openings, self._nozzles, strict=True), key=lambda pair: pair[0].start_s):
             if opening.start_s <= self.time_s < opening.drained_s:
-                drive_nozzle(
-                    particles.position, particles.velocity, acceleration, particles.count,
-                    opening.centre, opening.velocity, opening.axes[0], opening.axes[1],
-                    opening.half_size[0] + EDGE_IN_SPACINGS * self._spacing,
-                    opening.half_size[1] + EDGE_IN_SPACINGS * self._spacing, int(opening.is_round),
-                    opening.nozzle_depth * opening.speed,
-                )  # fmt: skip
+                drive_nozzle(particles.arrays, acceleration, nozzle)
 
     def advance(self, particles: ParticleSet, dt: float, first_id: int) -> int:
         """Let a step of time pass, and put the layers that have left by now among the particles.
@@ -153,17 +164,23 @@ class Emission:
         if count > self._room(phase, particles):
             self.capped += count
             return
-        moved = ti.math.vec3(*(opening.layer_at(layer, self.time_s)[0] - opening.points[0]))
-        grid = self._grid
-        find_free_places(
-            places, count, moved, particles.position, particles.cells.cell_start, sorted_count, particles.count,
-            ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape), grid.reach,
-            BLOCKED_IN_SPACINGS * min(self._spacing, opening.layer_distance), self._free,
-        )  # fmt: skip
-        added = exclusive_scan(self._free, count, self._scratch, self._order)
-        particles.append_layer(
-            places, moved, ti.math.vec3(*opening.velocity), phase, self._free, self._order, count, added, first_id
+        moved = opening.layer_at(layer, self.time_s)[0] - opening.points[0]
+        candidates = Layer(
+            places=places,
+            count=count,
+            moved=(moved[0], moved[1], moved[2]),
+            velocity=tuple(opening.velocity),
+            phase=phase,
+            free=self._free,
+            order=self._order,
+            first_id=first_id,
         )
+        clearance = BLOCKED_IN_SPACINGS * min(self._spacing, opening.layer_distance)
+        find_free_places(
+            candidates, particles.arrays, particles.cells.cell_start, self._grid.on_device, sorted_count, clearance
+        )
+        added = exclusive_scan(self._free, count, self._scratch, self._order)
+        particles.append(candidates, added)
         self.emitted += added
         self.blocked += count - added
 
@@ -173,7 +190,9 @@ class Emission:
         cap = self._fluids[phase].max_particles
         if cap is None:
             return room
-        present = count_phase(particles.phase, particles.count, phase) if len(self._fluids) > 1 else particles.count
+        present = (
+            count_phase(particles.arrays.phase, particles.count, phase) if len(self._fluids) > 1 else particles.count
+        )
         return min(room, cap - int(present))
 
 
@@ -183,55 +202,61 @@ def _device_points(points: NDArray[np.float64]) -> ti.Ndarray:
     return array
 
 
-@fast_launch
-@ti.kernel
-def drive_nozzle(
-    position: Vectors, velocity: Vectors, acceleration: Vectors, count: ti.i32,
-    centre: ti.math.vec3, inflow: ti.math.vec3, first: ti.math.vec3, second: ti.math.vec3,
-    half_first: ti.f32, half_second: ti.f32, is_round: ti.i32, reach: ti.f32,
-):  # fmt: skip
-    """v_i = velocity of the inflow, a_i = 0, in a disc or a rectangle and as deep as depth times speed is `reach`."""
-    for i in range(count):
-        from_centre = position[i] - centre
-        depth = from_centre.dot(inflow)
-        if depth > 0.0 and depth < reach:
-            u = from_centre.dot(first) / half_first
-            v = from_centre.dot(second) / half_second
+def _nozzle(opening: Opening, edge: float) -> Nozzle:
+    """The nozzle of an opening, wider than that by an edge [m]."""
+    return Nozzle(
+        tuple(opening.centre),
+        tuple(opening.velocity),
+        tuple(opening.axes[0]),
+        tuple(opening.axes[1]),
+        opening.half_size[0] + edge,
+        opening.half_size[1] + edge,
+        int(opening.is_round),
+        opening.nozzle_depth * opening.speed,
+    )
+
+
+@kernel
+def drive_nozzle(particles: Particles, acceleration: Vectors, nozzle: Nozzle):
+    """v_i = velocity of the inflow, a_i = 0, in a nozzle."""
+    for i in range(particles.count):
+        from_centre = particles.position[i] - nozzle.centre
+        depth = from_centre.dot(nozzle.inflow)
+        if depth > 0.0 and depth < nozzle.reach:
+            u = from_centre.dot(nozzle.first) / nozzle.half_first
+            v = from_centre.dot(nozzle.second) / nozzle.half_second
             inside = ti.max(ti.abs(u), ti.abs(v)) < 1.0
-            if is_round != 0:
+            if nozzle.is_round != 0:
                 inside = u * u + v * v < 1.0
             if inside:
-                velocity[i] = inflow
+                particles.velocity[i] = nozzle.inflow
                 acceleration[i] = ti.math.vec3(0.0)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def find_free_places(
-    places: Vectors, count: ti.i32, moved: ti.math.vec3, position: Vectors, cell_start: Integers,
-    sorted_count: ti.i32, particle_count: ti.i32,
-    origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells, reach: ti.i32, clearance: ti.f32, free: Integers,
-):  # fmt: skip
+    layer: Layer, particles: Particles, cell_start: Integers, grid: Grid, sorted_count: ti.i32, clearance: ti.f32
+):
     """1 for each place without a particle nearer than the clearance, else 0.
 
     Particles have moved by less than the skin since they were sorted; the cells to either side are wider than both
     together. Those that other layers brought in this step, from `sorted_count` on, are in no cell yet.
     """
-    for k in range(count):
-        x_k = places[k] + moved
-        cell = cell_of_point(x_k, origin, inverse_cell_size, shape, reach)
+    for k in range(layer.count):
+        x_k = layer.places[k] + layer.moved
+        cell = cell_of_point(x_k, grid)
         near = 0
-        for dz in range(-reach, reach + 1):
-            for dy in range(-reach, reach + 1):
-                row = row_of_cell(cell, dy, dz, shape)
-                for j in range(cell_start[row - reach], cell_start[row + reach + 1]):
-                    near += ti.cast((position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)
-        for j in range(sorted_count, particle_count):
-            near += ti.cast((position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)
-        free[k] = ti.cast(near == 0, ti.i32)
+        for dz in range(-grid.reach, grid.reach + 1):
+            for dy in range(-grid.reach, grid.reach + 1):
+                row = row_of_cell(cell, dy, dz, grid)
+                for j in range(cell_start[row - grid.reach], cell_start[row + grid.reach + 1]):
+                    near += ti.cast((particles.position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)
+        for j in range(sorted_count, particles.count):
+            near += ti.cast((particles.position[j] - x_k).norm_sqr() < clearance * clearance, ti.i32)
+        layer.free[k] = ti.cast(near == 0, ti.i32)
 
 
-@ti.kernel
+@kernel
 def count_phase(phase: Integers, count: ti.i32, wanted: ti.i32) -> ti.i32:
     """Particles of a fluid; a sum of integers, exact in any order."""
     total = 0

@@ -1,12 +1,12 @@
-"""How fast a fluid will become, as far as its start tells."""
+"""Largest speed of a fluid, as far as its start tells."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.domain import DomainParameters
-from sim.parameters import Vector3
+from sim.core.domain import DomainParameters
+from sim.core.parameters import Vector3
 
 SLOWEST_EXPECTED_SPEED = 0.1
 """Where neither gravity nor an initial velocity says what to expect [m/s]."""

@@ -16,7 +16,7 @@ from sim.shapes.placement import build_solid
 from sim.shapes.sampling import fill_with_particles
 
 if TYPE_CHECKING:
-    from sim.domain import DomainParameters
+    from sim.core.domain import DomainParameters
     from sim.fluid.parameters import FluidParameters
     from sim.shapes.solid import Solid
 

@@ -1,312 +1,325 @@
-"""Forces on the particles of every SPH solver: gravity, viscosity, cohesion, and pressure once it is known."""
+"""Forces on the particles, whatever the solver finds their pressure by, and their reaction on bodies and sheets."""
 
-from abc import abstractmethod
-from dataclasses import replace
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.cells import Cells, cell_of_point, row_of_cell
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle
+from sim.core.cells import Grid, cell_of_point, row_of_cell
+from sim.core.launch import kernel
+from sim.core.neighbors import Neighbors
+from sim.fluid.body_forces import Exerted
+from sim.fluid.body_friction import BodyFriction
+from sim.fluid.boundary import Samples
+from sim.fluid.discretization import Smoothing
 from sim.fluid.kernels import inverse_distance, spline_slope
-from sim.fluid.material_fluid import MaterialFluid
-from sim.fluid.sheet_forces import DENSITY, SheetForces
-from sim.fluid.sheet_samples import SheetSamples
-from sim.fluid.surface_tension import cohesion_becker_teschner2007
-from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING, pair_viscosity, viscous_factor
-from sim.launch import fast_launch
-from sim.solver import Arrays
+from sim.fluid.particles import Particles
+from sim.fluid.phases import Materials, Phases, device_table
+from sim.fluid.sheet_forces import DENSITY
+from sim.fluid.solve_record import SolveRecord
+from sim.fluid.surface_tension import Cohesion, cohesion_becker_teschner2007
+from sim.fluid.surface_tension_akinci2013 import SurfaceTensionAkinci2013
+from sim.fluid.tank import ParticleTank
+from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING, Viscosity, pair_viscosity, viscous_factor
+from sim.fluid.viscosity_implicit import ImplicitViscosity
 
 
-class SPHFluid(MaterialFluid):
-    """A particle fluid with the forces that do not depend on how its pressure is found.
+@bundle
+class Elastic(NamedTuple):
+    """Pressure that follows the density, (capacity,) each."""
+
+    pressure_term: Floats  # P_i [Pa]
+    frequency_squared: Floats  # of each particle against its own pressure [1/s²]
+    slope: ti.f32  # dp/d(rho/rho0) at rest density [Pa]
+    is_given: ti.template()  # False where pressure is found later
+
+
+class Forces:
+    """Gravity, viscosity, surface tension, and pressure where it is known before the step.
 
     a_i = g - 1/rho0 [sum_j V (P_i + P_j) grad W_ij + sum_b V_b P_i grad W_ib] + viscosity + cohesion
 
-    with P = p/(rho/rho0)², Monaghan's viscosity (`sim.fluid.viscosity`) and the cohesion of Becker & Teschner 2007.
+    with P = p/(rho/rho0)², Monaghan's viscosity (`sim.fluid.viscosity`) and the cohesion of Becker & Teschner 2007, or
+    implicit viscosity (`sim.fluid.viscosity_implicit`) and the surface tension of Akinci et al. 2013 in their place.
+
+    Attributes:
+        acceleration: of each particle [m/s²], (capacity,) of 3-vectors.
+        artificial_viscosity: alpha c h/2 [m²/s], which stands where 2 (d + 2) nu does.
+        implicit_viscosity: the solve for stiff fluids; None where viscosity is explicit.
     """
 
-    _pressure_slope = 0.0
-    """dp/d(rho/rho0) at rest density [Pa], where pressure follows the density."""
+    def __init__(
+        self, tank: ParticleTank, phases: Phases, cohesion: Cohesion, *, signal_speed: float, with_implicit: bool
+    ) -> None:
+        """Prepare for the particles of a tank.
 
-    sheets_answer = False
-    """Whether sheets answer to pressures that are tried within a step."""
-
-    def __init__(self, *args: Any, sheets: SheetSamples | None = None, **keywords: Any) -> None:
-        """Take particles, walls and bodies, as `ParticleFluid` does, and sheets."""
-        super().__init__(*args, sheets=None if sheets is None else sheets.boundary, **keywords)
-        self._acceleration = ti.Vector.ndarray(3, ti.f32, self._particles.capacity)
-        if sheets is not None:
-            self.body_forces.sheets = SheetForces(
-                self.boundary, sheets, gravity=self.gravity, capacity=self.capacity, spacing=self.spacing,
-                support_in_spacings=self.parameters.support_in_spacings, answers=self.sheets_answer,
-            )  # fmt: skip
-
-    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
-        """As of every particle fluid, with what it expects of sheets."""
-        sheets = self.body_forces.sheets
-        return {**super().checkpoint(), **({} if sheets is None else sheets.checkpoint())}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Continue from a checkpoint bit for bit.
-
-        Raises:
-            ValueError: the arrays are not a checkpoint of this fluid.
+        Args:
+            tank: holds them.
+            phases: their materials.
+            cohesion: surface tension of the materials.
+            signal_speed: speed c in the artificial viscosity [m/s].
+            with_implicit: whether viscosity is solved for.
         """
-        super().restore(arrays)
-        if self.body_forces.sheets is not None:
-            self.body_forces.sheets.restore(arrays)
+        self._tank, self._phases, self._cohesion = tank, phases, cohesion
+        parameters, support = phases.shared, tank.discretization.support_radius
+        capacity = tank.particles.capacity
+        self.acceleration = ti.Vector.ndarray(3, ti.f32, capacity)
+        self.artificial_viscosity = parameters.artificial_viscosity * signal_speed * support / 2.0
+        wall_friction = parameters.wall_friction
+        self._viscosity = Viscosity(
+            SOFTENING * support**2, self.artificial_viscosity, wall_friction, wall_friction > 0.0
+        )
+        self._materials = phases.materials
+        self.implicit_viscosity: ImplicitViscosity | None = None
+        if with_implicit:
+            tank.body_forces.let_bodies_respond(tank.gravity, tank.discretization.spacing)
+            bodies = BodyFriction(tank.boundary, tank.body_forces.response)
+            self.implicit_viscosity = ImplicitViscosity(capacity, bodies, wall_friction)
+            nothing = device_table(np.zeros(len(phases)))
+            self._materials = phases.materials._replace(dynamic_viscosity=nothing)
+        self._akinci2013 = (
+            SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, tank.discretization)
+            if cohesion.is_akinci2013
+            else None
+        )
+        density = tank.particles.density
+        self._no_pressure = Elastic(density, density, 0.0, False)
 
-    def boundary_forces(self) -> NDArray[np.float32]:
+    @property
+    def solves(self) -> dict[str, SolveRecord]:
+        """The solves of this frame, by what they are for."""
+        return {} if self.implicit_viscosity is None else {"viscosity": self.implicit_viscosity.record}
+
+    def begin_frame(self) -> None:
+        """Restart the counters of the frame."""
+        if self.implicit_viscosity is not None:
+            self.implicit_viscosity.record = SolveRecord()
+
+    def begin_sheets(self) -> None:
+        """Find the fluid that touches sheets at the start of a step, before anything acts between them."""
+        if self._tank.body_forces.sheets is not None:
+            self._tank.body_forces.sheets.begin_step(self._tank.particles, self._tank.body_forces.near)
+
+    def compute(self, dt: float, elastic: Elastic | None = None) -> None:
+        """Fill `acceleration` with all forces known before a step of dt [s], and count their reaction."""
+        tank = self._tank
+        compute_acceleration(
+            tank.particles.arrays,
+            tank.particles.near,
+            tank.boundary.samples,
+            tank.discretization.smoothing,
+            self._materials,
+            self._no_pressure if elastic is None else elastic,
+            self._viscosity,
+            tank.gravity,
+            tank.discretization.spacing,
+            self._cohesion.is_becker_teschner2007,
+            self.acceleration,
+        )
+        if self._akinci2013 is not None:
+            self._akinci2013.add_acceleration(
+                tank.particles.arrays, tank.particles.near, tank.boundary.samples, self.acceleration
+            )
+        self._begin_reaction(None if elastic is None else elastic.pressure_term, dt)
+        self.add_implicit_viscosity(dt)
+
+    def exerted(self, pressure_term: ti.Ndarray | None, *, with_friction: bool) -> Exerted:
+        """Forces on bodies by pressure, by explicit friction or by both."""
+        tank = self._tank
+        d = tank.discretization
+        return Exerted(
+            particles=tank.particles.arrays,
+            pressure_term=tank.particles.density if pressure_term is None else pressure_term,
+            materials=self._materials,
+            volume_gradient_factor=d.particle_volume * d.sigma / d.support_radius,
+            inverse_support=1.0 / d.support_radius,
+            viscosity=self._viscosity,
+            with_pressure=pressure_term is not None,
+            with_friction=with_friction and self._viscosity.with_wall_friction,
+        )
+
+    def react(self, pressure_term: ti.Ndarray, dt: float) -> None:
+        """Count the pressure of a step of dt [s], found after its other forces, as impulses on bodies.
+
+        Call it with the positions that the particles felt it at.
+        """
+        self._tank.body_forces.gather(self.exerted(pressure_term, with_friction=False), dt)
+
+    def recoil_sheets(self, solve: int, dt: float) -> None:
+        """Push the sheets' samples by the opposite of what acted on them in this solve of the last step."""
+        if self._tank.body_forces.sheets is not None:
+            self._tank.body_forces.sheets.begin_solve(solve)
+            self._tank.body_forces.sheets.recoil(dt)
+
+    def boundary_forces(self, pressure_term: ti.Ndarray) -> NDArray[np.float32]:
         """Pressure force of the fluid on each fixed boundary sample, in the order they were given [N], (m, 3).
 
         The reaction to the pressure part of a_i, gathered per sample: f_b = sum_i V V_b P_i grad_i W_ib.
         Samples beyond the reach of the fluid's grid feel nothing.
         """
-        self._compute_density()
-        boundary = self.boundary
+        boundary = self._tank.boundary
         forces = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
+        exerted = self.exerted(pressure_term, with_friction=False)
+        cell_start = self._tank.particles.cells.cell_start
         gather_boundary_forces(
-            boundary.position, boundary.volume, boundary.fixed_count,
-            self._particles.cells.cell_start, ti.math.vec3(*self._grid.origin), 1.0 / self._grid.cell_size,
-            Cells(*self._grid.shape), self._grid.reach,
-            self._particles.position, self._pressure_term,
-            self.particle_volume * self._sigma / self.support_radius, 1.0 / self.support_radius,
-            forces,
-        )  # fmt: skip
+            boundary.samples, boundary.fixed_count, cell_start, self._tank.grid.on_device, exerted, forces
+        )
         result = np.zeros((boundary.given_count, 3), dtype=np.float32)
         result[boundary.index] = forces.to_numpy()[: boundary.fixed_count]
         return result
 
-    def pressures(self) -> NDArray[np.float32]:
-        """Pressure of each particle [Pa], (n,), by particle id."""
-        self._compute_density()
-        return self._pressures()[self._by_id()]
-
-    def _pressures(self) -> NDArray[np.float32]:
-        density, term = self._host(self._density), self._host(self._pressure_term)
-        return (term * density**2).astype(np.float32)
-
-    @property
-    @abstractmethod
-    def _pressure_term(self) -> ti.Ndarray:
-        """P_i = p_i/(rho_i/rho0)² of each particle [Pa]."""
-
-    @property
-    @abstractmethod
-    def _signal_speed(self) -> float:
-        """Speed c in the artificial viscosity [m/s]."""
-
-    @property
-    def _artificial_viscosity(self) -> float:
-        """alpha c h/2 [m²/s], which stands where 2 (d + 2) nu does."""
-        return self.parameters.artificial_viscosity * self._signal_speed * self.support_radius / 2.0
-
-    def _compute_acceleration(self, pressure_term: ti.Ndarray | None) -> None:
-        """Fill `_acceleration` with gravity, viscosity, cohesion and, where its term P is given, pressure."""
-        particles, parameters, phases = self._particles, self.parameters, self.phases
-        assert pressure_term is None or self._frequency_squared is not None
-        compute_acceleration(
-            particles.position, particles.velocity, particles.phase, self._density,
-            self._density if pressure_term is None else pressure_term,
-            particles.count, *self._list,
-            self.boundary.position, self.boundary.velocity, self.boundary.volume, self.boundary.friction_volume,
-            self.boundary.moving_count > 0,
-            phases.rest_density, self._explicit_viscosity, phases.surface_tension, len(phases) > 1,
-            self.gravity, self.particle_volume, self._sigma, 1.0 / self.support_radius,
-            pressure_term is not None, self._pressure_slope,
-            SOFTENING * self.support_radius**2, self._artificial_viscosity,
-            parameters.wall_friction, self.spacing, parameters.wall_friction > 0.0,
-            self._with_kappa, self._acceleration,
-            self._density if self._frequency_squared is None else self._frequency_squared,
-        )  # fmt: skip
-        self._add_surface_tension(self._acceleration)
-
-    def _begin_sheets(self) -> None:
-        """Find the fluid that touches sheets at the start of a step, before anything acts between them."""
-        if self.body_forces.sheets is not None:
-            self.body_forces.sheets.begin_step(self.body_forces.near, self._sheet_terms, self._particles.count)
-
-    def _recoil_sheets(self, solve: int, dt: float) -> None:
-        """Push the sheets' samples by the opposite of what acted on them in this solve of the last step."""
-        if self.body_forces.sheets is not None:
-            self.body_forces.sheets.begin_solve(solve)
-            self.body_forces.sheets.recoil(dt)
-
-    def sheets_moved(self, way: float, speed: float, *, elapsed_s: float) -> None:
-        """Take note that the samples of sheets were placed anew.
-
-        Args:
-            way: how far any of them got at most [m].
-            speed: the largest of them [m/s].
-            elapsed_s: time since they were placed last [s]; 0 where they are put there anew.
-        """
-        self._boundary_travelled += way
-        self._sheet_speed = speed
-        self._without_neighbors |= elapsed_s == 0.0
-
-    def take_sheet_motion(self, change: ti.Ndarray, largest_change: float, dt: float) -> None:
-        """Let the fluid that touched sheets in the last step move along with them.
-
-        Args:
-            change: what the velocity of each sample of a sheet differs by from what the last step took it for [m/s].
-            largest_change: norm of the largest of them [m/s].
-            dt: that step [s].
-        """
-        sheets = self.body_forces.sheets
-        assert sheets is not None
-        sheets.take_motion(self._sheet_terms, self._particles.velocity, change, dt, walls=self._stepper.box.walls)
-        self._travelled += dt * largest_change
-        self._motion = replace(self._motion, max_speed=self._motion.max_speed + largest_change)
-
-    def _react_on_bodies(self, pressure_term: ti.Ndarray | None, dt: float, *, with_friction: bool = True) -> None:
-        """Count what the particles feel from moving bodies as impulses on these, for a step of dt [s].
-
-        Call it with the positions and velocities that the particles felt it at. `with_friction` is False where
-        friction was counted before, in the first call of the step. There, bodies that answer within the step begin to
-        fall, as the particles do by `_compute_acceleration`.
-        """
-        sheets = self.body_forces.sheets
-        if with_friction and sheets is not None:
+    def _begin_reaction(self, pressure_term: ti.Ndarray | None, dt: float) -> None:
+        """Count what has acted so far on bodies and sheets; those that answer within the step then begin to fall."""
+        body_forces = self._tank.body_forces
+        sheets = body_forces.sheets
+        if sheets is not None:
             sheets.begin_solve(DENSITY)
-        if pressure_term is not None or self.parameters.wall_friction > 0.0:
-            self.body_forces.gather(*self._body_force_terms(pressure_term, with_friction=with_friction), dt=dt)
+        if pressure_term is not None or self._viscosity.with_wall_friction:
+            body_forces.gather(self.exerted(pressure_term, with_friction=True), dt)
         # After the gathering: the particles felt friction against samples that had not begun to fall or recoil.
-        if with_friction and self.body_forces.response is not None:
-            self.body_forces.response.fall(dt)
-        if with_friction and sheets is not None:
+        if body_forces.response is not None:
+            body_forces.response.fall(dt)
+        if sheets is not None:
             sheets.recoil(dt)
-            sheets.add_missing_weight(self.body_forces.near, self._sheet_terms, dt)
+            sheets.add_missing_weight(self._tank.particles, body_forces.near, dt)
 
-    @property
-    def _sheet_terms(self) -> tuple[Any, ...]:
-        """What `SheetForces` takes of the particles."""
-        return self._particles.position, self._particles.phase, *self._list, self.phases.rest_density
+    def add_implicit_viscosity(self, dt: float) -> None:
+        """Add viscosity to all other accelerations, where it is implicit, and count its friction on bodies."""
+        solver, tank = self.implicit_viscosity, self._tank
+        if solver is None:
+            return
+        viscous = self.exerted(None, with_friction=True)._replace(
+            materials=self._phases.materials, viscosity=self._viscosity._replace(artificial=0.0), with_friction=True
+        )
 
-    def _body_force_terms(self, pressure_term: ti.Ndarray | None, *, with_friction: bool) -> tuple[Any, ...]:
-        """What the forces on bodies by pressure, by friction or by both are made of (`gather_sample_forces`)."""
-        particles, phases = self._particles, self.phases
-        return (
-            particles.position, particles.velocity, particles.phase, self._density,
-            self._density if pressure_term is None else pressure_term,
-            phases.rest_density, self._explicit_viscosity,
-            self.particle_volume * self._sigma / self.support_radius, 1.0 / self.support_radius,
-            SOFTENING * self.support_radius**2, self._artificial_viscosity, self.parameters.wall_friction,
-            pressure_term is not None, with_friction and self.parameters.wall_friction > 0.0,
-        )  # fmt: skip
+        def friction(velocity: ti.Ndarray, sample_velocity: ti.Ndarray) -> NDArray[np.float64]:
+            moving = viscous._replace(particles=viscous.particles._replace(velocity=velocity))
+            return tank.body_forces.measure(moving, sample_velocity)
+
+        solver.add_acceleration(
+            tank.particles, tank.boundary.samples, self._phases, tank.discretization, friction, self.acceleration, dt
+        )
+        if self._viscosity.with_wall_friction:
+            found = viscous._replace(particles=viscous.particles._replace(velocity=solver.velocity))
+            tank.body_forces.gather(found, dt, sample_velocity=solver.bodies.found_velocity())
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def compute_acceleration(
-    position: Vectors, velocity: Vectors, phase: Integers, density: Floats, pressure_term: Floats, count: ti.i32,
-    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
-    boundary_position: Vectors, boundary_velocity: Vectors, boundary_volume: Floats, friction_volume: Floats,
-    with_moving: ti.template(),
-    rest_density: Floats, dynamic_viscosity: Floats, surface_tension: Floats, several: ti.template(),
-    gravity: ti.math.vec3, volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, with_pressure: ti.template(),
-    pressure_slope: ti.f32, softening: ti.f32, artificial: ti.f32, wall_friction: ti.f32, spacing: ti.f32,
-    with_wall_friction: ti.template(), with_cohesion: ti.template(), acceleration: Vectors, frequency_squared: Floats,
-):  # fmt: skip
-    """All accelerations in one pass over the neighbours, or all but that by pressure; the terms stand at the solver.
+    particles: Particles,
+    near: Neighbors,
+    samples: Samples,
+    smoothing: Smoothing,
+    materials: Materials,
+    elastic: Elastic,
+    viscosity: Viscosity,
+    gravity: ti.math.vec3,
+    spacing: ti.f32,
+    with_cohesion: ti.template(),
+    acceleration: Vectors,
+):
+    """All accelerations in one pass over the neighbours, or all but that by pressure; the terms stand at `Forces`.
 
     With pressure also the square of the frequency at which a particle would swing against the pressures that its own
-    displacement makes, dp/d(rho/rho0) A_ii with A_ii as in `sim.fluid.pressure_kernels`: high where a particle is
-    squeezed, or close to boundary samples. `pressure_slope` is dp/d(rho/rho0) at rest density [Pa].
+    displacement makes, dp/d(rho/rho0) A_ii with A_ii as in `sim.fluid.pressure`: high where a particle is squeezed, or
+    close to boundary samples.
     """
-    gradient_factor = sigma * inverse_support
+    gradient_factor = smoothing.sigma * smoothing.inverse_support
     ti.loop_config(block_dim=128)
-    for i in range(count):
-        x_i, v_i, rho_i = position[i], velocity[i], density[i]
+    for i in range(particles.count):
+        x_i, v_i, rho_i = particles.position[i], particles.velocity[i], particles.density[i]
         pressure_i = 0.0
-        if ti.static(with_pressure):
-            pressure_i = pressure_term[i]
+        if ti.static(elastic.is_given):
+            pressure_i = elastic.pressure_term[i]
         own = 0
-        if ti.static(several):
-            own = phase[i]
-        rho0, mu = rest_density[own], LAPLACIAN_FACTOR * dynamic_viscosity[own]
+        if ti.static(materials.several):
+            own = particles.phase[i]
+        rho0, mu = materials.rest_density[own], LAPLACIAN_FACTOR * materials.dynamic_viscosity[own]
         fluid_sum = ti.math.vec3(0.0)
         gradient_sum = ti.math.vec3(0.0)
         square_sum = 0.0
         cohesion_sum = ti.math.vec3(0.0)
-        first = start[i]
-        for k in range(fluid_count[i]):
-            j = neighbors[first + k * stride]
-            x_ij = x_i - position[j]
+        first = near.start[i]
+        for k in range(near.fluid_count[i]):
+            j = near.indices[first + k * near.stride]
+            x_ij = x_i - particles.position[j]
             r_squared = x_ij.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             r = r_squared * inverse_r
-            v_dot_x = (v_i - velocity[j]).dot(x_ij)
+            v_dot_x = (v_i - particles.velocity[j]).dot(x_ij)
             mu_ij, rho0_ij, alike = mu, rho0, 1.0
-            if ti.static(several):
-                other = phase[j]
+            if ti.static(materials.several):
+                other = particles.phase[j]
                 alike = ti.cast(other == own, ti.f32)
-                mu_ij = pair_viscosity(mu, LAPLACIAN_FACTOR * dynamic_viscosity[other])
-                rho0_ij = 0.5 * (rho0 + rest_density[other])
-            viscous = viscous_factor(v_dot_x, r_squared, softening, mu_ij, artificial * rho0_ij)
-            scale = 2.0 * viscous / (rho_i + density[j])
-            if ti.static(with_pressure):
-                scale -= pressure_i + pressure_term[j]
-            slope = spline_slope(r * inverse_support)
+                mu_ij = pair_viscosity(mu, LAPLACIAN_FACTOR * materials.dynamic_viscosity[other])
+                rho0_ij = 0.5 * (rho0 + materials.rest_density[other])
+            viscous = viscous_factor(v_dot_x, r_squared, viscosity.softening, mu_ij, viscosity.artificial * rho0_ij)
+            scale = 2.0 * viscous / (rho_i + particles.density[j])
+            if ti.static(elastic.is_given):
+                scale -= pressure_i + elastic.pressure_term[j]
+            slope = spline_slope(r * smoothing.inverse_support)
             gradient = slope * inverse_r * x_ij
             fluid_sum += scale * gradient
-            if ti.static(with_pressure):
+            if ti.static(elastic.is_given):
                 gradient_sum += gradient
                 lightness = 1.0
-                if ti.static(several):
-                    lightness = rho0 / rest_density[phase[j]]
+                if ti.static(materials.several):
+                    lightness = rho0 / materials.rest_density[particles.phase[j]]
                 square_sum += slope * slope * lightness
             if ti.static(with_cohesion):
-                cohesion_sum += alike * cohesion_becker_teschner2007(r, inverse_support, spacing) * x_ij
+                cohesion_sum += alike * cohesion_becker_teschner2007(r, smoothing.inverse_support, spacing) * x_ij
         boundary_sum = ti.math.vec3(0.0)
         boundary_gradient = ti.math.vec3(0.0)
-        first += fluid_count[i] * stride
-        for k in range(boundary_count[i]):
-            b = neighbors[first + k * stride]
-            x_ib = x_i - boundary_position[b]
+        first += near.fluid_count[i] * near.stride
+        for k in range(near.boundary_count[i]):
+            b = near.indices[first + k * near.stride]
+            x_ib = x_i - samples.position[b]
             r_squared = x_ib.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             r = r_squared * inverse_r
-            slope = spline_slope(r * inverse_support)
-            if ti.static(with_wall_friction):
+            slope = spline_slope(r * smoothing.inverse_support)
+            if ti.static(viscosity.with_wall_friction):
                 v_ib = v_i
-                if ti.static(with_moving):
-                    v_ib -= boundary_velocity[b]
-                viscous = viscous_factor(v_ib.dot(x_ib), r_squared, softening, mu, artificial * rho0)
-                boundary_sum += wall_friction * viscous / rho_i * friction_volume[b] * slope * inverse_r * x_ib
-            gradient = boundary_volume[b] * slope * inverse_r * x_ib
+                if ti.static(samples.with_moving):
+                    v_ib -= samples.velocity[b]
+                viscous = viscous_factor(
+                    v_ib.dot(x_ib), r_squared, viscosity.softening, mu, viscosity.artificial * rho0
+                )
+                boundary_sum += (
+                    viscosity.wall_friction * viscous / rho_i * samples.friction_volume[b] * slope * inverse_r * x_ib
+                )
+            gradient = samples.volume[b] * slope * inverse_r * x_ib
             boundary_sum -= pressure_i * gradient
             boundary_gradient += gradient
-        if ti.static(with_pressure):
+        if ti.static(elastic.is_given):
+            volume = smoothing.volume
             diagonal = (volume * gradient_sum + boundary_gradient).norm_sqr() + volume * volume * square_sum
             stiffer = rho_i * rho_i * rho_i
-            frequency_squared[i] = pressure_slope / rho0 * stiffer * stiffer * gradient_factor**2 * diagonal
-        a_i = gravity + gradient_factor / rho0 * (volume * fluid_sum + boundary_sum)
+            elastic.frequency_squared[i] = elastic.slope / rho0 * stiffer * stiffer * gradient_factor**2 * diagonal
+        a_i = gravity + gradient_factor / rho0 * (smoothing.volume * fluid_sum + boundary_sum)
         if ti.static(with_cohesion):
-            a_i -= surface_tension[own] * sigma * cohesion_sum
+            a_i -= materials.surface_tension[own] * smoothing.sigma * cohesion_sum
         acceleration[i] = a_i
 
 
-@ti.kernel
+@kernel
 def gather_boundary_forces(
-    boundary_position: Vectors, boundary_volume: Floats, boundary_count: ti.i32,
-    cell_start: Integers, origin: ti.math.vec3, inverse_cell_size: ti.f32, shape: Cells,
-    reach: ti.i32, position: Vectors, pressure_term: Floats,
-    volume_gradient_factor: ti.f32, inverse_support: ti.f32, force: Vectors,
-):  # fmt: skip
+    samples: Samples, count: ti.i32, cell_start: Integers, grid: Grid, exerted: Exerted, force: Vectors
+):
     """Reaction to the pressure acceleration that each sample causes, summed in the order of the sorted particles."""
-    for b in range(boundary_count):
-        x_b = boundary_position[b]
-        cell = cell_of_point(x_b, origin, inverse_cell_size, shape, reach)
+    for b in range(count):
+        x_b = samples.position[b]
+        cell = cell_of_point(x_b, grid)
         total = ti.math.vec3(0.0)
-        for dz in range(-reach, reach + 1):
-            for dy in range(-reach, reach + 1):
-                row = row_of_cell(cell, dy, dz, shape)
-                for i in range(cell_start[row - reach], cell_start[row + reach + 1]):
-                    x_ib = position[i] - x_b
+        for dz in range(-grid.reach, grid.reach + 1):
+            for dy in range(-grid.reach, grid.reach + 1):
+                row = row_of_cell(cell, dy, dz, grid)
+                for i in range(cell_start[row - grid.reach], cell_start[row + grid.reach + 1]):
+                    x_ib = exerted.particles.position[i] - x_b
                     inverse_r = inverse_distance(x_ib.norm_sqr())
                     r = x_ib.norm_sqr() * inverse_r
-                    total += pressure_term[i] * spline_slope(r * inverse_support) * inverse_r * x_ib
-        force[b] = volume_gradient_factor * boundary_volume[b] * total
+                    total += exerted.pressure_term[i] * spline_slope(r * exerted.inverse_support) * inverse_r * x_ib
+        force[b] = exerted.volume_gradient_factor * samples.volume[b] * total

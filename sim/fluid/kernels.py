@@ -17,7 +17,8 @@ import taichi as ti
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from sim.reductions import runs_on_gpu
+from sim.core.bundles import func
+from sim.core.reductions import runs_on_gpu
 
 TINY_DISTANCE = 1.0e-12
 """Keeps x/|x| finite where two particles coincide; their force is then 0 [m]."""
@@ -29,7 +30,7 @@ NEAR_LAYER_IN_SPACINGS = 0.3, 1.2
 """Between these distances from the fluid is the first of two layers of samples, at every support up to 4."""
 
 
-@ti.func
+@func
 def spline(q: ti.f32) -> ti.f32:
     """Shape w(q) of the kernel; W = sigma w."""
     outer = ti.max(1.0 - q, 0.0)
@@ -37,7 +38,7 @@ def spline(q: ti.f32) -> ti.f32:
     return 2.0 * outer * outer * outer - 8.0 * inner * inner * inner
 
 
-@ti.func
+@func
 def spline_slope(q: ti.f32) -> ti.f32:
     """Slope w'(q) of the kernel's shape; grad W = (sigma / h) w' x/|x|."""
     outer = ti.max(1.0 - q, 0.0)
@@ -45,7 +46,7 @@ def spline_slope(q: ti.f32) -> ti.f32:
     return 24.0 * inner * inner - 6.0 * outer * outer
 
 
-@ti.func
+@func
 def inverse_distance(r_squared: ti.f32) -> ti.f32:
     """1/|x| from |x|², finite at 0: `r_squared * inverse_distance(r_squared)` is |x|.
 
@@ -54,7 +55,7 @@ def inverse_distance(r_squared: ti.f32) -> ti.f32:
     return ti.rsqrt(r_squared + TINY_DISTANCE * TINY_DISTANCE)
 
 
-@ti.func
+@func
 def distance(r_squared: ti.f32) -> ti.f32:
     """|x| from |x|², in the way that is fastest on the device: a CPU would divide to invert."""
     r = ti.sqrt(r_squared)

@@ -1,16 +1,13 @@
-"""How much memory a particle fluid takes."""
+"""Memory of a particle fluid."""
 
 from __future__ import annotations
 
+from sim.core.neighbors import GROWTH
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS
-from sim.neighbors import GROWTH
 
 EXPECTED_NEIGHBORS = 48
 """Places in the neighbour list per particle, with the skin, and on a GPU the padding of its slices, at the usual
 support radius; they grow with its cube."""
-
-IMPLICIT_PRESSURE_BYTES = 40
-"""What DFSPH and PCISPH have more of a particle than WCSPH: pressures, their acceleration, diagonal and errors."""
 
 
 def estimate_bytes(
@@ -28,7 +25,7 @@ def estimate_bytes(
         boundary_count: samples of walls and bodies.
         cell_count: cells of the search for neighbours, which cover the whole domain.
         support_in_spacings: support radius of the kernel.
-        extra_bytes: of a particle, for what WCSPH does not have.
+        extra_bytes: of a particle, as the solver's `SolverTraits` have them.
     """
     vector, number = 12, 4
     state = 2 * (2 * vector + 2 * number) + vector  # position, velocity, id and phase, sorted from and to; reference

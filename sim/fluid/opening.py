@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sim.fluid.parameters import DiscOpening
 
 if TYPE_CHECKING:
-    from sim.domain import DomainParameters
+    from sim.core.domain import DomainParameters
     from sim.fluid.parameters import EmitterParameters
     from sim.shapes.solid import Solid
 

@@ -8,8 +8,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sim.parameters import NonNegative, Parameters, Positive, Vector3
+from sim.core.parameters import NonNegative, Parameters, Positive, Vector3
+from sim.fluid.traits import TRAITS
 from sim.shapes.parameters import Placement
+
+WITH_SOUND_SPEED = " or ".join(f'"{name}"' for name, traits in TRAITS.items() if traits.has_sound_speed)
 
 
 class FluidBlockParameters(Placement):
@@ -51,6 +54,14 @@ class EmitterParameters(Parameters):
         if self.end_s is not None and self.end_s <= self.start_s:
             raise ValueError(f"end_s must be after start_s = {self.start_s:g} s, got {self.end_s:g} s")
         return self
+
+    def emitted_volume(self, until_s: float) -> float:
+        """Volume that flows in until a time [s], as far as there is room [m³]."""
+        area = (
+            math.prod(self.shape.size) if isinstance(self.shape, RectangleOpening) else math.pi * self.shape.radius**2
+        )
+        end_s = until_s if self.end_s is None else min(self.end_s, until_s)
+        return area * self.speed * max(0.0, end_s - self.start_s)
 
 
 class FluidParameters(Parameters):
@@ -131,31 +142,31 @@ class FluidParameters(Parameters):
     cfl: Positive = Field(default=1.0, le=2.0, description="Factor on the CFL time step [-].")
 
     @property
+    def spacing(self) -> float:
+        """Lattice spacing d = 2r [m]."""
+        return 2.0 * self.particle_radius
+
+    @property
     def lattice_volume(self) -> float:
-        """What a particle takes of a block, (2r)³ [m³]."""
-        return (2.0 * self.particle_radius) ** 3
+        """Volume that a particle takes of a block, d³ [m³]."""
+        return self.spacing**3
 
     @property
     def most_volume(self) -> float:
-        """What `max_particles` take [m³]; infinite without that key."""
+        """Volume that `max_particles` take [m³]; infinite without that key."""
         return math.inf if self.max_particles is None else self.max_particles * self.lattice_volume
 
     @property
     def skin(self) -> float:
-        """How much farther than the support the neighbour list reaches [support radii].
-
-        More means fewer searches, and more pairs in every step (docs/performance.md). DFSPH takes steps in which
-        particles use any skin up, and passes over the pairs many times in each: it searches anew for every step.
-        PCISPH looks at the pairs where they will be.
-        """
-        return 0.0 if self.solver == "dfsph" else 0.1
+        """Reach of the neighbour list beyond the support [support radii]."""
+        return TRAITS[self.solver].skin
 
     @model_validator(mode="after")
     def _comes_from_somewhere(self) -> Self:
         if not self.block and not self.emitter:
             raise ValueError("has neither a block nor an emitter; add [[fluid.block]] or [[fluid.emitter]]")
-        if self.sound_speed is not None and self.solver != "wcsph":
-            raise ValueError(f'sound_speed is for solver = "wcsph"; remove it, as "{self.solver}" has none')
+        if self.sound_speed is not None and not TRAITS[self.solver].has_sound_speed:
+            raise ValueError(f'sound_speed is for solver = {WITH_SOUND_SPEED}; remove it, as "{self.solver}" has none')
         if self.adhesion and self.surface_tension_model != "akinci2013":
             raise ValueError('adhesion needs surface_tension_model = "akinci2013"; remove it or name that model')
         return self
@@ -164,7 +175,7 @@ class FluidParameters(Parameters):
 OWN_KEYS = frozenset(
     ("name", "block", "emitter", "max_particles", "rest_density", "viscosity", "surface_tension", "adhesion")
 )
-"""What each fluid of a tank has of its own; all else is shared, as they share particles, steps and walls."""
+"""Keys that each fluid of a tank has of its own; all else is shared, as they share particles, steps and walls."""
 
 LARGEST_DENSITY_CONTRAST = 10.0
 """Largest rest density over the smallest in one tank. At 10 a light fluid stays at rest on a heavy one, and a heavy
@@ -172,23 +183,22 @@ one sinks through a light one; water and air (1000) would need another formulati
 
 
 def shared_conflicts(fluids: Sequence[FluidParameters]) -> list[tuple[int, str, str]]:
-    """Why fluids cannot share a tank: number of the fluid, its key, and a sentence, for each reason."""
+    """Reasons for which fluids cannot share a tank: number of the fluid, its key, and a sentence."""
     conflicts = []
     for number, fluid in enumerate(fluids[1:], start=1):
         for key in FluidParameters.model_fields:
             own, first = getattr(fluid, key), getattr(fluids[0], key)
             if key not in OWN_KEYS and own != first:
-                conflicts.append(
-                    (number, key, f'is {_written(own)}, but {_written(first)} in fluid[0] "{fluids[0].name}"; '
-                     "all fluids of a tank share it")
-                )  # fmt: skip
+                reason = f'is {_written(own)}, but {_written(first)} in fluid[0] "{fluids[0].name}"'
+                conflicts.append((number, key, f"{reason}; all fluids of a tank share it"))
         lightest, heaviest = sorted((fluid.rest_density, fluids[0].rest_density))
         if heaviest > LARGEST_DENSITY_CONTRAST * lightest:
-            conflicts.append(
-                (number, "rest_density", f"is {fluid.rest_density:g} kg/m³, and {fluids[0].rest_density:g} kg/m³ in "
-                 f'fluid[0] "{fluids[0].name}"; densities in a tank may differ by a factor of '
-                 f"{LARGEST_DENSITY_CONTRAST:g} at most")
-            )  # fmt: skip
+            reason = (
+                f"is {fluid.rest_density:g} kg/m³, and {fluids[0].rest_density:g} kg/m³ in fluid[0] "
+                f'"{fluids[0].name}"; densities in a tank may differ by a factor of '
+                f"{LARGEST_DENSITY_CONTRAST:g} at most"
+            )
+            conflicts.append((number, "rest_density", reason))
     return conflicts
 
 

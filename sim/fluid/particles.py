@@ -1,17 +1,45 @@
-"""The arrays of a particle fluid: physically sorted by cell, compacted when particles leave."""
+"""Arrays of the particles of a tank: physically sorted by cell, compacted when particles leave."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.cells import CellGrid, CellSort, SortedPoints
-from sim.launch import fast_launch
-from sim.neighbors import NeighborList, list_stride
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle
+from sim.core.cells import CellGrid, CellSort, SortedPoints
+from sim.core.launch import kernel
+from sim.core.neighbors import NeighborList, Neighbors, list_stride
 
 HostArrays = Mapping[str, NDArray[np.generic]]
+
+
+@bundle
+class Particles(NamedTuple):
+    """Particles as kernels read them, (capacity,) each."""
+
+    position: Vectors  # [m]
+    velocity: Vectors  # [m/s]
+    particle_id: Integers  # distinct; stays with a particle for good
+    phase: Integers  # number of its fluid
+    density: Floats  # relative to the rest density [-]; of the positions at which it was computed last
+    count: ti.i32  # particles that are there
+
+
+@bundle
+class Layer(NamedTuple):
+    """Particles that may come, (n,) each."""
+
+    places: Vectors  # where they are [m]
+    count: ti.i32
+    moved: ti.math.vec3  # how far all of them have moved from there [m]
+    velocity: ti.math.vec3  # of all of them [m/s]
+    phase: ti.i32  # number of their fluid
+    free: Integers  # 1 for the places to take, else 0
+    order: Integers  # number of taken places before each, (n + 1,)
+    first_id: ti.i32  # id of the first particle
 
 
 class ParticleSet:
@@ -21,38 +49,55 @@ class ParticleSet:
     sorted, and are part of every checkpoint.
 
     Attributes:
-        count: particles that are there; the arrays are longer where some have left or may still come.
-        position: (capacity,) of 3-vectors [m].
-        velocity: (capacity,) of 3-vectors [m/s].
-        particle_id: (capacity,), int32, distinct; stays with a particle for good.
-        phase: (capacity,), int32, which of the fluids a particle belongs to.
+        arrays: the particles as kernels read them; other ones after every sort.
         carried: scalars by name, (capacity,) each, float32.
-        reference: x, y and z when the neighbours were last found [m]; within half a skin of where particles are.
+        sorted_points: where the particles were when they were last sorted, within half a skin of where they are.
         cells: the sort of the last rebuild.
         neighbors: fluid and boundary neighbours within support + skin.
     """
 
     def __init__(self, grid: CellGrid, capacity: int, *, carried: tuple[str, ...] = ()) -> None:
-        self.count = 0
-        self.position, self._position_out = _vectors(capacity), _vectors(capacity)
-        self.velocity, self._velocity_out = _vectors(capacity), _vectors(capacity)
-        self.particle_id, self._particle_id_out = _integers(capacity), _integers(capacity)
-        self.phase, self._phase_out = _integers(capacity), _integers(capacity)
+        density = _floats(capacity)
+        self.arrays, self._spare = (
+            Particles(_vectors(capacity), _vectors(capacity), _integers(capacity), _integers(capacity), density, 0)
+            for _ in range(2)
+        )
         self.carried = {name: _floats(capacity) for name in carried}
         self._carried_out = _floats(capacity) if carried else _floats(1)
-        self.reference = (_floats(capacity), _floats(capacity), _floats(capacity))
         self.cells = CellSort(grid, capacity)
+        x, y, z = (_floats(capacity) for _ in range(3))
+        self.sorted_points = SortedPoints(x, y, z, self.cells.cell_start)
         self.neighbors = NeighborList(grid, capacity, stride=list_stride())
+
+    @property
+    def count(self) -> int:
+        """Particles that are there; the arrays are longer where some have left or may still come."""
+        return self.arrays.count
 
     @property
     def capacity(self) -> int:
         """Particles that the arrays have room for."""
-        return self.position.shape[0]
+        return int(self.position.shape[0])
 
     @property
-    def sorted_points(self) -> SortedPoints:
-        """Where the particles were when they were last sorted."""
-        return SortedPoints(self.reference, self.cells.cell_start)
+    def position(self) -> ti.Ndarray:
+        """Positions [m], (capacity,) of 3-vectors."""
+        return self.arrays.position
+
+    @property
+    def velocity(self) -> ti.Ndarray:
+        """Velocities [m/s], (capacity,) of 3-vectors."""
+        return self.arrays.velocity
+
+    @property
+    def density(self) -> ti.Ndarray:
+        """Densities relative to the rest density [-], (capacity,)."""
+        return self.arrays.density
+
+    @property
+    def near(self) -> Neighbors:
+        """The neighbour list as kernels read it."""
+        return self.neighbors.lists
 
     def load(self, arrays: HostArrays) -> None:
         """Take particles from the host.
@@ -61,83 +106,49 @@ class ParticleSet:
             arrays: `position` (n, 3), `velocity` (n, 3), `particle_id` (n,) and `phase` (n,), n at most the capacity;
                 carried scalars (n,) by name, 0 where there is none of the name.
         """
-        self.count = len(arrays["particle_id"])
-        for array, name in (
-            (self.position, "position"),
-            (self.velocity, "velocity"),
-            (self.particle_id, "particle_id"),
-            (self.phase, "phase"),
-        ):
-            array.from_numpy(_padded(arrays[name], self.capacity))
+        count = len(arrays["particle_id"])
+        self.arrays = self.arrays._replace(count=count)
+        for name in ("position", "velocity", "particle_id", "phase"):
+            getattr(self.arrays, name).from_numpy(_padded(arrays[name], self.capacity))
         for name, array in self.carried.items():
-            values = arrays.get(name, np.zeros(self.count, dtype=np.float32))
-            array.from_numpy(_padded(values, self.capacity))
+            array.from_numpy(_padded(arrays.get(name, np.zeros(count, dtype=np.float32)), self.capacity))
 
-    def append_layer(
-        self,
-        places: ti.Ndarray,
-        moved: ti.math.vec3,
-        velocity: ti.math.vec3,
-        phase: int,
-        free: ti.Ndarray,
-        order: ti.Ndarray,
-        count: int,
-        added: int,
-        first_id: int,
-    ) -> None:
-        """Add particles behind the others, their carried scalars 0; they have no neighbours before the next sort.
+    def append(self, layer: Layer, added: int) -> None:
+        """Add the particles of the places to take, their carried scalars 0, without neighbours before the next sort.
 
         Args:
-            places: where they are [m], (count,) of 3-vectors.
-            moved: and how far they all have moved from there [m].
-            velocity: of all of them [m/s].
-            phase: which of the fluids they are of.
-            free: 1 for the places to take, else 0, (count,).
-            order: number of taken places before each, (count,).
-            count: number of places.
+            layer: the particles.
             added: number of places taken; there must be room for them.
-            first_id: id of the first of them.
         """
-        append_particles(
-            places, moved, velocity, phase, free, order, count, self.count, first_id,
-            self.position, self.velocity, self.particle_id, self.phase,
-        )  # fmt: skip
+        append_particles(layer, self.arrays)
         for values in self.carried.values():
             clear_scalars(values, self.count, added)
-        self.count += added
+        self.arrays = self.arrays._replace(count=self.count + added)
 
     def host_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Copies of what `load` takes, in the order of the particles."""
-        arrays = {
-            "position": self.position,
-            "velocity": self.velocity,
-            "particle_id": self.particle_id,
-            "phase": self.phase,
-            **self.carried,
-        }
+        names = ("position", "velocity", "particle_id", "phase")
+        arrays = {name: getattr(self.arrays, name) for name in names} | self.carried
         return {name: self.host(array) for name, array in arrays.items()}
 
     def sort(self, keep_low: tuple[float, float, float], keep_high: tuple[float, float, float]) -> int:
         """Sort the particles by cell and id and drop those outside; returns how many were dropped."""
-        before = self.count
-        self.count = self.cells.sort(self.position, self.particle_id, before, keep_low, keep_high)
-        reorder_particles(
-            self.cells.order, self.count,
-            self.position, self.velocity, self.particle_id, self.phase,
-            self._position_out, self._velocity_out, self._particle_id_out, self._phase_out, *self.reference,
-        )  # fmt: skip
-        self.position, self._position_out = self._position_out, self.position
-        self.velocity, self._velocity_out = self._velocity_out, self.velocity
-        self.particle_id, self._particle_id_out = self._particle_id_out, self.particle_id
-        self.phase, self._phase_out = self._phase_out, self.phase
+        before = self.arrays
+        count = self.cells.sort(before.position, before.particle_id, before.count, keep_low, keep_high)
+        self.arrays, self._spare = self._spare._replace(count=count), before
+        reorder_particles(self.cells.order, before, self.arrays, self.sorted_points)
         for name, values in self.carried.items():
-            reorder_scalars(self.cells.order, self.count, values, self._carried_out)
+            reorder_scalars(self.cells.order, count, values, self._carried_out)
             self.carried[name], self._carried_out = self._carried_out, values
-        return before - self.count
+        return before.count - count
 
     def host(self, array: ti.Ndarray) -> NDArray[np.generic]:
-        """A copy of one of the arrays on the host, without the room for particles that are not there."""
+        """Copy of an array (capacity,) on the host, without the room for particles that are not there."""
         return array.to_numpy()[: self.count]
+
+    def order_by_id(self) -> NDArray[np.int64]:
+        """Indices of the particles by ascending id, (n,)."""
+        return np.argsort(self.host(self.arrays.particle_id))
 
 
 def _vectors(length: int) -> ti.Ndarray:
@@ -158,55 +169,42 @@ def _padded(rows: NDArray[np.generic], length: int) -> NDArray[np.generic]:
     return padded
 
 
-@fast_launch
-@ti.kernel
-def reorder_particles(
-    order: Integers, count: ti.i32,
-    position: Vectors, velocity: Vectors, particle_id: Integers, phase: Integers,
-    position_out: Vectors, velocity_out: Vectors, particle_id_out: Integers, phase_out: Integers,
-    reference_x: Floats, reference_y: Floats, reference_z: Floats,
-):  # fmt: skip
-    """Move particles to where the sort puts them, and note their positions."""
-    for k in range(count):
+@kernel
+def reorder_particles(order: Integers, before: Particles, after: Particles, reference: SortedPoints):
+    """Particles where the sort puts them, and their positions as the search reads them."""
+    for k in range(after.count):
         i = order[k]
-        x_i = position[i]
-        position_out[k] = x_i
-        velocity_out[k] = velocity[i]
-        particle_id_out[k] = particle_id[i]
-        phase_out[k] = phase[i]
-        reference_x[k] = x_i[0]
-        reference_y[k] = x_i[1]
-        reference_z[k] = x_i[2]
+        x_i = before.position[i]
+        after.position[k] = x_i
+        after.velocity[k] = before.velocity[i]
+        after.particle_id[k] = before.particle_id[i]
+        after.phase[k] = before.phase[i]
+        reference.x[k] = x_i[0]
+        reference.y[k] = x_i[1]
+        reference.z[k] = x_i[2]
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def reorder_scalars(order: Integers, count: ti.i32, values: Floats, values_out: Floats):
-    """Move one carried quantity to where the sort puts the particles."""
+    """One carried quantity where the sort puts the particles."""
     for k in range(count):
         values_out[k] = values[order[k]]
 
 
-@fast_launch
-@ti.kernel
-def append_particles(
-    places: Vectors, moved: ti.math.vec3, inflow: ti.math.vec3, number: ti.i32, free: Integers, order: Integers,
-    count: ti.i32, first: ti.i32, first_id: ti.i32,
-    position: Vectors, velocity: Vectors, particle_id: Integers, phase: Integers,
-):  # fmt: skip
-    """Write the particles of the free places behind the first ones."""
-    for k in range(count):
-        if free[k] != 0:
-            i = first + order[k]
-            position[i] = places[k] + moved
-            velocity[i] = inflow
-            particle_id[i] = first_id + order[k]
-            phase[i] = number
+@kernel
+def append_particles(layer: Layer, particles: Particles):
+    """Particles of the free places behind all others."""
+    for k in range(layer.count):
+        if layer.free[k] != 0:
+            i = particles.count + layer.order[k]
+            particles.position[i] = layer.places[k] + layer.moved
+            particles.velocity[i] = layer.velocity
+            particles.particle_id[i] = layer.first_id + layer.order[k]
+            particles.phase[i] = layer.phase
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def clear_scalars(values: Floats, first: ti.i32, count: ti.i32):
-    """Set a carried quantity of new particles to 0."""
+    """Zeros for a carried quantity of new particles."""
     for i in range(first, first + count):
         values[i] = 0.0

@@ -1,30 +1,36 @@
 """The fluids that share a tank: one set of particles, one time step, a material for each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from sim.core.arrays import Floats
+from sim.core.bundles import bundle
+from sim.fluid.parameters import FluidParameters
 
-    from sim.fluid.parameters import FluidParameters
+
+@bundle
+class Materials(NamedTuple):
+    """Materials by number, (k,) each."""
+
+    rest_density: Floats  # rho0 [kg/m³]
+    dynamic_viscosity: Floats  # mu = rho0 nu [Pa s]
+    surface_tension: Floats  # coefficient, in the unit of its model
+    several: ti.template()  # whether there is more than one
 
 
 class Phases:
-    """Materials by number; the particles' `phase` says which of them each one is of.
+    """Materials by number, one of which each particle has as its `phase`.
 
     Attributes:
         parameters: of each fluid.
         names: of each fluid.
         rest_densities: rho0 of each [kg/m³], (k,), float64, on the host.
         viscosities: nu of each [m²/s], (k,), float64, on the host.
-        rest_density: the same on the device, float32.
-        dynamic_viscosity: mu = rho0 nu of each [Pa s], on the device.
-        surface_tension: coefficient of each, in the unit of its model, on the device.
+        materials: of all of them on the device, float32.
     """
 
     def __init__(self, parameters: Sequence[FluidParameters]) -> None:
@@ -32,14 +38,17 @@ class Phases:
         self.names = tuple(fluid.name for fluid in parameters)
         self.rest_densities = np.array([fluid.rest_density for fluid in parameters])
         self.viscosities = np.array([fluid.viscosity for fluid in parameters])
-        self.rest_density = device_table(self.rest_densities)
-        self.dynamic_viscosity = device_table(self.rest_densities * self.viscosities)
-        self.surface_tension = device_table(np.array([fluid.surface_tension for fluid in parameters]))
+        self.materials = Materials(
+            rest_density=device_table(self.rest_densities),
+            dynamic_viscosity=device_table(self.rest_densities * self.viscosities),
+            surface_tension=device_table(np.array([fluid.surface_tension for fluid in parameters])),
+            several=len(self.parameters) > 1,
+        )
 
     def set_viscosities(self, viscosities: NDArray[np.float64]) -> None:
         """Change nu of each fluid [m²/s], (k,), in the arrays that solvers hold."""
         self.viscosities[:] = viscosities
-        self.dynamic_viscosity.from_numpy((self.rest_densities * viscosities).astype(np.float32))
+        self.materials.dynamic_viscosity.from_numpy((self.rest_densities * viscosities).astype(np.float32))
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -56,7 +65,7 @@ class Phases:
 
 
 def device_table(values: np.ndarray) -> ti.Ndarray:
-    """A number for each fluid, float32, on the device."""
+    """Numbers of the fluids on the device, float32, (k,)."""
     array = ti.ndarray(ti.f32, len(values))
     array.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
     return array

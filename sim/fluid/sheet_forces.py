@@ -1,14 +1,16 @@
 """Sheets in a fluid: what the fluid does to their samples, how these answer, and the fluid that moves along."""
 
-from typing import Any
-
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.fluid.boundary import Boundary
-from sim.fluid.kernels import normalization, particle_volume
+from sim.core.solver import Arrays
+from sim.fluid.boundary import Boundary, NearParticles
+from sim.fluid.discretization import Discretization
+from sim.fluid.particles import ParticleSet
+from sim.fluid.phases import Materials
 from sim.fluid.sheet_kernels import (
+    Contacts,
     accelerate_sheet_samples,
     add_missing_weight,
     add_sheets_to_diagonal,
@@ -22,7 +24,6 @@ from sim.fluid.sheet_kernels import (
     weigh_contacts,
 )
 from sim.fluid.sheet_samples import SheetSamples, one_sided_field, one_sided_tilt, resting_field
-from sim.solver import Arrays
 
 DIVERGENCE, DENSITY = SOLVES = 0, 1
 """Solves of a step whose forces are expected to last apart from each other: of divergence, and of density with all
@@ -30,8 +31,6 @@ other forces."""
 
 FULL_CONTACT = 0.5
 """Share of the density that samples give to fluid at rest beside them with which a particle touches them in full."""
-
-NearList = tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray]
 
 
 class SheetForces:
@@ -60,9 +59,16 @@ class SheetForces:
     """
 
     def __init__(
-        self, boundary: Boundary, sheets: SheetSamples, *, gravity: tuple[float, float, float], capacity: int,
-        spacing: float, support_in_spacings: float, answers: bool,
-    ) -> None:  # fmt: skip
+        self,
+        boundary: Boundary,
+        sheets: SheetSamples,
+        *,
+        gravity: tuple[float, float, float],
+        capacity: int,
+        discretization: Discretization,
+        materials: Materials,
+        answers: bool,
+    ) -> None:
         """Prepare for the sheets' samples of a boundary.
 
         Args:
@@ -70,17 +76,16 @@ class SheetForces:
             sheets: what they stand for.
             gravity: [m/s²].
             capacity: most particles that there can be.
-            spacing: of the particles [m].
-            support_in_spacings: support radius of the kernel.
+            discretization: of the fluid.
+            materials: of its particles.
             answers: whether samples answer within the fluid's step.
         """
-        self._boundary, self.answers = boundary, answers
+        self._boundary, self.answers, self._discretization = boundary, answers, discretization
+        self._materials = materials
         self._gravity = ti.math.vec3(*gravity)
-        support = support_in_spacings * spacing
-        self._volume, self._sigma = particle_volume(spacing, support_in_spacings), normalization(support)
-        self._inverse_support = 1.0 / support
-        self._full_field = FULL_CONTACT * resting_field(support_in_spacings)
-        self._one_side = one_sided_field(support_in_spacings), one_sided_tilt(support_in_spacings)
+        support = discretization.support_in_spacings
+        self._full_field = FULL_CONTACT * resting_field(support)
+        self._one_side = one_sided_field(support), one_sided_tilt(support)
         count = boundary.sheet_count
         self._own_mass, self._missing_volume = _floats(sheets.own_mass), _floats(sheets.missing_volume)
         self.mass, self._answering_mass = ti.ndarray(ti.f32, count), ti.ndarray(ti.f32, count)
@@ -89,23 +94,36 @@ class SheetForces:
         self._expected = [_zeros(count) for _ in SOLVES]
         self._found = [_zeros(count) for _ in SOLVES]
         self._solve = DIVERGENCE
-        self._count = 0
-        self._contact, self._start = ti.ndarray(ti.f32, capacity), ti.Vector.ndarray(3, ti.f32, capacity)
+        self._contacts = Contacts(ti.Vector.ndarray(3, ti.f32, capacity), ti.ndarray(ti.f32, capacity), 0)
 
-    def begin_step(self, near: NearList, particles: tuple[Any, ...], count: int) -> None:
-        """Forget the impulses of the last step, and find the masses with which samples answer in this one.
-
-        Args:
-            near: particles near each moving sample.
-            particles: their position, phase, neighbour list, and rest density of each phase, as kernels take them.
-            count: number of particles.
-        """
+    def begin_step(self, particles: ParticleSet, near: NearParticles) -> None:
+        """Forget the impulses of the last step, and find the masses with which samples answer in this one."""
+        boundary, smoothing = self._boundary, self._discretization.smoothing
         self._expected, self._found = self._found, self._expected
         for vectors in (self.impulse, self.push, *self._found):
-            clear_vectors(vectors, self._boundary.sheet_count)
-        self._weigh(near, particles, count)
+            clear_vectors(vectors, boundary.sheet_count)
+        self._contacts = self._contacts._replace(count=particles.count)
+        weigh_contacts(
+            particles.arrays,
+            particles.near,
+            self._materials,
+            boundary.samples,
+            boundary.sheets,
+            smoothing,
+            self._full_field,
+            self._contacts,
+        )
+        gather_contact_mass(
+            particles.arrays,
+            near,
+            boundary.samples,
+            boundary.sheets,
+            smoothing,
+            self._contacts.mass,
+            self.mass,
+        )
         if self.answers:
-            take_larger(self.mass, self._own_mass, self._boundary.sheet_count, self._answering_mass)
+            take_larger(self.mass, self._own_mass, boundary.sheet_count, self._answering_mass)
 
     def begin_solve(self, solve: int) -> None:
         """From now on forces count as those of this solve of the step, `DIVERGENCE` or `DENSITY`."""
@@ -122,80 +140,107 @@ class SheetForces:
 
     def count_forces(self, force: ti.Ndarray, dt: float) -> None:
         """Count forces on the moving samples [N] for a step of dt [s]; those of sheets answer to them."""
-        boundary = self._boundary
-        skipped, count = boundary.body_sample_count, boundary.sheet_count
-        count_impulses(force, skipped, count, dt, self._found[self._solve], self.impulse)
+        sheets = self._boundary.sheets
+        count_impulses(force, sheets, dt, self._found[self._solve], self.impulse)
         if self.answers:
-            self._push(force, skipped, dt)
+            self._push(force, sheets.skipped, dt)
 
     def accelerate(self, force: ti.Ndarray, acceleration: ti.Ndarray) -> None:
         """Fill in the accelerations of the sheets' samples by forces on the moving samples that are only tried."""
-        boundary = self._boundary
-        accelerate_sheet_samples(
-            force, boundary.body_sample_count, boundary.sheet_count, self._answering_mass, boundary.first_sheet,
-            acceleration,
-        )  # fmt: skip
+        accelerate_sheet_samples(force, self._boundary.sheets, self._answering_mass, acceleration)
 
     def add_to_diagonal(
-        self, near: NearList, particles: tuple[Any, ...], count: int, *, relaxation: float,
-        inverse_diagonal: ti.Ndarray,
-    ) -> None:  # fmt: skip
+        self, particles: ParticleSet, near: NearParticles, relaxation: float, inverse_diagonal: ti.Ndarray
+    ) -> None:
         """Add the sheets' share in A to its diagonal, such that relaxation by the diagonal converges.
 
         Their part of A is B_ij = V sum_b n_ib . n_jb / m_b with n_ib = V_b grad W_ib, and by Cauchy's inequality the
         diagonal matrix of V sum_b |n_ib| sum_j |n_jb| / m_b bounds it.
 
         Args:
-            near: particles near each moving sample.
-            particles: as for `begin_step`.
-            count: number of particles.
+            particles: of the fluid.
+            near: those near each moving sample.
             relaxation: omega that multiplies the inverse diagonal in the solve; the bound needs none.
             inverse_diagonal: 1/A_ii [kg/m]; becomes 1/(A_ii + omega times the bound).
         """
-        boundary = self._boundary
-        position, _, *neighbor_list = particles[:-1]
-        gradient_factor = self._sigma * self._inverse_support
+        samples, sheets = self._boundary.samples, self._boundary.sheets
+        inverse_support = self._discretization.smoothing.inverse_support
+        gradient_factor = self._discretization.sigma * inverse_support
+        weight = relaxation * self._discretization.particle_volume
         sum_sheet_gradients(
-            *self._samples, *near, position, gradient_factor, self._inverse_support, self._answering_mass, self._answer,
-        )  # fmt: skip
+            particles.arrays,
+            near,
+            samples,
+            sheets,
+            gradient_factor,
+            inverse_support,
+            self._answering_mass,
+            self._answer,
+        )
         add_sheets_to_diagonal(
-            position, count, *neighbor_list, boundary.position, boundary.first_sheet, self._answer, gradient_factor,
-            self._inverse_support, relaxation * self._volume, inverse_diagonal,
-        )  # fmt: skip
+            particles.arrays,
+            particles.near,
+            samples,
+            sheets,
+            self._answer,
+            gradient_factor,
+            inverse_support,
+            weight,
+            inverse_diagonal,
+        )
 
-    def add_missing_weight(self, near: NearList, particles: tuple[Any, ...], dt: float) -> None:
+    def add_missing_weight(self, particles: ParticleSet, near: NearParticles, dt: float) -> None:
         """Count the weight of the water that samples keep away and that a thin sheet would not, for a step of dt [s].
 
         Fluid keeps its distance from samples, as from a plate, and that plate would float. The water that is missing
         weighs on the sheet instead: what is lifted is the volume that the sheet has.
-
-        Args:
-            near: particles near each moving sample.
-            particles: as for `begin_step`.
-            dt: the step [s].
         """
-        boundary = self._boundary
-        position, phase, *_, rest_density = particles
+        boundary, d = self._boundary, self._discretization
         add_missing_weight(
-            boundary.position, boundary.first_sheet, boundary.body_sample_count, boundary.sheet_count, *near,
-            position, phase, rest_density, self._missing_volume, self._volume * self._sigma, *self._one_side,
-            self._inverse_support, dt * self._gravity, self.impulse,
-        )  # fmt: skip
+            particles.arrays,
+            near,
+            self._materials,
+            boundary.samples,
+            boundary.sheets,
+            self._missing_volume,
+            d.particle_volume * d.sigma,
+            *self._one_side,
+            d.smoothing.inverse_support,
+            dt * self._gravity,
+            self.impulse,
+        )
 
     def take_motion(
-        self, particles: tuple[Any, ...], velocity: ti.Ndarray, change: ti.Ndarray, dt: float, *, walls: Any
+        self,
+        particles: ParticleSet,
+        change: ti.Ndarray,
+        dt: float,
+        walls: tuple[tuple[float, float, float], tuple[float, float, float]],
     ) -> None:
-        """Give the fluid that touched at the start of the step these changes of velocity of the samples [m/s].
+        """Give the fluid that touched at the start of the step the changes of velocity of the samples.
 
-        Positions follow as if it had been so during the step of dt [s]; `walls`, two corners [m], hold them.
+        Positions follow as if it had been so during the step.
+
+        Args:
+            particles: of the fluid.
+            change: of the velocity of each sample [m/s].
+            dt: the step [s].
+            walls: two corners that hold the particles [m].
         """
-        boundary = self._boundary
-        position, phase, *neighbor_list, rest_density = particles
+        boundary, smoothing = self._boundary, self._discretization.smoothing
         take_sheet_motion(
-            position, velocity, phase, self._start, self._contact, self._count, *neighbor_list,
-            boundary.position, boundary.volume, boundary.first_sheet, change, rest_density, self._volume, self._sigma,
-            self._inverse_support, dt, *(ti.math.vec3(*corner) for corner in walls),
-        )  # fmt: skip
+            particles.arrays,
+            particles.near,
+            self._materials,
+            self._contacts,
+            boundary.samples,
+            boundary.sheets,
+            change,
+            smoothing,
+            dt,
+            walls[0],
+            walls[1],
+        )
 
     def checkpoint(self) -> dict[str, NDArray[np.float32]]:
         """The forces of the last step, which the next one expects."""
@@ -206,32 +251,14 @@ class SheetForces:
         for solve, force in enumerate(self._found):
             force.from_numpy(np.ascontiguousarray(arrays[f"sheet_force_{solve}"], dtype=np.float32))
 
-    @property
-    def _samples(self) -> tuple[Any, ...]:
-        """Positions and volumes of all samples, the first of sheets among them and among moving ones, their number."""
-        boundary = self._boundary
-        return (
-            boundary.position, boundary.volume, boundary.first_sheet, boundary.body_sample_count, boundary.sheet_count
-        )  # fmt: skip
-
     def _push(self, force: ti.Ndarray, skipped: int, factor: float) -> None:
-        boundary = self._boundary
         push_sheet_samples(
-            force, skipped, boundary.sheet_count, factor, self._answering_mass, boundary.first_sheet,
-            boundary.velocity, self.push,
-        )  # fmt: skip
-
-    def _weigh(self, near: NearList, particles: tuple[Any, ...], count: int) -> None:
-        boundary = self._boundary
-        self._count = count
-        position, phase, *neighbor_list, rest_density = particles
-        weigh_contacts(
-            position, phase, count, *neighbor_list, boundary.position, boundary.volume, boundary.first_sheet,
-            rest_density, self._volume, self._sigma, self._inverse_support, self._full_field, self._start,
-            self._contact,
-        )  # fmt: skip
-        gather_contact_mass(
-            *self._samples, *near, position, self._contact, self._sigma, self._inverse_support, self.mass
+            force,
+            self._boundary.sheets._replace(skipped=skipped),
+            factor,
+            self._answering_mass,
+            self._boundary.samples,
+            self.push,
         )
 
 

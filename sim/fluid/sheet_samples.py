@@ -45,9 +45,12 @@ class SheetSamples:
 
     @classmethod
     def of(
-        cls, rest: Sequence[NDArray[np.floating]], own_mass: NDArray[np.float64],
-        missing_volume: NDArray[np.float64], support_in_spacings: float = SUPPORT_IN_SPACINGS,
-    ) -> SheetSamples:  # fmt: skip
+        cls,
+        rest: Sequence[NDArray[np.floating]],
+        own_mass: NDArray[np.float64],
+        missing_volume: NDArray[np.float64],
+        support_in_spacings: float = SUPPORT_IN_SPACINGS,
+    ) -> SheetSamples:
         """Samples of sheets at rest [m], each (m_k, 3), with what each stands for, (m,) for all of them."""
         boundary = BoundarySamples.of_bodies(*rest).scaled(sheet_factor(support_in_spacings))
         return cls(boundary, own_mass, missing_volume)

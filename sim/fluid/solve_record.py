@@ -1,4 +1,4 @@
-"""What the iterative solves of a frame took."""
+"""Counters of the iterative solves of a frame."""
 
 import math
 from dataclasses import dataclass
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 @dataclass
 class SolveRecord:
-    """What the solves of one kind took in a frame.
+    """Counters of the solves of one kind in a frame.
 
     Attributes:
-        solves: how many there were.
+        solves: their number.
         iterations: of all of them.
         worst_error: largest error with which one ended [-].
-        not_converged: how many ended before their error was below the tolerance.
+        not_converged: number of those that ended before their error was below the tolerance.
     """
 
     solves: int = 0

@@ -1,26 +1,26 @@
-"""Moves particles, keeps them behind the walls, and measures the state on the way."""
+"""Steps of the particles: their motion, the walls that stop them, and measures of both."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Floats, Vectors
+from sim.core.arrays import Floats, Vectors
+from sim.core.launch import kernel
+from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduced_tree
 from sim.fluid.box import Box
-from sim.launch import fast_launch
-from sim.reductions import LaneReduction, Results, is_finite, reduced
 
 MAXIMA, COUNTS = 4, 3
 
 
 @dataclass(frozen=True)
 class MotionSummary:
-    """What the last step did to the particles.
+    """Motion of the particles in the last step.
 
     Attributes:
         max_speed: largest |v_i|, before a wall stops it [m/s].
         max_acceleration: largest |a_i| [m/s²].
-        max_displacement: largest way that a particle went [m].
+        max_displacement: largest displacement of a particle [m].
         max_frequency: largest frequency at which a particle can swing against its own pressure [1/s].
         left: particles that passed an open face.
         touched: particles that were put back onto a wall.
@@ -37,11 +37,10 @@ class MotionSummary:
 
 
 class ParticleStepper:
-    """Advances the particles by symplectic Euler and measures their motion in the same pass."""
+    """Symplectic Euler for the particles, which measures their motion in the same pass."""
 
     def __init__(self, box: Box) -> None:
         self.box = box
-        self._corners = (*box.walls, *box.openings)
         self._reduction = LaneReduction(maxima=MAXIMA, sums=COUNTS)
 
     def advance(
@@ -63,14 +62,19 @@ class ParticleStepper:
             dt: the step [s].
             frequency_squared: square of the frequency at which each particle can swing [1/s²], at least (count,).
         """
-        reduction = self._reduction
-        lanes = reduction.lanes
+        reduction, with_frequency = self._reduction, frequency_squared is not None
         results = advance_particles(
-            position, velocity, acceleration,
-            reduction.partial if frequency_squared is None else frequency_squared, frequency_squared is not None,
-            count, dt, *self._corners,
-            lanes.items(count), lanes.lane_step(count), lanes.item_step(), *reduction.tree,
-        )  # fmt: skip
+            position,
+            velocity,
+            acceleration,
+            frequency_squared if with_frequency else reduction.partial,
+            with_frequency,
+            count,
+            dt,
+            *self.box.walls,
+            *self.box.openings,
+            reduction.over(count),
+        )
         speed, strength, displacement, frequency, left, touched, bad = reduction.unpack(results)
         return MotionSummary(
             max_speed=float(np.sqrt(speed)),
@@ -83,21 +87,28 @@ class ParticleStepper:
         )
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def advance_particles(
-    position: Vectors, velocity: Vectors, acceleration: Vectors,
-    frequency_squared: Floats, with_frequency: ti.template(), count: ti.i32, dt: ti.f32,
-    wall_low: ti.math.vec3, wall_high: ti.math.vec3, keep_low: ti.math.vec3, keep_high: ti.math.vec3,
-    items: ti.i32, lane_step: ti.i32, item_step: ti.i32,
-    partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats,
-) -> Results:  # fmt: skip
+    position: Vectors,
+    velocity: Vectors,
+    acceleration: Vectors,
+    frequency_squared: Floats,
+    with_frequency: ti.template(),
+    count: ti.i32,
+    dt: ti.f32,
+    wall_low: ti.math.vec3,
+    wall_high: ti.math.vec3,
+    keep_low: ti.math.vec3,
+    keep_high: ti.math.vec3,
+    share: Share,
+) -> Results:
     """Symplectic Euler, then the walls; returns these.
 
     Largest |v|² [m²/s²], before a wall stops it, |a|² [m²/s⁴], |x - x before|² [m²] and squared frequency [1/s²];
     how many particles passed an open face, were put back onto a wall, and had a position or velocity that was
     not finite before the wall. Those that are not finite count neither as gone nor as put back.
     """
+    lanes = share.tree.lanes
     for lane in range(lanes):
         max_speed_squared = 0.0
         max_acceleration_squared = 0.0
@@ -106,8 +117,8 @@ def advance_particles(
         left = 0.0
         touched = 0.0
         bad = 0.0
-        for k in range(items):
-            i = lane * lane_step + k * item_step
+        for k in range(share.items):
+            i = lane * share.lane_step + k * share.item_step
             if i < count:
                 a_i = acceleration[i]
                 x_before = position[i]
@@ -135,11 +146,11 @@ def advance_particles(
                     max_frequency_squared = ti.max(max_frequency_squared, frequency_squared[i])
                 position[i] = x_i
                 velocity[i] = v_i
-        partial[lane] = max_speed_squared
-        partial[lanes + lane] = max_acceleration_squared
-        partial[2 * lanes + lane] = max_displacement_squared
-        partial[3 * lanes + lane] = max_frequency_squared
-        partial[4 * lanes + lane] = left
-        partial[5 * lanes + lane] = touched
-        partial[6 * lanes + lane] = bad
-    return reduced(partial, lanes, quantities, maxima, nodes)
+        share.tree.partial[lane] = max_speed_squared
+        share.tree.partial[lanes + lane] = max_acceleration_squared
+        share.tree.partial[2 * lanes + lane] = max_displacement_squared
+        share.tree.partial[3 * lanes + lane] = max_frequency_squared
+        share.tree.partial[4 * lanes + lane] = left
+        share.tree.partial[5 * lanes + lane] = touched
+        share.tree.partial[6 * lanes + lane] = bad
+    return reduced_tree(share.tree)

@@ -1,12 +1,57 @@
 """Surface tension as cohesion between particles."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
+from sim.core.bundles import func
+from sim.fluid.discretization import Discretization
 from sim.fluid.kernels import evaluate, lattice_offsets, spline
+from sim.fluid.parameters import FluidParameters
+from sim.fluid.surface_tension_akinci2013 import (
+    COHESION_PER_TENSION,
+    RATE_PER_COHESION,
+    cohesion_stress_akinci2013,
+)
 
 
-@ti.func
+@dataclass(frozen=True, eq=False)
+class Cohesion:
+    """Surface tension of the fluids of a tank: its model, its strength, and what it asks of speeds and steps.
+
+    Attributes:
+        is_becker_teschner2007: whether there is that of Becker & Teschner 2007.
+        is_akinci2013: whether there is that of Akinci et al. 2013.
+        akinci2013: its cohesion c of each fluid [m/s²], (k,).
+        stress: with which it pulls a filled lattice together, over the density [m²/s²].
+        rate: square of the frequency of a particle on the spring that its neighbours' cohesion is [1/s²].
+    """
+
+    is_becker_teschner2007: bool
+    is_akinci2013: bool
+    akinci2013: NDArray[np.float64]
+    stress: float
+    rate: float
+
+    @classmethod
+    def of(cls, fluids: tuple[FluidParameters, ...], discretization: Discretization) -> "Cohesion":
+        """The surface tension of these fluids, which share a model."""
+        support, support_in_spacings = discretization.support_radius, discretization.support_in_spacings
+        kappa = max(fluid.surface_tension for fluid in fluids)
+        is_akinci2013 = fluids[0].surface_tension_model == "akinci2013" and kappa > 0.0
+        c = np.array([COHESION_PER_TENSION * f.surface_tension / (f.rest_density * support**2) for f in fluids])
+        if is_akinci2013:
+            stress = cohesion_stress_akinci2013(support_in_spacings) * float(c.max()) * support
+            rate = RATE_PER_COHESION * float(c.max()) / support
+        else:
+            stress = cohesion_stress(support_in_spacings) * kappa / discretization.spacing
+            rate = cohesion_rate(support_in_spacings) * kappa / discretization.spacing**3
+        return cls(not is_akinci2013 and kappa > 0.0, is_akinci2013, c, stress, rate)
+
+
+@func
 def cohesion_becker_teschner2007(distance: ti.f32, inverse_support: ti.f32, spacing: ti.f32) -> ti.f32:
     """Factor on -kappa sigma (x_i - x_j) of the cohesion; w at the distance, at least one spacing.
 

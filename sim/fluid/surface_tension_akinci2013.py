@@ -1,11 +1,20 @@
 """Surface tension after Akinci, Akinci & Teschner 2013, "Versatile Surface Tension and Adhesion for SPH Fluids"."""
 
+from typing import NamedTuple
+
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Vectors
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
+from sim.core.neighbors import Neighbors
+from sim.fluid.boundary import Samples
+from sim.fluid.discretization import Discretization
 from sim.fluid.kernels import inverse_distance, lattice_offsets, particle_volume, spline_slope
-from sim.launch import fast_launch
+from sim.fluid.parameters import FluidParameters
+from sim.fluid.particles import Particles
+from sim.fluid.phases import device_table
 
 COHESION_PER_TENSION = 100.0
 """Cohesion c [m/s²] over sigma/(rho0 h²) with which a drop oscillates as one of surface tension sigma does (Rayleigh).
@@ -25,6 +34,15 @@ AREA_SHARE = 1.0e-3
 cohesion is gamma rho0 V C, its area force gamma (n_i - n_j), and rho0 is 1000 in its units."""
 
 
+@bundle
+class Attraction(NamedTuple):
+    """Attraction between particles, and to boundaries, of each fluid, (k,)."""
+
+    cohesion: Floats  # c [m/s²]
+    adhesion: Floats  # beta [-]
+    with_adhesion: ti.template()  # whether any fluid has adhesion
+
+
 class SurfaceTensionAkinci2013:
     """Cohesion and area forces between the particles of a fluid, and its adhesion to boundaries.
 
@@ -36,55 +54,27 @@ class SurfaceTensionAkinci2013:
     n_i - n_j is not along x_ij.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(
+        self, capacity: int, fluids: tuple[FluidParameters, ...], cohesion: np.ndarray, discretization: Discretization
+    ) -> None:
+        """Prepare for so many particles of these fluids, whose cohesion is c [m/s²], (k,)."""
         self._normal = ti.Vector.ndarray(3, ti.f32, max(capacity, 1))
+        self._discretization = discretization
+        adhesion = np.array([fluid.adhesion for fluid in fluids])
+        self._attraction = Attraction(device_table(cohesion), device_table(adhesion), bool((adhesion > 0.0).any()))
 
     def add_acceleration(
-        self,
-        *,
-        position: ti.Ndarray,
-        phase: ti.Ndarray,
-        density: ti.Ndarray,
-        count: int,
-        neighbor_list: tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray, ti.Ndarray, int],
-        boundary: tuple[ti.Ndarray, ti.Ndarray],
-        cohesion: ti.Ndarray,
-        adhesion: ti.Ndarray,
-        sigma: float,
-        volume: float,
-        support_radius: float,
-        with_adhesion: bool,
-        acceleration: ti.Ndarray,
+        self, particles: Particles, near: Neighbors, samples: Samples, acceleration: ti.Ndarray
     ) -> None:
-        """Add the accelerations by surface tension to all others.
-
-        Args:
-            position: of the particles [m].
-            phase: which fluid each particle is of.
-            density: relative to the rest density [-].
-            count: number of particles.
-            neighbor_list: start, fluid_count, boundary_count, indices, stride.
-            boundary: position [m] and volume [m³] of the boundary samples.
-            cohesion: c of each fluid [m/s²].
-            adhesion: beta of each fluid [-].
-            sigma: factor of the kernel [1/m³].
-            volume: of a particle [m³].
-            support_radius: h [m].
-            with_adhesion: whether any fluid has adhesion.
-            acceleration: by all other forces [m/s²]; that by surface tension is added.
-        """
-        start, fluid_count, _, neighbors, stride = neighbor_list
-        compute_normals(
-            position, phase, density, count, start, fluid_count, neighbors, stride,
-            sigma * volume, 1.0 / support_radius, self._normal,
-        )  # fmt: skip
+        """Add the accelerations by surface tension to all others [m/s²]."""
+        d = self._discretization
+        compute_normals(particles, near, d.sigma * d.particle_volume, 1.0 / d.support_radius, self._normal)
         add_surface_tension(
-            position, phase, density, count, *neighbor_list, *boundary, cohesion, adhesion,
-            volume, support_radius, with_adhesion, self._normal, acceleration,
-        )  # fmt: skip
+            particles, near, samples, self._attraction, d.particle_volume, d.support_radius, self._normal, acceleration
+        )
 
 
-@ti.func
+@func
 def cohesion_akinci2013(q: ti.f32) -> ti.f32:
     """C(q h) h³, eq. 2: 32/pi (1-q)³ q³, below q = 1/2 twice that less 1/64."""
     outer = ti.max(1.0 - q, 0.0)
@@ -103,66 +93,68 @@ def cohesion_stress_akinci2013(support_in_spacings: float) -> float:
     return particle_volume(1.0, support_in_spacings) * float((cohesion * q).sum()) / 6.0
 
 
-@ti.func
+@func
 def adhesion_akinci2013(q: ti.f32) -> ti.f32:
     """A(q h) h³, eq. 7: 0.007 (-4 q² + 6 q - 2)^(1/4) for 1/2 < q < 1."""
     return 0.007 * ti.sqrt(ti.sqrt(ti.max(-4.0 * q * q + 6.0 * q - 2.0, 0.0)))
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def compute_normals(
-    position: Vectors, phase: Integers, density: Floats, count: ti.i32,
-    start: Integers, fluid_count: Integers, neighbors: Integers, stride: ti.template(),
-    sigma_volume: ti.f32, inverse_support: ti.f32, normal: Vectors,
-):  # fmt: skip
+    particles: Particles, near: Neighbors, sigma_volume: ti.f32, inverse_support: ti.f32, normal: Vectors
+):
     """n_i = h sum_j V/rho_j grad W_ij over the particle's own fluid: 0 within, into the fluid at its surface."""
     ti.loop_config(block_dim=128)
-    for i in range(count):
-        x_i = position[i]
+    for i in range(particles.count):
+        x_i = particles.position[i]
         total = ti.math.vec3(0.0)
-        first = start[i]
-        for k in range(fluid_count[i]):
-            j = neighbors[first + k * stride]
-            if phase[j] == phase[i]:
-                x_ij = x_i - position[j]
+        first = near.start[i]
+        for k in range(near.fluid_count[i]):
+            j = near.indices[first + k * near.stride]
+            if particles.phase[j] == particles.phase[i]:
+                x_ij = x_i - particles.position[j]
                 r_squared = x_ij.norm_sqr()
                 inverse_r = inverse_distance(r_squared)
-                total += spline_slope(r_squared * inverse_r * inverse_support) * inverse_r / density[j] * x_ij
+                slope = spline_slope(r_squared * inverse_r * inverse_support)
+                total += slope * inverse_r / particles.density[j] * x_ij
         normal[i] = sigma_volume * total
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def add_surface_tension(
-    position: Vectors, phase: Integers, density: Floats, count: ti.i32,
-    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
-    boundary_position: Vectors, boundary_volume: Floats, cohesion: Floats, adhesion: Floats,
-    volume: ti.f32, support_radius: ti.f32, with_adhesion: ti.template(), normal: Vectors, acceleration: Vectors,
-):  # fmt: skip
+    particles: Particles,
+    near: Neighbors,
+    samples: Samples,
+    attraction: Attraction,
+    volume: ti.f32,
+    support_radius: ti.f32,
+    normal: Vectors,
+    acceleration: Vectors,
+):
     """Cohesion, area forces and adhesion; the equations stand at the class."""
     inverse_support = 1.0 / support_radius
     per_volume = inverse_support * inverse_support * inverse_support
     ti.loop_config(block_dim=128)
-    for i in range(count):
-        x_i, n_i, own = position[i], normal[i], phase[i]
+    for i in range(particles.count):
+        x_i, n_i, own = particles.position[i], normal[i], particles.phase[i]
         total = ti.math.vec3(0.0)
-        first = start[i]
-        for k in range(fluid_count[i]):
-            j = neighbors[first + k * stride]
-            x_ij = x_i - position[j]
+        first = near.start[i]
+        for k in range(near.fluid_count[i]):
+            j = near.indices[first + k * near.stride]
+            x_ij = x_i - particles.position[j]
             r_squared = x_ij.norm_sqr()
-            if phase[j] == own and r_squared < support_radius * support_radius:
+            if particles.phase[j] == own and r_squared < support_radius * support_radius:
                 inverse_r = inverse_distance(r_squared)
                 pull = volume * per_volume * cohesion_akinci2013(r_squared * inverse_r * inverse_support) * inverse_r
-                total += 2.0 / (density[i] + density[j]) * (pull * x_ij + AREA_SHARE * (n_i - normal[j]))
-        if ti.static(with_adhesion):
-            first += fluid_count[i] * stride
-            for k in range(boundary_count[i]):
-                b = neighbors[first + k * stride]
-                x_ib = x_i - boundary_position[b]
+                symmetric = 2.0 / (particles.density[i] + particles.density[j])
+                total += symmetric * (pull * x_ij + AREA_SHARE * (n_i - normal[j]))
+        if ti.static(attraction.with_adhesion):
+            first += near.fluid_count[i] * near.stride
+            for k in range(near.boundary_count[i]):
+                b = near.indices[first + k * near.stride]
+                x_ib = x_i - samples.position[b]
                 r_squared = x_ib.norm_sqr()
                 inverse_r = inverse_distance(r_squared)
-                pull = boundary_volume[b] * per_volume * adhesion_akinci2013(r_squared * inverse_r * inverse_support)
-                total += adhesion[own] * pull * inverse_r * x_ib
-        acceleration[i] -= cohesion[own] * total
+                pull = samples.volume[b] * per_volume * adhesion_akinci2013(r_squared * inverse_r * inverse_support)
+                total += attraction.adhesion[own] * pull * inverse_r * x_ib
+        acceleration[i] -= attraction.cohesion[own] * total

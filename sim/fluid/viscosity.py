@@ -1,6 +1,10 @@
 """Viscous forces between particles, shared by all particle fluids."""
 
+from typing import NamedTuple
+
 import taichi as ti
+
+from sim.core.bundles import bundle, func
 
 DIMENSIONS = 3
 LAPLACIAN_FACTOR = 2.0 * (DIMENSIONS + 2)
@@ -10,7 +14,17 @@ SOFTENING = 0.01
 """Keeps |x_ij|² + 0.01 h² away from zero for particles that meet."""
 
 
-@ti.func
+@bundle
+class Viscosity(NamedTuple):
+    """Viscosity that is not of one fluid alone."""
+
+    softening: ti.f32  # 0.01 h² [m²]
+    artificial: ti.f32  # alpha c_s h/2 [m²/s]
+    wall_friction: ti.f32  # viscosity against boundaries over that of the fluid [-]
+    with_wall_friction: ti.template()  # whether it is above 0
+
+
+@func
 def viscous_factor(v_dot_x: ti.f32, r_squared: ti.f32, softening: ti.f32, mu: ti.f32, artificial: ti.f32) -> ti.f32:
     """Factor on V/(rho_ij/rho0) grad W_ij / rho0 of the viscous acceleration.
 
@@ -31,7 +45,7 @@ def viscous_factor(v_dot_x: ti.f32, r_squared: ti.f32, softening: ti.f32, mu: ti
     return (mu * v_dot_x + artificial * ti.min(v_dot_x, 0.0)) / (r_squared + softening)
 
 
-@ti.func
+@func
 def pair_viscosity(mu_i: ti.f32, mu_j: ti.f32) -> ti.f32:
     """Dynamic viscosity between particles of two fluids, the harmonic mean: the shear stress is continuous then.
 

@@ -2,15 +2,23 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import taichi as ti
 
+from sim.core.reductions import LaneReduction
 from sim.fluid.body_friction import BodyFriction, Friction
+from sim.fluid.boundary import Samples
+from sim.fluid.discretization import Discretization
+from sim.fluid.particles import ParticleSet
+from sim.fluid.phases import Phases
 from sim.fluid.solve_record import SolveRecord
 from sim.fluid.time_step import CFL_NUMBER, VISCOUS_NUMBER
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING
 from sim.fluid.viscosity_kernels import (
+    Blocks,
+    Carried,
+    Iterate,
+    ViscousMatrix,
     advance_solve,
     finish_solve,
     multiply,
@@ -19,7 +27,6 @@ from sim.fluid.viscosity_kernels import (
     sum_norms,
     sum_products,
 )
-from sim.reductions import LaneReduction
 
 TOLERANCE = 1.0e-3
 """Where the iteration stops: the residual as a velocity, over the velocity changes that viscosity asks for, both as
@@ -80,19 +87,22 @@ class ImplicitViscosity:
         record: of the solves of this frame; its error is the true residual in the unit of `TOLERANCE`.
     """
 
-    def __init__(self, capacity: int, bodies: BodyFriction) -> None:
-        """Prepare for so many particles, and for bodies."""
+    def __init__(self, capacity: int, bodies: BodyFriction, wall_friction: float) -> None:
+        """Prepare for so many particles, for bodies, and for a viscosity against walls over that of the fluid [-]."""
         self.record = SolveRecord()
         self.bodies = bodies
+        self._wall_friction = wall_friction
         self._reduction = LaneReduction(maxima=0, sums=SUMS)
-        vectors = [ti.Vector.ndarray(3, ti.f32, max(capacity, 1)) for _ in range(7)]
-        self.velocity, self._change, self._residual, self._preconditioned, self._product = vectors[:5]
-        self._direction, self._direction_product = vectors[5:]
+        vectors = [ti.Vector.ndarray(3, ti.f32, max(capacity, 1)) for _ in range(9)]
+        self.velocity, self._iterate = vectors[0], Iterate(*vectors[1:7])
         # The right-hand side has been read when the first direction is written.
-        self._given = self._direction_product
-        # Two vectors hold the six numbers of a symmetric block: its diagonal, then xy, xz and yz.
-        self._inverse_diagonal = ti.Vector.ndarray(3, ti.f32, max(capacity, 1))
-        self._inverse_mixed = ti.Vector.ndarray(3, ti.f32, max(capacity, 1))
+        self._given = self._iterate.direction_product
+        self._blocks = Blocks(*vectors[7:])
+
+    @property
+    def change(self) -> ti.Ndarray:
+        """Change of the particles' velocities that the last solve found [m/s]."""
+        return self._iterate.change
 
     def begin_frame(self) -> None:
         """Restart the counters of the frame."""
@@ -100,110 +110,97 @@ class ImplicitViscosity:
 
     def add_acceleration(
         self,
-        *,
-        position: ti.Ndarray,
-        velocity: ti.Ndarray,
-        phase: ti.Ndarray,
-        density: ti.Ndarray,
-        count: int,
-        neighbor_list: tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray, ti.Ndarray, int],
-        boundary: tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray],
-        materials: tuple[ti.Ndarray, ti.Ndarray],
+        particles: ParticleSet,
+        samples: Samples,
+        phases: Phases,
+        discretization: Discretization,
         friction: Friction,
-        gradient_factor: float,
-        volume: float,
-        support_radius: float,
-        wall_friction: float,
-        rest_density: float,
-        carried: dict[str, ti.Ndarray],
         acceleration: ti.Ndarray,
         dt: float,
     ) -> None:
         """Add the viscous acceleration of a step to all others; leaves the new velocities in `velocity`.
 
         Args:
-            position: of the particles [m].
-            velocity: before the step [m/s].
-            phase: which of the materials each particle is of.
-            density: relative to the rest density [-].
-            count: number of particles.
-            neighbor_list: start, fluid_count, boundary_count, indices, stride.
-            boundary: position [m], velocity [m/s] and volume for friction [m³] of the boundary samples.
-            materials: rest density [kg/m³] and dynamic viscosity [Pa s] of each fluid.
+            particles: before the step, with the scalars `CARRIED`.
+            samples: of the boundary.
+            phases: materials of the particles.
+            discretization: of the fluid.
             friction: of the particles on the bodies.
-            gradient_factor: sigma/h of the kernel [1/m⁴].
-            volume: of a particle [m³].
-            support_radius: h [m].
-            wall_friction: viscosity against boundaries over that of the fluid [-].
-            rest_density: of the densest fluid [kg/m³].
-            carried: the particles' scalars with the names of `CARRIED`.
             acceleration: by all other forces [m/s²]; that by viscosity is added.
             dt: the step [s].
         """
-        changes = tuple(carried[name] for name in CARRIED)
-        bodies = self.bodies
+        carried = Carried(*(particles.carried[name] for name in CARRIED))
+        bodies, iterate = self.bodies, self._iterate
         bodies.forget()
-        if count == 0:
+        if particles.count == 0:
             return
-        self._with_bodies = bodies.are_free and wall_friction > 0.0
-        self._count, self._materials = count, (phase, materials[0])
-        operator = (
-            position, phase, density, count, *neighbor_list, boundary[0], boundary[2], *materials,
-            dt * LAPLACIAN_FACTOR * gradient_factor, volume, 1.0 / support_radius,
-            SOFTENING * support_radius**2, wall_friction,
-        )  # fmt: skip
-        predict_velocity(velocity, acceleration, count, dt, *changes, self.velocity, self._change)
+        self._with_bodies = bodies.are_free and self._wall_friction > 0.0
+        self._matrix = ViscousMatrix(
+            particles=particles.arrays,
+            near=particles.near,
+            samples=samples,
+            materials=phases.materials,
+            factor=dt * LAPLACIAN_FACTOR * discretization.gradient_factor,
+            volume=discretization.particle_volume,
+            inverse_support=1.0 / discretization.support_radius,
+            softening=SOFTENING * discretization.support_radius**2,
+            wall_friction=self._wall_friction,
+        )
+        self._share = self._reduction.over(particles.count)
+        predict_velocity(particles.velocity, acceleration, particles.count, dt, carried, self.velocity, iterate.change)
         if self._with_bodies:
-            self._product.fill(0.0)
-            bodies.prepare(friction, self.velocity, self._product, volume=volume, rest_density=rest_density, dt=dt)
-            bodies.guess(self._change)
-        self._solve(operator, boundary[1])
-        finish_solve(*self._materials, self._residual, self._change, count, dt, *changes, acceleration, self.velocity)
+            iterate.product.fill(0.0)
+            bodies.prepare(
+                friction,
+                self.velocity,
+                iterate.product,
+                volume=discretization.particle_volume,
+                rest_density=float(phases.rest_densities.max()),
+                dt=dt,
+            )
+            bodies.guess(iterate.change)
+        self._solve()
+        finish_solve(self._matrix, iterate, dt, carried, acceleration, self.velocity)
 
-    def _solve(self, operator: tuple[Any, ...], boundary_velocity: ti.Ndarray) -> None:
+    def _solve(self) -> None:
         """Find the change, and its true residual."""
-        left, given, asked = self._start(operator, boundary_velocity)
+        left, given, asked = self._start()
         if not left <= given:
             # Without the guess there is less to do: viscosity has nothing to change any more, or something new.
-            self._change.fill(0.0)
+            self._iterate.change.fill(0.0)
             self.bodies.forget()
-            left, _, asked = self._start(operator, boundary_velocity)
+            left, _, asked = self._start()
         asked = max(asked, LEAST_SQUARE / TOLERANCE**2)
         iterations, wanted, before = 0, TOLERANCE**2 * asked, math.inf
         while left > wanted and left <= STAGNATION**2 * before and iterations < MAX_ITERATIONS:
-            iterations += self._iterate(operator, wanted, MAX_ITERATIONS - iterations)
+            iterations += self._advance(wanted, MAX_ITERATIONS - iterations)
             before = left
-            left, _, _ = self._start(operator, boundary_velocity)
+            left, _, _ = self._start()
         self.record.add(iterations, math.sqrt(left / asked), converged=left <= wanted)
 
-    def _start(self, operator: tuple[Any, ...], boundary_velocity: ti.Ndarray) -> tuple[float, float, float]:
+    def _start(self) -> tuple[float, float, float]:
         """Find the true residual of the change so far; squares of it, of the right-hand side and of what that asks for.
 
         Squares are sums over the particles [m²/s²]: |r/rho0|², |b/rho0|² and |D⁻¹ b|².
         """
-        bodies = self.bodies
+        bodies, iterate = self.bodies, self._iterate
         if self._with_bodies:
-            bodies.restart(self._change)
-        start_solve(
-            *operator, boundary_velocity, self.velocity, self._change, bodies.changes,
-            self._inverse_diagonal, self._inverse_mixed, self._residual, self._preconditioned, self._given,
-        )  # fmt: skip
-        sum_norms(
-            *self._materials, self._residual, self._given, self._inverse_diagonal, self._inverse_mixed, *self._lanes,
-        )  # fmt: skip
+            bodies.restart(iterate.change)
+        start_solve(self._matrix, self.velocity, bodies.changes, self._blocks, iterate, self._given)
+        sum_norms(self._matrix, iterate.residual, self._given, self._blocks, self._share)
         return self._with_share_of(bodies.norms)
 
-    def _iterate(self, operator: tuple[Any, ...], wanted: float, most: int) -> int:
+    def _advance(self, wanted: float, most: int) -> int:
         """Conjugate gradients until the residual they carry along is as small as wanted; returns the iterations."""
-        bodies = self.bodies
+        bodies, iterate = self.bodies, self._iterate
         alpha = gamma_before = 0.0
         for iteration in range(most):
             if self._with_bodies:
                 bodies.spread_preconditioned()
-            multiply(*operator, self._preconditioned, bodies.changes, self._product)
+            multiply(self._matrix, iterate.preconditioned, bodies.changes, iterate.product)
             if self._with_bodies:
-                bodies.multiply(self._preconditioned)
-            sum_products(*self._materials, self._residual, self._preconditioned, self._product, *self._lanes)
+                bodies.multiply(iterate.preconditioned)
+            sum_products(self._matrix, iterate, self._share)
             gamma, delta, left = self._with_share_of(bodies.products)
             beta = gamma / gamma_before if iteration else 0.0
             curvature = delta - beta * gamma / alpha if iteration else delta
@@ -211,21 +208,10 @@ class ImplicitViscosity:
             if left <= wanted or not (curvature > 0.0 and gamma > 0.0):
                 return iteration
             alpha, gamma_before = gamma / curvature, gamma
-            advance_solve(
-                self._count, alpha, beta, self._inverse_diagonal, self._inverse_mixed, self._product,
-                self._direction, self._direction_product, self._change, self._residual, self._preconditioned,
-            )  # fmt: skip
+            advance_solve(self._matrix.particles.count, alpha, beta, self._blocks, iterate)
             if self._with_bodies:
                 bodies.advance(alpha, beta)
         return most
-
-    @property
-    def _lanes(self) -> tuple[Any, ...]:
-        """How many particles there are, and how a kernel shares them out, for the end of its arguments."""
-        count, lanes = self._count, self._reduction.lanes
-        return (
-            count, lanes.count, lanes.items(count), lanes.lane_step(count), lanes.item_step(), self._reduction.partial,
-        )  # fmt: skip
 
     def _with_share_of(self, bodies_share: Callable[[], tuple[float, float, float]]) -> tuple[float, float, float]:
         """The sums over all particles, and the bodies' share in them."""

@@ -1,28 +1,29 @@
 """Weakly compressible SPH (Becker & Teschner 2007) with the boundaries of Akinci et al. 2012."""
 
 import math
-from typing import Any
 
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Floats, Integers, Vectors
-from sim.fluid.forces import SPHFluid
-from sim.fluid.implicit_fluid import largest_eigenvalue
+from sim.core.arrays import Floats
+from sim.core.launch import kernel
+from sim.core.neighbors import Neighbors
+from sim.core.solver import Diagnostics
+from sim.fluid.boundary import Samples
+from sim.fluid.discretization import Smoothing
+from sim.fluid.fluid import SPHFluid
+from sim.fluid.forces import Elastic
 from sim.fluid.kernels import distance, spline
+from sim.fluid.particles import Particles
+from sim.fluid.pressure import largest_eigenvalue
+from sim.fluid.tank import FluidStart
 from sim.fluid.time_step import CFL_NUMBER, stable_time_step
-from sim.fluid.viscosity import LAPLACIAN_FACTOR
-from sim.launch import fast_launch
-from sim.solver import Diagnostics
 
 GAMMA = 7
 """Exponent of Tait's equation; the kernel multiplies it out."""
 
 SPEED_RATIO = 10.0
 """Speed of sound over the largest expected speed: keeps compression near 1 % (Monaghan 1994)."""
-
-RUNAWAY_RATIO = 3.0
-"""Speeds beyond this multiple of the speed of sound are numerical, not physical."""
 
 
 class WCSPHSolver(SPHFluid):
@@ -38,71 +39,76 @@ class WCSPHSolver(SPHFluid):
     whatever the densities.
 
     The force of a boundary sample (Akinci et al. 2012, eq. 9) has no mirrored second term p_i/rho0²: only this form
-    is the derivative of the fluid's internal energy. With the second term walls feed energy into the fluid: a column
-    at rest gained 1 J/kg within a second, whatever the time step.
+    is the derivative of the fluid's internal energy. With the second term walls feed energy into the fluid.
 
     Momentum of fluid pairs is conserved to rounding; energy is not gained, but lost to viscosity and to the clamping
     of the pressure at 0.
+
+    Attributes:
+        elastic: pressures of the present positions.
+        frequency_ratio: frequency of the stiffest swing of many particles over that of one against its own pressure.
     """
 
     speed_ratio = SPEED_RATIO
+    runaway = 3.0, "the speed of sound"
 
-    def __init__(self, *args: Any, **keywords: Any) -> None:
-        """Take particles, walls and bodies, as `ParticleFluid` does."""
-        super().__init__(*args, **keywords)
-        self.sound_speed = self.parameters.sound_speed or SPEED_RATIO * self._expected_speed
+    def __init__(self, start: FluidStart) -> None:
+        """Take particles, walls and bodies."""
+        super().__init__(start)
         self._stiffness = float(self.phases.rest_densities.max()) * self.sound_speed**2 / GAMMA
-        self._pressure_terms = ti.ndarray(ti.f32, self._particles.capacity)
-        self._frequency_squared = ti.ndarray(ti.f32, self._particles.capacity)
-        self._frequency_ratio = math.sqrt(largest_eigenvalue(self.parameters.support_in_spacings))
+        terms, frequencies = (ti.ndarray(ti.f32, self.particles.capacity) for _ in range(2))
+        self.elastic = Elastic(terms, frequencies, self._stiffness * GAMMA, True)
+        self.frequency_ratio = math.sqrt(largest_eigenvalue(self.discretization.support_in_spacings))
 
-    def stable_dt(self) -> float:
-        """Largest time step [s] for the current state, or the fixed one that the parameters name."""
-        if self.parameters.dt != "adaptive":
-            return float(self.parameters.dt)
-        artificial = self._artificial_viscosity / LAPLACIAN_FACTOR * max(1.0, self.parameters.wall_friction)
+    def substep(self, dt: float) -> None:
+        """Advance by dt [s]."""
+        self.compute_density()
+        self.forces.begin_sheets()
+        self.forces.compute(dt, self.elastic)
+        self.advance(dt, self.elastic.frequency_squared)
+
+    def compute_density(self) -> None:
+        """Relative density of each particle by summation, and its pressure by Tait's equation."""
+        self.tank.update_neighbors()
+        compute_density_and_pressure(
+            self.particles.arrays,
+            self.particles.near,
+            self.boundary.samples,
+            self.discretization.smoothing,
+            self._stiffness,
+            self.elastic.pressure_term,
+        )
+
+    def adapt_time_step(self) -> float:
+        """Largest time step [s] for the current state."""
+        motion, cfl = self.tank.motion, self.parameters.cfl
         # The pressure of the densest fluid pushes particles of the lightest one.
         sound_speed = self.sound_speed * math.sqrt(self.phases.density_contrast)
         limit = stable_time_step(
             spacing=self.spacing,
-            signal_speed=sound_speed + max(self._motion.max_speed, self._boundary_speed),
-            acceleration=self._motion.max_acceleration,
-            viscosity=self._limiting_viscosity + artificial,
-            cohesion_rate=self._cohesion_rate,
-            pressure_frequency=self._frequency_ratio * self._motion.max_frequency,
-            cfl=self.parameters.cfl,
+            signal_speed=sound_speed + max(motion.max_speed, self.tank.boundary_speed),
+            acceleration=motion.max_acceleration,
+            viscosity=self.limiting_viscosity,
+            cohesion_rate=self.cohesion_rate,
+            pressure_frequency=self.frequency_ratio * motion.max_frequency,
+            cfl=cfl,
         )
-        return min(limit, self._emission.longest_step(self.parameters.cfl * CFL_NUMBER * self.spacing))
-
-    def substep(self, dt: float) -> None:
-        """Advance by dt [s]."""
-        self._compute_density()
-        self._begin_sheets()
-        self._compute_acceleration(self._pressure_terms)
-        self._react_on_bodies(self._pressure_terms, dt)
-        self._apply_implicit_viscosity(self._acceleration, dt)
-        self._advance_particles(self._acceleration, dt)
+        return min(limit, self.tank.emission.longest_step(cfl * CFL_NUMBER * self.spacing))
 
     @property
-    def _pressure_slope(self) -> float:
-        return self._stiffness * GAMMA
+    def sound_speed(self) -> float:
+        """Numerical speed of sound [m/s]."""
+        return self.signal_speed
 
     @property
-    def _pressure_term(self) -> ti.Ndarray:
-        return self._pressure_terms
-
-    @property
-    def _signal_speed(self) -> float:
-        return self.sound_speed
-
-    @property
-    def _runaway(self) -> tuple[float, str, float]:
-        return RUNAWAY_RATIO, "the speed of sound", self.sound_speed
+    def pressure_term(self) -> ti.Ndarray:
+        """P_i = p_i/(rho_i/rho0)² of each particle [Pa]."""
+        return self.elastic.pressure_term
 
     def diagnostics(self) -> Diagnostics:
         """As for every particle fluid, with the elastic energy of the compression, V sum_i int p/r² dr [J]."""
-        common = super().diagnostics()
-        ratio = np.maximum(self._host(self._density)[self._by_id()].astype(np.float64), 1.0)
+        common, particles = super().diagnostics(), self.particles
+        ratio = np.maximum(particles.host(particles.density)[particles.order_by_id()].astype(np.float64), 1.0)
         per_volume = self._stiffness * ((ratio ** (GAMMA - 1) - 1.0) / (GAMMA - 1) + 1.0 / ratio - 1.0)
         return {
             **common,
@@ -110,42 +116,33 @@ class WCSPHSolver(SPHFluid):
             "sound_speed": self.sound_speed,
         }
 
-    def _compute_density(self) -> None:
-        self._update_neighbors()
-        particles = self._particles
-        compute_density_and_pressure(
-            particles.position, particles.count, *self._list, self.boundary.position, self.boundary.volume,
-            self.particle_volume, self._sigma, 1.0 / self.support_radius, self._stiffness,
-            self._density, self._pressure_terms,
-        )  # fmt: skip
 
-
-@fast_launch
-@ti.kernel
+@kernel
 def compute_density_and_pressure(
-    position: Vectors, count: ti.i32,
-    start: Integers, fluid_count: Integers, boundary_count: Integers, neighbors: Integers, stride: ti.template(),
-    boundary_position: Vectors, boundary_volume: Floats,
-    volume: ti.f32, sigma: ti.f32, inverse_support: ti.f32, stiffness: ti.f32,
-    density: Floats, pressure_term: Floats,
-):  # fmt: skip
+    particles: Particles,
+    near: Neighbors,
+    samples: Samples,
+    smoothing: Smoothing,
+    stiffness: ti.f32,
+    pressure_term: Floats,
+):
     """rho_i/rho0 = sum_j V W_ij + sum_b V_b W_ib, and P_i by Tait's equation with p_i >= 0."""
     ti.loop_config(block_dim=128)
-    for i in range(count):
-        x_i = position[i]
+    for i in range(particles.count):
+        x_i = particles.position[i]
         fluid_sum = 1.0  # w(0): the particle itself
-        first = start[i]
-        for k in range(fluid_count[i]):
-            fluid_sum += spline(distance((x_i - position[neighbors[first + k * stride]]).norm_sqr()) * inverse_support)
+        first = near.start[i]
+        for k in range(near.fluid_count[i]):
+            x_j = particles.position[near.indices[first + k * near.stride]]
+            fluid_sum += spline(distance((x_i - x_j).norm_sqr()) * smoothing.inverse_support)
         boundary_sum = 0.0
-        first += fluid_count[i] * stride
-        for k in range(boundary_count[i]):
-            b = neighbors[first + k * stride]
-            boundary_sum += boundary_volume[b] * spline(
-                distance((x_i - boundary_position[b]).norm_sqr()) * inverse_support
-            )
-        ratio = sigma * (volume * fluid_sum + boundary_sum)
+        first += near.fluid_count[i] * near.stride
+        for k in range(near.boundary_count[i]):
+            b = near.indices[first + k * near.stride]
+            r = distance((x_i - samples.position[b]).norm_sqr())
+            boundary_sum += samples.volume[b] * spline(r * smoothing.inverse_support)
+        ratio = smoothing.sigma * (smoothing.volume * fluid_sum + boundary_sum)
         ratio_3 = ratio * ratio * ratio
         p_i = ti.max(stiffness * (ratio_3 * ratio_3 * ratio - 1.0), 0.0)
-        density[i] = ratio
+        particles.density[i] = ratio
         pressure_term[i] = p_i / (ratio * ratio)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.solver import Arrays
 from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, solve_positions
 from sim.rigid.contacts import Contacts, Indices, Key, key_set
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
-from sim.solver import Arrays
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.motion.rotation import cross
 from sim.rigid.contacts import Contacts, tangent_basis
-from sim.rigid.rotation import cross
 
 Array = NDArray[np.float64]
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.motion.poses import Poses
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -15,19 +17,6 @@ Key = tuple[int, int, int]
 """What tells a contact from others from step to step: the two bodies, and which ball of which of them."""
 
 FEATURE_BITS = 32
-
-
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """Where all bodies are: the moving ones, the static ones, and last the domain, which walls belong to.
-
-    Attributes:
-        position: centres of mass [m], (n, 3).
-        rotation: body axes to world axes, (n, 3, 3).
-    """
-
-    position: Array
-    rotation: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.rigid import rotation
+from sim.core.motion import rotation
 from sim.rigid.states import MovingBodies
 
 Array = NDArray[np.float64]

@@ -2,73 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sim.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
-from sim.shapes.parameters import Placement
+from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
+from sim.core.parameters import Fraction, NonNegative, Vector3
+from sim.shapes.parameters import WeightedPlacement
 
 
-class RigidKeyframeParameters(Parameters):
-    """Where something on a path is at one time."""
-
-    time_s: NonNegative = Field(description="Time [s]; later than that of the keyframe before.")
-    position: Vector3 = Field(description="World position of the shape's centre [m].")
-    rotation_deg: Vector3 = Field(
-        default=(0.0, 0.0, 0.0),
-        description="Rotation about x, then y, then z (world axes) [degrees]; "
-        "the way from one keyframe to the next is the shortest, below 180 degrees.",
-    )
-
-
-def placed_at_first_keyframe(data: Any, what: str) -> Any:
-    """What a job file says of something with keyframes, with the pose of the first as its place.
-
-    So everybody who asks where it starts gets that pose.
-
-    Args:
-        data: as it comes to a validator, before anything is known about it.
-        what: how to call the thing in messages.
-
-    Raises:
-        ValueError: it is placed elsewhere as well.
-    """
-    if not isinstance(data, dict) or not isinstance(data.get("keyframe"), list | tuple) or not data["keyframe"]:
-        return data
-    first = data["keyframe"][0]
-    placed = [key for key in ("position", "rotation_deg") if key in data]
-    if isinstance(first, RigidKeyframeParameters):
-        first = first.model_dump()
-    if not isinstance(first, dict) or "position" not in first:
-        return data  # the keyframe's own validation says what is wrong with it
-    start = {key: first[key] for key in ("position", "rotation_deg") if key in first}
-    for key in placed:
-        if tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
-            raise ValueError(f"{key} differs from that of the first keyframe, which places the {what}; remove {key}")
-    return {**data, **start}
-
-
-def require_ascending_times(keyframes: Sequence[RigidKeyframeParameters]) -> None:
-    """Raises ValueError unless each keyframe is later than the one before."""
-    for number, (before, after) in enumerate(pairwise(keyframes), start=1):
-        if after.time_s <= before.time_s:
-            raise ValueError(
-                f"keyframe[{number}].time_s must be after {before.time_s:g} s, that of the keyframe before, "
-                f"got {after.time_s:g} s"
-            )
-
-
-class BallastParameters(Parameters):
-    """A small heavy piece fixed in a dynamic body, such as the weight that keeps a toy duck upright."""
-
-    mass: Positive = Field(description="Mass [kg], on top of that of the density.")
-    position: Vector3 = Field(description="Where it sits, from the shape's centre, before the body is turned [m].")
-
-
-class RigidBodyParameters(Placement):
+class RigidBodyParameters(WeightedPlacement):
     """A rigid body: fixed, moved along a path, or moved by forces and contacts."""
 
     name: str = Field(description="Name of the body, unique in the job.", pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")
@@ -76,16 +19,6 @@ class RigidBodyParameters(Placement):
         default="static",
         description="static: never moves; kinematic: follows its keyframes, or its constant velocities, whatever it "
         "hits; dynamic: moved by gravity, contacts and fluid.",
-    )
-    density: Positive | None = Field(
-        default=None,
-        description="Mass per volume [kg/m³]; dynamic bodies need one. Within some 10 % of a fluid's, a body that "
-        "starts deep below its surface rises or sinks slowly.",
-    )
-    ballast: tuple[BallastParameters, ...] = Field(
-        default=(),
-        description="Point masses fixed in a dynamic body: they shift its centre of mass and add to its inertia, and "
-        "displace nothing.",
     )
     velocity: Vector3 = Field(
         default=(0.0, 0.0, 0.0),
@@ -103,7 +36,7 @@ class RigidBodyParameters(Placement):
         description="Speed after an impact over the speed before [-]; a pair of bodies has the larger of its two. "
         "Where a rough body hits with an edge it may be less: no impact adds energy.",
     )
-    keyframe: tuple[RigidKeyframeParameters, ...] = Field(
+    keyframe: tuple[KeyframeParameters, ...] = Field(
         default=(), description="Path of a kinematic body; it rests before the first and after the last keyframe."
     )
     interpolation: Literal["cubic", "linear"] = Field(

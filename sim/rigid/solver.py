@@ -8,21 +8,23 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.domain import DomainParameters
-from sim.parameters import Vector3
-from sim.rigid import rotation
+from sim.core.domain import DomainParameters
+from sim.core.motion import rotation
+from sim.core.motion.paths import Path, path_onwards
+from sim.core.motion.poses import Poses
+from sim.core.parameters import Vector3
+from sim.core.snapshots import Snapshot
+from sim.core.solver import Arrays, Diagnostics, Remedies
+from sim.core.walls import walls_of
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
-from sim.rigid.contacts import Contacts, Poses
+from sim.rigid.contacts import Contacts
 from sim.rigid.free_motion import rotate_freely
-from sim.rigid.geometry import BodyGeometry
-from sim.rigid.keyframes import Path, path_of, path_onwards
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.paths import path_of
 from sim.rigid.states import Inertia, MovingBodies
-from sim.rigid.walls import walls_of
+from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.solid import Points
-from sim.snapshots import Snapshot
-from sim.solver import Arrays, Diagnostics, Remedies
 
 Array = NDArray[np.float64]
 

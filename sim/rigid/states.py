@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.rigid import rotation
+from sim.core.motion import rotation
 
 Array = NDArray[np.float64]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.snapshots import Snapshot
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.placement import build_solid
 from sim.shapes.sampling import sample_surface
 from sim.shapes.solid import TriangleMesh
-from sim.snapshots import Snapshot
 
 
 class StaticBody:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from sim.parameters import Parameters, Positive, Vector3
+from sim.core.parameters import Parameters, Positive, Vector3
 
 PositiveVector3 = tuple[Positive, Positive, Positive]
 
@@ -103,3 +103,25 @@ class Placement(Parameters):
         default=(0.0, 0.0, 0.0), description="Rotation about x, then y, then z (world axes) [degrees]."
     )
     scale: Positive = Field(default=1.0, description="Uniform scale factor [-].")
+
+
+class BallastParameters(Parameters):
+    """A small heavy piece fixed in a dynamic body, such as the weight that keeps a toy duck upright."""
+
+    mass: Positive = Field(description="Mass [kg], on top of that of the density.")
+    position: Vector3 = Field(description="Where it sits, from the shape's centre, before the body is turned [m].")
+
+
+class WeightedPlacement(Placement):
+    """A shape in the world that may have a mass."""
+
+    density: Positive | None = Field(
+        default=None,
+        description="Mass per volume [kg/m³]; dynamic bodies need one. Within some 10 % of a fluid's, a body that "
+        "starts deep below its surface rises or sinks slowly.",
+    )
+    ballast: tuple[BallastParameters, ...] = Field(
+        default=(),
+        description="Point masses fixed in a dynamic body: they shift its centre of mass and add to its inertia, and "
+        "displace nothing.",
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sim.parameters import Parameters
+from sim.core.parameters import Parameters
 from sim.shapes.parameters import (
     BoxShape,
     BunnyShape,

@@ -7,7 +7,7 @@ is first-order in time by itself; MacCormack's second pass corrects the error of
 
 import taichi as ti
 
-from sim.parameters import Vector3
+from sim.core.parameters import Vector3
 from sim.smoke.balance import CorrectionBalance
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import (

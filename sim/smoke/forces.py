@@ -5,7 +5,7 @@ import math
 import numpy as np
 import taichi as ti
 
-from sim.parameters import Vector3
+from sim.core.parameters import Vector3
 from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import Obstacles
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sim.domain import DomainParameters, Face
+from sim.core.domain import DomainParameters, Face
 from sim.smoke.parameters import WHOLE, SmokeParameters
 
 Index3 = tuple[int, int, int]

@@ -34,7 +34,7 @@ import math
 
 import taichi as ti
 
-from sim.reductions import runs_on_gpu
+from sim.core.reductions import runs_on_gpu
 
 GPU_LANES = 32
 """As many as the threads of a GPU that run in step: together they read whole lines of memory."""

@@ -11,9 +11,9 @@ import math
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Integers
-from sim.launch import fast_launch
-from sim.short_loops import is_short
+from sim.core.arrays import Integers
+from sim.core.launch import fast_launch
+from sim.core.scheduling import is_short
 from sim.smoke.lanes import (
     RUN,
     has_runs,

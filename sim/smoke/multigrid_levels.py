@@ -14,7 +14,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats
+from sim.core.arrays import Floats
 from sim.smoke.grid import Index3, SmokeGrid
 from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import Obstacles

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sim.domain import DomainParameters, Face
-from sim.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
-from sim.rigid.parameters import RigidKeyframeParameters, placed_at_first_keyframe, require_ascending_times
+from sim.core.domain import DomainParameters, Face
+from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
+from sim.core.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
 
 WHOLE = 1.0e-6
@@ -63,7 +63,7 @@ class SmokeSourceParameters(Placement):
         description="Its strength over time: linear between these points, and constant before and after them; "
         "1 if omitted.",
     )
-    keyframe: tuple[RigidKeyframeParameters, ...] = Field(
+    keyframe: tuple[KeyframeParameters, ...] = Field(
         default=(), description="Path of the source; it rests before the first and after the last keyframe."
     )
     interpolation: Literal["cubic", "linear"] = Field(

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from sim.launch import fast_launch
+from sim.core.launch import fast_launch
 from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.multigrid import MultigridVCycle
 from sim.smoke.obstacles import Obstacles
@@ -66,7 +66,7 @@ class PressureProjection:
         self._size = grid.size
         self._u, self._v, self._w = velocity
         self._obstacles = obstacles
-        # Before the multigrid, which uses its fields: what is made in between shares a group of them (`sim.runtime`).
+        # Before the multigrid, which uses its fields: what is made in between shares a group (`sim.core.runtime`).
         self._correction = ti.field(ti.f32, shape=grid.size)
         self._search = ti.field(ti.f32, shape=grid.size)
         self._search_image = ti.field(ti.f32, shape=grid.size)

@@ -7,7 +7,7 @@ of n lanes of m cells errs by (m + n/256 + 256) units of 6e-8 at most, relative 
 
 import taichi as ti
 
-from sim.reductions import BRANCHES, device_lanes
+from sim.core.reductions import BRANCHES, device_lanes
 from sim.smoke.lanes import lane_count
 
 Pair = ti.types.vector(2, ti.f32)

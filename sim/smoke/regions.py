@@ -10,7 +10,7 @@ import math
 import numpy as np
 import taichi as ti
 
-from sim.arrays import Floats, Integers, LongIntegers
+from sim.core.arrays import Floats, Integers, LongIntegers
 from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.obstacles import AIR, Obstacles
 

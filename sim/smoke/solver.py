@@ -7,10 +7,12 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.domain import DomainParameters
-from sim.parameters import Vector3
-from sim.reductions import is_finite
-from sim.runtime import require_room_for_fields
+from sim.core.domain import DomainParameters
+from sim.core.parameters import Vector3
+from sim.core.reductions import is_finite
+from sim.core.runtime import require_room_for_fields
+from sim.core.snapshots import Snapshot
+from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.smoke.advection import Advection
 from sim.smoke.air_force import AirForce
 from sim.smoke.balance import CorrectionBalance
@@ -27,8 +29,6 @@ from sim.smoke.reductions import Pair, RowReductions
 from sim.smoke.sources import build_sources
 from sim.smoke.turbulence import Turbulence
 from sim.smoke.wind import Wind
-from sim.snapshots import Snapshot
-from sim.solver import Arrays, Diagnostics, Remedies
 
 RUNAWAY_SPEED = 1.0e4
 """No smoke of this kind moves at thirty times the speed of sound [m/s]."""

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.rigid import rotation
-from sim.rigid.keyframes import KeyframePath, Motion, path_through
+from sim.core.motion import rotation
+from sim.core.motion.paths import KeyframePath, Motion, path_through
 
 if TYPE_CHECKING:
-    from sim.rigid.parameters import RigidBodyParameters
-    from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
+    from sim.smoke.parameters import SmokeSourceParameters
 
 Array = NDArray[np.float64]
 
@@ -47,7 +45,7 @@ class PathMotion:
     """
 
     def __init__(self, path: KeyframePath, reach: float) -> None:
-        self._path, self._way, self._speed = path, path.way(reach), path.largest_speed(reach)
+        self._path, self._way, self._speed = path, path.arc_length(reach), path.largest_speed(reach)
 
     def poses(self, begin_s: float, end_s: float, *, spacing: float) -> list[Motion]:
         """See `SourceMotion`."""
@@ -136,36 +134,6 @@ def motion_of(source: SmokeSourceParameters, reach: float) -> SourceMotion | Non
     if not source.keyframe:
         return None
     return PathMotion(path_through(source.keyframe, linear=source.interpolation == "linear"), reach)
-
-
-def with_sources_on(smoke: SmokeParameters, bodies: Sequence[RigidBodyParameters]) -> SmokeParameters:
-    """The smoke with its sources on static bodies where these stand; only those on bodies that move still follow.
-
-    Raises:
-        ValueError: a source follows a body that is not there.
-    """
-    by_name = {body.name: body for body in bodies}
-    sources = []
-    for number, source in enumerate(smoke.source):
-        if source.follow is not None and source.follow not in by_name:
-            raise ValueError(f'smoke "{smoke.name}", source {number}: no rigid body is named "{source.follow}"')
-        body = None if source.follow is None else by_name[source.follow]
-        sources.append(placed_on(source, body) if body is not None and body.kind == "static" else source)
-    return smoke.model_copy(update={"source": tuple(sources)})
-
-
-def placed_on(source: SmokeSourceParameters, body: RigidBodyParameters) -> SmokeSourceParameters:
-    """The source where it is in the world at the start; one with a velocity blows along the world's axes there."""
-    from scipy.spatial.transform import Rotation
-
-    turned = Rotation.from_euler("xyz", body.rotation_deg, degrees=True)
-    own = Rotation.from_euler("xyz", source.rotation_deg, degrees=True)
-    x, y, z = (np.asarray(body.position) + turned.apply(source.position)).tolist()
-    a, b, c = (turned * own).as_euler("xyz", degrees=True).tolist()
-    velocity = None if source.velocity is None else tuple(turned.apply(source.velocity).tolist())
-    return source.model_copy(
-        update={"position": (x, y, z), "rotation_deg": (a, b, c), "velocity": velocity, "follow": None}
-    )
 
 
 def _times(begin_s: float, end_s: float, length: float, spacing: float) -> list[float]:

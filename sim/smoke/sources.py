@@ -7,13 +7,13 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.arrays import Floats, Integers
-from sim.rigid import rotation
+from sim.core.arrays import Floats, Integers
+from sim.core.hashed_numbers import hash_to_unit, smooth_noise, spread
+from sim.core.motion import rotation
 from sim.shapes import build_solid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.obstacles import Obstacles
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
-from sim.smoke.random_numbers import hash_to_unit, smooth_noise, spread
 from sim.smoke.source_motion import SourceMotion, motion_of
 from sim.smoke.sweep import CELLS, SweptShape
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.rigid import rotation
-from sim.rigid.keyframes import Motion
+from sim.core.motion import rotation
+from sim.core.motion.paths import Motion
 from sim.shapes.level_set import LevelSet
 from sim.shapes.parameters import BunnyShape, DuckShape, MeshShape, Placement
 from sim.shapes.placement import PlacedSolid, build_solid

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.shapes import Solid
 from sim.shapes.sampling import stratified_points
 from sim.smoke.parameters import WHOLE, SmokeParameters

@@ -6,11 +6,11 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.parameters import Vector3
+from sim.core.hashed_numbers import hash_bits, hash_to_unit, spread
+from sim.core.parameters import Vector3
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import lane_count, lane_items, lane_place
 from sim.smoke.parameters import CELLS_PER_EDDY, TurbulenceParameters
-from sim.smoke.random_numbers import hash_bits, hash_to_unit, spread
 
 REACH = 4
 """Nodes of the lattice along an axis that a cell and its faces depend on."""

@@ -2,8 +2,8 @@
 
 import taichi as ti
 
-from sim.domain import Face
-from sim.parameters import Vector3
+from sim.core.domain import Face
+from sim.core.parameters import Vector3
 from sim.smoke.obstacles import Obstacles
 
 

@@ -1,4 +1,4 @@
-"""The fluid at one moment, sorted into cells, ready to be asked about points and potentials."""
+"""The fluid at one moment, sorted into cells: its potentials, and its flow at any points."""
 
 import math
 
@@ -6,8 +6,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.cells import CellGrid, Cells, CellSort
-from sim.whitewater.kernels import compute_normals, compute_potentials, sample_flow
+from sim.core.cells import CellGrid, CellSort
+from sim.whitewater.kernels import Fluid, compute_normals, compute_potentials, sample_flow
 from sim.whitewater.motion import FluidState
 
 SUPPORT_IN_SPACINGS = 2.0
@@ -24,7 +24,7 @@ _ANYWHERE = (3.0e38, 3.0e38, 3.0e38)
 
 
 class FluidField:
-    """Answers for the fluid of one moment after the other; `sim.runtime.initialize` must have run.
+    """Fluid at one moment after the other; `sim.core.runtime.initialize` must have run.
 
     Attributes:
         support_radius: h [m].
@@ -42,52 +42,50 @@ class FluidField:
         self._grid = CellGrid.covering(bounds[0], bounds[1], self.support_radius)
         self._cells = CellSort(self._grid, capacity)
         self._order = np.zeros(0, np.int32)
-        self._position = self._velocity = np.zeros((0, 3), np.float32)
+        self._fluid: Fluid | None = None
 
     def update(self, state: FluidState) -> None:
         """Take the fluid's particles as they are now."""
         count = len(state.position)
-        self._order = np.zeros(0, np.int32)
-        if count:
-            nowhere = (-_ANYWHERE[0], -_ANYWHERE[1], -_ANYWHERE[2])
-            self._cells.sort(_device(state.position), _device(state.particle_id), count, nowhere, _ANYWHERE)
-            self._order = self._cells.order.to_numpy()[:count]
-        self._position = state.position[self._order]
-        self._velocity = state.velocity[self._order]
+        self._order, self._fluid = np.zeros(0, np.int32), None
+        if not count:
+            return
+        nowhere = (-_ANYWHERE[0], -_ANYWHERE[1], -_ANYWHERE[2])
+        self._cells.sort(_device(state.position), _device(state.particle_id), count, nowhere, _ANYWHERE)
+        self._order = self._cells.order.to_numpy()[:count]
+        self._fluid = Fluid(
+            _device(state.position[self._order]),
+            _device(state.velocity[self._order]),
+            count,
+            self._cells.cell_start,
+            self._grid.on_device,
+            self.support_radius,
+        )
 
     def potentials(self, min_speed: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Trapped air [m/s] and wave crest [-] of every particle, (n,) each, in the order of `update`.
 
         Both are 0 for particles slower than `min_speed` [m/s]. See `sim.whitewater.kernels.compute_potentials`.
         """
-        count = len(self._position)
+        count = len(self._order)
         trapped_air, wave_crest = np.zeros(count, np.float32), np.zeros(count, np.float32)
-        if count == 0:
+        if self._fluid is None:
             return trapped_air, wave_crest
-        normal = np.empty((count, 3), np.float32)
-        compute_normals(self._position, count, *self._search, self.support_radius, normal)
-        sorted_air, sorted_crest = np.empty(count, np.float32), np.empty(count, np.float32)
-        compute_potentials(
-            self._position, self._velocity, normal, count, *self._search, self.support_radius,
-            min_speed, _FULL_WEIGHT, _FULL_SURFACE_WEIGHT, sorted_air, sorted_crest,
-        )  # fmt: skip
-        trapped_air[self._order], wave_crest[self._order] = sorted_air, sorted_crest
+        normal = ti.Vector.ndarray(3, ti.f32, count)
+        compute_normals(self._fluid, normal)
+        air, crest = ti.ndarray(ti.f32, count), ti.ndarray(ti.f32, count)
+        compute_potentials(self._fluid, normal, min_speed, _FULL_WEIGHT, _FULL_SURFACE_WEIGHT, air, crest)
+        trapped_air[self._order], wave_crest[self._order] = air.to_numpy(), crest.to_numpy()
         return trapped_air, wave_crest
 
     def sample(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Velocity of the fluid at points (n, 3) [m/s], (n, 3), and the number of its particles within h, (n,)."""
-        flow, neighbors = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.int32)
-        if len(points) and len(self._position):
-            sample_flow(
-                np.ascontiguousarray(points, np.float32), len(points), self._position, self._velocity,
-                *self._search, self.support_radius, flow, neighbors,
-            )  # fmt: skip
-        return flow, neighbors
-
-    @property
-    def _search(self) -> tuple[object, ...]:
-        grid = self._grid
-        return self._cells.cell_start, ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape)
+        count = len(points)
+        if not count or self._fluid is None:
+            return np.zeros((count, 3), np.float32), np.zeros(count, np.int32)
+        flow, neighbors = ti.Vector.ndarray(3, ti.f32, count), ti.ndarray(ti.i32, count)
+        sample_flow(_device(points.astype(np.float32, copy=False)), count, self._fluid, flow, neighbors)
+        return flow.to_numpy(), neighbors.to_numpy()
 
 
 def _device(values: np.ndarray) -> ti.Ndarray:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.philox import uniforms
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.motion import FluidState
 from sim.whitewater.parameters import WhitewaterParameters
-from sim.whitewater.random_numbers import uniforms
 
 _COUNTS, _PLACES, _FATES = 0, 1, 2
 """Streams of random numbers."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.snapshots import Snapshot
+from sim.core.snapshots import Snapshot
 
 Float32Array = NDArray[np.float32]
 

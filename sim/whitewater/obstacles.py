@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
+from sim.core.snapshots import Snapshot
 from sim.shapes.level_set import LevelSet
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
-from sim.snapshots import Snapshot
 
 Float64Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from sim.parameters import NonNegative, Parameters, Positive
+from sim.core.parameters import NonNegative, Parameters, Positive
 
 LARGEST_CLOUD = 20_000_000
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.domain import DomainParameters
-from sim.parameters import Vector3
+from sim.core.domain import DomainParameters
+from sim.core.parameters import Vector3
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.fluid_field import FluidField
 from sim.whitewater.generation import Moment, generate, generation_rate
@@ -43,7 +43,7 @@ class WhitewaterReport:
 
 
 class WhitewaterSolver:
-    """Advances whitewater through a fluid that is known already; `sim.runtime.initialize` must have run.
+    """Advances whitewater through a fluid that is known already; `sim.core.runtime.initialize` must have run.
 
     It keeps no state between frames: all that the next frame needs is in the cloud and the frames of the fluid.
     """

@@ -64,14 +64,14 @@ def test_a_finished_job_can_be_looked_at_from_all_sides(finished: Studio) -> Non
     assert story.startswith("render/000002: succeeded, up to date\n")
     assert "frames/000002.png" in story
     assert "attempt 1 on " in story
-    assert "starting at frame 0" in finished.run("logs", "tiny", "simulate").assert_code(0).out
-    assert len(finished.run("logs", "tiny").assert_code(0).out.splitlines()) == TASKS
+    assert "starting at frame 0" in finished.run("explain", "tiny", "simulate", "--log").assert_code(0).out
+    assert len(finished.run("explain", "tiny", "--log").assert_code(0).out.splitlines()) == TASKS
 
 
 def test_what_is_not_there_is_refused_with_the_nearest_name(finished: Studio) -> None:
     assert 'did you mean "render/000002"?' in finished.run("explain", "tiny", "render/00002").assert_code(1).err
     assert "no submitted job in renders/tinny" in finished.run("status", "tinny").assert_code(1).err
-    assert "no log of a task" in finished.run("logs", "tiny", "rendr/000002").assert_code(1).err
+    assert "no log of a task" in finished.run("explain", "tiny", "rendr/000002", "--log").assert_code(1).err
     assert "the stages are bodies, simulate" in finished.run("clean", "tiny", "--stage", "rendr").assert_code(1).err
     assert "the stages are bodies, simulate" in finished.run("rerun", "tiny", "--stage", "rendr").assert_code(1).err
 
@@ -122,7 +122,7 @@ def test_a_longer_film_continues_the_shorter_one_and_equals_one_made_at_once_on_
     kept = {path for path in before if not path.startswith("movie")}
     assert {path: finished.artifacts()[path] for path in kept} == {path: before[path] for path in kept}
     assert {path: finished.mtimes_ns()[path] for path in kept} == {path: times[path] for path in kept}
-    assert "starting at frame 5" in finished.run("logs", "tiny", "simulate").out
+    assert "starting at frame 5" in finished.run("explain", "tiny", "simulate", "--log").out
     assert not {task for task in finished.tasks_run_since(attempts) if task.endswith(("000000", "000005"))}
     at_once = Studio.open(tmp_path / "at once")
     at_once.submit("--set", "frames=9", "--cores", "1")  # neither how often it was begun nor their number matters

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from places import PROJECT
 
 from pipeline.job.loading import load_job
 from sim.build import build_world
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 
-JOB = Path(__file__).parents[2] / "jobs" / "hammock_of_water.toml"
+JOB = PROJECT / "jobs" / "hammock_of_water.toml"
 
 COARSE = (
     "fluid.water.particle_radius=0.012",

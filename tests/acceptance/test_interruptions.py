@@ -27,7 +27,7 @@ from films import (
 )
 from processes_seen import words_of
 
-from pipeline.task import FailureKind
+from pipeline.base.task import FailureKind
 
 # --- killed ---
 
@@ -74,7 +74,7 @@ def test_runner_killed_while_it_renders_leaves_nobody_behind_and_the_next_one_ta
     runner = finished.start("submit", "tiny.toml")
     assert finished.wait_for_attempt(runner, ["render"]) is not None
     kill(runner)
-    assert "not running" in finished.run("status", "tiny").assert_code(0).out
+    assert "tiny: queued" in finished.run("status", "tiny").assert_code(0).out
     taken_over = finished.submit()
     assert f"taking over from process {runner.pid}" in taken_over.err
     finished.assert_whole(like=reference)
@@ -108,7 +108,7 @@ def test_ctrl_c_once_keeps_a_checkpoint_that_the_simulation_continues_from(finis
     assert len(finished.artifacts()) < len(reference.artifacts())
     [checkpoint] = finished.layout.checkpoints.glob("[0-9]*.h5")
     finished.run("resume", "tiny").assert_code(0)
-    assert f"starting at frame {int(checkpoint.stem)}\n" in finished.run("logs", "tiny", "simulate").out
+    assert f"starting at frame {int(checkpoint.stem)}\n" in finished.run("explain", "tiny", "simulate", "--log").out
     finished.assert_whole(like=reference)
     # The frames came out the same, so nothing that is made of them was made again.
     assert {task for task, count in finished.attempts().items() if count > 1} == {"simulate"}
@@ -139,7 +139,7 @@ def test_a_second_submit_watches_the_first(finished: Studio, reference: Studio) 
     with standing_still(worker):
         second = finished.start("submit", "tiny.toml")
         said = listen(second, "watching it instead")
-        followed = finished.start("logs", "tiny", attempt.task, "--follow")
+        followed = finished.start("explain", "tiny", attempt.task, "--log", "--follow")
         state = json.loads(finished.run("status", "tiny", "--json").assert_code(0).out)
         assert state["runner"]["pid"] == first.pid
         assert f"running, process {first.pid}" in finished.run("status", "tiny").assert_code(0).out

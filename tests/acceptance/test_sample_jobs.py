@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import av
 import pytest
+from places import PROJECT
 
-JOBS = sorted((Path(__file__).parents[2] / "jobs").glob("*.toml"))
+JOBS = sorted((PROJECT / "jobs").glob("*.toml"))
 
 TINY = {
     "ball_into_cloth": {"cloth.sheet.shape.counts": [9, 9]},

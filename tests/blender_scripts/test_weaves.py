@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
 pytestmark = needs_bpy
 

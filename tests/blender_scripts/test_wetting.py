@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from fresh_python import run_python
 from needed_blender import needs_bpy
-
-from pipeline.job.looks import REFRACTING_LOOKS
+from warm_python import run_python
 
 pytestmark = needs_bpy
 
@@ -28,12 +26,6 @@ SETUP = """
     square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], np.float32)
     sheet = TriangleMesh(square, np.array([(0, 1, 2), (0, 2, 3)], np.int32))
 """
-
-
-def test_blender_and_the_pipeline_know_the_same_looks_as_clear():
-    assert sorted(run_python("from blender_scripts.looks import REFRACTING; print(*REFRACTING)").split()) == sorted(
-        REFRACTING_LOOKS
-    )
 
 
 def test_a_surface_is_wet_where_it_faces_a_body_from_near_and_where_it_dips_into_it():

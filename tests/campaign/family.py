@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import psutil
 
-from tests.processes_seen import lives, words_of
+from tests.helpers.processes_seen import lives, words_of
 
 _PR_SET_CHILD_SUBREAPER = 36
 _PR_CAPBSET_DROP = 24
@@ -67,7 +67,7 @@ class Family:
 
     def workers(self) -> list[psutil.Process]:
         """Worker processes, whatever they do."""
-        return self._called(lambda command: "pipeline.worker" in command)
+        return self._called(lambda command: "pipeline.run.executors.worker" in command)
 
     def blenders(self) -> list[psutil.Process]:
         """Blender executables that serve frames."""

@@ -18,7 +18,7 @@ NAME = "tiny"
 FRAMES = 8
 ARTIFACT_SUFFIXES = {".h5", ".ply", ".vdb", ".png", ".mp4"}
 SO_FAR = "so-far"
-"""In the names of the film so far, and of the folder in which it is made."""
+"""In the names of the preview movie, and of the folder in which it is made."""
 
 BALL = """\
 [[rigid]]
@@ -81,7 +81,7 @@ runpy.run_path(arguments[arguments.index("--python") + 1], run_name="__main__")
 
 
 def is_artifact(path: Path) -> bool:
-    """Whether a file of a job's folder is to be the same after every run; a film so far is gone then."""
+    """Whether a file of a job's folder is to be the same after every run; a preview movie is gone then."""
     return (
         path.suffix in ARTIFACT_SUFFIXES
         and path.parent.name != "checkpoints"

@@ -58,7 +58,7 @@ class Result:
         }
 
     def markdown(self) -> str:
-        """Tables for docs/reliability.md."""
+        """Tables for docs/guide/reliability.md."""
         lines = [
             f"Seed {self.seed}, scene `{self.scene}`: {self.outputs} outputs, {self.undisturbed_s:.1f} s of processor "
             "time undisturbed.",

@@ -1,4 +1,4 @@
-"""A short campaign, as CI runs it; a long one is made by hand, and its tables are in docs/reliability.md."""
+"""A short campaign, as CI runs it; a long one is made by hand, and its tables are in docs/guide/reliability.md."""
 
 from __future__ import annotations
 

@@ -13,10 +13,10 @@ from command_line import pipeline
 from half_simulated_jobs import half_simulated_job
 from needed_blender import needs_bpy, needs_egl
 
-from pipeline.layout import JobLayout
+from pipeline.base.layout import JobLayout
 from render import workbench
 from render.blender import BlenderUnavailableError, FrameRenderError, script_argv
-from render.parameters import MaterialParameters, StageParameters
+from render.parameters import MaterialParameters, SetParameters
 from render.spec import MeshObject, SceneObject
 from render.workbench import draw_frames, require_workbench
 
@@ -119,7 +119,7 @@ def test_bodies_have_the_colours_of_their_looks(tmp_path):
     ]
     green = MaterialParameters(look="metal", color=(0.05, 0.6, 0.1))
     balls.append(MeshObject(name="own", file="ball.ply", position=(0.0, 0.0, 0.85), material=green))
-    picture = workbench_picture(tmp_path, *balls, stage=StageParameters(tank=True))
+    picture = workbench_picture(tmp_path, *balls, set=SetParameters(tank=True))
     # 96 pixels x 50 mm / 36 mm / 2.5 m = 53 pixels a metre.
     orange, red, white = (picture[27, 48 + round(53 * x)] for x in (-0.35, 0.0, 0.35))
     assert orange[0] > 1.2 * orange[1] > 2.0 * orange[2]
@@ -137,7 +137,7 @@ def test_a_body_that_is_called_as_a_part_of_the_stage_has_its_own_colour_and_the
     green = MaterialParameters(look="plastic", color=(0.05, 0.6, 0.1))
     ball = MeshObject(name=name, file="ball.ply", position=(0.0, 0.0, 0.5), material=green)
     for tank in (False, True):
-        picture = workbench_picture(tmp_path, ball, stage=StageParameters(tank=tank))
+        picture = workbench_picture(tmp_path, ball, set=SetParameters(tank=tank))
         red, level, blue = picture[27, 48]
         assert level > 1.5 * max(red, blue)
         around = picture.copy()

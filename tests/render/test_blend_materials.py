@@ -13,11 +13,12 @@ from fresh_python import run_python
 from inline_tasks import run_task
 from needed_blender import needs_bpy
 
-from pipeline.executors.attempt import AttemptContext
-from pipeline.executors.base import Assignment, Finished, TaskEvent, Warned
+from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
+from pipeline.model.job import Job
+from pipeline.run.events import Finished, TaskEvent, Warned
+from pipeline.run.executors.attempt import AttemptContext
+from pipeline.run.executors.base import Assignment
 from pipeline.stages.bodies import BodiesStage
 from pipeline.stages.flat_pictures import FLAT_PICTURES
 from pipeline.stages.render import RenderStage
@@ -179,8 +180,8 @@ def test_a_picture_without_texture_coordinates_is_told_once_and_blender_is_not_s
     monkeypatch.setattr("render.blend_file.run_script", no_process)
     monkeypatch.setattr("pipeline.stages.render.content_name", lambda *_: "own")
     monkeypatch.setattr("pipeline.stages.render.own_picture_bytes", lambda _: 0)
-    monkeypatch.setattr("pipeline.stages.render.warm_renderer", lambda _: renderer)
-    monkeypatch.setattr("pipeline.stages.render.draw_until_good", draw)
+    monkeypatch.setattr("pipeline.stages.render_drawing.FrameDrawing.renderer", renderer)
+    monkeypatch.setattr("pipeline.stages.render_drawing.FrameDrawing.draw_until_good", draw)
     told = []
     for frame, task in enumerate(RenderStage().plan(film, layout)[:2]):
         events: list[TaskEvent] = []
@@ -215,7 +216,7 @@ def test_a_material_that_needs_a_picture_outside_of_the_file_is_refused(material
     ],
 )
 def test_a_material_that_needs_more_than_itself_is_an_obstacle_before_any_work(materials, name, reason):
-    (obstacle,) = RenderStage().obstacles(job(f"{materials}:{name}"))
+    (obstacle,) = RenderStage().preflight(job(f"{materials}:{name}"))
     assert f'the material "{name}" of' in obstacle and reason in obstacle
 
 
@@ -237,8 +238,8 @@ def job(blend: str, **render: object) -> Job:
 @pytest.mark.parametrize("external", [False, True])
 def test_a_missing_name_is_an_obstacle_before_any_work(materials, tmp_path, external):
     render = {"blender": str(write_blender_stand_in(tmp_path))} if external else {}
-    assert RenderStage().obstacles(job(f"{materials}:Driven", **render)) == []
-    assert RenderStage().obstacles(job(f"{materials}:Gold", **render)) == [
+    assert RenderStage().preflight(job(f"{materials}:Driven", **render)) == []
+    assert RenderStage().preflight(job(f"{materials}:Gold", **render)) == [
         f'material.ball.blend: {materials} has no material "Gold"; there are {NAMES}'
     ]
     assert not (materials.parent / "proof").exists()
@@ -246,7 +247,7 @@ def test_a_missing_name_is_an_obstacle_before_any_work(materials, tmp_path, exte
 
 def test_a_file_that_is_no_blend_file_is_an_obstacle(tmp_path):
     (tmp_path / "text.blend").write_text("this is no Blender file")
-    (obstacle,) = RenderStage().obstacles(job(f"{tmp_path}/text.blend:Gold"))
+    (obstacle,) = RenderStage().preflight(job(f"{tmp_path}/text.blend:Gold"))
     assert obstacle.startswith(f"{tmp_path}/text.blend: cannot read the materials of")
     with pytest.raises(InvalidFileError):
         read_material_names(tmp_path / "text.blend", None)

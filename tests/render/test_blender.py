@@ -29,13 +29,15 @@ from fresh_python import run_python
 from inline_tasks import run_task
 from needed_blender import needs_bpy
 from refused_removal import refuse_removal
+from warm_python import run_python as run_warm_python
 
-from pipeline.executors.base import Failed, Finished, TaskEvent
+from blender_scripts.look_table import looks_for
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import FailureKind
 from pipeline.job.loading import load_job
-from pipeline.layout import JobLayout
+from pipeline.run.events import Failed, Finished, TaskEvent
 from pipeline.stages import render_drawing
 from pipeline.stages.render import RenderStage
-from pipeline.task import FailureKind
 from render.blender import (
     BlenderDiedError,
     BlenderUnavailableError,
@@ -48,7 +50,7 @@ from render.blender import (
     run_script,
 )
 from render.gpus import find_gpus
-from render.parameters import CameraParameters, MaterialParameters, StageParameters
+from render.parameters import CameraParameters, MaterialParameters, SetParameters
 from render.spec import MeshObject, MeshSequenceObject, RenderSpec
 from render.temporary_folder import environment_of_child
 
@@ -307,26 +309,25 @@ def test_smoke_is_drawn_where_it_is_and_unfit_volumes_are_refused(tmp_path):
     assert abs(darkening[:, 36:42]).mean() < 0.15 * empty[10:26, 36:42].mean()
 
 
-def test_every_look_and_stage_builds_and_draws(tmp_path):
+def test_every_look_and_set_builds_and_draws(tmp_path):
     positions, triangles = sphere((0.0, 0.0, 0.0), 0.12, rings=8, segments=12)
     write_mesh(tmp_path / "ball.ply", positions, triangles)
-    looks = ("water", "honey", "milk", "rubber", "ceramic", "plastic", "metal", "stone", "wood", "glass")
     objects = tuple(
         MeshObject(
             name=look,
             file="ball.ply",
-            position=(-0.3 + 0.3 * (index % 3), 0.0, 0.15 + 0.3 * (index // 3)),
+            position=(-0.45 + 0.3 * (index % 4), 0.0, 0.15 + 0.3 * (index // 4)),
             material=MaterialParameters(look=look),
         )
-        for index, look in enumerate(looks)
+        for index, look in enumerate(looks_for("rigid"))
     )
-    night = StageParameters(name="night", strength=30.0)
-    window = StageParameters(name="window", ground="stone")
+    night = SetParameters(name="night", strength=30.0)
+    window = SetParameters(name="window", ground="stone")
     camera = still_camera(CameraParameters())
-    for stage in (StageParameters(name="studio", tank=True), StageParameters(name="outdoor"), night, window):
-        spec = spec_of(*objects, samples=2).model_copy(update={"stage": stage, "camera": camera})
+    for stage in (SetParameters(name="studio", tank=True), SetParameters(name="outdoor"), night, window):
+        spec = spec_of(*objects, samples=2).model_copy(update={"set": stage, "camera": camera})
         spec.write(tmp_path / "spec.json")
-        run_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")
+        run_warm_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")
         assert 10 < read(tmp_path / f"{stage.name}.png").mean() < 245
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blender_scenes import RENDER_FRAMES, read, redness, spec_of, still_camera
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters

@@ -11,10 +11,10 @@ import pytest
 from command_line import pipeline
 from needed_blender import needs_bpy
 
-from pipeline import gpus
-from pipeline.gpu_kernels import kernels_marker
-from pipeline.layout import JobLayout
-from pipeline.receipts import read_receipt
+from pipeline.base.layout import JobLayout
+from pipeline.stages import gpus
+from pipeline.stages.gpu_kernels import kernels_marker
+from pipeline.store.receipts import read_receipt
 
 pytestmark = [needs_bpy, pytest.mark.slow]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from blender_scenes import RENDER_FRAMES, read, redness, spec_of, sphere, spread, still_camera, write_mesh
 from drawn_jobs import BALL, RED, pose
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
 from render.parameters import CameraParameters
 from render.poses import write_poses

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blender_scenes import RENDER_FRAMES, RESOLUTION, read, spec_of, sphere, still_camera, write_mesh
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
 from render.meshes import write_ply
-from render.parameters import CameraParameters, MaterialParameters, StageParameters
+from render.parameters import CameraParameters, MaterialParameters, SetParameters
 from render.spec import MeshObject, MeshSequenceObject, SceneObject
 
 pytestmark = needs_bpy
@@ -154,7 +154,7 @@ def test_the_grain_of_a_sheet_hangs_on_its_coordinates_at_rest(tmp_path):
 
 
 @pytest.mark.parametrize("look", ["glass", "metal", "stone", "ceramic", "plastic", "rubber"])
-def test_solid_looks_are_lit_and_differ_from_the_stage_behind_them(look, tmp_path):
+def test_solid_looks_are_lit_and_differ_from_the_set_behind_them(look, tmp_path):
     write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.5), 0.3))
     ball = MeshObject(name=look, file="ball.ply", material=MaterialParameters(look=look))
     with_ball, without = draw(tmp_path, ball, samples=8), draw(tmp_path, samples=8)
@@ -174,7 +174,7 @@ def test_caustics_bend_the_sun_s_light_and_leave_the_rest_of_the_ground_as_it_is
     for caustics in (False, True):
         glass = MaterialParameters(look="glass", caustics=caustics)
         ball = MeshObject(name="ball", file="ball.ply", material=glass)
-        scene = {"stage": StageParameters(name="outdoor", strength=0.5), "camera": above}
+        scene = {"set": SetParameters(name="outdoor", strength=0.5), "camera": above}
         spec = spec_of(ball, samples=64, motion_blur=False).model_copy(update=scene)
         spec.write(tmp_path / "spec.json")
         run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0", "2")

@@ -18,16 +18,16 @@ from blender_scenes import (
 )
 from blender_stand_in import write_blender_stand_in
 from drawn_jobs import BALL, draw_frame, job_of_the_ball, pose
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
-from pipeline.job.models import Job
-from pipeline.layout import JobLayout
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import Task
+from pipeline.model.job import Job
 from pipeline.stages.render import RenderStage
-from pipeline.task import Task
 from render.blender import open_renderer
 from render.poses import write_poses
-from sim.snapshots import Snapshot
+from sim.core.snapshots import Snapshot
 
 pytestmark = needs_bpy
 

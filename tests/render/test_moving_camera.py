@@ -18,15 +18,15 @@ from blender_scenes import (
 )
 from drawn_jobs import BALL as MOVING_BALL
 from drawn_jobs import RED, draw_frame, job_of_the_ball, pose
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
 from pipeline.stages.render import RenderStage
 from render.camera_path import View, write_views
 from render.parameters import CameraParameters
 from render.poses import write_poses
 from render.spec import MeshObject
-from sim.snapshots import Snapshot
+from sim.core.snapshots import Snapshot
 
 pytestmark = needs_bpy
 

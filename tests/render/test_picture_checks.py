@@ -13,20 +13,21 @@ from fresh_python import run_python
 from inline_tasks import run_task
 from needed_blender import needs_bpy
 from PIL import Image
+from places import PROJECT
 
-from pipeline.cache import write_frame
-from pipeline.executors.base import Failed, Finished, TaskEvent
+from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
-from pipeline.layout import JobLayout
+from pipeline.run.events import Failed, Finished, TaskEvent
 from pipeline.stages import render_drawing
 from pipeline.stages.render import RenderStage
+from pipeline.store.cache import write_frame
 from render.camera_path import View, write_views
 from render.errors import InvalidFileError
 from render.parameters import CameraParameters
-from render.pictures import require_more_than_stage, validate_picture
+from render.pictures import over_black, read_picture, require_more_than_set, validate_picture
 from render.spec import MeshObject
-from sim.snapshots import Snapshot
-from sim.world import FrameReport
+from sim.core.snapshots import Snapshot
+from sim.core.world import FrameReport
 
 SAME_FRAMES = """
     import sys
@@ -35,15 +36,15 @@ SAME_FRAMES = """
     folder, blender = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
     renderer = open_renderer(folder / "spec.json", threads=1, blender=blender)
     renderer.render(0, folder / "before.png")
-    renderer.render_stage(0, folder / "stage.png", resolution=(32, 18))
+    renderer.render_set(0, folder / "stage.png", resolution=(32, 18))
     renderer.render(0, folder / "after.png")
-    renderer.render_stage(1, folder / "stage1.png", resolution=(32, 18))
+    renderer.render_set(1, folder / "stage1.png", resolution=(32, 18))
     renderer.close()
 """
 
 
 @needs_bpy
-def test_the_empty_stage_is_drawn_without_bodies_and_leaves_the_frames_as_they_are(tmp_path):
+def test_the_empty_set_is_drawn_without_bodies_and_leaves_the_frames_as_they_are(tmp_path):
     ball = MeshObject(name="ball", file="ball.ply", position=(0.0, 0.0, 0.5), material=RED)
     write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.0), 0.3))
     (tmp_path / "views").mkdir()
@@ -102,7 +103,7 @@ def draw_with_faults(folder: Path, faults: int):
     counter.write_text(str(faults))
     lines = executable.read_text().splitlines()
     start = next(index for index, line in enumerate(lines) if "runpy.run_path" in line)
-    root = Path(__file__).resolve().parents[2]
+    root = PROJECT
     fault = [f"sys.path.insert(0, {str(root)!r})", *DROPS_BODIES.format(counter=str(counter)).splitlines()]
     executable.write_text("\n".join([*lines[:start], *fault, *lines[start:]]) + "\n")
     executable.chmod(executable.stat().st_mode | stat.S_IXUSR)
@@ -114,7 +115,7 @@ def test_a_body_that_was_dropped_once_is_drawn_by_a_new_renderer(tmp_path):
     ended, layout = draw_with_faults(tmp_path, 1)
     assert isinstance(ended, Finished), ended
     assert (read(layout.path(layout.picture(1)))[..., 0] > 100).any()
-    assert "shows the empty stage" in layout.log(ended.task_id, 1).read_text()
+    assert "shows the empty set" in layout.log(ended.task_id, 1).read_text()
     assert (tmp_path / "faults").read_text() == "0"
     assert not layout.rejected_picture(1).exists()
 
@@ -123,13 +124,17 @@ def test_a_body_that_was_dropped_once_is_drawn_by_a_new_renderer(tmp_path):
 def test_a_body_that_is_dropped_again_fails_the_frame_and_its_picture_is_kept(tmp_path):
     ended, layout = draw_with_faults(tmp_path, 2)
     assert isinstance(ended, Failed)
-    assert ended.message.startswith("frame 1: the picture shows the empty stage, though bodies are in ")
+    assert ended.message.startswith("frame 1: the picture shows the empty set, though bodies are in ")
     assert str(layout.rejected_picture(1)) in ended.message
     validate_picture(layout.rejected_picture(1), SIZE)
     assert not layout.path(layout.picture(1)).exists()
 
 
-def test_only_cells_that_bodies_are_in_count_against_the_stage(tmp_path):
+def require_more(path: Path, empty: np.ndarray, cells: np.ndarray) -> None:
+    require_more_than_set(path, over_black(read_picture(path)), empty, cells)
+
+
+def test_only_cells_that_bodies_are_in_count_against_the_set(tmp_path):
     shade = np.linspace(60, 120, 40)[:, None, None] * np.ones((40, 80, 3))
     stage = shade.reshape(20, 2, 40, 2, 3).mean(axis=(1, 3)).astype(np.uint8)
     noise = np.random.default_rng(0).normal(0.0, 2.0, shade.shape)
@@ -141,10 +146,12 @@ def test_only_cells_that_bodies_are_in_count_against_the_stage(tmp_path):
     beside[:, 60:] += 50
     for name, pixels in (("empty", empty), ("drawn", drawn), ("beside", beside)):
         Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
-    require_more_than_stage(tmp_path / "drawn.png", stage, cells)
+    require_more(tmp_path / "drawn.png", stage, cells)
     for name in ("empty", "beside"):
         with pytest.raises(InvalidFileError, match="though bodies are in 12 % of it"):
-            require_more_than_stage(tmp_path / f"{name}.png", stage, cells)
+            require_more_than_set(
+                tmp_path / f"{name}.png", over_black(read_picture(tmp_path / f"{name}.png")), stage, cells
+            )
 
 
 def test_a_picture_of_one_colour_and_rounding_is_flat_and_one_with_a_faint_shade_is_not(tmp_path):
@@ -166,9 +173,9 @@ def test_a_black_body_before_nothing_is_seen_by_its_alpha(tmp_path):
     cells = body[..., 3] > 0
     Image.fromarray(body).save(tmp_path / "drawn.png")
     Image.fromarray(nothing).save(tmp_path / "empty.png")
-    require_more_than_stage(tmp_path / "drawn.png", nothing, cells)
-    with pytest.raises(InvalidFileError, match="shows the empty stage"):
-        require_more_than_stage(tmp_path / "empty.png", nothing, cells)
+    require_more(tmp_path / "drawn.png", nothing, cells)
+    with pytest.raises(InvalidFileError, match="shows the empty set"):
+        require_more(tmp_path / "empty.png", nothing, cells)
 
 
 def test_without_a_background_a_picture_may_be_empty(tmp_path):
@@ -186,7 +193,7 @@ def test_without_a_background_a_picture_may_be_empty(tmp_path):
 @pytest.mark.parametrize("background", ["plain", "transparent"])
 def test_a_frame_that_the_ball_is_not_in_is_no_fault_without_a_background(tmp_path, background):
     away = "[camera]\nposition = [0.0, -3.0, 9.0]\nlook_at = [0.0, 0.0, 12.0]\n"
-    _, layout = job_of_the_ball(tmp_path, "away", f'{away}[stage]\nbackground = "{background}"\n')
+    _, layout = job_of_the_ball(tmp_path, "away", f'{away}[set]\nbackground = "{background}"\n')
     ended = draw_the_ball(layout)
     assert isinstance(ended, Finished), ended
 

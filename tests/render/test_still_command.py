@@ -10,7 +10,7 @@ from half_simulated_jobs import half_simulated_job
 from needed_blender import needs_bpy
 from PIL import Image
 
-from pipeline.layout import JobLayout
+from pipeline.base.layout import JobLayout
 from pipeline.stages import render_drawing
 from render.pictures import validate_exr, validate_picture
 
@@ -75,7 +75,7 @@ def test_a_still_goes_where_it_is_wanted_and_replaces_what_is_there(job, tmp_pat
     target = tmp_path / "pictures" / "poster.png"
     target.parent.mkdir()
     target.write_bytes(b"an older poster")
-    arguments = ("--set", "render.samples=1", "--set", "stage.color=[0.5, 0.1, 0.1]", "-o", target)
+    arguments = ("--set", "render.samples=1", "--set", "set.color=[0.5, 0.1, 0.1]", "-o", target)
     result = pipeline("still", job.root, "--frame", 0, "--quality", "draft", *arguments)
     render_drawing.close_renderers()
     assert result.exit_code == 0, result.output

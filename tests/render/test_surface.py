@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import HELPERS, PROJECT
 
 from render.meshes import SurfaceMesh
 from render.parameters import SurfaceParameters
@@ -133,13 +134,11 @@ def test_the_same_particles_give_the_same_bytes_in_every_process():
     positions = splash()
     script = f"""
 import sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path[:0] = [{str(HELPERS)!r}, {str(Path(__file__).parent)!r}]
 from test_surface import digest, mesh_of, splash
 print(digest(mesh_of(splash(), splash())))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", script], check=True, cwd=PROJECT, capture_output=True, text=True)
     digests = {digest(mesh_of(positions, positions)) for _ in range(4)}
     assert digests == {done.stdout.strip()}
 
@@ -153,14 +152,12 @@ def test_a_process_keeps_its_number_of_threads():
 def test_several_threads_give_the_same_surface_up_to_order_and_rounding():
     script = f"""
 import sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path[:0] = [{str(HELPERS)!r}, {str(Path(__file__).parent)!r}]
 from test_surface import *
 mesh = reconstruct_surface(splash(), splash(), particle_radius=RADIUS, parameters=PARAMETERS, threads=2)
 print(enclosed_volume(mesh), is_closed_manifold(mesh), len(mesh.vertices))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", script], check=True, cwd=PROJECT, capture_output=True, text=True)
     volume, closed, vertex_count = done.stdout.split()
     mesh = mesh_of(splash())
     assert float(volume) == pytest.approx(enclosed_volume(mesh), rel=1e-4)  # order of summation and of collapses

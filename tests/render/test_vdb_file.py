@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import HELPERS, PROJECT
 
 from render import vdb_file
 from render.errors import InvalidFileError, VolumeUnavailableError
@@ -60,7 +61,7 @@ def test_what_the_disk_refused_is_told_by_its_own_error(tmp_path):
     """A limit on the size of files refuses like a full disk, in the middle of a write, with EFBIG for ENOSPC."""
     script = f"""
 import resource, signal, sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path[:0] = [{str(HELPERS)!r}, {str(Path(__file__).parent)!r}]
 from pathlib import Path
 from render import vdb_file
 from test_vdb_file import unsigned
@@ -75,7 +76,7 @@ vdb_file.sign(path)
         [sys.executable, "-c", script],
         check=False,
         cwd=tmp_path,
-        env={"PYTHONPATH": str(Path(__file__).parents[2])},
+        env={"PYTHONPATH": str(PROJECT)},
         capture_output=True,
         text=True,
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import PROJECT
 
 from render.errors import InvalidFileError, VolumeUnavailableError
 from render.parameters import VolumeParameters
@@ -275,7 +276,7 @@ def test_fields_of_different_grids_are_refused(tmp_path, smoke):
 
 def test_openvdb_is_found_without_importing_bpy():
     script = "import sys; from render.volume import import_openvdb; import_openvdb(); assert 'bpy' not in sys.modules"
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2])
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=PROJECT)
 
 
 def test_a_python_without_bpy_is_told_where_openvdb_comes_from(tmp_path):
@@ -286,8 +287,6 @@ importlib.util.find_spec = lambda name, *rest: None if name in ("bpy", "openvdb"
 from render.volume import import_openvdb
 import_openvdb()
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], check=False, cwd=Path(__file__).parents[2], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", script], check=False, cwd=PROJECT, capture_output=True, text=True)
     assert done.returncode == 1
     assert "VolumeUnavailableError: OpenVDB is not installed: it comes inside the bpy wheel" in done.stderr

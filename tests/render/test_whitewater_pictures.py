@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blender_scenes import RENDER_FRAMES, RESOLUTION, read, spec_of, sphere, write_mesh
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
-from pipeline.job.looks import WHITEWATER
+from pipeline.model.looks import WHITEWATER
 from render.parameters import MaterialParameters
 from render.point_clouds import KINDS, PointCloud, write_point_cloud
 from render.spec import MeshSequenceObject, PointSequenceObject

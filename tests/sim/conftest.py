@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 
 DEVICE_VARIABLE = "PIPELINE_TEST_DEVICE"
 """Environment variable with the device to test on, where that is not the CPU: `PIPELINE_TEST_DEVICE=cuda pytest ...`.

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 
 
 @pytest.fixture(scope="session")

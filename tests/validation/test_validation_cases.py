@@ -2,8 +2,7 @@
 
 import pytest
 
-from benchmarks.validation.cases import CASES, compute, load_case
-from benchmarks.validation.checks import CaseResult
+from validation.cases import CASES, load_case
 
 FAST = {("kernel", "wcsph"), ("free-momentum", "wcsph"), ("inertia", "rigid"), ("viscosity", "wcsph")}
 """What takes about a second; all others are marked slow."""
@@ -17,6 +16,6 @@ RUNS = [
 
 @pytest.mark.parametrize(("case", "solver"), RUNS)
 def test_every_number_of_the_case_is_within_its_tolerance(taichi_cpu, case, solver):
-    result: CaseResult = compute(case, solver, quick=True)
+    result = load_case(case).compute(solver, quick=True)
     assert result.checks
     assert not result.failures, "\n".join(str(check) for check in result.checks)

@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from benchmarks.validation.cases import CASES, load_case
-from benchmarks.validation.checks import CaseResult, Check, fitted_order
-from benchmarks.validation.page import FOLDER, PAGE, load_results, table_of, with_tables
+from validation.cases import CASES, load_case
+from validation.checks import CaseResult, Check, fitted_order
+from validation.page import FOLDER, PAGE, load_results, table_of, with_tables
 
 TEXT = (FOLDER / PAGE).read_text(encoding="utf-8")
 
@@ -20,7 +20,7 @@ def test_tables_of_the_page_are_made_from_the_kept_numbers():
 @pytest.mark.parametrize("case", CASES)
 def test_every_case_is_on_the_page_with_its_command_and_all_its_solvers(case):
     assert f"<!-- numbers: {case} -->" in TEXT
-    assert f"python -m benchmarks.validation {case}" in TEXT
+    assert f"python -m validation --full {case}" in TEXT
     assert [result.solver for result in load_results(case)] == list(load_case(case).solvers)
 
 

@@ -35,7 +35,7 @@ def _said(name: str) -> str:
 
 def _role() -> str:
     command = " ".join(sys.orig_argv)
-    if "pipeline.worker" in command:
+    if "pipeline.run.executors.worker" in command:
         return "worker"
     return "runner" if "-m pipeline submit" in command else "other"
 

@@ -1,4 +1,4 @@
-"""Cloth against theory: what benchmarks/validation/cloth.py does not compute, or not as strictly."""
+"""Cloth against theory: what validation/cases/cloth.py does not compute, or not as strictly."""
 
 import math
 

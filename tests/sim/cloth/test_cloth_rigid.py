@@ -7,13 +7,13 @@ from cloth_scenes import EARTH, GRAVITY, SOFT, WEIGHTLESS, cloth, rectangle, sol
 from contact_scenes import SPACE, cloth_of, contacts_of, displace, distances_to_body, momenta, rigid_of, world_of
 from device_distances import measure_distances
 
-from benchmarks.validation.crossing_triangles import crossings
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.rigid_contact_bodies import CollisionBodies
-from sim.rigid.contacts import Poses
-from sim.rigid.geometry import BodyGeometry
+from sim.core.motion.poses import Poses
 from sim.rigid.parameters import RigidBodyParameters
+from sim.shapes.body_geometry import BodyGeometry
+from validation.crossing_triangles import crossings
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
@@ -56,10 +56,7 @@ def test_device_has_the_distances_of_the_solids(shape, tolerance):
     near = ti.Vector.ndarray(3, ti.f32, len(points))
     near.from_numpy((points + body.centre_of_mass).astype(np.float32))
     result = ti.ndarray(ti.f32, len(points))
-    measure_distances(
-        near, bodies.kind, bodies.size, bodies.grid_values, bodies.grid_first, bodies.grid_origin,
-        bodies.grid_spacing, bodies.grid_shape, result,
-    )  # fmt: skip
+    measure_distances(near, bodies.on_device, result)
     error = np.abs(result.to_numpy() - body.signed_distance(points))
     inside_grid = np.all((points > body.bounds[0]) & (points < body.bounds[1]), axis=1)
     assert error[inside_grid].max() < tolerance

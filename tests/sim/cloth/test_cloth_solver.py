@@ -6,9 +6,9 @@ import trimesh
 from cloth_scenes import EARTH, SOFT, VACUUM, WEIGHTLESS, advance, cloth, rectangle, solver_of
 from thread_counts import outputs_by_threads
 
-from sim import short_loops
 from sim.build import build_world
 from sim.cloth.solver import ClothSolver
+from sim.core import scheduling
 from sim.scene import SceneParameters
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -182,10 +182,10 @@ def test_a_checkpoint_of_another_cloth_is_refused():
 
 STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim import short_loops
-short_loops.LONGEST_NS = float(sys.argv[2])
+from sim.core import scheduling
+scheduling.LONGEST_NS = float(sys.argv[2])
 from cloth_scenes import SOFT, cloth, rectangle, solver_of
 digest = hashlib.sha256()
 for integrator in ("xpbd", "explicit"):
@@ -201,7 +201,7 @@ print(digest.hexdigest())
 """
 
 
-@pytest.mark.parametrize("longest_ns", [short_loops.LONGEST_NS, 0.0], ids=["short loops serial", "all parallel"])
+@pytest.mark.parametrize("longest_ns", [scheduling.LONGEST_NS, 0.0], ids=["short loops serial", "all parallel"])
 def test_results_do_not_depend_on_the_number_of_threads(longest_ns):
     digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, repr(longest_ns), beside=__file__)
     assert len(digests[0].strip()) == 64

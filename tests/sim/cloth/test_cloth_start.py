@@ -5,13 +5,13 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from benchmarks.validation.crossing_triangles import crossings
 from sim.build import build_world
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.sheet import build_sheet
 from sim.cloth.springs import edges_of
 from sim.cloth.start import TOUCHING, first_crossing, start_positions
 from sim.scene import SceneParameters
+from validation.crossing_triangles import crossings
 
 
 def soup(seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -5,9 +5,9 @@ import pytest
 from cloth_scenes import cloth, rectangle, solver_of
 from contact_scenes import ROOM, cloth_of, contacts_of, rigid_of, world_of
 
-from benchmarks.validation.crossing_triangles import crossings
 from sim.cloth.lone_cloth import LoneCloth
 from sim.cloth.patches import Patches
+from validation.crossing_triangles import crossings
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
@@ -25,7 +25,7 @@ def test_spheres_around_patches_and_their_displacements_hold_all_corners():
     patches = Patches(state.host)
     lone = LoneCloth(state, patches)
     assert lone.look(state) >= np.linalg.norm(u, axis=1).max() * (1.0 - 1e-6)
-    centre, shift, turn, radius, rest = (array.to_numpy() for array in lone.motion_arrays)
+    centre, shift, turn, radius, rest = (array.to_numpy() for array in lone.motion)
     assert not turn.any()
     first = patches.first_corner.to_numpy()
     for m, corners in enumerate(np.split(patches.corners.to_numpy(), first[1:-1])):

@@ -72,7 +72,7 @@ def test_tension_is_straightened_in_rows_as_in_lists(monkeypatch):
         solver.state.set_positions(positions)
         solver._predict(solver.stable_dt())
         solver._integrator.displace(solver.stable_dt())
-    assert lists._integrator._threads[0]._is_taut.to_numpy().any()
+    assert lists._integrator._threads[0]._pieces.is_taut.to_numpy().any()
     moved = lists.state.displacement.to_numpy()
     difference = np.abs(rows.state.displacement.to_numpy() - moved).max()
     assert difference < 1e-3 * np.abs(moved).max()

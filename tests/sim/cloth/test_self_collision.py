@@ -15,10 +15,10 @@ from contact_scenes import (
 )
 from thread_counts import outputs_by_threads
 
-from benchmarks.validation.crossing_triangles import crossings, edges_of_triangles
-from sim import short_loops
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.self_collision import SelfCollision
+from sim.core import scheduling
+from validation.crossing_triangles import crossings, edges_of_triangles
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
@@ -379,10 +379,10 @@ def test_a_run_with_contacts_continues_bit_for_bit(self_collision):
 
 STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim import short_loops
-short_loops.LONGEST_NS = float(sys.argv[2])
+from sim.core import scheduling
+scheduling.LONGEST_NS = float(sys.argv[2])
 from contact_scenes import cloth_of, contacts_of, world_of
 from cloth_scenes import rectangle
 sheet = {"shape": rectangle((0.2, 0.2), (11, 11)), "thickness": 4e-3, "rotation_deg": (60.0, 5.0, 0.0),
@@ -400,7 +400,7 @@ print(digest.hexdigest(), contacts_of(cloth_of(world)).diagnostics()["contacts"]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("self_collision", [True, False])
-@pytest.mark.parametrize("longest_ns", [short_loops.LONGEST_NS, 0.0], ids=["short loops serial", "all parallel"])
+@pytest.mark.parametrize("longest_ns", [scheduling.LONGEST_NS, 0.0], ids=["short loops serial", "all parallel"])
 def test_contacts_do_not_depend_on_the_number_of_threads(longest_ns, self_collision):
     arguments = repr(longest_ns), str(self_collision)
     digests = outputs_by_threads(STEP_AND_PRINT_DIGEST, *arguments, beside=__file__, counts=(1, 2, 5))

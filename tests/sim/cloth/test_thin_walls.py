@@ -6,7 +6,7 @@ import trimesh
 from cloth_scenes import EARTH
 from contact_scenes import SPACE, cloth_of, world_of
 
-from sim.rigid import shape_grids
+from sim.shapes import distance_grids as shape_grids
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from coupled_tanks import EVERY_FACE, WEIGHTLESS, Tank
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.kernels import evaluate_slope
 from sim.fluid.viscosity_implicit import TOLERANCE
 
@@ -85,20 +85,20 @@ def test_velocities_and_error_are_those_of_the_explicit_matrix(taichi_cpu):
         **STICKY,
     )
     fluid, dt = tank.fluid, 2.0e-3
-    fluid._compute_density()
+    fluid.compute_density()
     n = fluid.particle_count
-    velocity = np.random.default_rng(2).normal(0.0, 0.5, (fluid.capacity, 3)).astype(np.float32)
-    fluid._particles.velocity.from_numpy(velocity)
+    velocity = np.random.default_rng(2).normal(0.0, 0.5, (fluid.particles.capacity, 3)).astype(np.float32)
+    fluid.particles.velocity.from_numpy(velocity)
     masses, matrix, given = friction_system(tank, dt)
-    fluid._acceleration.fill(0.0)
+    fluid.forces.acceleration.fill(0.0)
     fluid.begin_frame(0.0)
-    fluid._apply_implicit_viscosity(fluid._acceleration, dt)
-    state, solver = fluid.diagnostics(), fluid._implicit_viscosity
+    fluid.forces.add_implicit_viscosity(dt)
+    state, solver = fluid.diagnostics(), fluid.forces.implicit_viscosity
 
     def mean_square(change: np.ndarray) -> float:
         return float(change @ masses @ change) / 1000.0
 
-    change = np.concatenate([solver._change.to_numpy()[:n].ravel(), solver.bodies._change.ravel()]).astype(np.float64)
+    change = np.concatenate([solver.change.to_numpy()[:n].ravel(), solver.bodies._change.ravel()]).astype(np.float64)
     left = np.linalg.solve(masses, given - matrix @ change)
     starts = [*range(0, 3 * n, 3), 3 * n, 3 * n + 6, 3 * n + 12]
     asked = np.concatenate([np.linalg.solve(matrix[i:j, i:j], given[i:j]) for i, j in itertools.pairwise(starts)])
@@ -112,7 +112,7 @@ def test_velocities_and_error_are_those_of_the_explicit_matrix(taichi_cpu):
     assert mean_square(change - exact) < mean_square(left)
     # What acts are the pair sums at the velocities found.
     impulses = np.concatenate(fluid.body_forces.take_impulses(), axis=1).ravel() / fluid.particle_volume
-    found = np.concatenate([1000.0 * dt * fluid._acceleration.to_numpy()[:n].ravel(), impulses])
+    found = np.concatenate([1000.0 * dt * fluid.forces.acceleration.to_numpy()[:n].ravel(), impulses])
     acts = given - (matrix - masses) @ change
     np.testing.assert_allclose(found, acts, atol=1.0e-5 * np.abs(acts).max())
 
@@ -120,13 +120,13 @@ def test_velocities_and_error_are_those_of_the_explicit_matrix(taichi_cpu):
 def friction_system(tank: Tank, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Masses, matrix and right-hand side of all particles and of two bodies, over V, (3 n + 12, ...), in float64."""
     fluid, bodies = tank.fluid, tank.rigid.bodies
-    n, support, volume = fluid.particle_count, fluid.support_radius, fluid.particle_volume
+    n, support, volume = fluid.particle_count, fluid.discretization.support_radius, fluid.particle_volume
     boundary = fluid.boundary
-    position = np.concatenate([fluid._particles.position.to_numpy()[:n], boundary.position.to_numpy()])
-    velocity = np.concatenate([fluid._particles.velocity.to_numpy()[:n], boundary.velocity.to_numpy()])
+    position = np.concatenate([fluid.particles.position.to_numpy()[:n], boundary.samples.position.to_numpy()])
+    velocity = np.concatenate([fluid.particles.velocity.to_numpy()[:n], boundary.samples.velocity.to_numpy()])
     position, velocity = position.astype(np.float64), velocity.astype(np.float64)
-    volumes = np.concatenate([np.full(n, volume), boundary.volume.to_numpy().astype(np.float64)])
-    density = fluid._density.to_numpy()[:n].astype(np.float64)
+    volumes = np.concatenate([np.full(n, volume), boundary.samples.volume.to_numpy().astype(np.float64)])
+    density = fluid.particles.density.to_numpy()[:n].astype(np.float64)
 
     # Changes of the velocities of particles and samples by the unknowns: (3 of each, 3 n + 12).
     jacobian = np.zeros((len(position), 3, 3 * n + 12))

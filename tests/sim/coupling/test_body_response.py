@@ -4,7 +4,7 @@ import numpy as np
 from coupled_tanks import SPACING, Tank
 from scipy.spatial.distance import cdist
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.kernels import evaluate_slope
 
 
@@ -26,12 +26,16 @@ def two_light_bodies() -> Tank:
 def wrenches(tank: Tank) -> tuple[np.ndarray, np.ndarray]:
     """n_i of every particle and body in float64, (bodies, particles, 6), and the bodies' M^-1, (bodies, 6, 6)."""
     fluid, bodies = tank.fluid, tank.rigid.bodies
-    x = fluid._particles.position.to_numpy()[: fluid.particle_count].astype(np.float64)
+    x = fluid.particles.position.to_numpy()[: fluid.particle_count].astype(np.float64)
     first = fluid.boundary.fixed_count
-    samples = fluid.boundary.position.to_numpy()[first:].astype(np.float64)
-    volumes = fluid.boundary.volume.to_numpy()[first:].astype(np.float64)
+    samples = fluid.boundary.samples.position.to_numpy()[first:].astype(np.float64)
+    volumes = fluid.boundary.samples.volume.to_numpy()[first:].astype(np.float64)
     distance = cdist(x, samples)
-    slope = np.where(distance < fluid.support_radius, evaluate_slope(distance, fluid.support_radius), 0.0)
+    slope = np.where(
+        distance < fluid.discretization.support_radius,
+        evaluate_slope(distance, fluid.discretization.support_radius),
+        0.0,
+    )
     gradient = (volumes * slope / distance)[:, :, None] * (x[:, None] - samples[None])
     n, mobility = [], []
     for body, (start, stop) in enumerate(
@@ -49,13 +53,13 @@ def wrenches(tank: Tank) -> tuple[np.ndarray, np.ndarray]:
 def test_the_diagonal_bounds_what_bodies_add_to_the_pressure_matrix(taichi_cpu):
     tank = two_light_bodies()
     fluid = tank.fluid
-    fluid._compute_density()
-    with_bodies = fluid._inverse_diagonal.to_numpy()[: fluid.particle_count].astype(np.float64)
+    fluid.compute_density()
+    with_bodies = fluid.pressure.system.inverse_diagonal.to_numpy()[: fluid.particle_count].astype(np.float64)
     response, fluid.body_forces.response = fluid.body_forces.response, None
-    fluid._compute_density()
-    without = fluid._inverse_diagonal.to_numpy()[: fluid.particle_count].astype(np.float64)
+    fluid.compute_density()
+    without = fluid.pressure.system.inverse_diagonal.to_numpy()[: fluid.particle_count].astype(np.float64)
     fluid.body_forces.response = response
-    bound = (1.0 / with_bodies - 1.0 / without) / fluid._relaxation
+    bound = (1.0 / with_bodies - 1.0 / without) / fluid.pressure.relaxation
     n, mobility = wrenches(tank)
     matrix = fluid.particle_volume * np.einsum("bia,bac,bjc->ij", n, mobility, n)
     eigenvalues = np.linalg.eigvalsh(np.diag(bound) - matrix)
@@ -68,11 +72,11 @@ def test_the_diagonal_bounds_what_bodies_add_to_the_pressure_matrix(taichi_cpu):
 def test_samples_answer_to_a_pressure_as_the_bodies_would(taichi_cpu):
     tank = two_light_bodies()
     fluid, bodies = tank.fluid, tank.rigid.bodies
-    fluid._compute_density()
-    pressure = np.random.default_rng(1).uniform(0.0, 1000.0, fluid.capacity).astype(np.float32)
-    fluid._next_pressure.from_numpy(pressure)
-    fluid._bodies_respond(fluid._next_pressure)
-    found = fluid._boundary_response.to_numpy()[: fluid.boundary.count]
+    fluid.compute_density()
+    pressure = np.random.default_rng(1).uniform(0.0, 1000.0, fluid.particles.capacity).astype(np.float32)
+    fluid.pressure.next_pressure.from_numpy(pressure)
+    fluid.pressure.accelerate_by(fluid.pressure.next_pressure)
+    found = fluid.pressure.boundary_response.to_numpy()[: fluid.boundary.count]
     n, mobility = wrenches(tank)
     count = fluid.particle_count
     for body, (start, stop) in enumerate(
@@ -80,7 +84,7 @@ def test_samples_answer_to_a_pressure_as_the_bodies_would(taichi_cpu):
     ):
         answer = mobility[body] @ (fluid.particle_volume * pressure[:count].astype(np.float64) @ n[body])
         first = fluid.boundary.fixed_count
-        arm = fluid.boundary.position.to_numpy()[first + start : first + stop] - bodies.position[body]
+        arm = fluid.boundary.samples.position.to_numpy()[first + start : first + stop] - bodies.position[body]
         expected = answer[:3] + np.cross(answer[3:], arm)
         # Sums of some hundred float32 forces of both signs.
         np.testing.assert_allclose(found[first + start : first + stop], expected, atol=1.0e-4 * np.abs(expected).max())
@@ -93,7 +97,7 @@ def test_free_bodies_fall_within_the_step_and_driven_ones_do_not(taichi_cpu):
     tank.coupling.resume()
     tank.fluid.body_forces.response.fall(0.5)
     boundary = tank.fluid.boundary
-    velocity = boundary.velocity.to_numpy()[: boundary.count]
+    velocity = boundary.samples.velocity.to_numpy()[: boundary.count]
     ball = slice(boundary.fixed_count, boundary.fixed_count + boundary.body_start[1])
     np.testing.assert_allclose(velocity[ball], np.broadcast_to([0.0, 0.0, -4.905], velocity[ball].shape), rtol=1.0e-6)
     np.testing.assert_array_equal(velocity[: boundary.fixed_count], 0.0)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from coupled_tanks import SPACING, Tank
 
+from sim.core.domain import DomainParameters
 from sim.coupling.body_samples import LEAST_FACTOR, completing_factors, least_factor
-from sim.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import BoundarySamples, sink_samples
 from sim.fluid.kernels import evaluate
-from sim.rigid.geometry import BodyGeometry
 from sim.rigid.parameters import RigidBodyParameters
+from sim.shapes.body_geometry import BodyGeometry
 
 
 def geometry(shape: dict) -> BodyGeometry:

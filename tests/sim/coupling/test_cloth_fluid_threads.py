@@ -5,7 +5,7 @@ from thread_counts import outputs_by_threads
 
 STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 from cloth_tanks import EDGES, ClothTank, rectangle
 tank = ClothTank(

@@ -5,8 +5,8 @@ import pytest
 
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.solver import ClothSolver
+from sim.core.domain import DomainParameters
 from sim.coupling.cloth_samples import ClothSamples
-from sim.domain import DomainParameters
 from sim.fluid.kernels import evaluate, particle_volume
 from sim.fluid.sheet_samples import AMID_SAMPLES, kept_away, sheet_standoff
 

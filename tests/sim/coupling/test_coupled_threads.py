@@ -4,10 +4,10 @@ from thread_counts import outputs_by_threads
 
 STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 from coupled_tanks import Tank
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.36, 0.36, 0.6))
 ball = {"kind": "dynamic", "density": 300.0, "shape": {"type": "sphere", "radius": 0.09}}
 for solver in ("wcsph", "dfsph"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from coupled_tanks import EVERY_FACE, SPACING, WEIGHTLESS, Tank
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.solvers import SOLVERS
 
 OPEN_SPACE = DomainParameters(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5), open_faces=EVERY_FACE)

@@ -3,7 +3,7 @@
 import pytest
 from coupled_tanks import SPACING, Tank
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.solvers import SOLVERS
 
 RADIUS = 2.5 * SPACING

@@ -7,7 +7,7 @@ SCENE_OF_ALL = """
 # 1 thread runs all frames and leaves a checkpoint, from which 2 threads go on.
 import hashlib, sys
 import numpy as np
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 from sim.build import build_world
 from sim.scene import SceneParameters

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from half_full_rooms import SILENT_SOURCE, SPACING, HalfFullRoom, lattice
 
+from sim.core.domain import DomainParameters
 from sim.coupling.water_room import room_for_water
-from sim.domain import DomainParameters
 from sim.smoke.grid import SmokeGrid
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")

@@ -5,14 +5,14 @@ import pytest
 from thread_counts import outputs_by_threads
 
 from sim.build import build_world
+from sim.core.domain import DomainParameters
+from sim.core.motion import rotation
 from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
-from sim.domain import DomainParameters
-from sim.rigid import rotation
-from sim.rigid.geometry import BodyGeometry
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
 from sim.scene import SceneParameters
+from sim.shapes.body_geometry import BodyGeometry
 from sim.smoke.obstacles import AIR, MOVING, STATIC
 from sim.smoke.parameters import SmokeParameters
 
@@ -292,7 +292,7 @@ def test_air_flows_around_a_sphere_as_around_a_dipole(cells):
 
 THREADS = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 from test_smoke_rigid import PISTON, build
 ball = {"name": "ball", "kind": "dynamic", "density": 300.0, "shape": {"type": "sphere", "radius": 0.1}}

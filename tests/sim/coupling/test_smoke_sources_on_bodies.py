@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sim.build import build_world
-from sim.coupling.smoke_sources import SmokeSourcesOnBodies
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
+from sim.coupling.smoke_sources import SmokeSourcesOnBodies, placed_on, with_sources_on
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.solver import RigidSolver
 from sim.scene import SceneParameters
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
-from sim.smoke.source_motion import BodyMotion, motion_of, placed_on, with_sources_on
+from sim.smoke.source_motion import BodyMotion, motion_of
 
 DOMAIN = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.6, 0.6, 0.6))
 CELL = 0.05

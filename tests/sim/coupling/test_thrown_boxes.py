@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.build import build_world
-from sim.rigid import rotation
+from sim.core.motion import rotation
 from sim.scene import SceneParameters
 
 EDGE, SPACING, SPEED = 0.1, 0.02, 2.5

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import pytest
 from small_fluids import lattice, make_fluid
 
-from sim.domain import DomainParameters
-from sim.fluid.forces import SPHFluid
+from sim.core.domain import DomainParameters
+from sim.fluid.fluid import SPHFluid
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial import cKDTree
 from small_fluids import lattice
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
 from sim.fluid.kernels import evaluate, layer_field, particle_volume, wall_calibration, wall_layers
 

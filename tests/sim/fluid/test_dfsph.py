@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
+from sim.fluid.dfsph import NOT_SOLVED
 from sim.fluid.kernels import evaluate, evaluate_slope
-from sim.fluid.pressure_kernels import NOT_SOLVED
 
 SPACING, SUPPORT = 0.02, 0.04
 CORNER = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.2, 0.2, 0.2), open_faces=("x+", "y+", "z+"))
@@ -42,27 +42,35 @@ def shaken_corner(taichi_cpu):
     particles += random.uniform(-0.1 * SPACING, 0.1 * SPACING, particles.shape).astype(np.float32)
     velocities = random.normal(-0.5, 0.2, particles.shape).astype(np.float32)
     return make_fluid(
-        CORNER, particles, velocities, solver="dfsph", dt=1.0e-3, artificial_viscosity=0.0, viscosity=0.0,
-        density_tolerance=1e-7, divergence_tolerance=1e-7, max_iterations=2000,
-    )  # fmt: skip
+        CORNER,
+        particles,
+        velocities,
+        solver="dfsph",
+        dt=1.0e-3,
+        artificial_viscosity=0.0,
+        viscosity=0.0,
+        density_tolerance=1e-7,
+        divergence_tolerance=1e-7,
+        max_iterations=2000,
+    )
 
 
 def test_density_and_diagonal_are_those_of_the_explicit_matrix(shaken_corner):
     fluid = shaken_corner
-    fluid._compute_density()
+    fluid.compute_density()
     position = fluid.checkpoint()["position"]
     density, rates = explicit(position, domain_wall_samples(CORNER, SPACING).positions, fluid.particle_volume)
     # A = V D M^-1 D^T with M = 1000 V, in float32.
     diagonal = (rates**2).sum(axis=(1, 2)) / 1000.0
-    np.testing.assert_allclose(fluid._host(fluid._density), density, rtol=1e-5)
-    np.testing.assert_allclose(fluid._host(fluid._inverse_diagonal), 1.0 / diagonal, rtol=1e-4)
+    np.testing.assert_allclose(fluid.particles.host(fluid.particles.density), density, rtol=1e-5)
+    np.testing.assert_allclose(fluid.particles.host(fluid.pressure.system.inverse_diagonal), 1.0 / diagonal, rtol=1e-4)
 
 
 def test_a_step_leaves_no_compression_and_pushes_only_where_there_would_be(shaken_corner):
     fluid = shaken_corner
     before = fluid.checkpoint()["position"]
     density, rates = explicit(before, domain_wall_samples(CORNER, SPACING).positions, fluid.particle_volume)
-    correction = fluid._correction(1.0e-3)
+    correction = fluid.pressure.correction(1.0e-3)
     fluid.begin_frame(0.0)
     ids = fluid.checkpoint()["particle_id"]
     fluid.substep(1.0e-3)
@@ -82,15 +90,15 @@ def test_a_step_leaves_no_compression_and_pushes_only_where_there_would_be(shake
 def test_pressure_acts_as_the_transposed_matrix(shaken_corner):
     fluid = shaken_corner
     fluid.substep(1.0e-3)
-    fluid._compute_density()
+    fluid.compute_density()
     position = fluid.checkpoint()["position"]
     _, rates = explicit(position, domain_wall_samples(CORNER, SPACING).positions, fluid.particle_volume)
-    pressure = fluid._particles.carried["pressure"]
-    fluid._accelerate_by_pressure(pressure)
-    expected = -np.einsum("nmk,n->mk", rates, fluid._host(pressure).astype(np.float64)) / 1000.0
+    pressure = fluid.particles.carried["pressure"]
+    fluid.pressure.accelerate_by(pressure)
+    expected = -np.einsum("nmk,n->mk", rates, fluid.particles.host(pressure).astype(np.float64)) / 1000.0
     # Sums of some thirty float32 terms that cancel in part.
     np.testing.assert_allclose(
-        fluid._host(fluid._pressure_acceleration), expected, atol=1e-5 * np.abs(expected).max(), rtol=1e-4
+        fluid.particles.host(fluid.pressure.acceleration), expected, atol=1e-5 * np.abs(expected).max(), rtol=1e-4
     )
 
 
@@ -99,11 +107,17 @@ def test_divergence_is_gone_before_any_other_force_acts(taichi_cpu):
     particles = lattice((-0.1,) * 3, (0.1,) * 3, SPACING)
     squeezed = (-2.0 * particles).astype(np.float32)  # 6/s of compression everywhere
     fluid = make_fluid(
-        domain, particles, squeezed, gravity=(0.0,) * 3, solver="dfsph", dt=1.0e-3, divergence_tolerance=1e-7,
+        domain,
+        particles,
+        squeezed,
+        gravity=(0.0,) * 3,
+        solver="dfsph",
+        dt=1.0e-3,
+        divergence_tolerance=1e-7,
         max_iterations=1000,
-    )  # fmt: skip
-    fluid._compute_density()
-    fluid._correct_divergence(1.0e-3)
+    )
+    fluid.compute_density()
+    fluid.correct_divergence_error(1.0e-3)
     state = fluid.checkpoint()
     _, gradients = pairs_of(state["position"], state["position"])
     velocity = state["velocity"].astype(np.float64)
@@ -119,11 +133,16 @@ def test_a_divergence_within_its_tolerance_is_relaxed_once_and_becomes_less(taic
     domain = DomainParameters(min=(-1.0,) * 3, max=(1.0,) * 3, open_faces=EVERY_FACE)
     particles = lattice((-0.1,) * 3, (0.1,) * 3, SPACING)
     fluid = make_fluid(
-        domain, particles, (-2.0 * particles).astype(np.float32), gravity=(0.0,) * 3, solver="dfsph", dt=1.0e-3,
+        domain,
+        particles,
+        (-2.0 * particles).astype(np.float32),
+        gravity=(0.0,) * 3,
+        solver="dfsph",
+        dt=1.0e-3,
         divergence_tolerance=0.1,
-    )  # fmt: skip
+    )
     fluid.begin_frame(0.0)
-    fluid._compute_density()
+    fluid.compute_density()
 
     def mean_compression(velocity):
         apart = velocity[:, None].astype(np.float64) - velocity[None]
@@ -132,8 +151,8 @@ def test_a_divergence_within_its_tolerance_is_relaxed_once_and_becomes_less(taic
 
     before = fluid.checkpoint()
     _, gradients = pairs_of(before["position"], before["position"])
-    solved = fluid._host(fluid._density) >= fluid._least_density
-    fluid._correct_divergence(1.0e-3)
+    solved = fluid.particles.host(fluid.particles.density) >= fluid.least_density
+    fluid.correct_divergence_error(1.0e-3)
     state = fluid.diagnostics()
     assert state["divergence_iterations"] == 1.0
     # The error that is reported is that before the relaxation, in float32.
@@ -147,10 +166,10 @@ def test_particles_at_walls_take_part_in_the_divergence_solve_and_those_at_the_s
     domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.2, 0.2, 0.3))
     particles = lattice((0.0,) * 3, (0.2, 0.2, 0.2), SPACING)
     fluid = make_fluid(domain, particles, solver="dfsph", support_in_spacings=support)
-    fluid._compute_density()
-    fluid._correct_divergence(1.0e-3)
+    fluid.compute_density()
+    fluid.correct_divergence_error(1.0e-3)
     position = fluid.checkpoint()["position"]
-    is_solved = fluid._host(fluid._compression) > 0.5 * NOT_SOLVED
+    is_solved = fluid.particles.host(fluid.pressure.system.compression) > 0.5 * NOT_SOLVED
     is_at_surface = position[:, 2] > 0.2 - SPACING
     is_at_wall = (np.abs(position[:, :2] - 0.1) > 0.1 - SPACING).any(axis=1)
     assert is_solved[~is_at_surface].all()
@@ -175,6 +194,5 @@ def test_the_neighbour_list_has_no_skin_and_is_made_anew_for_every_step(shaken_c
     assert fluid.diagnostics()["neighbor_searches"] == 3.0  # one before the second step, the third and this
     position = fluid.checkpoint()["position"].astype(np.float64)
     near = np.linalg.norm(position[:, None] - position[None], axis=-1) < SUPPORT
-    neighbors = fluid._particles.neighbors
-    found = neighbors.fluid_count.to_numpy()[: fluid.particle_count]
+    found = fluid.particles.near.fluid_count.to_numpy()[: fluid.particle_count]
     np.testing.assert_array_equal(found, near.sum(axis=1) - 1)

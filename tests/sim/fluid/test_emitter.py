@@ -9,12 +9,13 @@ from scipy.spatial import cKDTree
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.build import build_world
-from sim.cells import CellGrid, Cells, CellSort
-from sim.domain import DomainParameters
+from sim.core.cells import CellGrid, CellSort
+from sim.core.domain import DomainParameters
 from sim.fluid.emitter import find_free_places
 from sim.fluid.nozzles import nozzle_collision, pipes
 from sim.fluid.opening import Opening, obstruction, pipe_clearance
 from sim.fluid.parameters import EmitterParameters
+from sim.fluid.particles import Layer, Particles
 from sim.scene import SceneParameters
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
@@ -304,10 +305,10 @@ def test_a_place_is_taken_by_a_particle_within_the_clearance_in_cells_of_either_
     cells.sort(positions, ids, len(cloud), (0.0,) * 3, (1.0,) * 3)
     positions.from_numpy(cloud[cells.order.to_numpy()])
     clearance = 0.9 * radius
-    find_free_places(
-        places, len(wanted), ti.math.vec3(0.0), positions, cells.cell_start, len(cloud), len(cloud),
-        ti.math.vec3(*grid.origin), 1.0 / grid.cell_size, Cells(*grid.shape), grid.reach, clearance, free,
-    )  # fmt: skip
+    layer = Layer(places, len(wanted), (0.0,) * 3, (0.0,) * 3, 0, free, free, 0)
+    density = ti.ndarray(ti.f32, len(cloud))
+    particles = Particles(positions, positions, ids, ids, density, len(cloud))
+    find_free_places(layer, particles, cells.cell_start, grid.on_device, len(cloud), clearance)
     distance, _ = cKDTree(cloud).query(wanted)
     expected = distance > clearance
     assert 0 < expected.sum() < len(wanted)
@@ -358,7 +359,7 @@ def test_walls_keep_their_friction_beyond_the_reach_of_a_nozzle(taichi_cpu):
     boundary = jet(FROM_BELOW, domain=wide, **STICKY).boundary
     position, volume, friction = (
         array.to_numpy()[: boundary.fixed_count]
-        for array in (boundary.position, boundary.volume, boundary.friction_volume)
+        for array in (boundary.samples.position, boundary.samples.volume, boundary.samples.friction_volume)
     )
     # The nozzle is 4 particles wide and 2 d deep, the support 2 d; pipe and floor are 0.95 d outside.
     is_pipe = np.isin(boundary.index, np.arange(boundary.given_count)[-len(opening_of(FROM_BELOW).pipe(SPACING)) :])

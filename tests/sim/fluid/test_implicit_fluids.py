@@ -6,8 +6,8 @@ from small_fluids import EVERY_FACE, lattice, make_fluid
 from thread_counts import outputs_by_threads
 
 from sim.build import build_world
-from sim.domain import DomainParameters
-from sim.fluid.implicit_fluid import filled_diagonal, iterations_ahead, largest_eigenvalue
+from sim.core.domain import DomainParameters
+from sim.fluid.pressure import filled_diagonal, iterations_ahead, largest_eigenvalue
 from sim.fluid.solve_record import SolveRecord
 from sim.scene import SceneParameters
 
@@ -67,9 +67,9 @@ def test_ten_steps_equal_five_restore_five(dam_break, solver):
 
 STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from small_fluids import lattice, make_fluid
 domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.5, 0.3, 0.4))
 digest = hashlib.sha256()
@@ -197,15 +197,16 @@ def test_a_pressure_that_is_not_finite_is_told_and_not_taken_for_none(dam_break,
 @BOTH
 def test_an_error_that_is_not_finite_is_no_small_one(dam_break, solver):
     fluid = dam_break(solver=solver)
-    fluid._compute_density()
-    fluid._remaining.fill(0.0)
-    pressure = fluid._particles.carried["pressure"]
-    assert fluid._mean_error(fluid._remaining, pressure, 1.0e-3) == 0.0
-    remaining = np.zeros(fluid.capacity, dtype=np.float32)
+    fluid.compute_density()
+    found = fluid.pressure.system.remaining
+    found.fill(0.0)
+    pressure = fluid.particles.carried["pressure"]
+    assert fluid.pressure.mean_error(pressure, 1.0e-3) == 0.0
+    remaining = np.zeros(fluid.particles.capacity, dtype=np.float32)
     for value in (np.nan, -np.inf, np.inf):
         remaining[7] = value
-        fluid._remaining.from_numpy(remaining)
-        assert fluid._mean_error(fluid._remaining, pressure, 1.0e-3) == np.inf
+        found.from_numpy(remaining)
+        assert fluid.pressure.mean_error(pressure, 1.0e-3) == np.inf
 
 
 @BOTH

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 
 OPEN_SPACE = DomainParameters(min=(-1.0,) * 3, max=(1.0,) * 3, open_faces=EVERY_FACE)
 
@@ -12,9 +12,15 @@ OPEN_SPACE = DomainParameters(min=(-1.0,) * 3, max=(1.0,) * 3, open_faces=EVERY_
 def test_positions_after_a_step_have_the_density_that_was_predicted(taichi_cpu):
     particles = lattice((-0.1,) * 3, (0.1,) * 3, 0.02)
     fluid = make_fluid(
-        OPEN_SPACE, particles, -2.0 * particles, gravity=(0.0,) * 3, solver="pcisph", dt=2.0e-3,
-        density_tolerance=1e-6, max_iterations=1000,
-    )  # fmt: skip
+        OPEN_SPACE,
+        particles,
+        -2.0 * particles,
+        gravity=(0.0,) * 3,
+        solver="pcisph",
+        dt=2.0e-3,
+        density_tolerance=1e-6,
+        max_iterations=1000,
+    )
     fluid.substep(2.0e-3)
     assert fluid.diagnostics()["not_converged"] == 0.0
     # Compressed by 12 per mille without pressure; what 1e-6 in the mean leaves to one of 1000 particles is 1e-3.
@@ -27,20 +33,21 @@ def test_first_correction_is_that_of_a_filled_neighbourhood(taichi_cpu):
     # A lattice compressed by 1 %: delta (rho - 1) of its inner particles, with delta = 1/(lambda dt² A) by hand.
     particles = (lattice((-0.1,) * 3, (0.1,) * 3, 0.02) * 0.99 ** (1 / 3)).astype(np.float32)
     fluid = make_fluid(OPEN_SPACE, particles, gravity=(0.0,) * 3, solver="pcisph", dt=1.0e-3)
-    fluid._compute_density()
-    fluid._acceleration.fill(0.0)
-    fluid._pressure_acceleration.fill(0.0)
-    pressure = fluid._particles.carried["pressure"]
-    fluid._start_from(pressure)
-    fluid._relax(pressure, 1.0e-3, 0)
+    fluid.compute_density()
+    fluid.forces.acceleration.fill(0.0)
+    fluid.pressure.acceleration.fill(0.0)
+    pressure = fluid.particles.carried["pressure"]
+    fluid.pressure.start_from(pressure)
+    fluid.predict_and_correct(pressure, 1.0e-3, 0)
     inside = (np.abs(fluid.checkpoint()["position"]) < 0.06).all(axis=1)
-    compression = fluid._host(fluid._density)[inside] - 1.0
+    compression = fluid.particles.host(fluid.particles.density)[inside] - 1.0
     # sigma = 8/(pi h³), h = 2 d, V = d³: A = V² (sigma/h)² sum (6 (1-q)²)²/rho0 over 6, 12 and 8 neighbours.
     factor = 8.0 / (np.pi * 8.0) / 2.0 / 0.02
     squares = [count * (6.0 * (1.0 - r / 2.0) ** 2) ** 2 for count, r in ((6, 1.0), (12, 2**0.5), (8, 3**0.5))]
-    delta = fluid._relaxation / (1.0e-6 * factor**2 * sum(squares) / 1000.0)
+    delta = fluid.pressure.relaxation / (1.0e-6 * factor**2 * sum(squares) / 1000.0)
     # A compressed neighbourhood is stiffer by some percent than the lattice; the stiffer of the two counts.
-    correction = fluid._host(fluid._relaxed_before)[inside] / (delta * compression * fluid._correction(1.0e-3))
+    relaxed = fluid.particles.host(fluid.pressure.system.relaxed_before)[inside]
+    correction = relaxed / (delta * compression * fluid.pressure.correction(1.0e-3))
     assert (correction > 0.9).all()
     assert (correction <= 1.001).all()
 
@@ -88,8 +95,8 @@ def test_what_a_pair_adds_that_is_predicted_nearer_than_the_list_reaches_is_smal
     fluid = make_fluid(OPEN_SPACE, particles, velocities, gravity=(0.0,) * 3, solver="pcisph", artificial_viscosity=0.0)
     dt = fluid.stable_dt()
     assert dt == pytest.approx(0.2 * 0.02 / 1.0)
-    fluid._compute_density()
-    alone = fluid._host(fluid._density).max()
+    fluid.compute_density()
+    alone = fluid.particles.host(fluid.particles.density).max()
     fluid.substep(dt)
     nearest = 0.0441 - 2.0 * dt
     state = fluid.diagnostics()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_fluids import lattice, make_fluid
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 
 HEIGHT = 0.2
 

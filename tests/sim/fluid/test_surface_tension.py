@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from scipy.spatial import ConvexHull
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.surface_tension import cohesion_rate, cohesion_stress
 from sim.fluid.surface_tension_akinci2013 import cohesion_stress_akinci2013

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import jv
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.viscosity_implicit import TOLERANCE, is_implicit
 
 OPEN_SPACE = DomainParameters(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5), open_faces=EVERY_FACE)
@@ -69,9 +69,14 @@ def test_a_first_guess_that_is_worse_than_none_is_forgotten(taichi_cpu):
     particles = lattice((-0.1,) * 3, (0.1,) * 3, SPACING)
     velocities = np.random.default_rng(5).normal(0.0, 0.3, particles.shape).astype(np.float32)
     fluid = make_fluid(
-        OPEN_SPACE, particles, velocities, gravity=(0.0, 0.0, 0.0), viscosity=1.0, viscosity_solver="implicit",
+        OPEN_SPACE,
+        particles,
+        velocities,
+        gravity=(0.0, 0.0, 0.0),
+        viscosity=1.0,
+        viscosity_solver="implicit",
         artificial_viscosity=0.0,
-    )  # fmt: skip
+    )
     fluid.substep(1.0e-3)
     stopped = dict(fluid.checkpoint())
     stopped["velocity"] = np.broadcast_to(np.float32((1.0, 2.0, 3.0)), velocities.shape).copy()

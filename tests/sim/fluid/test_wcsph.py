@@ -5,7 +5,7 @@ import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid
 from thread_counts import outputs_by_threads
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.fluid.boundary_akinci2012 import sink_samples
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.memory import estimate_bytes
@@ -187,9 +187,9 @@ def test_a_checkpoint_that_does_not_fit_is_refused(dam_break, spoil):
 
 STEP_AND_PRINT_DIGEST = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from small_fluids import lattice, make_fluid
 domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(0.5, 0.3, 0.4))
 fluid = make_fluid(domain, lattice((0.0, 0.0, 0.0), (0.3, 0.3, 0.2), 0.02))
@@ -335,7 +335,7 @@ def test_a_particle_that_is_pressed_against_a_wall_shortens_the_step(taichi_cpu)
 
 def test_the_speed_of_a_body_that_is_not_a_number_is_told(dam_break):
     fluid = dam_break()
-    fluid._body_speed = np.nan
+    fluid.tank.body_speed = np.nan
     assert np.isfinite(fluid.stable_dt())  # the larger of two speeds hides it
     fluid.substep(1.0e-5)
     assert "moving body" in fluid.first_bad_quantity()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from small_fluids import lattice, make_fluid
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 
 SPACING, DT = 0.02, 1.0e-4
 
@@ -19,7 +19,7 @@ def stiffest(**material: object) -> float:
     for _ in range(600):
         fluid.substep(DT)
         assert fluid.first_bad_quantity() is None
-        largest = max(largest, DT * fluid._frequency_ratio * fluid._motion.max_frequency)
+        largest = max(largest, DT * fluid.frequency_ratio * fluid.tank.motion.max_frequency)
     return largest
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rigid_scenes import GRAVITY, SPACE, advance, ball, body, cube, in_room, in_space, totals
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.rigid.solver import RigidSolver
 
 

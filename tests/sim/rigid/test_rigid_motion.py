@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rigid_scenes import GRAVITY, advance, ball, body, cube, in_room, in_space, totals
 
-from sim.rigid import rotation
+from sim.core.motion import rotation
 
 
 def test_free_fall_is_exact():

@@ -5,8 +5,9 @@ import pytest
 from pydantic import ValidationError
 from rigid_scenes import ball
 
-from sim.rigid.keyframes import KeyframePath, path_of
+from sim.core.motion.paths import KeyframePath
 from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.paths import path_of
 
 
 def parameters(**more) -> RigidBodyParameters:
@@ -81,7 +82,7 @@ def test_path_passes_its_keyframes_and_rests_at_its_ends(interpolation):
 @pytest.mark.parametrize("interpolation", ["cubic", "linear"])
 @pytest.mark.parametrize("time_s", [0.6, 0.9, 1.3, 1.99])
 def test_velocities_are_the_derivatives_of_the_path(interpolation, time_s):
-    from sim.rigid import rotation
+    from sim.core.motion import rotation
 
     path = path_of(parameters(kind="kinematic", keyframe=KEYFRAMES, interpolation=interpolation))
     h = 1e-5

@@ -6,10 +6,10 @@ import trimesh
 from rigid_scenes import GRAVITY, advance, ball, body, cube, in_room
 
 from sim.build import build_world
-from sim.rigid import rotation
+from sim.core.motion import rotation
+from sim.core.world import World
 from sim.rigid.start import check_start
 from sim.scene import SceneParameters
-from sim.world import World
 
 
 def tumbling_scene() -> SceneParameters:

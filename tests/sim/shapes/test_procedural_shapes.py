@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
-from sim.rigid.mass_properties import mass_properties_of_mesh
 from sim.shapes import build_solid
+from sim.shapes.mass_properties import mass_properties_of_mesh
 from sim.shapes.parameters import Placement
 from sim.shapes.tessellation import cut_along
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from sim.rigid.mass_properties import mass_properties_of_mesh, mass_properties_of_solid
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.static import StaticBody
 from sim.shapes import TriangleMesh, build_solid
+from sim.shapes.mass_properties import mass_properties_of_mesh, mass_properties_of_solid
 from sim.shapes.mesh_solid import solid_from_triangles
 from sim.shapes.parameters import Placement
 

@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
-from pathlib import Path
+
+from places import PROJECT
 
 
 def test_parameters_load_neither_trimesh_nor_igl():
     code = "import sys, sim.shapes.parameters; print({'trimesh', 'igl', 'scipy'} & set(sys.modules) or 'none')"
-    repository = Path(__file__).parents[3]
+    repository = PROJECT
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=repository)
     assert answer.stdout == "none\n"
 

@@ -3,7 +3,7 @@ import pytest
 import taichi as ti
 from smoke_scenes import CLOSED_BOX, OPEN_BOX, unit_grid
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.smoke.balance import CorrectionBalance
 from sim.smoke.obstacles import Obstacles
 from sim.smoke.parameters import SmokeParameters

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
 

@@ -5,8 +5,8 @@ import pytest
 import taichi as ti
 from smoke_scenes import CLOSED_BOX, mark
 
-from sim import short_loops
-from sim.domain import DomainParameters
+from sim.core import scheduling
+from sim.core.domain import DomainParameters
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
 from sim.smoke import lanes
@@ -27,7 +27,7 @@ def on_gpu(request, monkeypatch) -> bool:
 
 
 def choose_lanes(monkeypatch, *, on_gpu: bool) -> None:
-    for module in ("sim.reductions", "sim.short_loops", "sim.smoke.lanes"):
+    for module in ("sim.core.reductions", "sim.core.scheduling", "sim.smoke.lanes"):
         monkeypatch.setattr(f"{module}.runs_on_gpu", lambda: on_gpu)
 
 
@@ -159,7 +159,7 @@ def test_a_plume_is_the_same_in_runs_of_cells_and_one_by_one(monkeypatch, open_f
     states = []
     # Every loop by all threads and nothing in runs; runs, and all of the V-cycle or its coarse levels by one thread.
     for longest_ns, least_cells in ((0.0, 1_000_000), (1.0e9, 0), (2.0e3, 0)):
-        monkeypatch.setattr(short_loops, "LONGEST_NS", longest_ns)
+        monkeypatch.setattr(scheduling, "LONGEST_NS", longest_ns)
         monkeypatch.setattr(lanes, "LEAST_CELLS_IN_RUNS", least_cells)
         parameters = SmokeParameters.model_validate(
             {

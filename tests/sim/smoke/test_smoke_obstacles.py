@@ -3,7 +3,7 @@ import pytest
 from scipy import ndimage
 from smoke_scenes import OPEN_BOX, mark, unit_grid
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.multigrid_levels import Coefficients
 from sim.smoke.obstacles import Obstacles, time_of_travel

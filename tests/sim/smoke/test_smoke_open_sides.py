@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from smoke_scenes import OPEN_BOX
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
 

@@ -7,8 +7,8 @@ import taichi as ti
 from smoke_scenes import OPEN_BOX
 from thread_counts import outputs_by_threads
 
-from sim import short_loops
-from sim.domain import DomainParameters
+from sim.core import scheduling
+from sim.core.domain import DomainParameters
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
 from sim.smoke import lanes
@@ -257,11 +257,11 @@ def test_grid_is_the_domain_unless_the_smoke_names_its_own_box():
 
 CHILD = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
-from sim import short_loops
+from sim.core import scheduling
 from sim.smoke import lanes
-short_loops.LONGEST_NS, lanes.LEAST_CELLS_IN_RUNS = map(float, sys.argv[2:])
+scheduling.LONGEST_NS, lanes.LEAST_CELLS_IN_RUNS = map(float, sys.argv[2:])
 from test_smoke_solver import advance, build_plume, digest
 solver = build_plume()
 advance(solver, 6)
@@ -316,7 +316,7 @@ def test_a_plain_box_takes_less_than_120_bytes_a_cell(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("longest_ns", "least_cells"),
-    [(short_loops.LONGEST_NS, lanes.LEAST_CELLS_IN_RUNS), (2.0e4, 0.0)],
+    [(scheduling.LONGEST_NS, lanes.LEAST_CELLS_IN_RUNS), (2.0e4, 0.0)],
     ids=["as a small grid", "as a large one: runs of cells, and coarse levels alone by one thread"],
 )
 def test_one_thread_and_two_give_the_same_bits(longest_ns, least_cells):

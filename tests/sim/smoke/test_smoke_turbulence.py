@@ -5,7 +5,7 @@ import pytest
 import taichi as ti
 from thread_counts import outputs_by_threads
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters, TurbulenceParameters
 from sim.smoke.turbulence import Turbulence
@@ -104,7 +104,7 @@ def test_eddies_that_cells_cannot_carry_are_refused():
 
 CHILD = """
 import sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 import hashlib
 from test_smoke_turbulence import Gusts

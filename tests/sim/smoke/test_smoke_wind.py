@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
 from sim.smoke.parameters import SmokeParameters

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.source_motion import motion_of

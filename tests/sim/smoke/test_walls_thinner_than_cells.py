@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from scipy import ndimage
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
 from sim.smoke.grid import SmokeGrid

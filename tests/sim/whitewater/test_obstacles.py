@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from whitewater_scenes import BOX, FPS, NO_FLUID, RADIUS, cloud, solver
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.shapes.level_set import LevelSet
 from sim.shapes.parameters import Placement
 from sim.whitewater.obstacles import MovingObstacle, Obstacles, Pose, sample_at_rest

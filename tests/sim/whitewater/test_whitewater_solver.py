@@ -7,7 +7,7 @@ import pytest
 from thread_counts import outputs_by_threads
 from whitewater_scenes import ALL_FACES, FPS, GRAVITY, NO_FLUID, RADIUS, SPACING, cloud, fluid, jets, lattice, solver
 
-from sim.domain import DomainParameters
+from sim.core.domain import DomainParameters
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.fluid_field import FluidField
 from sim.whitewater.generation import generation_rate
@@ -203,7 +203,7 @@ def test_the_same_frame_gives_the_same_bits_and_another_seed_does_not(taichi_cpu
 
 DIGEST = """
 import hashlib, sys
-from sim.runtime import initialize
+from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 from whitewater_scenes import RADIUS, jets, solver
 from sim.whitewater.cloud import WhitewaterCloud

@@ -1,0 +1,287 @@
+"""What benchmarks share - JSON, medians, two checkouts in turns -, and a table of two checkouts.
+
+    python -m benchmarks.compare DIR [--turns 5] [--only fluid start-up ...] [--json FILE]
+    python -m benchmarks.fluid --particles 20000 --against DIR [--turns 5]
+
+Both run the same commands here and in another checkout, in turns, so that whatever else the machine does slows both
+alike. Printed are the medians here and there, and the median of the ratios within a turn: over 1 is slower here. The
+other checkout may be an old one: of it only commands are run. Its own `benchmarks.fluid` prints what this one prints;
+what it prints beyond that, or less, is left out. Jobs run by its command line, and their stages' times are read from
+the record that it leaves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sqlite3
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parents[1]
+NOISE = 0.03
+"""A median ratio above this over 1 is told as slower."""
+
+TIMES = ("_s", "_ms", "_us", "_per_frame", "_bare", "[ms]", "plan", "nothing to do", "submit", "status", "command")
+"""How the names of numbers end that are times."""
+
+OF_THE_SCENE = ("dt_s", "simulated_s", "building_s", "first_step_s")
+"""How the names of those end that are no times of the program, or are mostly those of compiling kernels."""
+
+Numbers = dict[str, float]
+
+
+# --- what each benchmark uses ----------------------------------------------------------------------------------------
+
+
+def arguments_of(doc: str | None) -> argparse.ArgumentParser:
+    """A command line that tells a benchmark's docstring."""
+    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def start_taichi(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The arguments, with `--device` and `--threads`, on which Taichi is started; `device` is what was found."""
+    from sim.core.runtime import initialize
+
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int)
+    arguments = parser.parse_args()
+    arguments.device = initialize(arguments.device, threads=arguments.threads)
+    return arguments
+
+
+def machine(device: str = "cpu") -> dict[str, Any]:
+    """What numbers depend on besides the code."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"device": device, "cores": cores, "load_average": round(os.getloadavg()[0], 2)}
+
+
+def timed(work: Callable[[], object]) -> tuple[float, float]:
+    """Wall and processor time of a call [s]; the latter is that of all threads, which other programs do not enter."""
+    wall, processor = time.perf_counter(), time.process_time()
+    work()
+    return time.perf_counter() - wall, time.process_time() - processor
+
+
+def spread(values: Sequence[float], *, scale: float = 1.0) -> dict[str, float]:
+    """Median, least and most, times a scale."""
+    return {name: scale * of(values) for name, of in (("median", statistics.median), ("least", min), ("most", max))}
+
+
+def child(command: Sequence[str], **how: Any) -> Any:
+    """The JSON that a Python process prints, whatever else its libraries print before and after it.
+
+    Raises:
+        subprocess.CalledProcessError: the process failed.
+        ValueError: there is no JSON in what it printed.
+    """
+    return json_in(
+        subprocess.run([sys.executable, *command], stdout=subprocess.PIPE, text=True, check=True, **how).stdout
+    )
+
+
+def json_in(text: str) -> Any:
+    """The largest piece of JSON that begins at the beginning of a line. Raises ValueError where there is none."""
+    decoder, largest, found = json.JSONDecoder(), 0, None
+    start = 0
+    for line in text.splitlines(keepends=True):
+        if line[0] in "[{":
+            try:
+                value, end = decoder.raw_decode(text, start)
+            except json.JSONDecodeError:
+                end = start
+            if end - start > largest:
+                largest, found = end - start, value
+        start += len(line)
+    if not largest:
+        raise ValueError(f"no JSON in: {text[-500:]!r}")
+    return found
+
+
+def keep_output_for_json() -> None:
+    """From now on only what this program prints gets to the standard output; libraries write to the standard error."""
+    sys.stdout.flush()
+    sys.stdout = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+
+
+def run(main: Callable[[], object]) -> None:
+    """Run a benchmark's main and print the JSON of what it returns; with `--against DIR`, in turns with another's."""
+    if "--against" in sys.argv:
+        own = argparse.ArgumentParser(add_help=False)
+        own.add_argument("--against", type=Path, required=True)
+        own.add_argument("--turns", type=int, default=5)
+        chosen, others = own.parse_known_args()
+        spec = sys.modules["__main__"].__spec__
+        assert spec is not None
+        name = spec.name.rpartition(".")[2]
+        turns = take_turns(lambda tree: benchmark(tree, name, *others), chosen.against.resolve(), chosen.turns)
+        print(table({name: turns}))
+        return
+    keep_output_for_json()
+    if (result := main()) is not None:
+        print(json.dumps(result, indent=1))
+
+
+# --- two checkouts ---------------------------------------------------------------------------------------------------
+
+
+def environment(tree: Path) -> dict[str, str]:
+    """That of a process which is to import a checkout's packages."""
+    return {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": ""}
+
+
+def benchmark(tree: Path, name: str, *arguments: str) -> Numbers:
+    """The times that a checkout's own benchmark tells."""
+    return dict(times_in(child(["-m", f"benchmarks.{name}", *arguments], cwd=tree, env=environment(tree))))
+
+
+def times_in(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    """Every number in JSON that is a time, by its path; of a spread the median; pairs are wall and processor time."""
+    if isinstance(value, Mapping):
+        if "median" in value and "least" in value:
+            value = value["median"]
+        else:
+            for key, each in value.items():
+                yield from times_in(each, f"{path}/{key}" if path else str(key))
+    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+        for number, each in enumerate(value):
+            yield from times_in(each, f"{path}/{number}" if path else str(number))
+    elif isinstance(value, list) and len(value) == 2 and path.endswith(TIMES):
+        yield f"{path}, processor", float(value[1])
+        value = value[0]
+    stem = path.removesuffix("_median").removesuffix("_min")
+    if isinstance(value, int | float) and stem.endswith(TIMES) and not stem.endswith(OF_THE_SCENE):
+        yield path, float(value)
+
+
+def pipeline(tree: Path, *arguments: str, cwd: Path) -> float:
+    """Wall time of a command of a checkout's command line [s]. Raises subprocess.CalledProcessError where it fails."""
+    command = [sys.executable, "-P", "-m", "pipeline", *arguments]
+    begin = time.perf_counter()
+    subprocess.run(command, cwd=cwd, env=environment(tree), check=True, capture_output=True)
+    return time.perf_counter() - begin
+
+
+def film(tree: Path, job: str) -> Numbers:
+    """A job as a checkout's `pipeline submit` makes it: wall time, and what its stages took by its record [s].
+
+    Of stages with several tasks a task's median counts, of others the sum.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        (root / "film.toml").write_text(job, encoding="utf-8")
+        numbers = {"film_s": pipeline(tree, "submit", "film.toml", "--output", ".", "--executor", "inline", cwd=root)}
+        seconds: dict[str, list[float]] = {}
+        with closing(sqlite3.connect(root / "film" / "manifest.db")) as record:
+            for stage, spent in record.execute(
+                "SELECT stage, seconds FROM attempt JOIN task ON task.id = attempt.task"
+            ):
+                seconds.setdefault(stage, []).append(spent)
+        return numbers | {f"{stage}_s": statistics.median(spent) for stage, spent in seconds.items()}
+
+
+def start_up(tree: Path) -> Numbers:
+    """This checkout's `benchmarks.start_up` for another's command line."""
+    result = child([str(HERE / "benchmarks" / "start_up.py"), "--repeats", "1"], cwd=tree, env=environment(tree))
+    return dict(times_in(result))
+
+
+def take_turns(measure: Callable[[Path], Numbers], other: Path, turns: int) -> list[tuple[Numbers, Numbers]]:
+    """What is measured here and in another checkout, turn by turn, after one of each that warms up."""
+    pairs = []
+    for turn in range(turns + 1):
+        order = (HERE, other) if turn % 2 else (other, HERE)
+        found = {tree: measure(tree) for tree in order}
+        pairs.append((found[HERE], found[other]))
+    return pairs[1:]
+
+
+def ratios(turns: Sequence[tuple[Numbers, Numbers]]) -> dict[str, tuple[float, float, float]]:
+    """Medians here and there, and of the ratios within a turn, of what both tell in every turn."""
+    names = [
+        name for name in turns[0][0] if all(name in numbers and numbers[name] > 0 for pair in turns for numbers in pair)
+    ]
+    return {
+        name: (
+            statistics.median(here[name] for here, _ in turns),
+            statistics.median(there[name] for _, there in turns),
+            statistics.median(here[name] / there[name] for here, there in turns),
+        )
+        for name in names
+    }
+
+
+def table(measured: Mapping[str, Sequence[tuple[Numbers, Numbers]]]) -> str:
+    """A Markdown table of what was measured, by benchmark."""
+    lines = ["| benchmark | here | there | ratio | |", "|---|---|---|---|---|"]
+    for benchmark_name, turns in measured.items():
+        for name, (here, there, ratio) in ratios(turns).items():
+            verdict = "slower" if ratio > 1.0 + NOISE else "faster" if ratio < 1.0 - NOISE else ""
+            lines.append(f"| {benchmark_name}: {name} | {here:.4g} | {there:.4g} | {ratio:.3f} | {verdict} |")
+    return "\n".join(lines)
+
+
+FILM = """
+name = "film"
+frames = 12
+device = "cpu"
+[domain]
+min = [-0.3, -0.3, 0.0]
+max = [0.3, 0.3, 0.6]
+[[rigid]]
+name = "ball"
+kind = "dynamic"
+density = 300.0
+shape = { type = "sphere", radius = 0.06 }
+position = [0.05, 0.0, 0.3]
+[[fluid]]
+name = "water"
+particle_radius = 0.008
+[[fluid.block]]
+shape = { type = "box", size = [0.6, 0.6, 0.15] }
+position = [0.0, 0.0, 0.075]
+[render]
+resolution = [160, 90]
+quality = "draft"
+"""
+
+MEASURED: dict[str, Callable[[Path], Numbers]] = {
+    "start-up": start_up,
+    "fluid": lambda tree: benchmark(tree, "fluid", "--particles", "30000", "--steps", "10", "--blocks", "5"),
+    "smoke": lambda tree: benchmark(tree, "smoke", "--cells", "64"),
+    "cloth": lambda tree: benchmark(tree, "cloth", "--nodes", "64", "--frames", "20"),
+    "dispatch": lambda tree: benchmark(tree, "dispatch", "--tasks", "200"),
+    "scale": lambda tree: benchmark(tree, "scale", "--tasks", "10000", "--dispatched", "50"),
+    "render": lambda tree: benchmark(tree, "render", "--resolution", "240", "136"),
+    "film": lambda tree: film(tree, FILM),
+}
+"""What `python -m benchmarks.compare` runs."""
+
+
+def main() -> None:
+    parser = arguments_of(__doc__)
+    parser.add_argument("other", type=Path, metavar="DIR", help="the other checkout")
+    parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--only", nargs="+", choices=list(MEASURED), default=list(MEASURED))
+    parser.add_argument("--json", type=Path, help="also write every turn's numbers here")
+    arguments = parser.parse_args()
+    measured = {}
+    for name in arguments.only:
+        measured[name] = take_turns(MEASURED[name], arguments.other.resolve(), arguments.turns)
+        print(table({name: measured[name]}), file=sys.stderr, flush=True)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(measured, indent=1) + "\n")
+    print(table(measured))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The ground of the orchestrator: tasks, paths, errors, files, leases, resources."""

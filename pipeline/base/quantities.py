@@ -1,0 +1,210 @@
+"""Quantities of the solvers' diagnostics: names, units, plots.
+
+The solvers name their diagnostics (`sim.core.solver.Diagnostics`); a name that is not known here is shown as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+SHARE = "%"
+"""Unit of numbers that are stored as fractions of 1 and shown in per cent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """Presentation of a number of the diagnostics.
+
+    Attributes:
+        name: as the solvers write it.
+        label: in words, without the unit.
+        unit: in which it is stored, `SHARE` for fractions; empty for counts.
+        panel: title of the plot that it belongs on, with others of its kind.
+        counted: it is a whole number.
+    """
+
+    name: str
+    label: str
+    unit: str
+    panel: str
+    counted: bool = False
+
+    def text(self, value: float) -> str:
+        """The number with its unit, to four digits."""
+        if self.counted:
+            return f"{value:,.0f}"
+        if self.unit == SHARE:
+            return f"{100.0 * value:.3g} %"
+        return f"{value:.4g} {self.unit}".rstrip()
+
+
+def quantity(name: str, *, of_kind: str | None = None) -> Quantity:
+    """The quantity of a name.
+
+    Args:
+        name: as in the diagnostics.
+        of_kind: what the body is; the mass of smoke is an integral of its density, which has no unit.
+    """
+    found = _KNOWN.get(name)
+    if found is None and name.startswith(COUNT_OF_FLUID):
+        return Quantity(name, f"particles of {name.removeprefix(COUNT_OF_FLUID)}", "", _COUNT, counted=True)
+    if found is None:
+        label = name.replace("_", " ")
+        return Quantity(name, label, "", label.capitalize())
+    if of_kind == "smoke" and found.unit == "kg":
+        return Quantity(name, found.label, "m³", "Smoke")
+    return found
+
+
+COUNT_OF_FLUID = "particle_count_"
+"""Begins the name of the number of particles of one fluid among several in a tank; its name follows."""
+
+MECHANICAL_ENERGY = "mechanical_energy"
+"""Sum of `PARTS_OF_ENERGY`; not written by any solver."""
+PARTS_OF_ENERGY = ("kinetic_energy", "potential_energy", "elastic_energy")
+
+_ENERGY, _MOMENTUM, _ANGULAR, _MASS, _SPEED = "Energy", "Momentum", "Angular momentum", "Mass", "Largest speed"
+_ITERATIONS, _ERROR, _COUNT = "Solver iterations", "Density and divergence error", "Particles"
+
+_KNOWN = {
+    each.name: each
+    for each in (
+        Quantity("substeps", "substeps", "", "Substeps per frame", counted=True),
+        Quantity("smallest_dt_s", "smallest time step", "s", "Smallest time step"),
+        Quantity("iterations", "iterations", "", _ITERATIONS),
+        Quantity("divergence_iterations", "divergence iterations", "", _ITERATIONS),
+        Quantity("viscosity_iterations", "viscosity iterations", "", _ITERATIONS),
+        Quantity("density_error", "density error", SHARE, _ERROR),
+        Quantity("divergence_error", "divergence error", SHARE, _ERROR),
+        Quantity("viscosity_error", "viscosity error", SHARE, "Error of the viscosity solve"),
+        Quantity("max_compression", "largest compression", SHARE, _ERROR),
+        Quantity("residual", "residual", "", "Residual"),
+        Quantity("divergence", "largest divergence", "1/s", "Divergence"),
+        Quantity("compression", "compression of closed air", "1/s", "Compression of closed air"),
+        Quantity("not_converged", "solves at their iteration limit", "", "Solves at their limit", counted=True),
+        Quantity("squeezed", "squeezed beyond 20 %", "", "Frames with squeezed particles", counted=True),
+        Quantity("linear_solves", "solves made linear", "", "Solves made linear", counted=True),
+        Quantity("particle_count", "particles", "", _COUNT, counted=True),
+        Quantity("whitewater_particles", "whitewater particles", "", "Whitewater particles", counted=True),
+        Quantity("whitewater_capped", "whitewater capped", "", "Particles not emitted", counted=True),
+        Quantity("particles_removed", "particles removed", "", _COUNT, counted=True),
+        Quantity("node_count", "nodes", "", "Cloth nodes", counted=True),
+        Quantity("nodes_lost", "nodes out of sight", "", "Cloth nodes out of sight", counted=True),
+        Quantity("bodies_lost", "bodies out of sight", "", "Bodies out of sight", counted=True),
+        Quantity("particles_emitted", "particles emitted", "", _COUNT, counted=True),
+        Quantity("emission_blocked", "emission blocked", "", "Particles not emitted", counted=True),
+        Quantity("emission_capped", "emission capped", "", "Particles not emitted", counted=True),
+        Quantity("contacts", "contacts", "", "Contacts", counted=True),
+        Quantity("repaired_crossings", "crossings repaired", "", "Cloth crossings repaired", counted=True),
+        Quantity("crossings_left", "crossings left", "", "Cloth crossings left", counted=True),
+        Quantity("impact_zone_vertices", "nodes moved as one", "", "Cloth nodes moved as one", counted=True),
+        Quantity("jammed", "cloth jammed", "", "Frames with jammed cloth", counted=True),
+        Quantity("overlong_springs", "springs too long", "", "Cloth springs too long", counted=True),
+        Quantity("max_strain", "largest strain", SHARE, "Strain"),
+        Quantity("wall_contacts", "wall contacts", "", "Contacts", counted=True),
+        Quantity("max_penetration", "deepest penetration", "m", "Penetration"),
+        Quantity("neighbor_searches", "neighbour searches", "", "Neighbour searches per frame", counted=True),
+        Quantity("max_speed", "largest speed", "m/s", _SPEED),
+        Quantity("sound_speed", "numerical speed of sound", "m/s", "Numerical speed of sound"),
+        Quantity("max_temperature", "highest temperature", "K", "Temperature"),
+        Quantity(MECHANICAL_ENERGY, "mechanical energy", "J", _ENERGY),
+        Quantity("kinetic_energy", "kinetic energy", "J", _ENERGY),
+        Quantity("potential_energy", "potential energy", "J", _ENERGY),
+        Quantity("elastic_energy", "elastic energy", "J", _ENERGY),
+        Quantity("mass", "mass", "kg", _MASS),
+        Quantity("emitted_mass", "emitted", "kg", _MASS),
+        Quantity("covered_mass", "covered by obstacles", "kg", _MASS),
+        Quantity("uncovered_mass", "left by obstacles", "kg", _MASS),
+        *(Quantity(f"momentum_{axis}", f"momentum {axis}", "kg m/s", _MOMENTUM) for axis in "xyz"),
+        *(Quantity(f"angular_momentum_{axis}", f"angular momentum {axis}", "kg m²/s", _ANGULAR) for axis in "xyz"),
+    )
+}
+"""In the order in which they are shown."""
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Names as they are shown: those that are known first."""
+    known = list(_KNOWN)
+
+    def place(name: str) -> tuple[int, str]:
+        of_all = "particle_count" if name.startswith(COUNT_OF_FLUID) else name
+        return known.index(of_all) if of_all in _KNOWN else len(known), name
+
+    return sorted(names, key=place)
+
+
+@dataclass(frozen=True, slots=True)
+class CountedEvent:
+    """A number of the diagnostics that counts what should not happen.
+
+    Attributes:
+        name: as the solvers write it.
+        one: what has happened once.
+        many: what has happened several times.
+        running_total: the number counts since the start; else it is counted anew in every frame.
+    """
+
+    name: str
+    one: str
+    many: str
+    running_total: bool = False
+
+    def text(self, count: int) -> str:
+        """Count in words: `3 solves hit their iteration limit`."""
+        return f"1 {self.one}" if count == 1 else f"{count:,} {self.many}"
+
+
+WARNINGS = (
+    CountedEvent("not_converged", "solve hit its iteration limit", "solves hit their iteration limit"),
+    CountedEvent(
+        "squeezed",
+        "frame has particles squeezed by more than 20 %",
+        "frames have particles squeezed by more than 20 %",
+    ),
+    CountedEvent(
+        "emission_blocked",
+        "particle was not emitted, as its place was taken",
+        "particles were not emitted, as their places were taken",
+    ),
+    CountedEvent(
+        "emission_capped",
+        "particle was not emitted, as there are max_particles",
+        "particles were not emitted, as there are max_particles",
+    ),
+    CountedEvent(
+        "whitewater_capped",
+        "particle was not made, as there are max_particles",
+        "particles were not made, as there are max_particles",
+    ),
+    CountedEvent(
+        "crossings_left",
+        "crossing of cloth could not be prevented",
+        "crossings of cloth could not be prevented",
+    ),
+    CountedEvent(
+        "jammed",
+        "frame has cloth so jammed that much of it moves as one, which is slow: give weaker wind, slower pins and "
+        "bodies, or a larger thickness",
+        "frames have cloth so jammed that much of it moves as one, which is slow: give weaker wind, slower pins and "
+        "bodies, or a larger thickness",
+    ),
+    CountedEvent(
+        "overlong_springs",
+        "spring of a cloth is half too long: give more substeps or iterations, or pin more nodes",
+        "springs of cloth are half too long: give more substeps or iterations, or pin more nodes",
+    ),
+    CountedEvent(
+        "nodes_lost",
+        "node of a cloth fell out of sight and was stopped",
+        "nodes of cloths fell out of sight and were stopped",
+        running_total=True,
+    ),
+    CountedEvent(
+        "bodies_lost",
+        "body fell out of sight and was stopped",
+        "bodies fell out of sight and were stopped",
+        running_total=True,
+    ),
+)
+"""Each is told when it first happens, and counted in `status` and in the report."""

@@ -1,0 +1,48 @@
+"""Times, sizes and common phrases, as people read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+
+def duration(seconds: float) -> str:
+    """A time span, to two figures or so: `4.1 s`, `42 s`, `5 min 3 s`, `2 h 10 min`."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    if seconds < 59.5:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
+def size(byte_count: float) -> str:
+    """A file size: `512 bytes`, `3.4 KiB`, `1.9 GiB`."""
+    if byte_count < 1024:
+        return f"{byte_count:.0f} bytes"
+    for unit in ("KiB", "MiB"):
+        byte_count /= 1024
+        if byte_count < 1024:
+            return f"{byte_count:.1f} {unit}"
+    return f"{byte_count / 1024:.1f} GiB"
+
+
+def moment(time_s: float) -> str:
+    """A wall time [s since the epoch] in this machine's time zone."""
+    return datetime.fromtimestamp(time_s, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+
+
+def mixed_devices(drawn_on: Mapping[str, int]) -> list[str]:
+    """A warning of a film that was drawn by several kinds of device; empty for one that was not.
+
+    Args:
+        drawn_on: number of frames by device.
+    """
+    if len(drawn_on) < 2:
+        return []
+    counts = ", ".join(f"{frames} on {device}" for device, frames in drawn_on.items())
+    return [
+        f"the film's frames were drawn by devices that round differently: {counts}; pipeline explain tells about each "
+        "frame, pipeline rerun --stage render draws them anew"
+    ]

@@ -1,0 +1,1 @@
+"""The command line: options and printing, one module a group of commands."""

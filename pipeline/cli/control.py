@@ -1,0 +1,230 @@
+"""Commands that control jobs which run or wait: pause, resume, cancel, priority, work."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from pipeline.base.errors import DiskFullError, PipelineError
+from pipeline.base.layout import JobLayout
+from pipeline.cli.arguments import (
+    PRIORITY,
+    find_job,
+    output_option,
+    parse_frames,
+    place,
+    queue_options,
+    submitted_job_argument,
+)
+from pipeline.queue.submitting import QueueOptions, is_finished, look_at, run, stages_to_run
+
+STOPPED_EXIT_CODE = 143
+"""As shells report a program that SIGTERM ended."""
+FAILED_EXIT_CODE = 5
+
+
+@click.command()
+@submitted_job_argument
+def pause(job: str, output: Path) -> None:
+    """Stop a job for the time being.
+
+    Frames that are being made are finished first, and a simulation writes a checkpoint. Other jobs of the queue go on.
+
+    \b
+    pipeline pause my-film
+    """
+    from pipeline.queue.changes import pause_job
+    from pipeline.queue.turns import as_given
+
+    queue, name = place(job, output)
+    runs = pause_job(queue, name)
+    click.echo(f"{name} {'pauses as soon as what runs is finished' if runs else 'pauses'}")
+    click.echo(f"continue with: pipeline resume {as_given(queue.layout(name)).root}")
+
+
+@click.command()
+@submitted_job_argument
+@queue_options
+def resume(job: str, output: Path, options: QueueOptions) -> None:
+    """Continue a job from its own folder.
+
+    A job that pauses goes on, and ends after the stages that its submission named with --until. A folder that was moved
+    to another disk continues there; the original job file is not needed.
+
+    \b
+    pipeline resume my-film
+    pipeline resume /mnt/films/dam-break --detach
+    """
+    from pipeline.job.loading import job_of_text, load_job
+    from pipeline.record.interrupted_recording import complete_crashed_take
+    from pipeline.run.goal import read_goal, what_is_made
+
+    queue, name = place(job, output)
+    waiting = queue.find(name)
+    if waiting is not None and waiting.text is not None:  # paused before its run took its job file over
+        layout = queue.layout(name)
+        submitted = job_of_text(waiting.text, layout.job_file)
+    else:
+        layout = find_job(job, output)
+        if sentence := complete_crashed_take(layout):
+            click.echo(sentence, err=True)
+        submitted = load_job(layout.job_file)
+    until = read_goal(layout) if waiting is None else waiting.until
+    state = look_at(submitted, layout, until)
+    if is_finished(state, layout, None, until):
+        click.echo(f"up to date: {what_is_made(layout)}")
+        return
+    sys.exit(run(submitted, layout, stages_to_run(state), options=options, paused=waiting, until=until))
+
+
+@click.command()
+@submitted_job_argument
+def cancel(job: str, output: Path) -> None:
+    """Stop a job at once and take it out of the queue.
+
+    What it has finished stays.
+
+    \b
+    pipeline cancel my-film
+    """
+    from pipeline.queue.changes import cancel_job
+    from pipeline.queue.turns import as_given
+
+    queue, name = place(job, output)
+    cancel_job(queue, name)
+    click.echo(f"{name} is cancelled; what is finished stays in {as_given(queue.layout(name)).root}")
+
+
+@click.command(context_settings={"ignore_unknown_options": True})  # -5 is a priority
+@output_option
+@click.argument("job", metavar="JOB")
+@click.argument("value", metavar="PRIORITY", type=PRIORITY)
+def priority(job: str, output: Path, value: int) -> None:
+    """Let a job of the queue go before or after others.
+
+    Jobs of higher priority go first, and interrupt lower ones without loss.
+
+    \b
+    pipeline priority my-film 10
+    pipeline priority my-film -5
+    """
+    from pipeline.queue.changes import set_priority
+
+    queue, name = place(job, output)
+    set_priority(queue, name, value)
+    click.echo(f"{name} has priority {value}")
+
+
+@click.command()
+@output_option
+@click.argument("job", metavar="[JOB]", required=False)
+@click.option(
+    "--stage", help="Run this stage of JOB in this process, for a farm manager: no queue, no record, no retry."
+)
+@click.option("--frames", metavar="RANGES", help="With --stage: only these frames: 7 or 0-29 or 0-29,60-89.")
+@click.option("--cores", type=click.IntRange(min=1), help="With --stage: processor cores to use at most.")
+@click.option("--openjd", is_flag=True, help="With --stage: tell progress the way Open Job Description has it.")
+def work(
+    job: str | None, *, output: Path, stage: str | None, frames: str | None, cores: int | None, openjd: bool
+) -> None:
+    """Run the queue in this terminal until nothing waits in it.
+
+    `submit --detach` does this in the background. Ctrl-C, or a signal TERM, lets the running job finish what it is at
+    and leaves the rest in the queue.
+
+    With a job and --stage, run just that stage, or some frames of it, without the queue: for farm managers, see
+    `pipeline export`. Any number of machines may work on different frames of a job at once. What is done is not done
+    again; what the stage reads must be there. Exits with 0 when all is there, 5 after a failure, 7 when the disk is
+    full, and 143 when it was stopped by SIGTERM, after which it continues.
+
+    \b
+    pipeline work
+    pipeline work --output /data/renders
+    pipeline work my-film --stage render --frames 0-9
+    """
+    if job is not None:
+        if stage is None:
+            raise click.UsageError("name the stage of the job: --stage; or leave the job out to run the whole queue")
+        _run_stage(find_job(job, output), stage, frames, cores=cores, openjd=openjd)
+    elif stage or frames or cores or openjd:
+        raise click.UsageError("--stage, --frames, --cores and --openjd are about one job: name it")
+    else:
+        _run_queue(output)
+
+
+def _run_queue(output: Path) -> None:
+    from pipeline.base.lease import Lease
+    from pipeline.queue.farm import FarmRunner
+    from pipeline.queue.job_queue import JobQueue
+    from pipeline.queue.turns import Turns, say
+
+    queue = JobQueue(output.absolute())
+    if not queue.folder.exists():
+        raise PipelineError(f"{output} has no queue: nothing was ever submitted there")
+    with Lease.acquire(queue.lease) as lease:
+        if lease.takeover is not None:
+            say(f"{lease.takeover}; its queue goes on")
+        turns = Turns(queue, None)
+        FarmRunner(queue, lease, turns.run, say, pause_on_signal=False, after_turn=turns.ended).work()
+    left = len(queue.waiting())
+    click.echo(f"{left} jobs are left in the queue" if left else "the queue is empty", err=True)
+
+
+def _run_stage(layout: JobLayout, stage: str, frames: str | None, *, cores: int | None, openjd: bool) -> None:
+    from dataclasses import replace
+
+    from pipeline.base.lease import refuse_if_held
+    from pipeline.base.resources import machine_capacity
+    from pipeline.base.task import FailureKind
+    from pipeline.job.loading import load_job
+    from pipeline.run.executors.worker_process import THREAD_VARIABLES
+    from pipeline.run.runner import STAGES_REFERENCE
+    from pipeline.run.single_stage import run_stage
+
+    layout = JobLayout(layout.root.absolute())
+    refuse_if_held(layout.lease)
+    capacity = machine_capacity(gpus=1)
+    capacity = replace(capacity, cores=min(cores or capacity.cores, capacity.cores))
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(capacity.cores)))  # before anything reads them
+    stopped = []
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        stopped.append(True)
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
+    outcome = run_stage(
+        load_job(layout.job_file),
+        layout,
+        stage,
+        None if frames is None else parse_frames(frames),
+        capacity=capacity,
+        stages=STAGES_REFERENCE,
+        stop_requested=lambda: bool(stopped),
+        tell=_tell_openjd if openjd else _tell,
+    )
+    for failed in outcome.failures:
+        click.secho(f"{failed.task_id}: {failed.message}", err=True, fg="red")
+    click.echo(
+        f"{stage}: {outcome.ran} tasks ran, {outcome.up_to_date} were up to date, {len(outcome.failures)} failed"
+    )
+    if stopped:
+        sys.exit(STOPPED_EXIT_CODE)
+    if outcome.failures:
+        full = any(failed.kind is FailureKind.DISK_FULL for failed in outcome.failures)
+        sys.exit(DiskFullError.exit_code if full else FAILED_EXIT_CODE)
+
+
+def _tell(share: float, sentence: str) -> None:
+    click.echo(f"{100 * share:.0f} %  {sentence}", err=True)
+
+
+def _tell_openjd(share: float, sentence: str) -> None:
+    """Lines of the specification "How Jobs Are Run", on standard output."""
+    print(f"openjd_progress: {100 * share:.1f}", flush=True)
+    print(f"openjd_status: {sentence}", flush=True)

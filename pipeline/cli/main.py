@@ -1,0 +1,120 @@
+"""The command line: parse, call, print. Importing this module loads neither the physics nor Blender."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pipeline import __version__
+from pipeline.base.errors import PLACE_TROUBLES, DiskFullError, PipelineError
+from pipeline.cli.control import cancel, pause, priority, resume, work
+from pipeline.cli.dashboard import dashboard
+from pipeline.cli.keep import clean, doctor, schema, verify
+from pipeline.cli.look import explain, status
+from pipeline.cli.make import check, export, new, plan, rerun, submit
+from pipeline.cli.pictures import animatic, compare, loop, report, still
+from pipeline.cli.steering import live
+from pipeline.cli.viewing import view
+from pipeline.run.executors.failures import is_disk_full
+
+SECTIONS = {
+    "Make a film": (new, check, plan, submit, rerun, export),
+    "Look at it": (status, explain, view, live, still, animatic, compare, loop, report, dashboard),
+    "Control jobs that run or wait": (pause, resume, cancel, priority, work),
+    "Keep things in order": (verify, clean, doctor, schema),
+}
+
+view.short_help = "Look at simulated frames in a browser: scrub, play, turn, colour."
+live.short_help = "Play with a scene in a browser while it is computed."
+dashboard.short_help = "Show all jobs in a browser, and control them there."
+
+FORMER = {
+    "queue": "pipeline status",
+    "watch": "pipeline status --follow my-film",
+    "logs": "pipeline explain --log my-film [TASK]",
+    "retry": "pipeline rerun --failed my-film",
+    "run-stage": "pipeline work my-film --stage STAGE",
+    "sheet": "pipeline still --sheet my-film",
+}
+"""What to type instead of a command that there was once."""
+
+
+class UnknownCommandError(PipelineError):
+    """A word in place of a command is none; says what to type instead."""
+
+    exit_code = 2
+
+
+class PipelineGroup(click.Group):
+    """A group of commands in sections, whose errors are lines for people and no tracebacks."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; a `PipelineError` decides the exit code."""
+        try:
+            return super().invoke(ctx)
+        except PipelineError as error:
+            for line in str(error).splitlines():
+                click.secho(f"error: {line}", err=True, fg="red")
+            ctx.exit(error.exit_code)
+        except OSError as error:
+            if error.errno not in PLACE_TROUBLES:
+                raise
+            place = f"{error.filename}: " if error.filename else ""
+            click.secho(f"error: {place}{error.strerror}; what is finished stays: try again later", err=True, fg="red")
+            ctx.exit(DiskFullError.exit_code if is_disk_full(error) else PipelineError.exit_code)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that is called.
+
+        Raises:
+            UnknownCommandError: there is none.
+        """
+        name = args[0]
+        if name not in self.commands and not name.startswith("-"):
+            raise UnknownCommandError(_meant(name, args[1:], [*self.commands]))
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """Every command with its whole summary, section by section."""
+        width = max(map(len, self.commands), default=0)
+        for heading, commands in SECTIONS.items():
+            rows = [(f"{each.name:<{width}}", each.get_short_help_str(limit=1000)) for each in commands]
+            with formatter.section(heading):
+                formatter.write_dl(rows)
+
+
+def _meant(name: str, rest: list[str], commands: list[str]) -> str:
+    """A sentence about a word in place of a command."""
+    from difflib import get_close_matches
+
+    if name in FORMER:
+        words = [each for each in rest if not each.startswith("-")]
+        film = words[0] if words else "my-film"
+        return f"{name} is now: {FORMER[name].replace('my-film', film)}"
+    if Path(name).suffix == ".toml" or Path(name).is_file():
+        return f"{name} is a job file; did you mean: pipeline submit {name}"
+    if Path(f"{name}.toml").is_file():
+        return f"{name}.toml is a job file; did you mean: pipeline submit {name}"
+    near = get_close_matches(name, [*commands, *FORMER], n=1)
+    if near and near[0] in FORMER:
+        return f'no command "{name}"; did you mean: {FORMER[near[0]]}'
+    return f'no command "{name}"' + (f"; did you mean: pipeline {near[0]}" if near else "; see: pipeline --help")
+
+
+@click.group(
+    cls=PipelineGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Start with: pipeline new my-film, then: pipeline submit my-film",
+)
+@click.version_option(package_name=None, version=__version__, prog_name="pipeline")
+def main() -> None:
+    """From a job file to a film of simulated physics, resumable after any crash."""
+
+
+for section in SECTIONS.values():
+    for command in section:
+        main.add_command(command)

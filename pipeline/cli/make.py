@@ -1,0 +1,297 @@
+"""Commands that make films: new, check, plan, submit, rerun, export."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pipeline.base import wording
+from pipeline.base.console import print_warnings
+from pipeline.base.errors import PipelineError
+from pipeline.base.layout import JobLayout
+from pipeline.cli.arguments import (
+    find_job,
+    job_options,
+    json_option,
+    output_option,
+    parse_frames,
+    place,
+    queue_options,
+    require_own_programs,
+    require_plannable,
+    submission_folder,
+    submitted_job_argument,
+    until_option,
+)
+from pipeline.queue.submitting import QueueOptions, is_finished, look_at, run, say_what_it_takes, stages_to_run
+
+if TYPE_CHECKING:
+    from pipeline.run.plan import Assessment
+
+TEMPLATES = ("dam-break", "drop", "smoke", "cloth")
+"""As in `pipeline.job.starter`, which is too heavy to be imported for `--help`."""
+
+
+@click.command()
+@click.argument("name", type=click.Path(path_type=Path))
+@click.option("--template", type=click.Choice(TEMPLATES), default="dam-break", show_default=True, help="What happens.")
+def new(name: Path, template: str) -> None:
+    """Write a commented job file NAME.toml to start from.
+
+    \b
+    pipeline new my-film
+    pipeline new jobs/plume --template smoke
+    """
+    from pipeline.job.starter import write_starter
+
+    path = write_starter(name, template)
+    click.echo(f"wrote {path}; next: pipeline submit {path} --preview")
+
+
+@click.command()
+@job_options
+@until_option
+@click.option("--json", "as_json", is_flag=True, help="Print the whole job, defaults included, as JSON.")
+def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tuple[str, ...], as_json: bool) -> None:
+    """Say what is wrong with a job file, and how large the job is.
+
+    \b
+    pipeline check my-film
+    pipeline check dam.toml --set fluid.water.particle_radius=0.005
+    """
+    from pipeline.job.loading import read_job
+    from pipeline.kinds.table import KINDS
+    from pipeline.run.checked_job import load_checked_job, needs_pictures
+
+    require_own_programs(read_job(job_file, overrides, preview=preview), overrides)
+    loaded, findings = load_checked_job(job_file, overrides, preview=preview, until=until)
+    print_warnings(loaded.warnings)
+    if as_json:
+        click.echo(loaded.job.model_dump_json(indent=2))
+        return
+    job = loaded.job
+    click.echo(f"{job_file}: ok")
+    click.echo(f"  {job.name}: {job.frame_count} frames, {job.frame_count / job.fps:.3g} s at {job.fps} fps")
+    for kind in KINDS.values():
+        if kind.size and kind.bodies(job):
+            click.echo(f"  {kind.size.format(findings.elements[kind.name])}")
+    if needs_pictures(until):
+        width, height = job.render.resolution
+        click.echo(f"  {width} x {height} pixels, {job.render.quality} quality")
+
+
+@click.command()
+@job_options
+@until_option
+@output_option
+@json_option
+def plan(
+    *, job_file: Path, overrides: tuple[str, ...], preview: bool, until: tuple[str, ...], output: Path, as_json: bool
+) -> None:
+    """Say what submitting a job would run, and why.
+
+    Runs nothing.
+
+    \b
+    pipeline plan my-film
+    pipeline plan my-film --until surface
+    pipeline plan dam.toml --set 'camera.position=[0, -3, 1]'
+    """
+    from pipeline.job.loading import read_job
+    from pipeline.run.assessment import assess_job
+    from pipeline.run.checked_job import load_checked_job
+    from pipeline.run.plan import Verdict, estimate, summarize
+
+    require_own_programs(read_job(job_file, overrides, preview=preview), overrides)
+    loaded, _ = load_checked_job(job_file, overrides, preview=preview, until=until)
+    layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
+    assessments, estimates, _ = assess_job(loaded.job, layout, until)
+    if as_json:
+        click.echo(json.dumps([assessment_as_json(each) for each in assessments], indent=1))
+        return
+    print_warnings(loaded.warnings)
+    for line in summarize(assessments):
+        click.echo(line)
+    for each in estimate(assessments, estimates):
+        if each.seconds is not None and each.bytes is not None:
+            click.echo(f"{each.stage}: about {wording.duration(each.seconds)} of work, {wording.size(each.bytes)}")
+    todo = sum(len(each.rebuilds) for each in assessments)
+    at_most = "at most " if any(each.verdict is Verdict.DOWNSTREAM for each in assessments) else ""
+    click.echo(f"{at_most}{todo} of {sum(len(each.task.outputs) for each in assessments)} files to make")
+
+
+@click.command()
+@job_options
+@until_option
+@output_option
+@queue_options
+def submit(
+    *,
+    job_file: Path,
+    overrides: tuple[str, ...],
+    preview: bool,
+    until: tuple[str, ...],
+    output: Path,
+    options: QueueOptions,
+) -> None:
+    """Run a job until its film is there, or until a stage of it.
+
+    Whatever is there already is kept. Submitted again after a crash, a kill or Ctrl-C, it continues. Submitted again
+    after a change, it runs what the change concerns, and says so first. Jobs of the same output folder take turns: if
+    another one runs, this one waits in the queue, and if this one runs already, that run is watched.
+
+    With --until simulate, surface, volume or any other stage, only that stage and what it needs is made: data instead
+    of a film, for which neither pictures nor a Blender are asked. Submitted without it later, the job goes on.
+
+    \b
+    pipeline submit my-film
+    pipeline submit dam.toml --preview
+    pipeline submit dam.toml --until surface
+    pipeline submit dam.toml --set render.quality=final --set camera.f_stop=2.8
+    pipeline submit dam.toml --detach --priority 10
+    pipeline submit dam.toml --output /shared/renders --scheduler tcp://farm:8786
+    """
+    from pipeline.job.loading import read_job
+    from pipeline.record.interrupted_recording import complete_crashed_take
+    from pipeline.run.goal import what_is_made
+
+    if job_file.name == "job.toml" and (sentence := complete_crashed_take(JobLayout(job_file.parent))):
+        click.echo(sentence, err=True)
+    loaded = read_job(job_file, overrides, preview=preview)
+    require_own_programs(loaded, overrides)
+    require_plannable(loaded)
+    layout = submission_folder(job_file, loaded.job.name, output, is_changed=bool(overrides) or preview)
+    state = look_at(loaded.job, layout, until)
+    todo = stages_to_run(state)
+    if todo:
+        # Checking the scene builds its shapes, which takes longer than finding out that there is nothing to do.
+        from pipeline.queue.disk import size_of
+        from pipeline.run.checked_job import load_checked_job
+
+        loaded, findings = load_checked_job(job_file, overrides, preview=preview, until=until)
+        print_warnings(loaded.warnings)
+        if state is not None:
+            say_what_it_takes(state, size_of(loaded.job, findings), layout, options.reserve_bytes)
+    if is_finished(state, layout, loaded.text, until):
+        click.echo(f"up to date: {what_is_made(layout)}")
+        return
+    sys.exit(run(loaded.job, layout, todo, submitted=loaded, options=options, until=until))
+
+
+@click.command()
+@submitted_job_argument
+@click.option("--failed", is_flag=True, help="The tasks that failed; of a running job when its other tasks have ended.")
+@click.option("--stage", "stages", multiple=True, help="Only this stage; may be given several times.")
+@click.option("--frames", metavar="RANGES", help="Only these frames: 7 or 0-29 or 0-29,60-89.")
+@queue_options
+def rerun(
+    job: str, *, output: Path, failed: bool, stages: tuple[str, ...], frames: str | None, options: QueueOptions
+) -> None:
+    """Run again: failed tasks, or stages and frames that are done.
+
+    What depends on them follows if they turn out different.
+
+    \b
+    pipeline rerun my-film --failed
+    pipeline rerun my-film --stage render --frames 10-19
+    pipeline rerun my-film --stage surface
+    """
+    from pipeline.job.loading import load_job
+    from pipeline.run.control import Selection
+    from pipeline.run.goal import read_goal
+    from pipeline.run.plan import plan_job
+    from pipeline.stages import STAGES
+
+    if failed:
+        if stages or frames is not None:
+            raise click.UsageError("--failed means whatever failed; leave --stage and --frames out")
+        sys.exit(_try_failed_again(job, output, options))
+    if not stages and frames is None:
+        raise click.UsageError("say what to run again: --failed, --stage, --frames, or the last two together")
+    layout = find_job(job, output)
+    selection = Selection(frozenset(stages), None if frames is None else parse_frames(frames))
+    submitted = load_job(layout.job_file)
+    if submitted.recorded is not None and "simulate" in stages:
+        raise PipelineError(f"{submitted.name} is a live take ({submitted.recorded}): it cannot be simulated again")
+    until = read_goal(layout)
+    tasks = plan_job(submitted, layout, STAGES, until)
+    selection.of(tasks)  # refuses now what is not in the plan, not when its turn comes
+    todo = frozenset(task.stage for task in tasks)
+    sys.exit(run(submitted, layout, todo, options=options, rerun=selection, until=until))
+
+
+def _try_failed_again(job: str, output: Path, options: QueueOptions) -> int:
+    from pipeline.queue.changes import another_try
+    from pipeline.queue.turns import as_given, stand_in_queue
+
+    queue, name = place(job, output)
+    again = options.applied_to(another_try(queue, name, background=options.detach))
+    return stand_in_queue(queue, as_given(queue.layout(name)), again, detach=options.detach)
+
+
+@click.group()
+def export() -> None:
+    """Hand a job over to another farm manager.
+
+    \b
+    pipeline export openjd dam.toml --output /shared/renders
+    """
+
+
+@export.command()
+@job_options
+@output_option
+@click.option(
+    "--python",
+    default=sys.executable,
+    help="The interpreter with this program on the farm's machines; the present one if omitted.",
+)
+def openjd(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Path, python: str) -> None:
+    """Write an Open Job Description template, and the job's folder that it works in.
+
+    A step for each stage, cut into chunks of frames where frames do not depend on each other. The folder must lie on a
+    disk that all machines share; the template lies in it. What the farm has made, `pipeline resume` takes over.
+
+    \b
+    pipeline export openjd dam.toml --output /shared/renders
+    openjd check /shared/renders/dam/openjd.json
+    openjd run /shared/renders/dam/openjd.json --step movie --run-dependencies
+    """
+    from pipeline.base.files import replace_durably
+    from pipeline.base.lease import refuse_if_held
+    from pipeline.job.inputs import keep_inputs
+    from pipeline.run.checked_job import load_checked_job
+    from pipeline.run.executors.choice import require_named_devices
+    from pipeline.run.plan import plan_job
+    from pipeline.show.openjd import job_template
+    from pipeline.stages import STAGES
+
+    loaded, _ = load_checked_job(job_file, overrides, preview=preview)
+    require_own_programs(loaded, overrides)
+    require_named_devices(loaded.job, [stage.name for stage in STAGES])
+    print_warnings(loaded.warnings)
+    layout = JobLayout((output / loaded.job.name).absolute())
+    refuse_if_held(layout.lease)
+    layout.root.mkdir(parents=True, exist_ok=True)
+    job, text = keep_inputs(loaded, layout)
+    replace_durably(layout.job_file, text)
+    described = job_template(job.name, plan_job(job, layout, STAGES), python=python)
+    path = layout.root / "openjd.json"
+    replace_durably(path, json.dumps(described, indent=2, ensure_ascii=False) + "\n")
+    click.echo(f"wrote {path}; its job's folder is {layout.root}")
+
+
+def assessment_as_json(assessment: Assessment) -> dict[str, Any]:
+    """A task's verdict, for `--json`."""
+    return {
+        "task": assessment.task.id,
+        "stage": assessment.task.stage,
+        "frame": assessment.task.frame,
+        "verdict": assessment.verdict.value,
+        "reasons": [reason.text for reason in assessment.reasons],
+        "rebuilds": list(assessment.rebuilds),
+    }

@@ -1,0 +1,1 @@
+"""Checks of a job as a whole, one module a subject."""

@@ -1,0 +1,84 @@
+"""What a valid job may have wrong about the set that it is drawn on, and about materials of .blend files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.job.input_files import split_blend
+from pipeline.kinds.checks.meshes import file_exists
+from pipeline.model.job import Job
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+from render.parameters import MaterialParameters
+
+_SPHERE_ASPECT = 2.0
+"""A picture of the whole sphere is 360 degrees wide and 180 high."""
+
+
+def check_set(job: Job, findings: Findings) -> None:
+    """Note what is wrong with ground, background and the picture around the scene."""
+    parameters, given = job.set, job.set.model_fields_set
+    if parameters.hdri is not None:
+        _check_hdri(parameters.hdri, findings)
+        if "name" in given:
+            findings.warn(("set", "name"), "has no effect beside hdri, which light and sky come from; remove one")
+    elif "rotation_deg" in given:
+        findings.warn(("set", "rotation_deg"), "has no effect without hdri, which it turns")
+    for key in sorted({"sun_elevation_deg", "sun_azimuth_deg"} & given):
+        if parameters.hdri is not None:
+            findings.error(("set", key), "has no effect beside hdri, which all light comes from; remove one")
+        elif parameters.name != "outdoor":
+            findings.error(
+                ("set", key), f'has no effect on the set "{parameters.name}", which has no sun; set name = "outdoor"'
+            )
+    if parameters.tank and not job.has_panes:
+        findings.warn(("set", "tank"), "has no effect, as all sides of the domain are open: there is no pane")
+    if parameters.background != "set" and parameters.ground is not None:
+        findings.warn(
+            ("set", "ground"), f'is seen in reflections only, as background = "{parameters.background}" leaves it out'
+        )
+    if parameters.background == "plain" and job.render.format == "png16":
+        findings.error(
+            ("set", "background"),
+            'is "plain", which pictures are laid over in 8 bits, but render.format is "png16"; take "png"',
+        )
+
+
+def check_blend(material: MaterialParameters, path: KeyPath, kind: str | None, findings: Findings) -> None:
+    """Note what is wrong with a material that comes from a .blend file.
+
+    Args:
+        material: the material.
+        path: of its table.
+        kind: of the body that has it: "rigid"; None where there is none.
+        findings: where problems go.
+    """
+    assert material.blend is not None
+    file_exists(split_blend(material.blend)[0], ".blend file", (*path, "blend"), findings)
+    if kind == "smoke":
+        findings.error((*path, "blend"), 'is for surfaces; smoke can only look like "smoke" or "fire"')
+    check_keys_beside_blend(material, path, findings)
+
+
+def check_keys_beside_blend(material: MaterialParameters, path: KeyPath, findings: Findings) -> None:
+    """Note keys that change nothing, as the body or the part has a material of a .blend file."""
+    for key in sorted(material.model_fields_set - {"blend"}):
+        findings.warn((*path, key), "has no effect beside blend, whose material says all")
+
+
+def _check_hdri(name: str, findings: Findings) -> None:
+    from render.environment import read_environment_size
+    from render.errors import InvalidFileError
+
+    key = ("set", "hdri")
+    if not file_exists(name, "picture", key, findings):
+        return
+    try:
+        width, height = read_environment_size(Path(name))
+    except InvalidFileError as error:
+        findings.error(key, str(error))
+    except OSError as error:
+        findings.error(key, f"cannot read {name}: {error.strerror}")
+    else:
+        if width != _SPHERE_ASPECT * height:
+            findings.warn(key, f"is {width} x {height} pixels; a picture of the whole sphere is twice as wide as high")

@@ -1,0 +1,151 @@
+"""Checks of bodies that cloth meets: size, thickness, rods to be pinned to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.kinds.checks.mesh_grids import problem_of_mesh_grid
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+
+if TYPE_CHECKING:
+    from pipeline.model.job import Job
+    from sim.cloth.parameters import PinParameters
+    from sim.rigid.parameters import RigidBodyParameters
+    from sim.shapes import Solid
+    from sim.shapes.placement import PlacedSolid
+
+LEAST_EDGES = 2.0
+"""A body whose shortest side has fewer edges of the cloth may show between its nodes, and pass with less than half."""
+
+MOST = 0.5
+"""More of a rod's length than this is most of it."""
+
+ROUND_OFF = 1.0e-6
+"""Distances that differ by this share are the same."""
+
+TIMES = 64
+"""At so many times of the film it is looked up where a rod and a pin are, beside their keyframes."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClothAtStart:
+    """A cloth as it starts.
+
+    Attributes:
+        longest_edge: longest distance of neighbouring nodes [m].
+        pinned: where the nodes of each pin are at the start [m], (n, 3) each, by the pin's number.
+    """
+
+    longest_edge: float
+    pinned: Mapping[int, NDArray[np.float64]]
+
+
+def check_bodies_for_cloth(
+    job: Job, solids: Mapping[KeyPath, Solid], cloths: Mapping[int, ClothAtStart], findings: Findings
+) -> None:
+    """Warn of bodies that cloth may let through.
+
+    A rod may be thin for a sheet that is pinned along it, and stays so: the sheet hangs from it, and does not have to
+    find it.
+
+    Args:
+        job: the job.
+        solids: its solid shapes as far as they can be built, by path.
+        cloths: its cloths, by their numbers.
+        findings: where warnings go.
+    """
+    from sim.shapes.placement import PlacedSolid
+
+    if not cloths:
+        return
+    for path, solid in solids.items():
+        if path[0] != "rigid" or not isinstance(solid, PlacedSolid):
+            continue
+        axes = np.eye(3)
+        sides = solid.scale * (solid.shape.support(axes) + solid.shape.support(-axes))
+        body, thickness = job.rigid[int(path[1])], float(sides.min())
+        too_coarse = []
+        for number, cloth in cloths.items():
+            rod, pins = _Rod(body, solid, sides, cloth.longest_edge), job.cloth[number].pin
+            if thickness < LEAST_EDGES * cloth.longest_edge and not any(
+                rod.stays_with(pins[pin], nodes, job.frame_count / job.fps) for pin, nodes in cloth.pinned.items()
+            ):
+                too_coarse.append(number)
+        if too_coarse:
+            coarsest = max(too_coarse, key=lambda number: cloths[number].longest_edge)
+            findings.warn(
+                ("cloth", coarsest, "shape"),
+                f'"{body.name}" is {thickness:.3g} m across, less than two of the longest edges, '
+                f"{cloths[coarsest].longest_edge:.3g} m each: it may show or pass between the nodes; divide the sheet "
+                "more finely, or make the body larger",
+            )
+        if problem := problem_of_mesh_grid(solid, who="cloth", what="cloth"):
+            findings.warn((*path[:2], "shape"), problem)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rod:
+    """A body beside a cloth, of which two sides are thin if it is a rod.
+
+    Attributes:
+        body: what the job says of it.
+        solid: its shape at the start.
+        sides: of the box around it in its own axes [m], (3,).
+        longest_edge: longest distance of neighbouring nodes of the cloth [m].
+    """
+
+    body: RigidBodyParameters
+    solid: PlacedSolid
+    sides: NDArray[np.float64]
+    longest_edge: float
+
+    def stays_with(self, pin: PinParameters, nodes: NDArray[np.float64], film_s: float) -> bool:
+        """Whether it is a rod along which cloth is pinned for as long as the pin holds.
+
+        Args:
+            pin: what the job says of the pin.
+            nodes: that it holds, at the start [m], (n, 3).
+            film_s: how long the film is [s].
+        """
+        from sim.cloth.pin_paths import path_of_pin
+        from sim.core.motion import rotation
+        from sim.rigid.paths import path_of
+
+        if self.body.kind == "dynamic" or np.sort(self.sides)[1] >= LEAST_EDGES * self.longest_edge:
+            return False
+        of_body = path_of(self.body) if self.body.kind == "kinematic" else None
+        of_pin = path_of_pin(pin) if pin.keyframe else None
+        if of_body is None and of_pin is None:
+            return self._is_along(nodes)
+        end_s = min(film_s, np.inf if pin.release_s is None else pin.release_s)
+        keyframes_s = [each.time_s for each in self.body.keyframe] + [each.time_s for each in pin.keyframe]
+        centre = nodes.mean(axis=0)
+        for time_s in np.minimum([*keyframes_s, *np.linspace(0.0, end_s, TIMES)], end_s).tolist():
+            places = nodes
+            if of_pin is not None:
+                pose = of_pin.at(time_s)
+                places = centre + pose.position + (nodes - centre) @ rotation.matrices(pose.orientation[None])[0].T
+            if of_body is not None:
+                # Where they would be if the body had stayed.
+                pose = of_body.at(time_s)
+                own = (places - pose.position) @ rotation.matrices(pose.orientation[None])[0]
+                places = self.solid.position + own @ self.solid.rotation.T
+            if not self._is_along(places):
+                return False
+        return True
+
+    def _is_along(self, nodes: NDArray[np.float64]) -> bool:
+        """Whether nodes (n, 3) [m] lie along most of its length without a gap, nearer to it than it is thick."""
+        near = nodes[self.solid.signed_distance(nodes) < self.sides.min()]
+        axis = int(self.sides.argmax())
+        along = np.sort((near - self.solid.position) @ self.solid.rotation[:, axis])
+        if len(along) < 2:
+            return False
+        has_gap = np.diff(along).max() > (1.0 + ROUND_OFF) * self.longest_edge
+        return bool(not has_gap and np.ptp(along) > MOST * self.sides[axis])

@@ -1,0 +1,94 @@
+"""Checks of cloth and fluid: the fluid's weight on a cloth, and its buoyancy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.kinds.checks.fluid import openings_of
+from pipeline.model.boxes import Box
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+
+if TYPE_CHECKING:
+    from pipeline.model.job import Job
+    from sim.cloth.parameters import ClothParameters
+    from sim.fluid.opening import Opening
+    from sim.shapes import Solid
+
+
+def fluid_over(job: Job, solids: Mapping[KeyPath, Solid], box: Box) -> float:
+    """Mass of the fluid that falls onto a cloth within the film [kg], if nothing else is in its way and none runs off.
+
+    Blocks by the share of their box that is above the cloth's, jets by where their middle gets to its height; above is
+    along the axis that gravity is most nearly along.
+
+    Args:
+        job: the job.
+        solids: its solid shapes as far as they can be built, by path.
+        box: what the cloth spans at the start [m].
+    """
+    gravity = np.asarray(job.gravity, dtype=np.float64)
+    if not gravity.any():
+        return 0.0
+    down = int(np.abs(gravity).argmax())
+    sides = [axis for axis in range(3) if axis != down]
+    mass = 0.0
+    for index, fluid in enumerate(job.fluid):
+        volume = 0.0
+        for path, solid in solids.items():
+            if path[:2] == ("fluid", index):
+                low, high = solid.bounds
+                is_above = (box.mean(axis=0) - solid.bounds.mean(axis=0))[down] * gravity[down] > 0.0
+                shared = np.clip(np.minimum(high, box[1]) - np.maximum(low, box[0]), 0.0, None)[sides]
+                volume += is_above * solid.volume * float(np.prod(shared / (high - low)[sides]))
+        for _, opening in openings_of(fluid):
+            if _falls_onto(opening, box, gravity, down):
+                volume += len(opening.points) * opening.layers_due(job.frame_count / job.fps) * fluid.lattice_volume
+        mass += fluid.rest_density * min(volume, fluid.most_volume)
+    return mass
+
+
+def _falls_onto(opening: Opening, box: Box, gravity: NDArray[np.float64], down: int) -> bool:
+    """Whether the middle of a jet comes down to the middle of a box within its sides."""
+    sign = float(np.sign(gravity[down]))
+    way = sign * float(box[:, down].mean() - opening.centre[down])
+    speed, pull = sign * float(opening.velocity[down]), abs(float(gravity[down]))
+    if way <= 0.0:
+        return False
+    time = 2.0 * way / (speed + math.sqrt(speed**2 + 2.0 * pull * way))
+    point = opening.centre + time * opening.velocity + 0.5 * time**2 * gravity
+    within = (point >= box[0]) & (point <= box[1])
+    within[down] = True
+    return bool(within.all())
+
+
+DRIFT_IN_LAYERS: Mapping[str, float] = {"wcsph": 0.5, "dfsph": 0.06, "pcisph": 0.06}
+"""How well buoyancy of a sheet is known, by solver, in the mass of a layer of particles per area: from the force on one
+that is held fast in water with particles of 2 cm (docs/decisions/0023-cloth-and-fluid.md: 41 and 130 N/m² for 29), by
+DFSPH 1.2 kg/m² there, by WCSPH, where water at rest bears shear, ten; PCISPH is taken to be as good as DFSPH, and
+the error to shrink with the particles, as the void about a sheet does."""
+
+
+def check_buoyancy(job: Job, path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:
+    """Warn of loose cloth that weighs so nearly what it displaces that whether it sinks is not known.
+
+    Cloth that a pin holds for ever stays where it is all the same.
+    """
+    if any(pin.release_s is None for pin in cloth.pin) or not any(job.gravity):
+        return
+    for fluid in job.fluid:
+        displaced = fluid.rest_density * cloth.thickness
+        least = DRIFT_IN_LAYERS[fluid.solver] * fluid.rest_density * 2.0 * fluid.particle_radius
+        if abs(cloth.mass_per_area - displaced) < least:
+            findings.warn(
+                (*path, "mass_per_area"),
+                f'{cloth.mass_per_area:g} kg/m², and the "{fluid.name}" that its thickness displaces '
+                f"{displaced:.3g} kg/m²: with particles of this size they must differ by {least:.2g} kg/m² for it to "
+                "sink or float by its weight; below the surface it goes where the fluid takes it",
+            )
+            return

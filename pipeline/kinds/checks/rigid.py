@@ -1,0 +1,72 @@
+"""Checks of rigid bodies: places, starts of those that move, ballast."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.model.boxes import domain_box, overlap, smoke_box, span
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+
+if TYPE_CHECKING:
+    from pipeline.model.job import Job
+    from sim.shapes import PlacedSolid, Solid
+
+ROUND_OFF = 1.0e-6
+"""Share of a body's size by which ballast on its surface may be outside, as decimals do not add up exactly."""
+
+
+def check_places(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+    """Note bodies that are wholly outside of the domain and of every smoke's box."""
+    domain = domain_box(job.domain)
+    regions = [domain, *(smoke_box(smoke, job.domain) for smoke in job.smoke)]
+    for path, solid in solids.items():
+        if path[0] == "rigid" and not any(overlap(solid.bounds, region) for region in regions):
+            findings.error(path, f"is wholly outside the domain: it spans {span(solid.bounds)}, not {span(domain)}")
+
+
+def check_ballast(job: Job, solids: Mapping[KeyPath, PlacedSolid], findings: Findings) -> None:
+    """Note ballast that lies outside of its body: a slip of the unit, most likely, that would topple the body."""
+    for index, body in enumerate(job.rigid):
+        solid = solids.get(("rigid", index))
+        if not body.ballast or solid is None:
+            continue
+        unturned = replace(solid, rotation=np.eye(3), position=np.zeros(3))
+        low, high = unturned.bounds
+        distances = unturned.signed_distance(np.array([ballast.position for ballast in body.ballast]))
+        for number, distance in enumerate(distances):
+            if distance > ROUND_OFF * float(np.max(high - low)):
+                findings.error(
+                    ("rigid", index, "ballast", number, "position"),
+                    f"lies {distance:.3g} m outside of the body, whose shape spans {span(unturned.bounds)}; "
+                    "give it in metres from the shape's centre, before the body is turned",
+                )
+
+
+def check_rigid_start(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+    """Note dynamic bodies that overlap others or walls, as the simulation would refuse them.
+
+    Bodies without a shape in `solids` have been found wanting already; then nothing is looked at.
+    """
+    from sim.rigid.solver import RigidSolver
+    from sim.rigid.start import start_problems
+    from sim.shapes import ShapeError
+
+    dynamic = [index for index, body in enumerate(job.rigid) if body.kind == "dynamic"]
+    if not dynamic or any(("rigid", index) not in solids for index in range(len(job.rigid))):
+        return
+    moving = [body for body in job.rigid if body.kind != "static"]
+    static = [body for body in job.rigid if body.kind == "static"]
+    try:
+        solver = RigidSolver(moving, obstacles=static, domain=job.domain, gravity=job.gravity)
+        problems = start_problems(solver)
+    except ShapeError as error:
+        findings.error(("rigid", dynamic[0], "shape"), f"cannot be that of a body that moves: {error}")
+        return
+    index_of = {body.name: index for index, body in enumerate(job.rigid)}
+    for problem in problems:
+        findings.error(("rigid", index_of[problem.body]), problem.sentence)

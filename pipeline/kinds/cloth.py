@@ -1,0 +1,155 @@
+"""Cloth: sheets of triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cache
+from math import prod
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.base.content import status_of, tool_version
+from pipeline.base.errors import MissingInputError
+from pipeline.kinds.base import Change, Kind, Materials, Product, Solids
+from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.fluid import validate_mesh
+from pipeline.model.job import Job
+from pipeline.model.looks import BODY, CLOTHS
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+from render.parameters import MaterialParameters
+from sim.cloth.parameters import ClothParameters, RectangleSheet
+from sim.scene import SceneParameters
+from sim.shapes.parameters import MeshShape
+
+if TYPE_CHECKING:
+    import h5py
+
+    from pipeline.base.layout import JobLayout
+    from render.bounds import Reach
+    from render.spec import SceneObject
+    from sim.core.snapshots import Snapshot
+
+BASE_BYTES = 250_000_000
+"""Interpreter, numpy and h5py."""
+BYTES_PER_NODE = 600
+"""The frame's arrays, the normals of its triangles and the mesh as it is written."""
+
+
+def count_cloth_nodes(scene: SceneParameters) -> int:
+    """Number of nodes of all cloths.
+
+    Raises:
+        MissingInputError: a mesh file cannot be read, or holds no sheet.
+    """
+    return sum(count_nodes(cloth) for cloth in scene.cloth)
+
+
+def count_nodes(cloth: ClothParameters) -> int:
+    """Number of nodes; a mesh is read for it, once, as files of a size hold ten times as many or as few.
+
+    Raises:
+        MissingInputError: a mesh file cannot be read, or holds no sheet.
+    """
+    shape = cloth.shape
+    if isinstance(shape, RectangleSheet):
+        return prod(shape.node_counts)
+    status = status_of(shape.file, "mesh")
+    return _nodes_of_mesh(shape, status.st_size, status.st_mtime_ns)
+
+
+@cache
+def _nodes_of_mesh(shape: MeshShape, _size: int, _mtime_ns: int) -> int:
+    from sim.cloth.sheet import build_sheet
+    from sim.shapes import ShapeError
+
+    try:
+        return len(build_sheet(shape).vertices)
+    except ShapeError as error:
+        raise MissingInputError(f"{error}; the job needs it") from error
+
+
+def _materials(cloth: ClothParameters) -> Mapping[str, MaterialParameters]:
+    return {BODY: CLOTHS[cloth.material]}
+
+
+def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
+    from pipeline.kinds.checks.cloth import check_cloths
+
+    return check_cloths(job, solids, budget, findings)
+
+
+def _coarser(job: Job, factor: float, _can_be_built: bool) -> list[Change]:
+    changes: list[Change] = []
+    for index, cloth in enumerate(job.cloth):
+        # Pins would hold others in a coarser sheet where they name nodes by number, and others or none in a region.
+        by_place = all(pin.index is None and pin.region is None for pin in cloth.pin)
+        if isinstance(cloth.shape, RectangleSheet) and by_place:
+            changes.append(_coarser_sheet(("cloth", index, "shape"), cloth.shape, factor))
+    return changes
+
+
+def _coarser_sheet(path: KeyPath, sheet: RectangleSheet, factor: float) -> Change:
+    """The key that divides a sheet, and its value for so many fewer cells along each side."""
+    if sheet.counts is None:
+        assert sheet.resolution is not None
+        return (*path, "resolution"), sheet.resolution * factor
+    return (*path, "counts"), [max(2, round((count - 1) / factor) + 1) for count in sheet.counts]
+
+
+def _objects(_job: Job, _layout: JobLayout, cloth: ClothParameters, material_of: Materials) -> Iterator[SceneObject]:
+    from render.spec import MeshSequenceObject
+
+    file = f"cloths/{cloth.name}/{{frame}}.ply"
+    yield MeshSequenceObject(name=cloth.name, file=file, material=material_of(BODY))
+
+
+def _reach(_job: Job, _layout: JobLayout, _cloth: ClothParameters, group: h5py.Group) -> Reach | None:
+    from render.bounds import reach_of_points
+
+    return reach_of_points(group["position"][()])
+
+
+def _write_mesh(path: Path, cloth: Snapshot, _job: Job, _threads: int) -> None:
+    from render.cloth import vertex_normals
+    from render.meshes import write_ply
+
+    arrays = cloth.arrays
+    write_ply(
+        path,
+        arrays["position"],
+        arrays["triangles"],
+        normals=vertex_normals(arrays["position"], arrays["triangles"]),
+        velocities=arrays["velocity"],
+        uv=arrays["uv"],
+    )
+
+
+CLOTH = Kind(
+    name="cloth",
+    parameters=ClothParameters,
+    about="Cloths; they collide with each other, and share the keys that say how they step.",
+    size="{:,} cloth nodes",
+    elements=lambda _job, cloth: count_nodes(cloth),
+    snapshot_bytes=(60.0, 32.0, 54.0),
+    wears="cloth",
+    material=_materials,
+    check=_check,
+    coarser=_coarser,
+    product=Product(
+        stage="cloth",
+        version=1,
+        folder="cloths",
+        suffix=".ply",
+        tools=lambda _job: {"numpy": tool_version("numpy")},
+        parameters=lambda _job: {},
+        memory_bytes=lambda _job, cloth: BASE_BYTES + BYTES_PER_NODE * count_nodes(cloth),
+        write=_write_mesh,
+        validate=validate_mesh,
+        file_bytes=lambda nodes: 70.0 * nodes,
+    ),
+    objects=_objects,
+    reach=_reach,
+    reach_bytes=100.0,
+    facts=lambda cloth, _count: f"cloth of {cloth.material}, {cloth.mass_per_area:g} kg/m²",
+)

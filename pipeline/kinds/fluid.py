@@ -1,0 +1,201 @@
+"""Particle fluids: surfaces of their particles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from math import ceil, inf, prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from blender_scripts.look_table import LOOK_TABLE
+from pipeline.base.content import tool_version
+from pipeline.kinds.base import Change, Kind, Materials, Product, Solids
+from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.model.job import Job
+from pipeline.model.looks import BODY, WHITEWATER
+from pipeline.model.looks import FLUID as LOOK
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+from render.parameters import MaterialParameters
+from sim.fluid.parameters import FluidParameters
+from sim.scene import SceneParameters
+from sim.shapes.parameters import BoxShape, Placement
+
+if TYPE_CHECKING:
+    import h5py
+
+    from pipeline.base.layout import JobLayout
+    from render.bounds import Reach
+    from render.spec import SceneObject
+    from sim.core.snapshots import Snapshot
+
+MOST_IN_A_VOLUME = 1.5
+"""Of a thin block or a narrow opening, whose last particles reach beyond it, as against what the volume tells."""
+
+WETS_WITHIN_RADII = 1.5
+"""How near a fluid's surface is to what it touches, in radii of its particles. It ends 0.05 radii above a floor and a
+radius inside of a body where particles rest, and 0.8 above where they move; a layer of one particle is two thick."""
+
+WORKER_BYTES = 100_000_000
+BYTES_PER_SURFACE_PARTICLE = 140_000
+"""Memory of meshing, which goes with the surface: with the particles to the power 2/3, at `CUBE_SIZE`."""
+CUBE_SIZE = 0.75
+"""In radii. Cubes of half the width need four times the memory."""
+
+
+def most_particles(scene: SceneParameters) -> float:
+    """About the most particles of all fluids."""
+    return sum(most_particles_of(fluid, scene) for fluid in scene.fluid)
+
+
+def most_particles_of(fluid: FluidParameters, scene: SceneParameters, *, until_s: float = inf) -> float:
+    """About the most particles of a fluid: what its blocks and emitters give, at most a domain full.
+
+    Args:
+        fluid: one of the scene's.
+        scene: which has the domain.
+        until_s: what flows in later does not count [s].
+    """
+    filled = sum(
+        prod(block.shape.size) * block.scale**3 if isinstance(block.shape, BoxShape) else inf for block in fluid.block
+    )
+    emitted = sum(emitter.emitted_volume(until_s) for emitter in fluid.emitter)
+    room = prod(high - low for low, high in zip(scene.domain.min, scene.domain.max, strict=True))
+    volume = min(MOST_IN_A_VOLUME * (filled + emitted), room)
+    return min(volume, fluid.most_volume) / fluid.lattice_volume
+
+
+def _materials(_fluid: FluidParameters) -> Mapping[str, MaterialParameters]:
+    return {BODY: LOOK, **WHITEWATER}
+
+
+def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:
+    for number, block in enumerate(job.fluid[index].block):
+        yield ("block", number), block
+
+
+def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
+    from pipeline.kinds.checks.fluid import check_fluids
+    from pipeline.kinds.checks.fluid_size import check_fluid_size
+    from pipeline.kinds.checks.steps import check_time_steps
+
+    check_fluids(job, solids, findings)
+    check_time_steps(job, solids, findings)
+    return sum(check_fluid_size(job, index, solids, budget, findings) for index in range(len(job.fluid)))
+
+
+def _coarser(job: Job, factor: float, _can_be_built: bool) -> list[Change]:
+    changes: list[Change] = []
+    for index, fluid in enumerate(job.fluid):
+        changes.append((("fluid", index, "particle_radius"), fluid.particle_radius * factor))
+        if fluid.dt != "adaptive":
+            changes.append((("fluid", index, "dt"), fluid.dt * factor))
+    return changes
+
+
+def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: Materials) -> Iterator[SceneObject]:
+    from render.spec import MeshSequenceObject, PointSequenceObject
+
+    # Nobody sees from inside where a fluid of another look touches solids; a material of one's own may look at it.
+    material = material_of(BODY)
+    sees = material.look is None or LOOK_TABLE[material.look].refracts
+    yield MeshSequenceObject(
+        name=fluid.name,
+        file=f"surfaces/{fluid.name}/{{frame}}.ply",
+        material=material,
+        wets_within=WETS_WITHIN_RADII * fluid.particle_radius if sees else None,
+    )
+    for kind in WHITEWATER if fluid.name in job.whitewater else ():
+        yield PointSequenceObject(
+            name=f"{fluid.name}.{kind}",
+            file=f"whitewater/{fluid.name}/{{frame}}.ply",
+            kind=kind,
+            material=material_of(kind),
+        )
+
+
+def _reach(_job: Job, _layout: JobLayout, _fluid: FluidParameters, group: h5py.Group) -> Reach | None:
+    from render.bounds import reach_of_particles
+
+    position = group["position"][()]
+    return reach_of_particles(position, float(group.attrs["particle_radius"])) if len(position) else None
+
+
+# --- the surface of a frame ---
+
+
+def _surface_tools(job: Job) -> dict[str, str]:
+    names = ("pysplashsurf",) if job.surface.droplet_size == 1.0 else ("pysplashsurf", "scipy")
+    return {name: tool_version(name) for name in names}
+
+
+def _surface_parameters(job: Job) -> dict[str, Any]:
+    surface = job.surface.model_dump(mode="json")
+    if job.surface.droplet_size == 1.0:
+        del surface["droplet_size"]  # droplets are as earlier versions left them, and so is the file
+    return {"surface": surface}
+
+
+def _surface_memory(job: Job, fluid: FluidParameters) -> int:
+    """An upper bound: how many particles there are is not known before the simulation has filled its blocks."""
+    on_surface = most_particles_of(fluid, job, until_s=job.frame_count / job.fps) ** (2.0 / 3.0)
+    finer = CUBE_SIZE / job.surface.cube_size_in_radii
+    meshing: int = ceil(BYTES_PER_SURFACE_PARTICLE * on_surface * finer**2)
+    return WORKER_BYTES + meshing
+
+
+def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
+    from render.meshes import write_ply
+    from render.surface import reconstruct_surface
+
+    surface = reconstruct_surface(
+        fluid.arrays["position"],
+        fluid.arrays["velocity"],
+        particle_radius=fluid.number("particle_radius"),
+        parameters=job.surface,
+        threads=threads,
+    )
+    write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities)
+
+
+def validate_mesh(path: Path) -> None:
+    """Decode a PLY; raises InvalidArtifactError if it is damaged."""
+    from render.meshes import validate_ply
+
+    validate_ply(path)
+
+
+def _facts(fluid: FluidParameters, count: float | None) -> str:
+    particles = "particles" if count is None else f"{count:,.0f} particles"
+    return f"{fluid.solver.upper()}, {particles} of radius {fluid.particle_radius:g} m"
+
+
+FLUID = Kind(
+    name="fluid",
+    parameters=FluidParameters,
+    about="Particle fluids; several share one tank, and the keys that say how it is computed.",
+    size="about {:,} particles",
+    elements=lambda job, fluid: most_particles_of(fluid, job),
+    snapshot_bytes=(84.0, 26.0, 90.0),
+    wears="fluid",
+    material=_materials,
+    placements=_placements,
+    check=_check,
+    coarser=_coarser,
+    product=Product(
+        stage="surface",
+        version=2,
+        folder="surfaces",
+        suffix=".ply",
+        tools=_surface_tools,
+        parameters=_surface_parameters,
+        memory_bytes=_surface_memory,
+        write=_write_surface,
+        validate=validate_mesh,
+        file_bytes=lambda particles: 2_500.0 * particles ** (2 / 3),
+    ),
+    objects=_objects,
+    reach=_reach,
+    reach_bytes=160.0,
+    facts=_facts,
+)

@@ -1,0 +1,103 @@
+"""Rigid bodies: meshes at rest, which the poses of a frame place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from math import cos, radians, sin
+from typing import TYPE_CHECKING
+
+from pipeline.kinds.base import Kind, Materials, Solids
+from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.model.job import Job
+from pipeline.model.looks import BODY, NATURAL_MATERIALS, SOLID, parts_of
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+from render.parameters import MaterialParameters
+from sim.rigid.parameters import RigidBodyParameters
+from sim.shapes.parameters import Placement
+
+if TYPE_CHECKING:
+    import h5py
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pipeline.base.layout import JobLayout
+    from render.bounds import Reach
+    from render.spec import SceneObject
+
+
+def _materials(body: RigidBodyParameters) -> Mapping[str, MaterialParameters]:
+    return NATURAL_MATERIALS.get(body.shape.type, {BODY: SOLID})
+
+
+def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:
+    yield (), job.rigid[index]
+
+
+def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
+    from pipeline.kinds.checks.rigid import check_ballast, check_places, check_rigid_start
+
+    check_places(job, solids, findings)
+    check_rigid_start(job, solids, findings)
+    check_ballast(job, solids, findings)
+    return 0
+
+
+def _objects(_job: Job, layout: JobLayout, body: RigidBodyParameters, material_of: Materials) -> Iterator[SceneObject]:
+    """A static body stands where the job puts it; the others are where the poses of the frame say."""
+    from render.spec import MeshObject, MovingMeshObject
+
+    for part in parts_of(body.shape.type):
+        name = body.name if part == BODY else f"{body.name}.{part}"
+        file, material = layout.body_mesh(body.name, part), material_of(part)
+        if body.kind == "static":
+            orientation = _orientation(body.rotation_deg)
+            yield MeshObject(name=name, file=file, position=body.position, orientation=orientation, material=material)
+        else:
+            yield MovingMeshObject(name=name, file=file, body=body.name, poses=layout.poses, material=material)
+
+
+def _orientation(rotation_deg: tuple[float, float, float]) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) of rotations about the world's x, then y, then z axis: q = q_z q_y q_x."""
+    (cx, sx), (cy, sy), (cz, sz) = ((cos(half), sin(half)) for half in (radians(angle) / 2 for angle in rotation_deg))
+    return (
+        cx * cy * cz + sx * sy * sz,
+        sx * cy * cz - cx * sy * sz,
+        cx * sy * cz + sx * cy * sz,
+        cx * cy * sz - sx * sy * cz,
+    )
+
+
+def _reach(_job: Job, layout: JobLayout, body: RigidBodyParameters, group: h5py.Group) -> Reach | None:
+    """How far a body that moves reaches; one that stands still is of the film, not of a frame."""
+    import numpy as np
+
+    from render.bounds import reach_of_points
+    from sim.core.motion.rotation import rotated
+
+    if body.kind == "static":
+        return None
+    position, orientation = (np.asarray(group[key][()], np.float64) for key in ("position", "orientation"))
+    return reach_of_points(position + rotated(orientation, rest_vertices(layout, body)))
+
+
+def rest_vertices(layout: JobLayout, body: RigidBodyParameters) -> NDArray[np.float64]:
+    """Vertices of all parts of a body at rest [m], (n, 3)."""
+    import numpy as np
+
+    from render.meshes import read_ply
+
+    files = [layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
+    return np.concatenate([read_ply(layout.path(file)).vertices for file in files]).astype(np.float64)
+
+
+RIGID = Kind(
+    name="rigid",
+    parameters=RigidBodyParameters,
+    about="Rigid bodies.",
+    material=_materials,
+    placements=_placements,
+    check=_check,
+    objects=_objects,
+    reach=_reach,
+)

@@ -1,0 +1,185 @@
+"""Smoke: OpenVDB volumes of its grids."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from math import prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.base.content import ABSENT, tool_version
+from pipeline.base.errors import InvalidArtifactError
+from pipeline.kinds.base import Change, Kind, Materials, Product, Solids
+from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.model.job import Job
+from pipeline.model.looks import BODY
+from pipeline.model.looks import SMOKE as LOOK
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings
+from render.parameters import MaterialParameters
+from sim.shapes.parameters import Placement
+from sim.smoke.parameters import CELLS_PER_EDDY, SmokeParameters, SmokeSourceParameters
+
+if TYPE_CHECKING:
+    import h5py
+
+    from pipeline.base.layout import JobLayout
+    from pipeline.kinds.smoke_codec import SmokeInBox
+    from render.bounds import Reach
+    from render.spec import SceneObject
+    from sim.core.snapshots import Snapshot
+
+WORKER_BYTES = 130_000_000
+BYTES_PER_CELL = 80
+"""Of writing a volume all full of smoke, what is read from the cache included."""
+
+
+class SmokeCodec:
+    """Smoke in the cache, as exactly as pictures can show it: `smoke_codec`."""
+
+    def write(self, group: h5py.Group, name: str, snapshot: Snapshot, *, longest_shutter_s: float) -> None:
+        """Write the grids of a smoke where there is some."""
+        from pipeline.kinds.smoke_codec import write_smoke
+
+        write_smoke(group, name, snapshot, longest_shutter_s=longest_shutter_s)
+
+    def read(self, group: h5py.Group) -> SmokeInBox:
+        """The part of a smoke that is not empty."""
+        from pipeline.kinds.smoke_codec import read_smoke
+
+        return read_smoke(group)
+
+    def sparse(self, group: h5py.Group) -> dict[str, Iterator[Any]]:
+        """The grids, in slabs of the box that is not empty."""
+        from pipeline.kinds.smoke_codec import grids_of, slabs, stored_box
+
+        return {key: slabs(stored_box(grid)) for key, grid in grids_of(group).items()}
+
+
+def _materials(_smoke: SmokeParameters) -> Mapping[str, MaterialParameters]:
+    return {BODY: LOOK}
+
+
+def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:
+    for number, source in enumerate(job.smoke[index].source):
+        yield ("source", number), _at_the_start(job, source)
+
+
+def _at_the_start(job: Job, source: SmokeSourceParameters) -> SmokeSourceParameters:
+    """A source on a body stands where that does."""
+    body = next((body for body in job.rigid if body.name == source.follow), None)
+    if body is None:
+        return source
+    from sim.coupling.smoke_sources import placed_on
+
+    return placed_on(source, body)
+
+
+def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
+    from pipeline.kinds.checks.smoke import check_smokes
+
+    return check_smokes(job, solids, budget, findings)
+
+
+def _coarser(job: Job, factor: float, can_be_built: bool) -> list[Change]:
+    from pipeline.kinds.checks.coarser_smoke import coarser_cell_sizes
+
+    changes: list[Change] = []
+    cell_sizes = coarser_cell_sizes(job, factor) if can_be_built else [smoke.cell_size for smoke in job.smoke]
+    for index, (smoke, cell_size) in enumerate(zip(job.smoke, cell_sizes, strict=True)):
+        changes.append((("smoke", index, "cell_size"), cell_size))
+        gusts = smoke.turbulence
+        if gusts.strength > 0.0 and gusts.size < CELLS_PER_EDDY * cell_size:
+            changes.append((("smoke", index, "turbulence", "size"), CELLS_PER_EDDY * cell_size))
+    return changes
+
+
+def _objects(job: Job, _layout: JobLayout, smoke: SmokeParameters, material_of: Materials) -> Iterator[SceneObject]:
+    from render.spec import VolumeSequenceObject
+
+    box_min, box_max = smoke.corners(job.domain)
+    yield VolumeSequenceObject(
+        name=smoke.name,
+        file=f"volumes/{smoke.name}/{{frame}}.vdb",
+        box_min=box_min,
+        box_max=box_max,
+        open_faces=smoke.open_faces,
+        ambient_temperature=smoke.ambient_temperature,
+        material=material_of(BODY),
+    )
+
+
+def _reach(_job: Job, _layout: JobLayout, _smoke: SmokeParameters, group: h5py.Group) -> Reach | None:
+    from pipeline.kinds.smoke_codec import read_density
+    from render.bounds import box_of_smoke, reach_of_box
+
+    box = box_of_smoke(*read_density(group))
+    return None if box is None else reach_of_box(box)
+
+
+# --- the volume of a frame ---
+
+
+def _openvdb(_job: Job) -> dict[str, str]:
+    """The package that `import_openvdb` takes the binding from, with its version."""
+    provider = "openvdb" if tool_version("openvdb") != ABSENT else "bpy"
+    return {provider: tool_version(provider)}
+
+
+def _missing_openvdb() -> list[str]:
+    from render.errors import VolumeUnavailableError
+    from render.volume import import_openvdb
+
+    try:
+        import_openvdb()
+    except VolumeUnavailableError as error:
+        return [str(error)]
+    return []
+
+
+def _write_volume(path: Path, smoke: SmokeInBox, job: Job, _threads: int) -> None:
+    from render.volume import write_volume
+
+    try:
+        write_volume(path, **vars(smoke), parameters=job.volume, fps=job.fps, shutter=job.render.shutter)
+    except ValueError as error:
+        raise InvalidArtifactError(str(error)) from error
+
+
+def _validate_volume(path: Path) -> None:
+    from render.volume import validate_volume
+
+    validate_volume(path)
+
+
+SMOKE = Kind(
+    name="smoke",
+    parameters=SmokeParameters,
+    about="Smoke.",
+    size="{:,} smoke cells",
+    elements=lambda job, smoke: prod(smoke.cell_counts(job.domain)),
+    snapshot_bytes=(24.0, 2.0, 26.0),
+    wears="smoke",
+    material=_materials,
+    placements=_placements,
+    check=_check,
+    coarser=_coarser,
+    codec=SmokeCodec(),
+    product=Product(
+        stage="volume",
+        version=2,
+        folder="volumes",
+        suffix=".vdb",
+        tools=_openvdb,
+        parameters=lambda job: {"volume": job.volume, "fps": job.fps, "shutter": job.render.shutter},
+        memory_bytes=lambda job, smoke: WORKER_BYTES + BYTES_PER_CELL * prod(smoke.cell_counts(job.domain)),
+        write=_write_volume,
+        validate=_validate_volume,
+        file_bytes=lambda cells: 20_000 + 3.0 * cells,
+        preflight=_missing_openvdb,
+    ),
+    objects=_objects,
+    reach=_reach,
+    reach_bytes=8.0,
+    facts=lambda smoke, _count: f"smoke, cells of {smoke.cell_size:g} m",
+)

@@ -1,0 +1,143 @@
+"""The table of kinds, and what follows from it for a whole job.
+
+A new kind of body is a module beside this one and a row here; see docs/architecture.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache, partial
+from typing import Any
+
+from pydantic import Field, create_model
+
+from blender_scripts.look_table import LOOK_TABLE
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath
+from pipeline.kinds.base import Kind
+from pipeline.kinds.cloth import CLOTH
+from pipeline.kinds.fluid import FLUID
+from pipeline.kinds.rigid import RIGID
+from pipeline.kinds.smoke import SMOKE
+from pipeline.model.job import Job
+from pipeline.model.looks import BODY, SOLID, WHITEWATER
+from pipeline.model.positions import KeyPath
+from render.parameters import MaterialParameters
+from render.spec import (
+    MeshObject,
+    MeshSequenceObject,
+    MovingMeshObject,
+    PointSequenceObject,
+    SceneObject,
+    VolumeSequenceObject,
+)
+from sim.scene import SceneParameters
+from sim.shapes.parameters import Placement
+
+KINDS: dict[str, Kind] = {kind.name: kind for kind in (RIGID, FLUID, CLOTH, SMOKE)}
+"""Every kind by its name, in the order in which a job's bodies are listed."""
+
+
+def register(kind: Kind) -> None:
+    """Add a kind to the table: jobs may have tables of it from now on.
+
+    Raises:
+        ValueError: its name is taken, by a kind or by another key of the job file.
+    """
+    if kind.name in KINDS or kind.name in Job.model_fields:
+        raise ValueError(f'"{kind.name}" is a key of the job file already')
+    KINDS[kind.name] = kind
+
+
+def job_type() -> type[Job]:
+    """The model of the job file, with a table for each kind."""
+    return _job_type(tuple(KINDS))
+
+
+@cache
+def _job_type(names: tuple[str, ...]) -> type[Job]:
+    fields: dict[str, Any] = {
+        name: (tuple[KINDS[name].parameters, ...], Field(default=(), description=KINDS[name].about))  # type: ignore[misc]
+        for name in names
+        if name not in SceneParameters.model_fields
+    }
+    return create_model("Job", __base__=Job, **fields) if fields else Job
+
+
+def bodies(job: SceneParameters) -> Iterator[tuple[KeyPath, Kind, Any]]:
+    """Every body of a job with the path of its table and its kind."""
+    for kind in KINDS.values():
+        for index, body in enumerate(kind.bodies(job)):
+            yield (kind.name, index), kind, body
+
+
+def body_names(job: SceneParameters) -> list[str]:
+    """Names of all bodies."""
+    return [body.name for _, _, body in bodies(job)]
+
+
+def placements(job: Job) -> Iterator[tuple[KeyPath, Placement]]:
+    """Every solid that a job places, with the path of its table."""
+    for path, kind, _ in bodies(job):
+        for below, placement in kind.placements(job, int(path[1])):
+            yield (*path, *below), placement
+
+
+def products_of(job: Job, layout: JobLayout, frame: int) -> list[tuple[Kind, Any, ArtifactPath]]:
+    """Every body that has a file of its own in each frame, its kind, and the file."""
+    return [
+        (kind, body, layout.product(kind.product.folder, body.name, frame, kind.product.suffix))
+        for _, kind, body in bodies(job)
+        if kind.product is not None
+    ]
+
+
+_RANKS: dict[type, int] = {
+    MeshObject: 0,
+    MovingMeshObject: 0,
+    MeshSequenceObject: 1,
+    PointSequenceObject: 2,
+    VolumeSequenceObject: 3,
+}
+
+
+def scene_objects(job: Job, layout: JobLayout) -> list[SceneObject]:
+    """Objects that the renderer draws of all bodies: solids first, volumes last."""
+    objects = [
+        drawn
+        for _, kind, body in bodies(job)
+        for drawn in kind.objects(job, layout, body, partial(material_of, job, body.name))
+    ]
+    return sorted(objects, key=lambda drawn: _RANKS[type(drawn)])
+
+
+# --- materials ---
+
+
+def material_of(job: Job, body: str, part: str = BODY) -> MaterialParameters:
+    """Material of a body, or of a part of it or of its whitewater: from the job file, else as is usual.
+
+    Caustics are asked for only of what bends light: they change the light of the whole scene.
+    """
+    material = described_material(job, body, part)
+    if material.caustics and not (material.look and LOOK_TABLE[material.look].refracts):
+        return material.model_copy(update={"caustics": False})
+    return material
+
+
+def described_material(job: Job, body: str, part: str = BODY) -> MaterialParameters:
+    """The same with every key that the job file gives, also those that have no effect."""
+    usual = _usual_material(job, body, part)
+    if part != BODY and part not in WHITEWATER:
+        of_body = described_material(job, body)
+        usual = usual if of_body.look and LOOK_TABLE[of_body.look].paints_parts else of_body
+    said = job.material.get(body if part == BODY else f"{body}.{part}")
+    return usual if said is None else said.upon(usual)
+
+
+def _usual_material(job: Job, name: str, part: str) -> MaterialParameters:
+    """Material of a part of a body that the job file does not describe."""
+    if part in WHITEWATER:
+        return WHITEWATER[part]
+    found = next((kind.material(body) for _, kind, body in bodies(job) if body.name == name), {BODY: SOLID})
+    return found.get(part, found[BODY])

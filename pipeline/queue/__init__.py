@@ -1,0 +1,1 @@
+"""Jobs that take turns: the queue, its runner, notifications, the watch over the disk."""

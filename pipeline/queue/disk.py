@@ -1,0 +1,137 @@
+"""Disk space: how much a job will take, and how much of it stays free."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from pipeline.base import wording
+
+if TYPE_CHECKING:
+    from pipeline.model.job import Job
+    from pipeline.model.problems import Findings
+    from pipeline.record.reader import StageCost
+    from pipeline.run.plan import Assessment
+
+RESERVE_BYTES = 2 * 2**30
+"""Free space at which a job pauses: a checkpoint of a large simulation and the frames that are being written fit."""
+RESERVE_SHARE = 0.05
+"""On small disks the reserve is this share of the disk."""
+
+
+def free_bytes(folder: Path) -> int:
+    """Free space on the disk that a folder lies on [bytes]."""
+    return shutil.disk_usage(folder).free
+
+
+def usual_reserve_bytes(folder: Path) -> int:
+    """The reserve where nobody has asked for another one [bytes]."""
+    return min(RESERVE_BYTES, int(shutil.disk_usage(folder).total * RESERVE_SHARE))
+
+
+def shortage(folder: Path, reserve_bytes: int | None) -> str | None:
+    """A sentence if less than the reserve is free, else None.
+
+    Args:
+        folder: on the disk in question.
+        reserve_bytes: the reserve [bytes]; None: the usual one.
+    """
+    free = free_bytes(folder)
+    reserve = usual_reserve_bytes(folder) if reserve_bytes is None else reserve_bytes
+    if free >= reserve:
+        return None
+    return f"only {wording.size(free)} are free on the disk, less than the reserve of {wording.size(reserve)}"
+
+
+class Size(NamedTuple):
+    """What decides how much a frame of a job takes.
+
+    Attributes:
+        elements: particles, cells or nodes of all bodies of a kind, by its name.
+        pixels: of a picture.
+        picture_bytes_per_pixel: what a picture takes, on the mean of its files [bytes].
+        film_factor: how much more a film takes than one of H.264 [-].
+    """
+
+    elements: Mapping[str, float]
+    pixels: int
+    picture_bytes_per_pixel: float = 1.2
+    film_factor: float = 1.0
+
+
+def size_of(job: Job, findings: Findings) -> Size:
+    """The size of a job that was checked."""
+    width, height = job.render.resolution
+    return Size(
+        findings.elements,
+        width * height,
+        _picture_bytes_per_pixel(job),
+        _PRORES_FACTOR if job.movie.codec == "prores" else 1.0,
+    )
+
+
+def _picture_bytes_per_pixel(job: Job) -> float:
+    """Measured with a draft of the quickstart at 480x270; a job with masters has two files a frame."""
+    png = 4.7 if job.render.format == "png16" else 1.2
+    if not job.render.has_master:
+        return png
+    passes = len(job.render.passes)
+    return (png + (5.0 + 6.0 * passes if passes else 1.0)) / 2
+
+
+_PRORES_FACTOR = 30.0
+
+_BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
+    "simulate": lambda size: 22_000 + _snapshot_bytes(size, 1),
+    "whitewater": lambda size: 10.0 * size.elements.get("fluid", 0.0),
+    "bodies": lambda _: 400_000.0,
+    "bounds": lambda _: 3000.0,
+    "render": lambda size: 1_000 + size.picture_bytes_per_pixel * size.pixels,
+    # Segments of 120 frames and the film; a frame takes a tenth of a byte a pixel in each.
+    "movie": lambda size: 12.0 * size.film_factor * size.pixels,
+}
+"""What one file of a stage takes, about, where nothing has been made yet to go by [bytes]. The factors are those of a
+few small jobs, and rough."""
+
+
+def checkpoint_bytes(size: Size) -> float:
+    """What the two checkpoints that are kept take, about [bytes]."""
+    return 2 * _snapshot_bytes(size, 2)
+
+
+def _snapshot_bytes(size: Size, where: int) -> float:
+    """Of the bodies of all kinds; `where` as in `Kind.snapshot_bytes`."""
+    from pipeline.kinds.table import KINDS
+
+    return sum(kind.snapshot_bytes[where] * size.elements.get(name, 0.0) for name, kind in KINDS.items())
+
+
+def _bytes_per_artifact(stage: str, size: Size) -> float:
+    """What one file of a stage takes, about [bytes]; those of a product of bodies by their kind."""
+    from pipeline.kinds.table import KINDS
+
+    for name, kind in KINDS.items():
+        if kind.product is not None and kind.product.stage == stage:
+            return kind.product.file_bytes(size.elements.get(name, 0.0))
+    return _BYTES_PER_ARTIFACT[stage](size) if stage in _BYTES_PER_ARTIFACT else 0.0
+
+
+def estimate_bytes(assessments: Iterable[Assessment], costs: Mapping[str, StageCost], size: Size) -> float:
+    """What is to be made will take, about [bytes]; by what the same stage has taken in this job, where it has.
+
+    Args:
+        assessments: the plan, held against the record.
+        costs: what the stages have taken so far: `ManifestReader.stage_costs`.
+        size: of the job.
+    """
+    total = 0.0
+    simulated = False
+    for each in assessments:
+        stage = each.task.stage
+        cost = costs.get(stage)
+        one = cost.bytes_per_artifact if cost is not None else _bytes_per_artifact(stage, size)
+        total += one * len(each.rebuilds)
+        simulated |= stage == "simulate" and bool(each.rebuilds)
+    return total + (checkpoint_bytes(size) if simulated else 0.0)

@@ -1,0 +1,98 @@
+"""All jobs of a farm, each with its state: what `pipeline status` shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeline.base.errors import ManifestError, OutdatedManifestError
+from pipeline.base.layout import JobLayout
+from pipeline.base.lease import live_holder
+from pipeline.queue.following import done_and_total
+from pipeline.queue.job_queue import JobQueue, QueuedJob
+from pipeline.queue.states import JobState, state_of, state_without_entry
+from pipeline.record.reader import LastRun, ManifestReader
+
+
+@dataclass(frozen=True, slots=True)
+class ListedJob:
+    """A job in a line.
+
+    Attributes:
+        name: of its folder.
+        state: where it stands.
+        priority: in the queue; None: it is not in it.
+        changed: when it was submitted, or, out of the queue, when something last happened [s since the epoch].
+        done: how many of its tasks are done.
+        tasks: how many there are; 0 before its first run.
+        note: why it pauses or failed, or empty.
+    """
+
+    name: str
+    state: JobState
+    priority: int | None
+    changed: float
+    done: int = 0
+    tasks: int = 0
+    note: str = ""
+
+
+def list_jobs(queue: JobQueue) -> tuple[list[ListedJob], list[str]]:
+    """The jobs of a farm: those of the queue in the order in which they run, then the others, newest first.
+
+    Returns:
+        The jobs, and a sentence about each record or entry that cannot be read.
+    """
+    listing = queue.listing()
+    flaws = [*listing.flaws]
+    queued = [_listed(queue.layout(entry.name), entry, flaws) for entry in listing.jobs]
+    names = {job.name for job in queued}
+    folders = sorted(queue.farm.iterdir()) if queue.farm.is_dir() else []
+    others = [
+        _listed(JobLayout(folder), None, flaws)
+        for folder in folders
+        if folder.name not in names and not folder.name.startswith(".") and _holds_job(JobLayout(folder), flaws)
+    ]
+    return queued + sorted(others, key=lambda job: -job.changed), flaws
+
+
+def state_of_job(layout: JobLayout, entry: QueuedJob | None) -> JobState:
+    """Where a job stands.
+
+    Raises:
+        ManifestError: its record cannot be read.
+    """
+    runs = live_holder(layout.lease) is not None
+    if entry is not None:
+        return state_of(entry, runs=runs)
+    if not layout.manifest.exists():
+        return state_without_entry(layout, LastRun(None, None), runs=runs, is_empty=True)
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        return state_without_entry(layout, manifest.last_run(), runs=runs, is_empty=manifest.is_empty())
+
+
+def _listed(layout: JobLayout, entry: QueuedJob | None, flaws: list[str]) -> ListedJob:
+    name, note = layout.root.name, "" if entry is None else entry.note
+    priority = None if entry is None else entry.priority
+    changed = _last_change(layout) if entry is None else entry.submitted
+    try:
+        state = state_of_job(layout, entry)
+        done, tasks = done_and_total(layout)
+    except OutdatedManifestError:  # the next run brings it up to date
+        return ListedJob(name, JobState.INTERRUPTED, priority, changed, note=note)
+    except (ManifestError, OSError) as error:
+        flaws.append(f"{name}: {error}")
+        state = JobState.UNKNOWN if entry is None else state_of(entry, runs=False)
+        return ListedJob(name, state, priority, changed, note=note)
+    return ListedJob(name, state, priority, changed, done, tasks, note)
+
+
+def _holds_job(layout: JobLayout, flaws: list[str]) -> bool:
+    try:
+        return layout.job_file.is_file() or layout.manifest.is_file()
+    except OSError as error:
+        flaws.append(f"{layout.root}: {error.strerror}")
+        return False
+
+
+def _last_change(layout: JobLayout) -> float:
+    return max((path.stat().st_mtime for path in (layout.manifest, layout.job_file) if path.exists()), default=0.0)

@@ -1,0 +1,66 @@
+"""The child process that makes one preview movie: `REQUEST_FILE`; prints the processor time that it took [s]."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.base.files import sync
+
+_NICENESS = 10
+"""What the tasks leave over, and a tenth of a core where they leave nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the child is to make.
+
+    Attributes:
+        pictures: path of each frame that is drawn.
+        frames: how many the whole film has.
+        fps: of the film [1/s].
+        output: the MP4 to write.
+        copies: folder of small copies, kept for the next child.
+    """
+
+    pictures: dict[int, str]
+    frames: int
+    fps: float
+    output: str
+    copies: str
+
+    @classmethod
+    def read(cls, path: Path) -> Request:
+        """From a file of JSON, whose keys are texts."""
+        fields = json.loads(path.read_text(encoding="utf-8"))
+        fields["pictures"] = {int(frame): picture for frame, picture in fields["pictures"].items()}
+        return cls(**fields)
+
+
+def main() -> None:
+    """Make the film; the last line is for the runner, also that of an error."""
+    threading.Thread(target=_end_with_runner, daemon=True).start()
+    os.nice(_NICENESS)
+    from render.errors import InvalidFileError
+    from render.preview_movie import write_preview_movie
+
+    request = Request.read(Path(sys.argv[1]))
+    pictures = {frame: Path(picture) for frame, picture in request.pictures.items()}
+    output = Path(request.output)
+    try:
+        write_preview_movie(pictures, request.frames, output, fps=request.fps, copies=Path(request.copies))
+        sync(output)
+    except (InvalidFileError, OSError) as error:
+        sys.exit(str(error))
+    print(time.process_time())
+
+
+def _end_with_runner() -> None:
+    """Standard input ends when the runner does, however that came about: nobody wants the film then."""
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)

@@ -1,0 +1,231 @@
+"""Bring the record and the files together at the start of a run, whatever ended the last one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath, FailureKind, TaskState
+from pipeline.record.manifest import ArtifactRow, Manifest, artifact_row
+from pipeline.store.artifacts import edited_name, sweep_parts
+from pipeline.store.receipts import Receipt, hash_file, read_receipt, verify_artifact
+
+
+class FileCondition(StrEnum):
+    """Condition of a recorded artifact's file that does not count."""
+
+    MISSING = "missing"
+    EDITED = "edited"
+    INTERRUPTED = "interrupted"
+    """Its commit was cut short: the file may be the old or the new one, and has no receipt."""
+
+
+@dataclass(frozen=True, slots=True)
+class FileProblem:
+    """Fault of a recorded artifact's file.
+
+    Attributes:
+        condition: what kind of problem it is.
+        reason: a sentence about this file.
+    """
+
+    condition: FileCondition
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """State of the recorded artifacts' files.
+
+    Attributes:
+        problems: artifacts whose file does not count.
+        new_mtimes_ns: modification times [ns] of files that were touched or copied, but hold the recorded bytes.
+        newer_receipts: receipts of files that were committed anew without the record learning of it.
+    """
+
+    problems: Mapping[ArtifactPath, FileProblem]
+    new_mtimes_ns: Mapping[ArtifactPath, int]
+    newer_receipts: tuple[Receipt, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Reconciliation:
+    """The record as it stands now, and what was put right.
+
+    Attributes:
+        rows: every artifact on record, those with a problem included; input of `plan.assess`.
+        problems: the artifacts whose file does not count; input of `plan.assess`.
+        sentences: what the user should know, one line each; none after a clean run that nobody has touched.
+    """
+
+    rows: dict[ArtifactPath, ArtifactRow]
+    problems: dict[ArtifactPath, FileProblem]
+    sentences: tuple[str, ...]
+
+    @property
+    def valid_rows(self) -> dict[ArtifactPath, ArtifactRow]:
+        """The artifacts that count; input of `plan.up_to_date`."""
+        return {path: row for path, row in self.rows.items() if path not in self.problems}
+
+
+def reconcile(manifest: Manifest, layout: JobLayout, *, clean: bool) -> Reconciliation:
+    """Bring the record and the files together.
+
+    Always: attempts that are still open are closed as worker lost, and each recorded artifact is looked at by its size
+    and modification time (its bytes are hashed only where these differ). After an unclean end as well: part files are
+    swept away, and receipts that the record lacks are adopted. Artifacts whose file vanished are dropped from the
+    record.
+
+    Args:
+        manifest: the record; the caller holds the job's lease.
+        layout: the job's folder.
+        clean: what `Manifest.begin_run` returned.
+    """
+    sentences = [*_close_open_attempts(manifest)]
+    if not clean:
+        swept = sweep_parts(layout)
+        if swept:
+            sentences.append(f"swept away {_count(len(swept), 'unfinished file')}")
+        adopted = _adopt_receipts(manifest, layout)
+        if adopted:
+            sentences.append(f"found {_count(adopted, 'finished file')} that the record did not know yet")
+    rows = manifest.artifacts()
+    inspection = inspect_files(layout, rows)
+    rows.update({receipt.artifact: artifact_row(receipt) for receipt in inspection.newer_receipts})
+    for path, mtime_ns in inspection.new_mtimes_ns.items():
+        rows[path] = rows[path]._replace(mtime_ns=mtime_ns)
+    missing = [path for path, problem in inspection.problems.items() if problem.condition is FileCondition.MISSING]
+    with manifest.transaction():
+        manifest.record_artifacts(inspection.newer_receipts)
+        manifest.adopt_mtimes(inspection.new_mtimes_ns)
+        manifest.forget_artifacts(missing)
+        for path, problem in inspection.problems.items():
+            if problem.condition is FileCondition.EDITED:
+                sentences.append(f"{path}: {problem.reason}")
+                manifest.log_event("edited", sentences[-1], task=rows[path].task)
+    return Reconciliation(rows, dict(inspection.problems), tuple(sentences))
+
+
+def inspect_files(layout: JobLayout, rows: Mapping[ArtifactPath, ArtifactRow]) -> Inspection:
+    """Compare the recorded artifacts with their files; changes nothing, so `plan` may call it beside a runner."""
+    problems: dict[ArtifactPath, FileProblem] = {}
+    new_mtimes_ns: dict[ArtifactPath, int] = {}
+    newer_receipts: list[Receipt] = []
+    root = str(layout.root)
+    for artifact, row in rows.items():
+        try:
+            status = os.stat(f"{root}/{artifact}")  # noqa: PTH116 - 100,000 Path objects would take half of the time
+        except (FileNotFoundError, NotADirectoryError):
+            problems[artifact] = FileProblem(FileCondition.MISSING, "file is missing")
+            continue
+        if status.st_mtime_ns == row.mtime_ns and status.st_size == row.size:
+            continue
+        receipt = read_receipt(layout, artifact)
+        if status.st_size == row.size and hash_file(layout.path(artifact)) == row.hash:
+            if receipt is None:
+                problems[artifact] = FileProblem(FileCondition.INTERRUPTED, "its receipt is missing or damaged")
+                continue
+            if artifact_row(receipt)._replace(mtime_ns=row.mtime_ns) == row:
+                new_mtimes_ns[artifact] = status.st_mtime_ns
+                continue
+        if receipt is None:
+            problems[artifact] = FileProblem(FileCondition.INTERRUPTED, "its commit was cut short")
+            continue
+        finding = verify_artifact(layout, receipt)
+        if finding is None:
+            newer_receipts.append(receipt)
+        else:
+            problems[artifact] = FileProblem(FileCondition.EDITED, _describe_edit(layout, artifact, finding))
+    return Inspection(problems, new_mtimes_ns, tuple(newer_receipts))
+
+
+def rebuild_manifest(layout: JobLayout) -> tuple[Path | None, int]:
+    """Make a new manifest of the receipts; the caller holds the job's lease.
+
+    Artifacts and the numbers of their attempts come back; logs of attempts, events and old parameter sets do not.
+
+    Returns:
+        Where the old manifest was moved to (None if there was none), and how many artifacts the new one knows.
+    """
+    kept = _move_aside(layout.manifest)
+    with Manifest(layout.manifest) as manifest:
+        reconcile(manifest, layout, clean=False)
+        return kept, len(manifest.artifacts())
+
+
+def receipts(layout: JobLayout) -> Iterator[Receipt]:
+    """Every readable receipt of the job's folder."""
+    root = str(layout.receipts)
+    for folder, _, names in os.walk(root):
+        prefix = folder[len(root) + 1 :]
+        for name in names:
+            if name.endswith(".json"):
+                artifact = ArtifactPath(os.path.join(prefix, name.removesuffix(".json")))  # noqa: PTH118 - as above
+                receipt = read_receipt(layout, artifact)
+                if receipt is not None:
+                    yield receipt
+
+
+def _close_open_attempts(manifest: Manifest) -> Iterator[str]:
+    lost = manifest.running_attempts()
+    if not lost:
+        return
+    with manifest.transaction():
+        for attempt in lost:
+            manifest.finish_attempt(
+                attempt.task,
+                attempt.number,
+                failure=FailureKind.WORKER_LOST,
+                message="the runner ended before the attempt did",
+                state=TaskState.PENDING,
+            )
+    yield f"{_count(len(lost), 'attempt')} ended with the last runner, first {lost[0].task}; each starts again"
+
+
+def _adopt_receipts(manifest: Manifest, layout: JobLayout) -> int:
+    """Record what has been committed without the record learning of it; returns how many files."""
+    rows = manifest.artifacts()
+    unknown = [receipt for receipt in receipts(layout) if not _is_known(receipt, rows)]
+    adopted = [receipt for receipt in unknown if verify_artifact(layout, receipt) is None]
+    with manifest.transaction():
+        manifest.remember_attempts(unknown)
+        manifest.record_artifacts(adopted)
+    return len(adopted)
+
+
+def _is_known(receipt: Receipt, rows: Mapping[ArtifactPath, ArtifactRow]) -> bool:
+    row = rows.get(receipt.artifact)
+    return row is not None and (row.task, row.attempt, row.fingerprint, row.hash) == (
+        receipt.task,
+        receipt.attempt,
+        receipt.fingerprint,
+        receipt.hash,
+    )
+
+
+def _describe_edit(layout: JobLayout, artifact: ArtifactPath, finding: str) -> str:
+    if layout.path(artifact).stat().st_size == 0:
+        return finding
+    return f"{finding}; before it is made anew it is kept as {edited_name(layout, artifact)}"
+
+
+def _move_aside(manifest: Path) -> Path | None:
+    """Rename a manifest with its journal, so that SQLite still finds both together."""
+    if not manifest.exists():
+        return None
+    number = 1
+    while (kept := manifest.with_name(f"{manifest.name}.damaged-{number}")).exists():
+        number += 1
+    for suffix in ("-wal", "-shm", "-journal", ""):
+        part = manifest.with_name(f"{manifest.name}{suffix}")
+        if part.exists():
+            part.rename(f"{kept}{suffix}")
+    return kept
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

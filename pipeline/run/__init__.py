@@ -1,0 +1,1 @@
+"""A run of one job: plan, scheduler, runner, progress."""

@@ -1,0 +1,80 @@
+"""The check of a job before any work: what its file describes, and what its stages can do here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.base.errors import JobFileError
+from pipeline.job.checks.job import check_description
+from pipeline.job.loading import LoadedJob, read_job
+from pipeline.model.job import Job
+from pipeline.model.problems import Findings, suggestion
+from pipeline.stages import STAGES
+from pipeline.stages.movie import MovieStage
+from pipeline.stages.render import RenderStage
+
+PICTURE_KEYS = frozenset({"camera", "light", "stage", "material", "render", "movie"})
+"""Tables of the job file that decide nothing but pictures."""
+
+
+def needs_pictures(until: Sequence[str]) -> bool:
+    """Whether a job that ends after these stages draws anything; one that is named wrongly counts as if it did."""
+    names = [stage.name for stage in STAGES]
+    drawing = names.index(RenderStage.name) if RenderStage.name in names else len(names)
+    return not until or any(name not in names or names.index(name) >= drawing for name in until)
+
+
+def without_pictures(findings: Findings) -> Findings:
+    """What was found, but for what is about pictures alone."""
+    errors, warnings = (
+        [each for each in problems if not each.path or each.path[0] not in PICTURE_KEYS]
+        for problems in (findings.errors, findings.warnings)
+    )
+    return replace(findings, errors=errors, warnings=warnings)
+
+
+def check_job(job: Job, *, memory_bytes: int | None = None, until: Sequence[str] = ()) -> Findings:
+    """Look at the whole job: everything that can be known before any work starts.
+
+    Reads the mesh files and fills the fluid's blocks, so it takes a second or two for a large scene.
+
+    Args:
+        job: a job as `read_job` returns it, with absolute mesh paths.
+        memory_bytes: what the simulation may use; this machine's if omitted.
+        until: the stages after which the job ends; what is about pictures alone does not count if it draws none.
+    """
+    findings = check_description(job, memory_bytes)
+    for obstacle in MovieStage().preflight(job):
+        findings.error(("movie", "codec"), obstacle)
+    _check_limits(job, findings)
+    return findings if needs_pictures(until) else without_pictures(findings)
+
+
+def _check_limits(job: Job, findings: Findings) -> None:
+    stages = [stage.name for stage in STAGES]
+    for name, limits in job.limits.items():
+        if name not in stages:
+            hint = suggestion(name, stages) or f"; stages are {', '.join(stages)}"
+            findings.error(("limits", name), f'no stage is named "{name}"{hint}')
+        if limits.timeout_s is not None and limits.timeout_s < limits.stall_s and "stall_s" in limits.model_fields_set:
+            findings.warn(
+                ("limits", name, "stall_s"),
+                f"has no effect: a task is ended after timeout_s = {limits.timeout_s:g} s in any case",
+            )
+
+
+def load_checked_job(
+    path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False, until: Sequence[str] = ()
+) -> tuple[LoadedJob, Findings]:
+    """Read a job file as `read_job` does, and look at the whole job; its warnings are in place.
+
+    Raises:
+        JobFileError: carries every problem found.
+    """
+    loaded = read_job(path, overrides, preview=preview)
+    findings = check_job(loaded.job, until=until)
+    if findings.errors:
+        raise JobFileError(loaded.source.describe_all(findings.errors))
+    return replace(loaded, warnings=tuple(loaded.source.describe_all(findings.warnings))), findings

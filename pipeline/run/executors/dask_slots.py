@@ -1,0 +1,176 @@
+"""Which Dask worker gets a task: arithmetic on what workers offer and what is taken of it.
+
+Workers say what they offer with Dask's resource tags: `--resources "CPU=16 MEM=64e9 GPU=1"`. Dask's own scheduler would
+put tasks with tags into the queues of workers that are busy, where a frame may wait for the end of a simulation; so the
+worker is chosen here, and only for a task that fits into what is free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pipeline.base.resources import fits, minus, plus
+from pipeline.base.task import Resources
+
+CPU_TAG, MEMORY_TAG, GPU_TAG = "CPU", "MEM", "GPU"
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A Dask worker.
+
+    Attributes:
+        address: where it listens.
+        identity: name of this incarnation; one that was restarted at the same address has another.
+        host: its machine.
+        resources: what tasks may occupy of it.
+        tags: the resource tags that it has. Dask runs no task that asks for a tag which its worker does not have.
+    """
+
+    address: str
+    identity: str
+    host: str
+    resources: Resources
+    tags: frozenset[str] = frozenset()
+
+    def demand(self, need: Resources) -> dict[str, float]:
+        """A need in this worker's tags, so that Dask keeps several runners from taking the same cores."""
+        amounts = {CPU_TAG: need.cores, MEMORY_TAG: need.memory_bytes, GPU_TAG: need.gpus}
+        return {tag: float(amount) for tag, amount in amounts.items() if amount and tag in self.tags}
+
+
+def offered(tags: Mapping[str, float], *, threads: int, memory_bytes: int) -> Resources:
+    """What a worker offers, by its tags; without a tag, its number of threads, its memory limit, and no GPU."""
+    return Resources(
+        cores=int(tags.get(CPU_TAG, threads)),
+        memory_bytes=int(tags.get(MEMORY_TAG, memory_bytes)),
+        gpus=int(tags.get(GPU_TAG, 0)),
+    )
+
+
+def offer_from(address: str, info: Mapping[str, Any], *, identity: str) -> Offer:
+    """An offer from what Dask's scheduler tells of a worker."""
+    tags = info["resources"]
+    resources = offered(tags, threads=info["nthreads"], memory_bytes=info["memory_limit"])
+    return Offer(address, identity, info["host"], resources, frozenset(tags))
+
+
+@dataclass(slots=True)
+class _Worker:
+    offer: Offer
+    free: Resources
+    threads: int
+    stages: set[str] = field(default_factory=set)
+    trusted: bool = True
+
+
+class Slots:
+    """What of the workers is free. Not safe to use from several threads."""
+
+    def __init__(self) -> None:
+        self._workers: dict[str, _Worker] = {}
+        self._seen: set[Resources] = set()
+
+    @property
+    def offers(self) -> list[Offer]:
+        """The workers that tasks are given to."""
+        return [worker.offer for worker in self._workers.values() if worker.trusted]
+
+    @property
+    def total(self) -> Resources:
+        """All workers together."""
+        total = Resources(0, 0, 0)
+        for offer in self.offers:
+            total = plus(total, offer.resources)
+        return total
+
+    @property
+    def largest(self) -> Resources:
+        """The most that a single worker has, of each; no worker need have all of it, see `clamp`."""
+        offers = [offer.resources for offer in self.offers]
+        return Resources(
+            cores=max((each.cores for each in offers), default=0),
+            memory_bytes=max((each.memory_bytes for each in offers), default=0),
+            gpus=max((each.gpus for each in offers), default=0),
+        )
+
+    def update(self, offers: Mapping[str, tuple[Offer, int]], present: Collection[str] = ()) -> None:
+        """Take in which workers there are now, by address, with their number of threads.
+
+        One that went takes what was taken of it with it; one that came back as another incarnation is free. One that is
+        there still and offers nothing, because it is paused or has yet to say who it is, keeps its tasks meanwhile.
+
+        Args:
+            offers: those that tasks may be given to.
+            present: addresses of others that are there.
+        """
+        for address, worker in [*self._workers.items()]:
+            if address in offers:
+                if offers[address][0].identity != worker.offer.identity:
+                    del self._workers[address]
+            elif address in present:
+                worker.trusted = False
+            else:
+                del self._workers[address]
+        for address, (offer, threads) in offers.items():
+            self._workers.setdefault(address, _Worker(offer, offer.resources, threads)).trusted = True
+            self._seen.add(offer.resources)
+
+    def remove(self, address: str) -> None:
+        """Give the worker at this address nothing more, until an update lists it again; it keeps what it has."""
+        if address in self._workers:
+            self._workers[address].trusted = False
+
+    def clamp(self, need: Resources) -> Resources:
+        """A need that a single worker can meet, where the given one is put together from several.
+
+        Who asks for more cores and memory than there are together gets all of one worker: that with the most memory of
+        those with enough GPUs. Workers that went count: a need that one of them met waits for its like.
+        """
+        able = [each for each in self._seen if need.gpus <= each.gpus]
+        if not able or any(fits(need, each) for each in able):
+            return need
+        best = max(able, key=lambda each: (min(need.memory_bytes, each.memory_bytes), each.cores, -each.gpus))
+        return Resources(min(need.cores, best.cores), min(need.memory_bytes, best.memory_bytes), need.gpus)
+
+    def take(self, need: Resources, *, stage: str, reserved: Iterable[str] = ()) -> Offer | None:
+        """Choose a worker for a task and take what the task needs of it; None when it fits nowhere now.
+
+        Of those that it fits on, one that has run the stage before, so that Blender is warm there; else the fullest, so
+        that room is left for tasks that need more.
+
+        Args:
+            need: what the task occupies.
+            stage: its stage.
+            reserved: addresses that are kept for others.
+        """
+        fitting = [
+            worker
+            for address, worker in self._workers.items()
+            if worker.trusted and address not in reserved and worker.threads > 0 and fits(need, worker.free)
+        ]
+        if not fitting:
+            return None
+        best = min(fitting, key=lambda each: (stage not in each.stages, each.free.cores, each.offer.address))
+        best.free = minus(best.free, need)
+        best.threads -= 1
+        best.stages.add(stage)
+        return best.offer
+
+    def emptiest(self, need: Resources, *, reserved: Iterable[str] = ()) -> str | None:
+        """Address of the worker that will have room for this need first, going by its free cores; None: none ever."""
+        able = [
+            worker
+            for address, worker in self._workers.items()
+            if worker.trusted and address not in reserved and fits(need, worker.offer.resources)
+        ]
+        return max(able, key=lambda each: (each.free.cores, each.offer.address)).offer.address if able else None
+
+    def give_back(self, offer: Offer, need: Resources) -> None:
+        """A task has ended; nothing happens if its worker is gone."""
+        worker = self._workers.get(offer.address)
+        if worker is not None and worker.offer.identity == offer.identity:
+            worker.free = plus(worker.free, need)
+            worker.threads += 1

@@ -1,0 +1,61 @@
+"""The executor for looking into a stage: runs each assignment here and now, where a debugger can follow it."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from contextlib import ExitStack, redirect_stderr, redirect_stdout
+from dataclasses import replace
+
+from pipeline.base.task import FailureKind, TaskId
+from pipeline.run.events import Failed, TaskEvent
+from pipeline.run.executors.attempt import run_attempt
+from pipeline.run.executors.base import Assignment, ShutDownOnExit
+from pipeline.stages.gpus import first_gpu
+
+
+class InlineExecutor(ShutDownOnExit):
+    """Runs one assignment per `wait`, in the calling process; what it prints goes into the attempt's log.
+
+    Nothing interrupts a running task here, so `cancel` and timeouts act only on tasks that have not begun, and what a
+    C library prints stays on the terminal.
+    """
+
+    def __init__(self) -> None:
+        self._queue: deque[Assignment] = deque()
+        self._events: list[TaskEvent] = []
+
+    def submit(self, assignment: Assignment) -> None:
+        """Put the attempt into the queue."""
+        self._queue.append(replace(assignment, gpu=first_gpu(assignment.task)) if assignment.need.gpus else assignment)
+
+    def wait(self, timeout_s: float) -> list[TaskEvent]:
+        """Run the next assignment to its end, however long that takes."""
+        if not self._events and self._queue:
+            self._run(self._queue.popleft())
+        elif not self._events:
+            time.sleep(timeout_s)
+        events, self._events = self._events, []
+        return events
+
+    def cancel(self, task_id: TaskId, *, grace_s: float) -> None:  # noqa: ARG002 - nothing that runs can be here
+        """Take a task out of the queue."""
+        for assignment in [assignment for assignment in self._queue if assignment.task.id == task_id]:
+            self._queue.remove(assignment)
+            self._events.append(Failed(task_id, assignment.attempt, FailureKind.CANCELLED, "cancelled"))
+
+    def shutdown(self) -> None:
+        """Take everything out of the queue."""
+        for assignment in list(self._queue):
+            self.cancel(assignment.task.id, grace_s=0.0)
+
+    def _run(self, assignment: Assignment) -> None:
+        with ExitStack() as output:
+
+            def open_log() -> None:
+                assignment.log.parent.mkdir(parents=True, exist_ok=True)
+                log = output.enter_context(assignment.log.open("a", encoding="utf-8"))
+                output.enter_context(redirect_stdout(log))
+                output.enter_context(redirect_stderr(log))
+
+            run_attempt(assignment, self._events.append, stop_requested=lambda: False, prepare=open_log)

@@ -1,0 +1,242 @@
+"""One worker process as its supervisor sees it: how it is started, watched and ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from math import inf
+from pathlib import Path
+
+import psutil
+
+from pipeline.base.memory import out_of_memory_kills, process_tree, tree_memory_bytes
+from pipeline.base.task import FailureKind
+from pipeline.run.events import Failed, Progress
+from pipeline.run.executors.base import Assignment
+from pipeline.run.executors.channel import Channel
+from pipeline.run.executors.worker import STACK_DUMP_SIGNAL
+from render.temporary_folder import environment_of_child
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+_LOG_TAIL_LINES = 20
+WorkerKey = tuple[str, int, int | None]
+"""Stage, thread count and GPU."""
+_LOG_TAIL_BYTES = 16_384
+_COMMAND_SHOWN = 100
+"""How much of a command line is shown [characters]."""
+
+
+class WorkerProcess:
+    """A process that runs one assignment after another, in a session and process group of its own.
+
+    Attributes:
+        key: stage, thread count and GPU that it is warm for.
+        assignment: what it runs, or None.
+        idle: it waits for an assignment.
+        single_use: it is to be replaced after the task that it ended last.
+        resident_memory_bytes: how large it was when its last task ended.
+        tasks_done: how many tasks it has ended.
+        began: when its assignment was given to it, monotonic [s].
+        limited_since: since when the assignment's limit of time counts, monotonic [s]; inf: not yet, it prepares.
+        last_sign: when it last said anything, monotonic [s].
+        peak_memory_bytes: most that it and all it started were seen to hold together during its assignment.
+        kill_at: when its process group is killed, monotonic [s], or None.
+        verdict: what its task fails of, when it is us who end it.
+    """
+
+    def __init__(self, key: WorkerKey, first: Assignment) -> None:
+        self.key = key
+        self.assignment: Assignment | None = None
+        self.idle = False
+        self.single_use = False
+        self.resident_memory_bytes = 0
+        self.tasks_done = 0
+        self.began = self.last_sign = self.limited_since = time.monotonic()
+        self.peak_memory_bytes = 0
+        self.kill_at: float | None = None
+        self.verdict: tuple[FailureKind, str] | None = None
+        self._out_of_memory_kills = 0
+        self._process, self.channel, self._scratch = _spawn(first)
+        self.exit_descriptor = _open_exit_descriptor(self._process.pid)
+
+    @property
+    def pid(self) -> int:
+        """Process id; that of its group as well."""
+        return self._process.pid
+
+    def assign(self, assignment: Assignment) -> None:
+        """Hand over an attempt."""
+        self.idle = False
+        self.assignment = assignment
+        self.verdict = None
+        self.began = self.last_sign = self.limited_since = time.monotonic()
+        self.peak_memory_bytes = 0
+        self._out_of_memory_kills = out_of_memory_kills()
+        self.channel.send(assignment)
+
+    def note_progress(self, progress: Progress) -> None:
+        """What it prepares once for this machine takes what it takes; its limit of time counts anew from the end."""
+        if progress.preparing:
+            self.limited_since = inf
+        elif self.limited_since == inf:
+            self.limited_since = time.monotonic()
+
+    def end_assignment(self, *, failed: bool) -> None:
+        """The attempt is over; what was planned against it is off.
+
+        A worker is not used again after a failure, whose traces it may carry, nor after a long task: there is no other
+        like it to be warm for, and its memory is wanted by the stages that follow.
+        """
+        assert self.assignment is not None
+        self.single_use = failed or self.assignment.task.checkpointed
+        self.assignment = None
+        self.verdict = None
+        self.kill_at = None
+        self.tasks_done += 1
+
+    def look_at_memory(self) -> int:
+        """Resident memory of it and all that it started, now [bytes]; the peak takes note of it."""
+        size = tree_memory_bytes(self.pid)
+        self.peak_memory_bytes = max(self.peak_memory_bytes, size)
+        return size
+
+    def leave_evidence(self, sentence: str) -> None:
+        """Write into its task's log why it is about to be ended, and what its processes are doing; then their stacks.
+
+        A process that was stopped from outside is continued for that, as it could write nothing.
+        """
+        assert self.assignment is not None
+        lines = [f"the runner ends this attempt: {sentence}", *map(_describe_process, process_tree(self.pid))]
+        with suppress(OSError), self.assignment.log.open("a", encoding="utf-8") as log:  # on a full disk, without
+            log.write("\n".join(lines) + "\n")
+        with suppress(ProcessLookupError):
+            self._process.send_signal(STACK_DUMP_SIGNAL)
+            self._process.send_signal(signal.SIGCONT)
+
+    def explain_failure(self, failed: Failed) -> Failed:
+        """What it says of its task, or rather: a Blender that the kernel killed looks like one that was lost."""
+        failed = replace(failed, peak_memory_bytes=max(failed.peak_memory_bytes, self.peak_memory_bytes))
+        if failed.kind is FailureKind.WORKER_LOST and self._memory_ran_out():
+            sentence = f"{failed.message}; the kernel killed it: the machine is out of memory"
+            return replace(failed, kind=FailureKind.OUT_OF_MEMORY, message=sentence)
+        return failed
+
+    def end_by(self, deadline: float, kind: FailureKind, sentence: str) -> None:
+        """Kill it at `deadline`, monotonic [s], unless that was to happen earlier already."""
+        if self.kill_at is None or deadline < self.kill_at:
+            self.kill_at = deadline
+        self.verdict = self.verdict or (kind, sentence)
+
+    def kill(self) -> None:
+        """Kill it with everything that it started."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+
+    def has_exited(self) -> bool:
+        """Whether the process is gone."""
+        return self._process.poll() is not None
+
+    def explain_exit(self) -> tuple[FailureKind, str]:
+        """What its task failed of, now that the process is gone."""
+        if self.verdict is not None:
+            return self.verdict
+        code = self._process.returncode
+        if code == -signal.SIGKILL and self._memory_ran_out():
+            return (
+                FailureKind.OUT_OF_MEMORY,
+                f"the kernel killed worker {self._process.pid}: the machine is out of memory",
+            )
+        how = f"died of {_signal_name(-code)}" if code < 0 else f"exited with code {code}"
+        return FailureKind.WORKER_LOST, f"worker {self._process.pid} {how} in the middle of its task"
+
+    def _memory_ran_out(self) -> bool:
+        """Whether the kernel has killed a process for want of memory since the assignment was given."""
+        return out_of_memory_kills() > self._out_of_memory_kills
+
+    def close(self) -> None:
+        """Give its descriptors back, and remove its temporary folder."""
+        self.channel.close()
+        if self.exit_descriptor is not None:
+            os.close(self.exit_descriptor)
+        self._scratch.close()
+
+
+def log_tail(log: Path) -> str:
+    """The last lines of a log; empty if there is none, or none that can be read."""
+    try:
+        with log.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - _LOG_TAIL_BYTES))
+            text = file.read().decode(errors="replace")
+    except OSError:  # on a shared disk anything can be; the failure that it was to explain matters more
+        return ""
+    return "\n".join(text.splitlines()[-_LOG_TAIL_LINES:])
+
+
+def python_argv(module: str, *words: str) -> list[str]:
+    """Arguments that run a module's `main` in a fresh interpreter, which finds modules where this one does."""
+    boot = f"import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from {module} import main; main()"
+    return [sys.executable, "-c", boot, *words, json.dumps([str(Path(entry).absolute()) for entry in sys.path])]
+
+
+def _describe_process(pid: int) -> str:
+    try:
+        process = psutil.Process(pid)
+        with process.oneshot():
+            times, memory, command = process.cpu_times(), process.memory_info().rss, " ".join(process.cmdline())
+            return (
+                f"  process {pid}, {process.status()}, {times.user + times.system:.1f} s of processor time, "
+                f"{memory / 1e6:.0f} MB: {command[:_COMMAND_SHOWN]}"
+            )
+    except psutil.Error:
+        return f"  process {pid} has ended"
+
+
+def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, ExitStack]:
+    """Start a fresh interpreter; what it prints before its first task goes into that task's log.
+
+    Its temporary folder is its own: Blender and Taichi leave theirs behind where they are killed. The last of what is
+    returned removes it.
+    """
+    first.log.parent.mkdir(parents=True, exist_ok=True)
+    ours, theirs = socket.socketpair()
+    with ExitStack() as on_failure, theirs, first.log.open("ab") as log:
+        on_failure.enter_context(ours)
+        # What somebody still writes goes with the worker's guardian.
+        scratch = on_failure.enter_context(ExitStack())
+        environment = scratch.enter_context(environment_of_child("pipeline-worker-"))
+        process = subprocess.Popen(
+            python_argv("pipeline.run.executors.worker", str(theirs.fileno()), str(os.getpid()), environment["TMPDIR"]),
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+            env={**environment, **dict.fromkeys(THREAD_VARIABLES, str(first.threads))},
+        )
+        on_failure.pop_all()
+    return process, Channel(ours), scratch
+
+
+def _open_exit_descriptor(pid: int) -> int | None:
+    """A descriptor that becomes readable when the process ends, where the system has such."""
+    if not hasattr(os, "pidfd_open"):
+        return None
+    try:
+        return os.pidfd_open(pid)
+    except OSError:  # a kernel before 5.3, or a sandbox that forbids it: exits are then polled for
+        return None
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -1,0 +1,106 @@
+"""Which of the tasks that are ready gets its resources next: the most urgent that fits, and none is starved.
+
+Part of the scheduler, and as pure: it does no input or output and has no clock.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import defaultdict
+from typing import NamedTuple
+
+from pipeline.base.resources import fits, minus, plus
+from pipeline.base.task import Resources, TaskId
+
+Priority = tuple[int, int, int]
+"""The lower, the more urgent; no two tasks have the same."""
+
+
+class _Claim(NamedTuple):
+    """A task and what it needs."""
+
+    task_id: TaskId
+    need: Resources
+
+
+class Packing:
+    """The tasks that are ready, in their order, and what those that have been taken leave free.
+
+    Args:
+        machine: the most that one task may need.
+        capacity: what may be used at a time, where that is more than one machine.
+
+    Attributes:
+        machine: the same.
+        free: what no task occupies. Less than nothing where a machine went whose tasks still count.
+    """
+
+    def __init__(self, *, machine: Resources, capacity: Resources) -> None:
+        self.machine = machine
+        self._capacity = self._at_least_a_machine(capacity)
+        self.free = self._capacity
+        self._ready: defaultdict[Resources, list[tuple[Priority, TaskId]]] = defaultdict(list)
+        self._blocked: _Claim | None = None
+        self._overtakers: dict[TaskId, Resources] = {}
+
+    @property
+    def has_ready(self) -> bool:
+        """Whether any task waits to be taken."""
+        return any(self._ready.values())
+
+    def resize(self, offered: Resources) -> None:
+        """Machines came or went: all that there are now offer this much together."""
+        capacity = self._at_least_a_machine(offered)
+        self.free = plus(self.free, minus(capacity, self._capacity))
+        self._capacity = capacity
+
+    def add(self, task_id: TaskId, *, need: Resources, priority: Priority) -> None:
+        """A task is ready."""
+        heapq.heappush(self._ready[need], (priority, task_id))
+
+    def give_back(self, task_id: TaskId, need: Resources) -> None:
+        """A task that was taken occupies nothing any more."""
+        self._overtakers.pop(task_id, None)
+        self.free = plus(self.free, need)
+
+    def take(self) -> TaskId | None:
+        """Take the most urgent task that fits, without starving a bigger one that is more urgent; it occupies its need.
+
+        When the most urgent task does not fit, others may overtake it only as long as it would fit beside all who did:
+        once those end that ran before it was blocked, it starts.
+        """
+        heaps = sorted(((need, heap) for need, heap in self._ready.items() if heap), key=lambda each: each[1][0])
+        for position, (need, heap) in enumerate(heaps):
+            candidate = _Claim(heap[0][1], need)
+            if position == 0 and self._blocked != candidate:
+                self._blocked = None
+            if not fits(need, self.free):
+                if position == 0 and self._blocked is None:
+                    self._blocked = candidate
+                    self._overtakers = {}
+                continue
+            if self._blocked not in (None, candidate) and self._would_delay_blocked(need):
+                continue
+            heapq.heappop(heap)
+            if candidate == self._blocked:
+                self._blocked = None
+            elif self._blocked is not None:
+                self._overtakers[candidate.task_id] = need
+            self.free = minus(self.free, need)
+            return candidate.task_id
+        return None
+
+    def _would_delay_blocked(self, need: Resources) -> bool:
+        assert self._blocked is not None
+        left = minus(self._capacity, self._blocked.need)
+        for taken in self._overtakers.values():
+            left = minus(left, taken)
+        return not fits(need, left)
+
+    def _at_least_a_machine(self, capacity: Resources) -> Resources:
+        """A capacity that a task can claim its machine of: it waits for one that went, and does not block for ever."""
+        return Resources(
+            cores=max(self.machine.cores, capacity.cores),
+            memory_bytes=max(self.machine.memory_bytes, capacity.memory_bytes),
+            gpus=max(self.machine.gpus, capacity.gpus),
+        )

@@ -1,0 +1,403 @@
+"""From a job to its tasks, and from tasks and the record to what would run, and why. Pure: no file is touched here."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, NamedTuple
+
+from pipeline.base.errors import PlanError
+from pipeline.base.fingerprint import task_fingerprint
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet, explain_difference
+from pipeline.base.paused_gc import many_objects
+from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.record.reader import ArtifactRow, StageCost
+from pipeline.record.reconcile import FileCondition, FileProblem
+
+if TYPE_CHECKING:
+    from pipeline.model.job import Job
+    from pipeline.stages.base import Stage
+
+
+NEVER_MADE = "never made"
+"""The reason of outputs that are not on record, as a group of reasons says it."""
+
+
+_CONDITION_WORDING = {
+    FileCondition.MISSING: "file is missing",
+    FileCondition.EDITED: "file was edited by hand; the edited one will be kept aside",
+    FileCondition.INTERRUPTED: "its commit was cut short",
+}
+
+
+class Verdict(StrEnum):
+    """What would become of a task."""
+
+    UP_TO_DATE = "up to date"
+    STALE = "stale"
+    """It will run."""
+    DOWNSTREAM = "downstream"
+    """Its inputs will be made anew; it runs if they turn out different."""
+
+
+class Reason(NamedTuple):
+    """Why a task is not up to date.
+
+    Attributes:
+        text: about this one task.
+        group: the same for many tasks alike, without what is particular to one.
+    """
+
+    text: str
+    group: str
+
+
+@dataclass(frozen=True, slots=True)
+class Assessment:
+    """One task's verdict.
+
+    Attributes:
+        task: the task.
+        verdict: what would become of it.
+        reasons: why; empty if it is up to date.
+        rebuilds: the outputs that would be made, or made anew. Of a checkpointed task only those that need it.
+    """
+
+    task: Task
+    verdict: Verdict
+    reasons: tuple[Reason, ...] = ()
+    rebuilds: tuple[ArtifactPath, ...] = ()
+
+
+class Estimate(NamedTuple):
+    """What a stage's share of a plan would take; None where nothing is known of it yet."""
+
+    stage: str
+    artifacts: int
+    seconds: float | None
+    bytes: float | None
+
+
+def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage], until: Sequence[str] = ()) -> list[Task]:
+    """The tasks of a job, makers before users.
+
+    Args:
+        job: the job.
+        layout: its folder.
+        stages: every stage, makers before users.
+        until: the stages after which it ends: only their tasks and what these need; empty: all. What comes after them
+            is not even asked for a plan, as that may need a Blender.
+
+    Raises:
+        PlanError: two tasks share a name or an output, an input has no maker, tasks wait for each other in a circle, or
+            the job has no task of a stage that it is to end after.
+    """
+    with many_objects():
+        if not until:
+            return in_order([task for stage in stages for task in stage.plan(job, layout)])
+        names = [stage.name for stage in stages]
+        for name in until:
+            if name not in names:
+                raise PlanError(f'no stage "{name}"; the stages are {", ".join(names)}')
+        last = max(names.index(name) for name in until)
+        tasks = in_order([task for stage in stages[: last + 1] for task in stage.plan(job, layout)])
+        for name in until:
+            if all(task.stage != name for task in tasks):
+                theirs = ", ".join(dict.fromkeys(task.stage for task in tasks)) or "none before it"
+                raise PlanError(f'this job has nothing for the stage "{name}"; it has {theirs}')
+        return made_from({task.id for task in tasks if task.stage in until}, tasks)
+
+
+def made_from(targets: Collection[TaskId], tasks: Sequence[Task]) -> list[Task]:
+    """These tasks and all that they are made from, in the order of the plan."""
+    makers = {output: each for each in tasks for output in each.outputs}
+    needed, waiting = set(targets), [each for each in tasks if each.id in targets]
+    while waiting:
+        for artifact in waiting.pop().inputs:
+            maker = makers[artifact]
+            if maker.id not in needed:
+                needed.add(maker.id)
+                waiting.append(maker)
+    return [each for each in tasks if each.id in needed]
+
+
+def in_order(tasks: Sequence[Task]) -> list[Task]:
+    """The tasks with makers before users.
+
+    Raises:
+        PlanError: see `plan_job`.
+    """
+    makers: dict[ArtifactPath, TaskId] = {}
+    names: set[TaskId] = set()
+    for task in tasks:
+        if task.id in names:
+            raise PlanError(f"two tasks are called {task.id}")
+        names.add(task.id)
+        for output in task.outputs:
+            if output in makers:
+                raise PlanError(f"{output} is made by two tasks, {makers[output]} and {task.id}")
+            makers[output] = task.id
+    if _makers_first(tasks, makers):
+        return [*tasks]
+    waiting: dict[TaskId, int] = {}
+    users: dict[TaskId, list[Task]] = {}
+    for task in tasks:
+        made_by = {makers[path] for path in task.inputs}
+        waiting[task.id] = len(made_by)
+        for maker in made_by:
+            users.setdefault(maker, []).append(task)
+    ready = deque(task for task in tasks if not waiting[task.id])
+    ordered: list[Task] = []
+    while ready:
+        task = ready.popleft()
+        ordered.append(task)
+        for user in users.get(task.id, ()):
+            waiting[user.id] -= 1
+            if not waiting[user.id]:
+                ready.append(user)
+    if len(ordered) < len(tasks):
+        stuck = [task.id for task in tasks if waiting[task.id]]
+        raise PlanError(f"{len(stuck)} tasks wait for each other in a circle, {stuck[0]} among them")
+    return ordered
+
+
+def _makers_first(tasks: Sequence[Task], makers: Mapping[ArtifactPath, TaskId]) -> bool:
+    """Whether the tasks stand in order already, as those of stages in order do; checks that every input is made."""
+    seen: set[TaskId] = set()
+    in_order = True
+    for task in tasks:
+        for path in task.inputs:
+            maker = makers.get(path)
+            if maker is None:
+                raise PlanError(f"{task.id} reads {path}, which no task makes")
+            in_order = in_order and maker in seen
+        seen.add(task.id)
+    return in_order
+
+
+def up_to_date(task: Task, rows: Mapping[ArtifactPath, ArtifactRow]) -> bool:
+    """Whether every output is there with the fingerprint that the task has now.
+
+    This is the early cutoff at dispatch: asked once a task's inputs are committed, it saves the run if what was made
+    anew upstream turned out the same.
+
+    Args:
+        task: a task whose inputs are all in `rows`.
+        rows: the artifacts that are valid now.
+    """
+    fingerprint = task_fingerprint(task, input_hashes(task, rows))
+    return all(output in rows and rows[output].fingerprint == fingerprint for output in task.outputs)
+
+
+def input_hashes(task: Task, rows: Mapping[ArtifactPath, ArtifactRow]) -> dict[ArtifactPath, str]:
+    """Content hash of each of a task's inputs."""
+    return {path: rows[path].hash for path in task.inputs}
+
+
+def assess(
+    tasks: Sequence[Task],
+    rows: Mapping[ArtifactPath, ArtifactRow],
+    problems: Mapping[ArtifactPath, FileProblem],
+    *,
+    parameters: Callable[[str], ParameterSet | None],
+    forced: frozenset[TaskId] = frozenset(),
+) -> list[Assessment]:
+    """What would run, and why.
+
+    Args:
+        tasks: the plan, makers before users.
+        rows: the artifacts on record.
+        problems: the recorded artifacts whose file does not count; see `reconcile.inspect_files`.
+        parameters: finds an old parameter set by its digest, to name what changed: `Manifest.parameters`.
+        forced: tasks that are to run again whatever the record says.
+    """
+    with many_objects():
+        return [*_Assessor(rows, problems, parameters, forced).assess(tasks)]
+
+
+class _Assessor:
+    """Walks the plan from makers to users, and remembers which artifacts will be made anew."""
+
+    def __init__(
+        self,
+        rows: Mapping[ArtifactPath, ArtifactRow],
+        problems: Mapping[ArtifactPath, FileProblem],
+        parameters: Callable[[str], ParameterSet | None],
+        forced: frozenset[TaskId],
+    ) -> None:
+        self._rows = rows
+        self._problems = problems
+        self._parameters = parameters
+        self._forced = forced
+        self._rebuilt: set[ArtifactPath] = set()
+        self._parameter_reasons = cache(self._compare_parameters)
+
+    def assess(self, tasks: Iterable[Task]) -> Iterator[Assessment]:
+        for task in tasks:
+            assessment = self._assess(task)
+            self._rebuilt.update(assessment.rebuilds)
+            yield assessment
+
+    def _assess(self, task: Task) -> Assessment:
+        if task.id in self._forced:
+            return Assessment(task, Verdict.STALE, (_same("to be run again, as asked"),), task.outputs)
+        rebuilt = [path for path in task.inputs if path in self._rebuilt]
+        fingerprint = None if rebuilt else task_fingerprint(task, input_hashes(task, self._rows))
+        if len(task.outputs) == 1:  # as for nearly every task of a large job
+            reasons = self._reasons(task, task.outputs[0], fingerprint)
+            if reasons:
+                return Assessment(task, Verdict.STALE, reasons, task.outputs)
+            if not rebuilt:
+                return Assessment(task, Verdict.UP_TO_DATE)
+        found = {output: self._reasons(task, output, fingerprint) for output in task.outputs}
+        bad = {output: reasons for output, reasons in found.items() if reasons}
+        if bad:
+            return Assessment(
+                task, Verdict.STALE, _collect(bad, len(found)), tuple(bad) if task.checkpointed else task.outputs
+            )
+        if rebuilt:
+            reasons = _abridge(
+                Reason(f"{path} will be made anew", f"{_kind(path)} will be made anew") for path in rebuilt
+            )
+            return Assessment(task, Verdict.DOWNSTREAM, reasons, task.outputs)
+        return Assessment(task, Verdict.UP_TO_DATE)
+
+    def _reasons(self, task: Task, output: ArtifactPath, fingerprint: str | None) -> tuple[Reason, ...]:
+        """Why one output does not count; `fingerprint` is None if an input will be made anew."""
+        row = self._rows.get(output)
+        if row is None:
+            return (Reason(f"{output} was never made", NEVER_MADE),)
+        if output in self._problems:
+            problem = self._problems[output]
+            return (Reason(f"{output}: {problem.reason}", _CONDITION_WORDING[problem.condition]),)
+        if row.parameters != task.parameters.digest:
+            return self._parameter_reasons(row.parameters, task.parameters)
+        if row.fingerprint == fingerprint:
+            return ()
+        return _abridge(self._compare_inputs(task, row, certain=fingerprint is not None))
+
+    def _compare_parameters(self, old_digest: str, new: ParameterSet) -> tuple[Reason, ...]:
+        old = self._parameters(old_digest)
+        if old is None:
+            return (_same("its parameters changed; what they were is not on record"),)
+        return tuple(_same(clause) for clause in explain_difference(old, new))
+
+    def _compare_inputs(self, task: Task, row: ArtifactRow, *, certain: bool) -> Iterator[Reason]:
+        """What differs from the inputs of last time. Those that will be made anew cannot be compared yet."""
+        used: dict[str, str] = json.loads(row.inputs)
+        if not used:
+            if certain:
+                yield _same("its inputs changed")
+            return
+        for path in task.inputs:
+            if path not in used:
+                yield Reason(f"{path} is a new input", f"inputs from {_kind(path)} were added")
+            elif path not in self._rebuilt and used[path] != self._rows[path].hash:
+                yield Reason(f"{path} changed", f"{_kind(path)} changed")
+        for gone in sorted(used.keys() - set(task.inputs)):
+            yield Reason(f"{gone} is no input any more", f"inputs from {_kind(gone)} were dropped")
+
+
+def summarize(assessments: Iterable[Assessment]) -> list[str]:
+    """Human lines, many tasks in one: `render 0-119: stale, camera.position changed from [0, -5, 2] to [0, -4, 2]`."""
+    frames: dict[str, list[int]] = {}
+    groups: dict[tuple[str, Verdict, tuple[str, ...]], list[Task]] = {}
+    for assessment in assessments:
+        task = assessment.task
+        if task.frame is not None:
+            frames.setdefault(_label(task), []).append(task.frame)
+        reasons = tuple(dict.fromkeys(reason.group for reason in assessment.reasons))
+        groups.setdefault((_label(task), assessment.verdict, reasons), []).append(task)
+    lines = []
+    for (label, verdict, reasons), tasks in groups.items():
+        wanted = {task.frame for task in tasks if task.frame is not None}
+        name = f"{label} {frame_ranges(wanted, frames[label])}" if wanted else label
+        lines.append(": ".join([name, ", ".join([_WORDING[verdict], *reasons])]))
+    return lines
+
+
+_WORDING = {
+    Verdict.UP_TO_DATE: "up to date",
+    Verdict.STALE: "stale",
+    Verdict.DOWNSTREAM: "runs if its inputs turn out different",
+}
+
+
+def frame_ranges(frames: Iterable[int], planned: Iterable[int]) -> str:
+    """Frames in short, as `0-11, 13`; a range runs over frames that follow each other in the plan."""
+    rank = {frame: index for index, frame in enumerate(sorted(set(planned)))}
+    runs: list[list[int]] = []
+    for frame in sorted(set(frames)):
+        if runs and rank[frame] == rank[runs[-1][-1]] + 1:
+            runs[-1].append(frame)
+        else:
+            runs.append([frame])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+
+
+def estimate(assessments: Iterable[Assessment], costs: Mapping[str, StageCost]) -> list[Estimate]:
+    """What the plan would take, per stage, going by what the same stage has taken before (`stage_costs`).
+
+    Time is that of one task after the other [s]; tasks that run only if their inputs differ count in full.
+    """
+    artifacts: dict[str, int] = {}
+    for assessment in assessments:
+        stage = assessment.task.stage
+        artifacts[stage] = artifacts.get(stage, 0) + len(assessment.rebuilds)
+    return [
+        Estimate(
+            stage,
+            count,
+            costs[stage].seconds_per_artifact * count if stage in costs else None,
+            costs[stage].bytes_per_artifact * count if stage in costs else None,
+        )
+        for stage, count in artifacts.items()
+        if count
+    ]
+
+
+def _abridge(reasons: Iterable[Reason]) -> tuple[Reason, ...]:
+    """One reason for each kind; where there are several, the first and how many more."""
+    texts: dict[str, list[str]] = {}
+    for reason in reasons:
+        texts.setdefault(reason.group, []).append(reason.text)
+    return tuple(
+        Reason(members[0] if len(members) == 1 else f"{members[0]}, and {len(members) - 1} more like it", group)
+        for group, members in texts.items()
+    )
+
+
+def _collect(found: Mapping[ArtifactPath, tuple[Reason, ...]], outputs: int) -> tuple[Reason, ...]:
+    """The reasons of a task's outputs as the task's; where several outputs share a kind, how many of them do."""
+    texts: dict[str, list[str]] = {}
+    for reasons in found.values():
+        for reason in reasons:
+            texts.setdefault(reason.group, []).append(reason.text)
+    return tuple(
+        Reason(members[0], group)
+        if len(members) == 1
+        else _same(group if len(members) == outputs else f"{len(members)} of {outputs} files: {group}")
+        for group, members in texts.items()
+    )
+
+
+def _label(task: Task) -> str:
+    if task.frame is None:
+        return task.id
+    return f"{task.stage} {task.subject}" if task.subject else task.stage
+
+
+def _kind(path: str) -> str:
+    """What a frame's artifact is one of: its folder. One outside any folder is one of its own."""
+    parent = PurePosixPath(path).parent
+    return path if parent == PurePosixPath() else f"{parent}/"
+
+
+def _same(sentence: str) -> Reason:
+    return Reason(sentence, sentence)

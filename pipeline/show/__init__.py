@@ -1,0 +1,1 @@
+"""What people look at beside the film: stills, animatics, reports, exports."""

@@ -1,0 +1,258 @@
+"""`pipeline doctor`: does this machine have what a job needs?
+
+Whatever loads foreign code (Blender, OpenVDB, codecs, device drivers) is tried in a child process, so that a crash in
+there is a finding. The doctor itself always ends with a report.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from render.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
+
+Status = Literal["ok", "warning", "failed"]
+
+PROBE_TIMEOUT_S = 180.0
+LITTLE_MEMORY_BYTES = 4e9
+LITTLE_DISK_BYTES = 5e9
+"""The quickstart takes a few hundred MB, a film of a million particles tens of GB."""
+
+_EXCEPTION_NAME = re.compile(r"^[\w.]+(Error|Exception): ")
+
+_BPY_PROBE = "import bpy; print('Blender', bpy.app.version_string, 'as the bpy module')"
+_OPENVDB_PROBE = """
+from render.volume import import_openvdb
+vdb = import_openvdb()
+print('OpenVDB', '.'.join(map(str, vdb.LIBRARY_VERSION)) if hasattr(vdb, 'LIBRARY_VERSION') else '')
+"""
+_CODEC_PROBE = """
+import av
+av.codec.Codec('libx264', 'w')
+print('libx264 in PyAV', av.__version__)
+"""
+_SURFACE_PROBE = """
+import pysplashsurf
+from importlib.metadata import version
+print('pysplashsurf', version('pysplashsurf'))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """One thing that was looked at.
+
+    Attributes:
+        name: what.
+        status: ok; warning: some jobs cannot run, or run slowly; failed: no job can run to its end.
+        detail: what was found.
+        remedy: what to do, or "".
+    """
+
+    name: str
+    status: Status
+    detail: str
+    remedy: str = ""
+
+    def as_json(self) -> dict[str, str]:
+        """For `--json`."""
+        return asdict(self)
+
+
+def examine(output: Path) -> list[Examination]:
+    """Look at everything; `output` is the folder that results go to. Takes some seconds."""
+    examinations: list[tuple[str, Callable[[], Iterable[Examination]]]] = [
+        ("Python", _examine_python),
+        ("shared libraries", _examine_shared_libraries),
+        ("devices", _examine_devices),
+        ("Blender", _examine_blender),
+        ("Cycles GPU", _examine_render_gpus),
+        ("OpenVDB", lambda: [_examine_import("OpenVDB", _OPENVDB_PROBE, "warning", "smoke needs the bpy package")]),
+        ("surfaces", lambda: [_examine_import("surfaces", _SURFACE_PROBE, "failed", _SYNC)]),
+        ("video", lambda: [_examine_import("video", _CODEC_PROBE, "failed", _SYNC)]),
+        ("processor", _examine_processor),
+        ("memory", _examine_memory),
+        ("output folder", lambda: _examine_output(output)),
+    ]
+    with ThreadPoolExecutor(max_workers=4) as pool:
+        results = pool.map(lambda item: _guarded(*item), examinations)
+    return [each for result in results for each in result]
+
+
+def print_report(examinations: Iterable[Examination]) -> None:
+    """A table for people."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    marks = {"ok": "[green]ok[/]", "warning": "[yellow]warning[/]", "failed": "[red]failed[/]"}
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for each in examinations:
+        remedy = f"\n[bold]→ {escape(each.remedy)}[/]" if each.remedy else ""
+        table.add_row(marks[each.status], each.name, escape(each.detail) + remedy)
+    Console().print(table)
+
+
+_SYNC = "run ./run once; it installs requirements.lock"
+
+
+def _guarded(name: str, look: Callable[[], Iterable[Examination]]) -> list[Examination]:
+    """An examination that fails itself is a finding as well: the report must come whatever the machine is like."""
+    try:
+        return list(look())
+    except Exception as error:
+        return [Examination(name, "failed", f"could not be examined: {type(error).__name__}: {error}")]
+
+
+def _examine_python() -> Iterable[Examination]:
+    found = f"{platform.python_implementation()} {platform.python_version()} on {platform.platform()}"
+    if sys.version_info[:2] in ((3, 11), (3, 13)):
+        yield Examination("Python", "ok", found)
+    else:
+        yield Examination(
+            "Python", "warning", f"{found}, for which there is no bpy", "use Python 3.11 or 3.13, or [render] blender"
+        )
+
+
+def _examine_shared_libraries() -> Iterable[Examination]:
+    missing = missing_libraries()
+    if missing:
+        yield Examination(
+            "shared libraries",
+            "failed",
+            f"missing: {', '.join(missing)}",
+            install_line(DEBIAN_PACKAGES[library] for library in missing),
+        )
+    else:
+        yield Examination("shared libraries", "ok", "all that Blender and Taichi link to")
+
+
+def _examine_devices() -> Iterable[Examination]:
+    from sim.core.runtime import available_devices
+
+    for device, answer in available_devices().items():
+        if answer == "ok":
+            yield Examination(f"device {device}", "ok", "computes")
+        elif device == "cpu":
+            yield Examination("device cpu", "failed", answer, _SYNC)
+        else:
+            yield Examination(f"device {device}", "ok", f"not used: {answer}")
+
+
+def _examine_blender() -> Iterable[Examination]:
+    succeeded, answer = _run_child(_BPY_PROBE)
+    executable = shutil.which("blender")
+    if succeeded:
+        yield Examination("Blender", "ok", answer)
+    elif executable:
+        yield Examination(
+            "Blender", "warning", f"no bpy module; {executable} is there", f'[render] blender = "{executable}"'
+        )
+    else:
+        yield Examination(
+            "Blender", "failed", answer, 'install Blender 4.5 or newer and set [render] blender = "/path"'
+        )
+
+
+def _examine_render_gpus() -> Iterable[Examination]:
+    """What Blender finds now, whatever is remembered."""
+    from importlib.metadata import version
+    from importlib.util import find_spec
+
+    from pipeline.stages.gpu_kernels import kernels_marker
+    from render.gpus import find_gpus
+
+    if find_spec("bpy") is None:
+        return
+    probe = find_gpus(None)
+    preferred = probe.of_kind("auto")
+    for gpu in probe.gpus:
+        kernels = "compiled" if kernels_marker(str(gpu), version("bpy")).exists() else "to be compiled"
+        place = f"GPU {preferred.index(gpu)}" if gpu in preferred else f'with render.device = "{gpu.backend.lower()}"'
+        yield Examination("Cycles GPU", "ok", f"{gpu}, {place}; kernels {kernels}, if the driver has to")
+    if probe.trouble:
+        yield Examination("Cycles GPU", "warning", probe.trouble, 'use render.device = "cpu", or look at the driver')
+    elif not probe.gpus:
+        yield Examination("Cycles GPU", "ok", "none found: frames are drawn on the processor")
+
+
+def _examine_import(name: str, code: str, otherwise: Status, remedy: str) -> Examination:
+    succeeded, answer = _run_child(code)
+    return Examination(name, "ok", answer) if succeeded else Examination(name, otherwise, answer, remedy)
+
+
+def _examine_processor() -> Iterable[Examination]:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    yield Examination("processor", "ok", f"{usable} of {os.cpu_count()} cores, {platform.machine()}")
+
+
+def _examine_memory() -> Iterable[Examination]:
+    import psutil
+
+    memory = psutil.virtual_memory()
+    found = f"{memory.total / 1e9:.1f} GB, {memory.available / 1e9:.1f} GB of it free"
+    if memory.total < LITTLE_MEMORY_BYTES:
+        yield Examination("memory", "warning", found, "keep to small jobs, or --preview")
+    else:
+        yield Examination("memory", "ok", found)
+
+
+def _examine_output(output: Path) -> Iterable[Examination]:
+    folder = next(each for each in (output.absolute(), *output.absolute().parents) if each.exists())
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"written")
+            file.flush()
+    except OSError as error:
+        yield Examination(
+            "output folder", "failed", f"{folder} cannot be written: {error.strerror}", "choose another with --output"
+        )
+        return
+    free = shutil.disk_usage(folder).free
+    found = f"{folder}: writable, {free / 1e9:.1f} GB free"
+    if free < LITTLE_DISK_BYTES:
+        yield Examination("output folder", "warning", found, "free some space, or choose another with --output")
+    else:
+        yield Examination("output folder", "ok", found)
+
+
+def _run_child(code: str) -> tuple[bool, str]:
+    """Run Python code in a child process: whether it succeeded, and its last line or what ended it."""
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", code],
+            check=False,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            stdin=subprocess.DEVNULL,
+            timeout=PROBE_TIMEOUT_S,
+            env={**os.environ, "PYTHONPATH": _search_path()},
+        )
+    except subprocess.TimeoutExpired:
+        return False, f"no answer within {PROBE_TIMEOUT_S:.0f} s"
+    if child.returncode < 0:
+        return False, f"ends the process with {signal.Signals(-child.returncode).name}"
+    if child.returncode == 0:
+        return True, child.stdout.strip().rpartition("\n")[2]
+    last_line = child.stderr.strip().rpartition("\n")[2]
+    return False, _EXCEPTION_NAME.sub("", last_line) or f"exit code {child.returncode}"
+
+
+def _search_path() -> str:
+    root = str(Path(__file__).resolve().parents[2])
+    return os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -1,0 +1,70 @@
+"""The stages that make one file of each body of a kind and frame: surfaces, cloths, volumes."""
+
+from __future__ import annotations
+
+from pipeline.base.errors import InvalidArtifactError
+from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import Resources, Task, TaskId
+from pipeline.kinds.base import Kind, Product
+from pipeline.model.job import Job
+from pipeline.stages.base import TaskContext
+from pipeline.store.cache import read_compact
+
+
+class ProductStage:
+    """One file a body and frame, each from that frame of the cache alone."""
+
+    def __init__(self, kind: Kind, product: Product) -> None:
+        self.name, self.version = product.stage, product.version
+        self._kind, self._product = kind, product
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        """One task a body and frame."""
+        product = self._product
+        bodies = self._kind.bodies(job)
+        if not bodies:
+            return []
+        parameters = ParameterSet.of(
+            product.parameters(job), stage=self.name, version=self.version, tools=product.tools(job)
+        )
+        return [
+            Task(
+                id=TaskId(f"{self.name}/{body.name}/{frame:06d}"),
+                stage=self.name,
+                inputs=(layout.frame_cache(frame),),
+                outputs=(layout.product(product.folder, body.name, frame, product.suffix),),
+                parameters=parameters,
+                subject=body.name,
+                frame=frame,
+                resources=resources,
+            )
+            for body in bodies
+            for resources in (Resources(memory_bytes=product.memory_bytes(job, body)),)
+            for frame in range(job.frame_count)
+        ]
+
+    def preflight(self, job: Job) -> list[str]:
+        """What this machine lacks to make the files, if there are any to make."""
+        return self._product.preflight() if self._kind.bodies(job) else []
+
+    def run(self, context: TaskContext) -> None:
+        """Make the file of one body and frame.
+
+        Raises:
+            InvalidArtifactError: the cached frame is damaged, or holds what no body of the kind has.
+        """
+        task = context.task
+        cached = context.layout.path(task.inputs[0])
+        body = read_compact(cached, task.subject)
+        with context.committing(task.outputs[0], self._product.validate) as path:
+            try:
+                self._product.write(path, body, context.job, context.threads)
+            except InvalidArtifactError as error:
+                raise InvalidArtifactError(f'{cached}: {self._kind.name} "{task.subject}": {error}') from error
+        context.progress(1, 1)
+
+
+def product_stages(kinds: dict[str, Kind]) -> tuple[ProductStage, ...]:
+    """A stage for each kind that has a product, in the order of the table."""
+    return tuple(ProductStage(kind, kind.product) for kind in kinds.values() if kind.product is not None)

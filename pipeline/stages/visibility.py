@@ -1,0 +1,122 @@
+"""The visibility of bodies in a frame: from the files that it is drawn from, before it is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.base.layout import JobLayout
+from pipeline.model.job import Job
+from pipeline.model.looks import parts_of
+from pipeline.stages.base import TaskContext
+from render.camera_path import View
+from render.meshes import read_ply
+from render.point_clouds import read_point_cloud
+from render.visibility import covered_cells, in_picture, is_inside, points_of_box
+
+Array = NDArray[np.float64]
+
+MOST_POINTS = 20_000
+"""Of a body that are looked for in the picture; of more, every second, third, ..."""
+LEAST_SHARE = 0.005
+"""Of the picture that bodies must cover for it to be sure that something is to be seen."""
+ROUND_THE_DOMAIN = 0.02
+"""How far a body may reach out of the domain, in edges of it, and still be in front of the set."""
+NOTHING_SEEN, CAMERA_INSIDE = "nothing in the picture", "camera inside"
+
+
+@dataclass(frozen=True)
+class BodyAtFrame:
+    """A body at a frame.
+
+    Attributes:
+        name: of the body.
+        points: on or in it [m], (n, 3); none while it is not there.
+        faces: triangles of these points if they are those of a mesh, (k, 3).
+        closed: whether the mesh has an inside.
+    """
+
+    name: str
+    points: Array
+    faces: NDArray[np.int32] | None = None
+    closed: bool = False
+
+
+def warn_if_invisible(context: TaskContext, view: View, bodies: Sequence[BodyAtFrame]) -> None:
+    """Warn if nothing of the scene is in the picture of a frame, or the camera is inside of something.
+
+    A picture may be meant so, or be empty as nothing has begun yet, so this is no failure.
+
+    Args:
+        context: of a frame's task, whose inputs are there.
+        view: of the camera at the frame.
+        bodies: all that is drawn.
+    """
+    frame = context.task.frame
+    assert frame is not None
+    width, height = context.job.render.resolution
+    for body in bodies:
+        if body.closed and body.faces is not None and is_inside(view.position, body.points, body.faces):
+            context.warn(CAMERA_INSIDE, f'frame {frame}: the camera is inside "{body.name}"; see [camera]')
+            return
+    points = [body.points[:: 1 + len(body.points) // MOST_POINTS] for body in bodies if len(body.points)]
+    if points and not in_picture(view, np.concatenate(points), aspect=width / height).any():
+        context.warn(NOTHING_SEEN, f"frame {frame}: nothing of the scene is in the picture; see [camera]")
+
+
+def bodies_at(
+    job: Job, layout: JobLayout, frame: int, poses: Mapping[str, Mapping[str, NDArray[Any]]]
+) -> Iterator[BodyAtFrame]:
+    """All drawn bodies at a frame; of a smoke, its whole box."""
+    from sim.core.motion.rotation import from_degrees, rotated
+
+    for body in job.rigid:
+        if body.kind == "static":
+            position, orientation = np.array(body.position), from_degrees(body.rotation_deg)
+        else:
+            position, orientation = poses[body.name]["position"], poses[body.name]["orientation"]
+        for part in parts_of(body.shape.type):
+            mesh = read_ply(layout.path(layout.body_mesh(body.name, part)))
+            placed = position + rotated(orientation, mesh.vertices.astype(np.float64))
+            yield BodyAtFrame(body.name, placed, mesh.faces, closed=True)
+    for fluid in job.fluid:
+        mesh = read_ply(layout.path(layout.surface(fluid.name, frame)))
+        yield BodyAtFrame(fluid.name, mesh.vertices.astype(np.float64), mesh.faces, closed=True)
+    for cloth in job.cloth:
+        mesh = read_ply(layout.path(layout.cloth(cloth.name, frame)))
+        yield BodyAtFrame(cloth.name, mesh.vertices.astype(np.float64), mesh.faces)
+    for name in job.whitewater:
+        cloud = read_point_cloud(layout.path(layout.whitewater(name, frame)))
+        yield BodyAtFrame(f"whitewater of {name}", cloud.position.astype(np.float64))
+    for smoke in job.smoke:
+        yield BodyAtFrame(smoke.name, points_of_box(*smoke.corners(job.domain)))
+
+
+def expected_cells(
+    job: Job, view: View, bodies: Sequence[BodyAtFrame], shape: tuple[int, int]
+) -> NDArray[np.bool_] | None:
+    """The cells (rows, columns) where a picture must differ from the empty set; None if none surely must.
+
+    Rigid bodies, fluids and cloths count, as far as they are in the domain: ground and backdrop may hide what is not.
+    From below the ground it hides all.
+    Smoke and spray may be too thin to be seen.
+    """
+    lower, upper = np.array(job.domain.min), np.array(job.domain.max)
+    if view.position[2] < lower[2]:
+        return None  # the ground may hide everything
+    slack = ROUND_THE_DOMAIN * (upper - lower)
+    width, height = job.render.resolution
+    cells, share = np.zeros(shape, np.bool_), 0.0
+    for body in bodies:
+        if body.faces is None or not len(body.faces):
+            continue
+        inside = ((body.points >= lower - slack) & (body.points <= upper + slack)).all(axis=1)
+        faces = body.faces[inside[body.faces].all(axis=1)]
+        covered, of_picture = covered_cells(view, body.points, faces, shape=shape, aspect=width / height)
+        cells |= covered
+        share += of_picture
+    return cells if min(share, cells.mean()) >= LEAST_SHARE else None

@@ -1,0 +1,1 @@
+"""Files of a job: the HDF5 cache, artifacts, their receipts and provenance."""

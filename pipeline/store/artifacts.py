@@ -1,0 +1,280 @@
+"""Committing artifacts: write aside, decode, hash, fsync, rename, receipt.
+
+An artifact counts only with its *receipt*; see pipeline.store.receipts.
+
+    write .<name>.part.<attempt>  ->  validate (decode it)  ->  hash  ->  fsync  ->  receipt aside, fsync
+    -> [locked: fence -> keep an edited file aside -> remove the old receipt, fsync its folder
+                -> rename the file, fsync its folder -> rename the receipt, fsync its folder]
+
+No crash point leaves a receipt that matches a wrong file:
+
+* Before the old receipt is removed, the old file and its receipt stand untouched; only part files are left over. All
+  that takes disk space happens here, so a full disk costs nothing that was there.
+* The removal of the old receipt is durable before the file is renamed. From here until the new receipt stands there
+  is a file without receipt, be it the old or the new one: it does not count, the task runs again and overwrites it.
+  That holds for a power cut as well, whatever order the file system chooses for what was not synced.
+* The new receipt appears by a rename, so it is there as a whole or not at all, and only after the artifact's bytes and
+  name have been synced: it never describes something that a power cut took away.
+* An edited file that stood in the way is renamed before its receipt is removed: a crash in between leaves a receipt
+  without file, which does not count either.
+
+The locked section makes "look at the existing receipt, then replace it" one step for all processes: a late writer of
+an older attempt finds the newer receipt and gives up. The lock is a `flock` on a file of the receipts' folder; the
+kernel drops it with its holder, so none is ever left behind.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import platform
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from pipeline.base.errors import InvalidArtifactError, StaleAttemptError
+from pipeline.base.files import sync
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath, Task
+from pipeline.store.provenance import keep_texts, maker
+from pipeline.store.receipts import Receipt, hash_file, read_receipt, verify_artifact
+
+_PART_NAME = re.compile(r"^\..+\.part\.\d+$")
+_LOCK_NAME = ".lock"
+
+
+def edited_name(layout: JobLayout, artifact: ArtifactPath) -> ArtifactPath:
+    """Name under which a file that was edited by hand is kept when its artifact is made anew: `<name>.edited-<n>`."""
+    number = 1
+    while os.path.lexists(layout.path(ArtifactPath(f"{artifact}.edited-{number}"))):
+        number += 1
+    return ArtifactPath(f"{artifact}.edited-{number}")
+
+
+def holds_frames(layout: JobLayout) -> bool:
+    """Whether anything lies where a job's simulated frames and its pictures go. Raises OSError."""
+    for frame in (layout.frame_cache(0), layout.picture(0)):
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(layout.path(frame).parent) as entries:
+            if any(entries):
+                return True
+    return False
+
+
+class Commit:
+    """An artifact on its way, as a context manager; see `committing`.
+
+    Attributes:
+        path: where to write it: `.<name>.part.<attempt>`, in the artifact's own folder.
+        receipt: set once it is committed, on leaving the block.
+        kept_aside: where a file that was edited by hand went, if there was one in the way.
+    """
+
+    def __init__(
+        self,
+        layout: JobLayout,
+        artifact: ArtifactPath,
+        *,
+        task: Task,
+        attempt: int,
+        fingerprint: str,
+        validate: Callable[[Path], None],
+        inputs: Mapping[ArtifactPath, str],
+        device: str,
+    ) -> None:
+        self._layout = layout
+        self._artifact = artifact
+        self._task = task
+        self._attempt = attempt
+        self._fingerprint = fingerprint
+        self._validate = validate
+        self._inputs = dict(inputs)
+        self._device = device
+        self._target = layout.path(artifact)
+        self._started = 0.0
+        self._receipt: Receipt | None = None
+        self.path = _part_path(self._target, attempt)
+        self._receipt_part = _part_path(layout.receipt(artifact), attempt)
+        self.kept_aside: ArtifactPath | None = None
+
+    @property
+    def receipt(self) -> Receipt:
+        """The receipt; there is one after the block has ended well."""
+        if self._receipt is None:
+            raise RuntimeError(f"{self._artifact} is not committed yet")
+        return self._receipt
+
+    def __enter__(self) -> Self:
+        self._started = _now_s()
+        _make_folder(self._target.parent)
+        self.path.unlink(missing_ok=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                self._commit()
+        finally:
+            for part in (self.path, self._receipt_part):
+                with suppress(OSError):  # must not hide the error that is on its way; sweep_parts gets what stays
+                    part.unlink(missing_ok=True)
+
+    def _commit(self) -> None:
+        if not self.path.is_file():
+            raise InvalidArtifactError(f"{self._artifact}: nothing was written, or a newer run has swept it away")
+        self._validate(self.path)
+        job = keep_texts(self._layout, self._task.parameters)
+        receipt = self._describe_part(job)
+        receipt_path = self._layout.receipt(self._artifact)
+        _make_folder(receipt_path.parent)
+        self._receipt_part.write_text(receipt.to_json())
+        sync(self._receipt_part)
+        with _lock(receipt_path.with_name(_LOCK_NAME)):
+            self._fence()
+            self.kept_aside = _invalidate(self._layout, self._artifact)
+            self.path.replace(self._target)
+            sync(self._target.parent)
+            self._receipt_part.replace(receipt_path)
+            sync(receipt_path.parent)
+        self._receipt = receipt
+
+    def _describe_part(self, job: str) -> Receipt:
+        """Hash the part and force it to the disk; only then are its size and time settled."""
+        content_hash = hash_file(self.path)
+        sync(self.path)
+        status = self.path.stat()
+        return Receipt(
+            artifact=self._artifact,
+            task=self._task.id,
+            stage=self._task.stage,
+            attempt=self._attempt,
+            fingerprint=self._fingerprint,
+            parameters=self._task.parameters.digest,
+            size=status.st_size,
+            mtime_ns=status.st_mtime_ns,
+            hash=content_hash,
+            inputs=self._inputs,
+            job=job,
+            maker=maker(),
+            host=platform.node(),
+            device=self._device,
+            started=self._started,
+            finished=_now_s(),
+        )
+
+    def _fence(self) -> None:
+        existing = read_receipt(self._layout, self._artifact)
+        if existing is not None and existing.task == self._task.id and existing.attempt > self._attempt:
+            raise StaleAttemptError(
+                f"{self._artifact}: attempt {existing.attempt} of {self._task.id} has committed it; "
+                f"attempt {self._attempt} came too late"
+            )
+
+
+def committing(
+    layout: JobLayout,
+    artifact: ArtifactPath,
+    *,
+    task: Task,
+    attempt: int,
+    fingerprint: str,
+    validate: Callable[[Path], None],
+    inputs: Mapping[ArtifactPath, str] | None = None,
+    device: str = "",
+) -> Commit:
+    """Commit one artifact: write to `commit.path` inside the block; after it `commit.receipt` is the Receipt.
+
+    On leaving the block: validate, hash, fsync, fence, rename, receipt; the module's text gives the order and why. An
+    exception in the block or on the way removes the part file and passes through untouched, so ENOSPC stays the
+    OSError that it is.
+
+    Args:
+        layout: the job's folder.
+        artifact: what is committed.
+        task: the task that makes it.
+        attempt: number of this attempt, from `Manifest.start_attempt`.
+        fingerprint: `task_fingerprint` of the task with the inputs as they are now.
+        validate: decodes the file; raises InvalidArtifactError if it is not what it should be.
+        inputs: hash of each input, kept so that `explain` can name the one that changed.
+        device: what computes it, if that decides its last bits.
+
+    Raises:
+        InvalidArtifactError: on leaving, if nothing was written or `validate` refused it.
+        StaleAttemptError: on leaving, if a newer attempt of the same task has committed this artifact.
+    """
+    return Commit(
+        layout,
+        artifact,
+        task=task,
+        attempt=attempt,
+        fingerprint=fingerprint,
+        validate=validate,
+        inputs=inputs or {},
+        device=device,
+    )
+
+
+def sweep_parts(layout: JobLayout) -> list[Path]:
+    """Remove the part files that dead attempts left anywhere in the job's folder; returns what was removed.
+
+    Only the holder of the job's lease may call it, before it starts an attempt of its own. A writer that is alive all
+    the same (an orphan on another machine) then fails at its commit, without harm.
+    """
+    swept = []
+    for folder, _, names in os.walk(layout.root):
+        for name in names:
+            if _PART_NAME.match(name):
+                path = Path(folder, name)
+                path.unlink(missing_ok=True)
+                swept.append(path)
+    return sorted(swept)
+
+
+def _now_s() -> float:
+    """Wall time [s since the epoch], of as many digits that none of them can change without changing the number."""
+    return round(time.time(), 6)
+
+
+def _part_path(path: Path, attempt: int) -> Path:
+    return path.with_name(f".{path.name}.part.{attempt}")
+
+
+def _invalidate(layout: JobLayout, artifact: ArtifactPath) -> ArtifactPath | None:
+    """Remove the old receipt, durably; first keep aside what somebody changed by hand since it was written."""
+    receipt = read_receipt(layout, artifact)
+    kept_aside = None
+    if receipt is not None and verify_artifact(layout, receipt) is not None:
+        target = layout.path(artifact)
+        if target.is_file() and target.stat().st_size > 0:  # an empty file holds nothing to keep
+            kept_aside = edited_name(layout, artifact)
+            target.rename(layout.path(kept_aside))
+    receipt_path = layout.receipt(artifact)
+    if receipt_path.exists():
+        receipt_path.unlink()
+        sync(receipt_path.parent)
+    return kept_aside
+
+
+@contextmanager
+def _lock(path: Path) -> Iterator[None]:
+    """Exclusive among all processes of all machines that use this lock file; held for a few milliseconds."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _make_folder(path: Path) -> None:
+    """Make a folder and its parents; each new name is forced to the disk."""
+    if path.is_dir():
+        return
+    _make_folder(path.parent)
+    path.mkdir(exist_ok=True)
+    sync(path.parent)

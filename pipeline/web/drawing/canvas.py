@@ -1,0 +1,205 @@
+"""A canvas in a browser: things by name, of which only what has changed is sent.
+
+It knows arrays, not jobs. viser keeps, for each thing, only its last state for pages that lag behind, so a slow page
+skips states and holds up nobody.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.web.drawing.camera import camera_orientation, quaternion_of, vertical_fov
+from pipeline.web.drawing.colors import Colors
+from pipeline.web.drawing.smoke_pictures import Slice
+from render.camera_path import View
+
+Rgb = tuple[int, int, int]
+NO_TURN = (1.0, 0.0, 0.0, 0.0)
+HALF_PRECISION = 2.0**-11
+"""Error of a 16-bit float, relative to its size."""
+MOST_ERROR_IN_RADII = 0.1
+"""Of particles' places; where 16 bits would be wronger, they are sent with 32."""
+
+
+class Canvas:
+    """The scene of a viser server. Not for several threads at once.
+
+    Args:
+        server: what pages connect to.
+        when_new: called with the name and viser's handle of each thing that is made, also of one that is made anew.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, *, when_new: Callable[[str, Any], None] = lambda _name, _handle: None
+    ) -> None:
+        self._server, self._when_new = server, when_new
+        server.scene.set_up_direction("+z")
+        server.scene.configure_default_lights(cast_shadow=False)  # a machine without a GPU draws thrice as fast
+        self._handles: dict[str, Any] = {}
+        self._drawn: set[str] = set()
+        self._kinds: dict[str, tuple[object, ...]] = {}
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of all things."""
+        return frozenset(self._handles)
+
+    @contextmanager
+    def picture(self) -> Iterator[None]:
+        """A whole picture: what is not drawn in the block is removed; pages get it in one piece."""
+        self._drawn = set()
+        with self._server.atomic():
+            yield
+            for name in [name for name in self._handles if name not in self._drawn]:
+                self._handles.pop(name).remove()
+                del self._kinds[name]
+
+    def points(self, name: str, position: NDArray[np.float32], colors: Colors | Rgb, *, radius: float) -> None:
+        """Round particles.
+
+        Args:
+            name: of the thing.
+            position: [m], (n, 3).
+            colors: of each, (n, 3), or of all.
+            radius: of each [m].
+        """
+        if not len(position):
+            return
+        middle = (position.min(axis=0) + position.max(axis=0)) / 2.0
+        local = position - middle
+        exact = float(np.abs(local).max()) * HALF_PRECISION > MOST_ERROR_IN_RADII * radius
+        colors = np.broadcast_to(np.asarray(colors, np.uint8), position.shape)
+        handle = self._kept(name, "points", len(position), exact)
+        if handle is None:
+            handle = self._server.scene.add_point_cloud(
+                name,
+                local,
+                colors,
+                point_size=2.0 * radius,
+                point_shape="circle",
+                precision="float32" if exact else "float16",
+                position=middle,
+            )
+            self._keep(name, handle, "points", len(position), exact)
+            return
+        handle.points, handle.colors, handle.position = local, colors, middle
+        handle.point_size = 2.0 * radius
+
+    def mesh(
+        self,
+        name: str,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        color: Rgb,
+        *,
+        opacity: float | None = None,
+        two_sided: bool = False,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        orientation: ArrayLike = NO_TURN,
+    ) -> None:
+        """A triangle mesh.
+
+        Args:
+            name: of the thing.
+            vertices: [m], (n, 3), in its own axes.
+            faces: (k, 3) vertex indices.
+            color: sRGB.
+            opacity: 0 to 1; opaque if omitted.
+            two_sided: as cloth is.
+            position: where its origin is [m].
+            orientation: unit quaternion w, x, y, z.
+        """
+        rows, triangles = np.asarray(vertices, np.float32), np.asarray(faces, np.uint32)
+        if not len(triangles):
+            return
+        key = (len(rows), len(triangles), opacity, two_sided)
+        handle = self._kept(name, "mesh", *key)
+        place, turn = _vector(position), _quaternion(orientation)
+        if handle is None:
+            handle = self._server.scene.add_mesh_simple(
+                name,
+                rows,
+                triangles,
+                color=color,
+                opacity=opacity,
+                side="double" if two_sided or opacity is not None else "front",
+                position=place,
+                wxyz=turn,
+            )
+            self._keep(name, handle, "mesh", *key)
+            return
+        handle.vertices, handle.faces, handle.color = rows, triangles, color
+        handle.position, handle.wxyz = place, turn
+
+    def lines(self, name: str, segments: ArrayLike, color: Rgb, *, pixels: float = 1.5) -> None:
+        """Straight lines: (n, 2, 3) [m], all so many pixels thick, however far away."""
+        points = np.asarray(segments, np.float32)
+        handle = self._kept(name, "lines", points.tobytes(), color, pixels)
+        if handle is None:
+            handle = self._server.scene.add_line_segments(
+                name, points, color, thickness=pixels, thickness_units="screen"
+            )
+            self._keep(name, handle, "lines", points.tobytes(), color, pixels)
+
+    def slice(self, name: str, cut: Slice) -> None:
+        """A picture that stands in the scene."""
+        width, height = float(np.linalg.norm(cut.right)), float(np.linalg.norm(cut.up))
+        right, up = cut.right / width, cut.up / height
+        # The picture's own axes: x to the right, y down, z away from who sees it upright.
+        turn = quaternion_of(np.stack([right, -up, np.cross(right, -up)], axis=1))
+        middle = cut.corner + (cut.right + cut.up) / 2.0
+        handle = self._server.scene.add_image(
+            name, cut.picture, width, height, format="png", wxyz=turn, position=middle, cast_shadow=False
+        )
+        self._keep(name, handle, "slice")
+
+    def camera(self, name: str, view: View, *, aspect: float, size: float, color: Rgb) -> None:
+        """The film's camera: `size` [m] is how far its frustum reaches."""
+        fov, turn, position = vertical_fov(view, aspect), camera_orientation(view), _vector(view.position)
+        handle = self._kept(name, "camera", aspect, size)
+        if handle is None:
+            handle = self._server.scene.add_camera_frustum(
+                name, fov, aspect, scale=size, thickness=size / 60.0, color=color, wxyz=turn, position=position
+            )
+            self._keep(name, handle, "camera", aspect, size)
+            return
+        handle.fov, handle.wxyz, handle.position = fov, turn, position
+
+    def _kept(self, name: str, *kind: object) -> Any:
+        """The thing of this name if it can become the new one by changing its numbers."""
+        self._drawn.add(name)
+        return self._handles.get(name) if self._kinds.get(name) == kind else None
+
+    def _keep(self, name: str, handle: Any, *kind: object) -> None:
+        self._drawn.add(name)
+        self._handles[name], self._kinds[name] = handle, kind
+        self._when_new(name, handle)
+
+
+def box_edges(low: Sequence[float], high: Sequence[float]) -> NDArray[np.float32]:
+    """The twelve edges of a box [m], (12, 2, 3)."""
+    ends = np.array([low, high], np.float32)
+    edges = []
+    for axis in range(3):
+        first, second = (each for each in range(3) if each != axis)
+        for a in (0, 1):
+            for b in (0, 1):
+                edge = np.empty((2, 3), np.float32)
+                edge[:, axis], edge[:, first], edge[:, second] = ends[:, axis], ends[a, first], ends[b, second]
+                edges.append(edge)
+    return np.array(edges)
+
+
+def _vector(values: ArrayLike) -> NDArray[np.float64]:
+    return np.asarray(values, np.float64)
+
+
+def _quaternion(values: ArrayLike) -> NDArray[np.float64]:
+    quaternion = _vector(values)
+    return quaternion / np.linalg.norm(quaternion)

@@ -1,0 +1,162 @@
+"""Cost of a frame: estimates, by kind of body, of how long it takes to compute. Estimated, not measured."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.kinds.checks.steps import SPEED_OF_SOUND_IN_SPEEDS, stable_dt
+from pipeline.kinds.cloth import count_cloth_nodes
+from sim.cloth.parameters import DEFAULT_SUBSTEPS
+from sim.fluid.expected_speed import expected_speed
+from sim.fluid.time_step import VISCOUS_NUMBER
+
+if TYPE_CHECKING:
+    from pipeline.model.job import Job
+
+NODE_SUBSTEP_S = 1.4e-6
+"""Core time of a node in a substep of cloth in contact [s]. Twice what the scene alone was measured to take (10 000
+nodes, 20 substeps: 101 to 144 ms of processor time, docs/live.md): threads wait for each other, and page and browser
+want their share of the cores."""
+
+APART_SHARE = 0.4
+"""Of it, where cloth does not collide with itself: measured are 0.25 to 0.35 on two cores."""
+
+PARTICLE_STEP_S = {"wcsph": 0.45e-6, "dfsph": 2.3e-6, "pcisph": 1.7e-6}
+"""Core time of a particle in a step at a support of two spacings [s] (docs/guide/live.md)."""
+
+VISCOUS_STEP_S = 12.0e-6
+"""Time that solving for viscosity adds to it [s]: 20 to 70 iterations a step, where a pressure takes 3 to 12."""
+
+BODIES_FACTOR = 2.0
+"""Factor of an implicit pressure that carries bodies, near which it is solved for ten times better."""
+
+STEP_S = {"wcsph": 0.25e-3, "dfsph": 1.7e-3, "pcisph": 1.7e-3}
+"""Of a step, however few particles there are, and however many cores: launches of its kernels [s]."""
+
+VISCOUS_LAUNCHES_S = 3.0e-3
+"""Time that solving for viscosity adds to that [s]."""
+
+SPLASHING = {"wcsph": 1.6, "dfsph": 1.8, "pcisph": 1.8}
+"""Largest speed over that of a fall from the top: jets are faster, and squeezed particles of wcsph are stiffer."""
+
+BRAKED = 0.5
+"""The same of a fluid so stiff that its viscosity is solved for."""
+
+
+def fewest_for_bodies(job: Job) -> int:
+    """Substeps a frame that the bodies of a scene need: its cloths take as many, however few they ask for."""
+    from sim.rigid.solver import largest_dt
+
+    return max(1, math.ceil(1.0 / (job.fps * largest_dt(job.rigid))))
+
+
+def cloth_frame_s(job: Job, *, power: float) -> float:
+    """Time that a frame of the cloths takes [s], on so many cores."""
+    if not job.cloth:
+        return 0.0
+    substeps = max(job.cloth[0].substeps or DEFAULT_SUBSTEPS, fewest_for_bodies(job))
+    meets = any(cloth.self_collision for cloth in job.cloth) or len(job.cloth) > 1
+    return count_cloth_nodes(job) * substeps * NODE_SUBSTEP_S * (1.0 if meets else APART_SHARE) / power
+
+
+def fluid_frame_s(job: Job, particles: int, *, power: float) -> float:
+    """Time that a frame of the fluids takes [s], on so many cores.
+
+    Args:
+        job: as it is simulated live.
+        particles: of all fluids.
+        power: cores that compute it.
+
+    Raises:
+        ShapeError: a block cannot be built.
+    """
+    if not job.fluid:
+        return 0.0
+    shared, is_viscous = job.fluid[0], _is_implicit(job)
+    particle_s = PARTICLE_STEP_S[shared.solver] * (shared.support_in_spacings / 2.0) ** 3
+    if shared.solver != "wcsph" and any(body.kind == "dynamic" for body in job.rigid):
+        particle_s *= BODIES_FACTOR
+    step_s = STEP_S[shared.solver]
+    if is_viscous:
+        particle_s, step_s = particle_s + VISCOUS_STEP_S, step_s + VISCOUS_LAUNCHES_S
+    return steps_a_frame(job) * (particles * particle_s / power + step_s)
+
+
+def steps_a_frame(job: Job) -> float:
+    """Steps a frame that the fluids of a job will take."""
+    shared = job.fluid[0]
+    if shared.dt != "adaptive":
+        dt = float(shared.dt)
+    else:
+        is_viscous = _is_implicit(job)
+        dt = stable_dt(job, shared, (BRAKED if is_viscous else SPLASHING[shared.solver]) * _fall_speed(job))
+        stiffest = _stiffest(job)
+        if stiffest > 0.0 and not is_viscous:
+            dt = min(dt, VISCOUS_NUMBER * (2.0 * shared.particle_radius) ** 2 / stiffest)
+    return max(1.0 / (job.fps * dt), float(fewest_for_bodies(job)))
+
+
+def _is_implicit(job: Job) -> bool:
+    """Whether viscosity is solved for."""
+    from sim.fluid.viscosity_implicit import is_implicit
+
+    shared = job.fluid[0]
+    speed = _fall_speed(job)
+    return is_implicit(
+        shared.viscosity_solver,
+        viscosity=_stiffest(job),
+        spacing=2.0 * shared.particle_radius,
+        speed=speed if shared.solver != "wcsph" else shared.sound_speed or SPEED_OF_SOUND_IN_SPEEDS * speed,
+        dt=shared.dt,
+        cfl=shared.cfl,
+    )
+
+
+def _stiffest(job: Job) -> float:
+    """Kinematic viscosity of the stiffest fluid, against walls too [m²/s]."""
+    return max(fluid.viscosity for fluid in job.fluid) * max(1.0, job.fluid[0].wall_friction)
+
+
+def _fall_speed(job: Job) -> float:
+    """Largest speed [m/s] of what falls from the top of a block, or out of an opening, to the domain's floor."""
+    from sim.shapes import build_solid
+
+    points, velocities = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for fluid in job.fluid:
+        for block in fluid.block:
+            low, high = build_solid(block).bounds
+            points.append(
+                np.clip(np.array(list(product(*zip(low, high, strict=True)))), job.domain.min, job.domain.max)
+            )
+            velocities.append(np.tile(block.velocity, (8, 1)))
+        for emitter in fluid.emitter:
+            direction = np.asarray(emitter.direction)
+            points.append(np.array([emitter.position]))
+            velocities.append(np.array([emitter.speed / np.linalg.norm(direction) * direction]))
+    return expected_speed(np.concatenate(points), np.concatenate(velocities), job.domain, job.gravity)
+
+
+FRAME_COSTS: Mapping[str, Callable[[Job, int, float], float]] = {
+    "cloth": lambda job, _particles, power: cloth_frame_s(job, power=power),
+    "fluid": lambda job, particles, power: fluid_frame_s(job, particles, power=power),
+}
+"""Estimates by kind of body, of a job, its particles and its cores; bodies of other kinds cost next to nothing."""
+
+
+def frame_s(job: Job, particles: int, *, power: float) -> float:
+    """Time that a frame of a scene takes [s].
+
+    Args:
+        job: as it is simulated live.
+        particles: of all fluids.
+        power: cores that compute it.
+
+    Raises:
+        ShapeError: a block cannot be built.
+    """
+    return sum(cost(job, particles, power) for cost in FRAME_COSTS.values())

@@ -1,0 +1,77 @@
+"""Requests of browsers to a scene, which are met between its frames, and the message that they leave."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from pipeline.base.errors import PipelineError
+
+Request = Callable[..., object]
+
+
+class CannotGoOnError(PipelineError):
+    """A scene is gone, and cannot be built again, or cannot be shown: there is no memory for it, say."""
+
+
+class Requests:
+    """A queue of calls from any thread, met by the thread that owns the scene.
+
+    Attributes:
+        refused: number of requests that were refused so far.
+
+    Args:
+        message: the first one.
+    """
+
+    def __init__(self, message: str) -> None:
+        self._queue: SimpleQueue[tuple[Request, tuple[Any, ...]]] = SimpleQueue()
+        self._result, self._refusal = message, ""
+        self.refused = 0
+
+    @property
+    def message(self) -> str:
+        """The last refusal, until another request is met; else the last result."""
+        return self._refusal or self._result
+
+    @message.setter
+    def message(self, result: str) -> None:
+        self._result, self._refusal = result, ""
+
+    def clear(self, result: str) -> None:
+        """Take back a result, if it is still the last one."""
+        if self._result == result:
+            self._result = ""
+
+    def ask(self, request: Request, *arguments: Any) -> None:
+        """Have a method called between two frames; an error that is meant for people becomes the message."""
+        self._queue.put((request, arguments))
+
+    def meet(self, wait_s: float, *, silent: tuple[Request, ...]) -> None:
+        """Do all that was asked for; wait for the first request for so long at most [s].
+
+        Args:
+            wait_s: longest wait [s].
+            silent: requests that leave a refusal standing.
+
+        Raises:
+            CannotGoOnError: a scene that had to begin anew has no memory.
+        """
+        try:
+            asked = self._queue.get(timeout=wait_s) if wait_s > 0.0 else self._queue.get_nowait()
+            while True:
+                request, arguments = asked
+                try:
+                    request(*arguments)
+                except CannotGoOnError:
+                    raise
+                except (ValueError, PipelineError, OSError) as error:
+                    self._refusal = str(error)
+                    self.refused += 1
+                else:
+                    if request not in silent:
+                        self._refusal = ""
+                asked = self._queue.get_nowait()
+        except Empty:
+            return

@@ -1,0 +1,334 @@
+"""The page of `pipeline view`: its controls, and the loop that shows frames.
+
+Controls only say that something changed; one loop reads them all and decides. So no callback waits for a file, and two
+browsers cannot make it inconsistent: they share the controls and see the same frame.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import viser
+
+from pipeline.base.errors import InvalidArtifactError, PipelineError
+from pipeline.base.layout import JobLayout
+from pipeline.job.loading import load_job
+from pipeline.store.cache import read_numbers
+from pipeline.web.bounded_cache import BoundedCache
+from pipeline.web.drawing.bodies import Extents
+from pipeline.web.drawing.camera import begin_at, camera_orientation, vertical_fov
+from pipeline.web.drawing.canvas import Canvas
+from pipeline.web.viewer.committed import CommittedFrames, Stamp, artifacts_of_frame, stamp_of
+from pipeline.web.viewer.controls import Controls
+from pipeline.web.viewer.frames import ShownFrame, read_shown_frame
+from pipeline.web.viewer.numbers import SolverSeries, plot, table
+from pipeline.web.viewer.playback import Playback
+from pipeline.web.viewer.scene import CAMERA, SURFACES, JobScene, Shown
+from pipeline.web.viewer.texts import lacking, legend, notice, thinned, title
+
+if TYPE_CHECKING:
+    from render.camera_path import View
+
+LOOK_S = 0.5
+"""Time between two looks for new frames [s]."""
+NUMBERS_S = 0.05
+"""Time that numbers of frames are read before the page gets its turn again [s]: long films have thousands."""
+ASIDE = np.radians(24.0)
+"""Angle from the film's camera to the first view of a page, about the vertical [rad]."""
+
+
+class ViewPage:
+    """A job in the browsers of a server.
+
+    Args:
+        server: what pages connect to.
+        layout: the job's folder, which is only read.
+        most_particles: of a fluid that are drawn.
+        most_bytes: of frames that are kept in memory.
+
+    Raises:
+        PipelineError: the job file cannot be used.
+    """
+
+    def __init__(self, server: viser.ViserServer, layout: JobLayout, *, most_particles: int, most_bytes: int) -> None:
+        self._server, self._layout, self._most_particles = server, layout, most_particles
+        self._commands: SimpleQueue[Callable[[float], None]] = SimpleQueue()
+        self._wake = threading.Event()
+        self._job_stamp = stamp_of(layout.job_file)
+        self._job = load_job(layout.job_file)
+        self._committed = CommittedFrames(layout)
+        self._scene = JobScene(self._job, layout, self._committed)
+        self._loaded: BoundedCache[int, ShownFrame] = BoundedCache(most_bytes, lambda shown: shown.bytes)
+        self._series, self._extents = SolverSeries(), Extents()
+        self._spoilt: dict[int, tuple[str, str]] = {}  # by frame: the hash it should have, and what is wrong
+        self._job_trouble = self._files_trouble = ""
+        self._canvas = Canvas(server)
+        self.playback = Playback(rate=float(min(self._job.fps, 60)))
+        self._drawn: tuple[object, ...] = ()
+        self._panel: tuple[object, ...] = ()
+        self._next_look = -np.inf
+        self._shown: ShownFrame | None = None
+        self._look_from_aside()
+        waits = not any(self._committed.folder.glob("*.h5.json"))
+        self._controls = Controls(server.gui, self._job, rate=int(self.playback.rate), waits=waits)
+        self._controls.offer_layers(self._scene.layers)
+        self._wire()
+
+    @property
+    def frame(self) -> int | None:
+        """The frame that is drawn."""
+        return None if self._shown is None else self._shown.numbers.frame
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The frames that can be seen."""
+        return self._committed.numbers
+
+    @property
+    def things(self) -> frozenset[str]:
+        """Names of everything that is drawn."""
+        return self._canvas.names
+
+    @property
+    def notice(self) -> str:
+        """Troubles that the page tells, as HTML."""
+        return str(self._controls.notice.content)
+
+    @property
+    def table(self) -> str:
+        """The solvers' numbers that the page shows, as HTML."""
+        return str(self._controls.table.content)
+
+    def run(self, stop: threading.Event) -> None:
+        """Show frames until told to stop."""
+        while not stop.is_set():
+            wait = self.advance(time.monotonic())
+            self._wake.wait(min(wait, 0.1))  # no longer, as `stop` does not wake it
+            self._wake.clear()
+
+    def advance(self, now: float) -> float:
+        """Do everything that is due at a time [s]; returns how long there is nothing more to do [s]."""
+        while True:
+            try:
+                command = self._commands.get_nowait()
+            except Empty:
+                break
+            command(now)
+        try:
+            if now >= self._next_look:
+                self._next_look = now + LOOK_S
+                self._look()
+            pending = self._read_numbers(time.monotonic() + NUMBERS_S)
+            frame = self.playback.advance(now)
+            self._files_trouble = ""
+            self._show(frame)
+        except OSError as error:  # a right that was taken away, or a server of files that is gone: it may come back
+            self._files_trouble = f"{self._layout.root} cannot be read now: {error}"
+            self._tell(self.playback.frame, self._controls.shown())
+            return LOOK_S
+        due = self.playback.wait(now)
+        waits = [self._next_look - now, *([] if due is None else [due]), *([0.0] if pending else [])]
+        return max(0.0, min(waits))
+
+    # --- what there is ---
+
+    def _look(self) -> None:
+        """Look for new frames, and for a job file that was replaced by a new submission."""
+        stamp = stamp_of(self._layout.job_file)
+        if stamp != self._job_stamp:
+            self._job_stamp = stamp
+            try:
+                self._job = load_job(self._layout.job_file)
+                self._job_trouble = ""
+                self._scene = JobScene(self._job, self._layout, self._committed)
+                self._loaded.clear()
+                self._drawn = ()
+                self._controls.offer_layers(self._scene.layers)
+            except (PipelineError, OSError) as error:
+                self._job_trouble = f"{self._layout.job_file}: {error}; shown as it was before"
+        if self._committed.update():
+            frames = self._committed.numbers
+            self.playback.offer(frames, follow=self._controls.follow.value)
+            self._series.keep(frames)
+            self._spoilt = {frame: told for frame, told in self._spoilt.items() if frame in frames}
+            self._controls.offer_frames(frames)
+            if self.playback.frame is not None and not self.playback.plays:
+                self._controls.slider.value = self.playback.frame
+
+    def _read_numbers(self, until: float) -> bool:
+        """Read numbers of frames that are new; returns whether there are more."""
+        changed = False
+        for frame in self._committed.numbers:
+            source = self._committed.receipt(frame).hash
+            if self._series.has(frame, source=source) or self._is_spoilt(frame):
+                continue
+            if time.monotonic() >= until:
+                return True
+            try:
+                numbers = read_numbers(self._layout.path(self._layout.frame_cache(frame)))
+                self._series.put(numbers, source=source)
+                changed = True
+            except InvalidArtifactError as error:
+                self._spoilt[frame] = (source, str(error))
+        if changed:
+            self._controls.offer_numbers(self._series)
+        return False
+
+    def _is_spoilt(self, frame: int) -> bool:
+        """Whether a frame could not be read, and was not simulated anew since."""
+        return frame in self._spoilt and self._spoilt[frame][0] == self._committed.receipt(frame).hash
+
+    def _known(self, frame: int) -> tuple[str | None, ...]:
+        """Hashes of a frame, and of the last one, on which the camera may depend.
+
+        Receipts may be newer: then a frame is read again when this has caught up.
+        """
+        return tuple(self._committed.known_hash(number) for number in (frame, self._job.frame_count - 1))
+
+    def _load(self, frame: int, stamp: Stamp, *, surfaces: bool) -> ShownFrame | None:
+        state = (stamp, self._known(frame), surfaces)
+        shown = self._loaded.get(frame, state)
+        if shown is None:
+            try:
+                shown = read_shown_frame(
+                    self._job,
+                    self._layout,
+                    self._committed,
+                    frame,
+                    most_particles=self._most_particles,
+                    surfaces=surfaces,
+                )
+            except (InvalidArtifactError, OSError) as error:
+                self._spoilt[frame] = (self._committed.receipt(frame).hash, str(error))
+                return None
+            self._spoilt.pop(frame, None)
+            self._loaded.put(frame, state, shown)
+            self._extents.see(shown.bodies)
+        return shown
+
+    # --- what is seen ---
+
+    def _show(self, frame: int | None) -> None:
+        settings = self._controls.shown()
+        self._extents.top_speed = self._series.largest("max_speed")
+        stamp = self._committed.stamp(artifacts_of_frame(self._job, self._layout, frame))
+        wanted = (frame, stamp, None if frame is None else self._known(frame), settings, self._extents.top_speed)
+        if wanted != self._drawn:
+            shown = None if frame is None else self._load(frame, stamp, surfaces=SURFACES in settings.layers)
+            self._scene.draw(self._canvas, shown, settings, self._extents)
+            self._shown, self._drawn = shown, wanted
+            if frame is not None and self.playback.plays:
+                self._controls.slider.value = frame
+            if shown is not None:
+                self._controls.offer_values({name for cloud in shown.fluids.values() for name in cloud.values})
+        self._tell(frame, settings)
+
+    def _tell(self, frame: int | None, settings: Shown) -> None:
+        """Text and plot; viser sends only what differs."""
+        controls, shown = self._controls, self._shown
+        # A recording that goes on has more frames than its job asks for, until it ends.
+        count = max(self._job.frame_count, 1 + max(self.frames, default=0))
+        controls.title.content = title(self._job.name, shown, frame, done=len(self.frames), count=count)
+        remarks = [*thinned(shown), *lacking(shown)] if shown is not None else []
+        controls.notice.content = notice(self._troubles(frame, settings), remarks)
+        controls.legend.content = self._legend(settings.color_by)
+        controls.play.label = "Pause" if self.playback.plays else "Play"
+        chosen = controls.chosen_numbers()
+        panel = (frame, chosen, self._series.version, count)
+        if panel != self._panel:
+            self._panel = panel
+            values = self._series.of(*chosen) if chosen is not None else ([], [])
+            controls.plot.content = plot(*values, current=frame, last=count - 1)
+            numbers = self._series.numbers(frame)
+            controls.table.content = "" if numbers is None else table(numbers)
+
+    def _troubles(self, frame: int | None, settings: Shown) -> list[str]:
+        troubles = [trouble for trouble in (self._job_trouble, self._files_trouble) if trouble]
+        if frame is None:
+            where = f"{self._layout.root} has no frame yet; they appear here as soon as they are simulated"
+            return [*troubles, where]
+        if self._is_spoilt(frame):
+            troubles.append(f"frame {frame} cannot be read, see: pipeline verify ({self._spoilt[frame][1]})")
+        if self._shown is not None:
+            troubles += self._shown.troubles
+            if SURFACES in settings.layers and not self._shown.surfaces:
+                troubles.append(f"frame {frame} has no surface yet")
+            if CAMERA in settings.layers and self._shown.view is None:
+                troubles.append("where the camera is follows when the whole film is simulated")
+        return [*troubles, *self._scene.troubles]
+
+    def _legend(self, color_by: str) -> str:
+        fluids = self._shown.fluids.values() if self._shown is not None else ()
+        cloud = next((of for of in fluids if color_by in of.values), None)
+        return "" if cloud is None else legend(color_by, self._extents.range(color_by, cloud))
+
+    # --- controls ---
+
+    def _wire(self) -> None:
+        controls = self._controls
+        controls.slider.on_update(self._when_used(lambda _: self.playback.seek(int(controls.slider.value))))
+        controls.play.on_click(self._when_used(self._play_or_pause))
+        controls.steps.on_click(self._when_used(lambda _: self._step(controls.steps.value)))
+        controls.rate.on_update(self._when_used(lambda now: self.playback.set_rate(float(controls.rate.value), now)))
+        controls.repeat.on_update(self._when_used(lambda _: setattr(self.playback, "repeats", controls.repeat.value)))
+        controls.follow.on_update(self._when_used(lambda _: self._go_to_newest()))
+        controls.when_changed(self._when_used(lambda _: None))
+        controls.through.on_click(self._look_through)
+
+    def _when_used(self, command: Callable[[float], None]) -> Callable[[Any], None]:
+        """A callback of a control: has a command done by the loop, but only if a person used it."""
+
+        def use(event: Any) -> None:
+            if event.client_id is not None:
+                self._commands.put(command)
+                self._wake.set()
+
+        return use
+
+    def _play_or_pause(self, now: float) -> None:
+        if self.playback.plays:
+            self.playback.pause(now)
+        else:
+            self.playback.play(now)
+
+    def _step(self, where: str) -> None:
+        far = len(self.frames)
+        self.playback.step({"first": -far, "back": -1, "next": 1, "last": far}[where])
+        if self.playback.frame is not None:
+            self._controls.slider.value = self.playback.frame
+
+    def _go_to_newest(self) -> None:
+        if self._controls.follow.value:
+            self._step("last")
+
+    # --- where it is seen from ---
+
+    def _first_view(self) -> View:
+        from pipeline.stages.render_scene import camera_path
+
+        return camera_path(self._job).first()
+
+    def _look_from_aside(self) -> None:
+        """Begin beside the film's camera."""
+        view = self._first_view()
+        target = np.array(view.look_at)
+        x, y, z = np.array(view.position) - target
+        cosine, sine = np.cos(ASIDE), np.sin(ASIDE)
+        aside = np.array([cosine * x - sine * y, sine * x + cosine * y, z])
+        begin_at(self._server, target + aside, target, fov=0.75)
+
+    def _look_through(self, event: Any) -> None:
+        """Put the camera of the page whose button it was where the film's is."""
+        view = self._shown.view if self._shown is not None and self._shown.view is not None else self._first_view()
+        width, height = self._job.render.resolution
+        camera = event.client.camera
+        with event.client.atomic():
+            camera.fov = vertical_fov(view, width / height)
+            camera.wxyz = camera_orientation(view)
+            camera.position = view.position
+            camera.look_at = view.look_at

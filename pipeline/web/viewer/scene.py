@@ -1,0 +1,133 @@
+"""A job's cached frames on the canvas: bodies, and around them surfaces, whitewater, pins, the domain, the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import ArtifactPath
+from pipeline.model.job import Job
+from pipeline.model.looks import BODY
+from pipeline.web.drawing.bodies import DRAWERS, SPEED, Extents, Look, Setting, color_of, draw_bodies
+from pipeline.web.drawing.canvas import Canvas, box_edges
+from pipeline.web.drawing.colors import PIN, SURFACE, WHITEWATER
+from pipeline.web.drawing.shapes import Pose
+from pipeline.web.pins import JobPin, pins_of_job
+from pipeline.web.viewer.committed import CommittedFrames, Stamp
+from pipeline.web.viewer.frames import ShownFrame
+from render.errors import InvalidFileError
+from render.meshes import read_ply
+from sim.core.motion.rotation import from_degrees
+
+DOMAIN_COLOR, CAMERA_COLOR = (120, 130, 146), (240, 190, 90)
+SURFACES, SPRAY, DOMAIN, PINS, CAMERA = "Surfaces", "Whitewater", "Domain", "Pins", "Camera"
+"""Layers beside those of `DRAWERS`."""
+
+
+@dataclass(frozen=True)
+class Shown(Look):
+    """A look that also says which layers are shown."""
+
+    color_by: str = SPEED
+    layers: frozenset[str] = frozenset()
+
+
+class JobScene:
+    """Frames of a job on a canvas.
+
+    Args:
+        job: the job.
+        layout: its folder, which is only read.
+        committed: tells which files of it may be read.
+    """
+
+    def __init__(self, job: Job, layout: JobLayout, committed: CommittedFrames) -> None:
+        self._job, self._layout, self._committed = job, layout, committed
+        self._meshes: dict[ArtifactPath, tuple[Stamp, tuple[NDArray[Any], NDArray[Any]]]] = {}
+        self._standing = {
+            body.name: Pose(np.array(body.position), from_degrees(body.rotation_deg))
+            for body in job.rigid
+            if body.kind == "static"
+        }
+        self._pins: list[JobPin] | None = None
+        self.troubles: list[str] = []
+        width, height = job.render.resolution
+        self._aspect = width / height
+        self._size = float(np.linalg.norm(np.subtract(job.domain.max, job.domain.min)))
+
+    @property
+    def layers(self) -> list[str]:
+        """Layers that this job has."""
+        job = self._job
+        has = {
+            **{drawer.layer: getattr(job, kind) for kind, drawer in DRAWERS.items()},
+            SURFACES: job.fluid,
+            SPRAY: job.whitewater,
+            DOMAIN: True,
+            PINS: any(cloth.pin for cloth in job.cloth),
+            CAMERA: True,
+        }
+        return [layer for layer, there in has.items() if there]
+
+    def draw(self, canvas: Canvas, frame: ShownFrame | None, shown: Shown, extents: Extents) -> None:
+        """Draw a frame; None: only what stays the same."""
+        self.troubles = []
+        job, layers = self._job, shown.layers
+        bodies = {**({} if frame is None else frame.bodies), **self._standing}
+        with canvas.picture():
+            if DOMAIN in layers:
+                canvas.lines("/domain", box_edges(job.domain.min, job.domain.max), DOMAIN_COLOR)
+            draw_bodies(canvas, bodies, Setting(job, self._mesh, shown, extents), layers=layers)
+            if frame is None:
+                return
+            if SURFACES in layers:
+                for name, mesh in frame.surfaces.items():
+                    opacity = 0.45 if DRAWERS["fluid"].layer in layers else None
+                    color = color_of(job, name, BODY, SURFACE)
+                    canvas.mesh(f"/surface/{name}", mesh.vertices, mesh.faces, color, opacity=opacity)
+            if SPRAY in layers:
+                for name, cloud in frame.whitewater.items():
+                    canvas.points(f"/whitewater/{name}", cloud.position, WHITEWATER, radius=cloud.radius)
+            if PINS in layers:
+                self._draw_pins(canvas, frame)
+            if CAMERA in layers and frame.view is not None:
+                canvas.camera("/camera", frame.view, aspect=self._aspect, size=self._size / 10.0, color=CAMERA_COLOR)
+
+    def _mesh(self, body: str, part: str) -> tuple[NDArray[Any], NDArray[Any]] | None:
+        """The mesh of a part of a body; None before it is made."""
+        artifact = self._layout.body_mesh(body, part)
+        stamp = self._committed.stamp([artifact])
+        kept = self._meshes.get(artifact)
+        if kept is not None and kept[0] == stamp:
+            return kept[1]
+        self._meshes.pop(artifact, None)
+        if not self._committed.is_there(artifact):
+            return None
+        try:
+            mesh = read_ply(self._layout.path(artifact))
+        except (InvalidFileError, OSError) as error:
+            self.troubles.append(f"{error}; see: pipeline verify")
+            return None
+        self._meshes[artifact] = stamp, (mesh.vertices, mesh.faces)
+        return mesh.vertices, mesh.faces
+
+    def _draw_pins(self, canvas: Canvas, frame: ShownFrame) -> None:
+        try:
+            if self._pins is None:
+                self._pins = pins_of_job(self._job)
+        except (ValueError, OSError) as error:  # the mesh of a cloth is gone or damaged
+            self.troubles.append(f"pins are not shown: {error}")
+            return
+        for name in dict.fromkeys(pin.cloth for pin in self._pins):
+            position = getattr(frame.bodies.get(name), "position", None)
+            held = [pin.nodes for pin in self._pins if pin.cloth == name and pin.holds(frame.numbers.time_s)]
+            if position is not None and held:
+                nodes = np.unique(np.concatenate(held))
+                if nodes[-1] >= len(position):  # the frame is of an earlier version of the job
+                    self.troubles.append(f"pins of {name} are not shown: this frame has fewer nodes than the job")
+                    continue
+                canvas.points(f"/pin/{name}", position[nodes], PIN, radius=self._size / 250.0)

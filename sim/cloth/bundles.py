@@ -1,0 +1,419 @@
+"""Bundles of arrays that the kernels of cloth take (`sim.core.bundles`), and the types of these arrays.
+
+n nodes, k triangles, m patches, p pairs of patches, c contacts, b bodies, w walls.
+"""
+
+from typing import NamedTuple
+
+import taichi as ti
+
+from sim.core.arrays import Floats, Integers, LongIntegers, Matrices, Vectors
+from sim.core.bundles import bundle
+from sim.shapes.device_distances import Shapes
+
+Two = ti.types.vector(2, ti.i32)
+Four = ti.types.vector(4, ti.i32)
+Lattice = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
+Laws = ti.types.ndarray(dtype=ti.math.vec3, ndim=1)
+Pairs = ti.types.ndarray(dtype=Two, ndim=1)
+Triples = ti.types.ndarray(dtype=ti.types.vector(3, ti.i32), ndim=1)
+Quadruples = ti.types.ndarray(dtype=Four, ndim=1)
+Weights = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
+Planes = ti.types.ndarray(dtype=ti.math.vec4, ndim=1)
+
+
+# --- nodes, springs, air; fields as the attributes of `ClothState`, `DeviceSprings` and `ClothAir` ------------------
+
+
+@bundle
+class Nodes(NamedTuple):
+    """Nodes as springs displace them."""
+
+    lattice: Lattice  # where the substep starts, in quanta, (n,)
+    quantum: ti.f32  # [m]
+    inverse_mass: Floats  # [1/kg], (n,)
+    displacement: Vectors  # in the substep [m], (n,)
+
+
+@bundle
+class NodeMotion(NamedTuple):
+    """Motion of nodes at the start of a substep."""
+
+    carry: Vectors  # [m], (n,)
+    velocity: Vectors  # [m/s], (n,)
+
+
+@bundle
+class Surface(NamedTuple):
+    """Nodes as contacts are looked for."""
+
+    position: Vectors  # at the start of the substep [m], (n,)
+    displacement: Vectors  # [m], (n,)
+    thickness: Floats  # [m], (n,)
+    friction: Floats  # [-], (n,)
+
+
+@bundle
+class SpringArrays(NamedTuple):
+    """Springs of one family, s of them."""
+
+    nodes: Integers  # (arity s,)
+    law: Laws  # rest length [m], stiffness [N/m], damping over stiffness [s], (s,)
+    coefficients: Floats  # of springs with four nodes, (4 s,)
+
+
+@bundle
+class Pieces(NamedTuple):
+    """Pieces of threads."""
+
+    segment_start: Integers  # first spring of each piece, and number of springs, (pieces + 1,)
+    piece_of_colour: Integers  # first piece of each colour, and number of pieces, (colours + 1,)
+    piece: Integers  # of each spring, (s,)
+    spring_of_colour: Integers  # first spring of each colour, and number of springs, (colours + 1,)
+    is_taut: Integers  # whether a piece has tension to straighten, (pieces,)
+
+
+@bundle
+class ThreadWork(NamedTuple):
+    """Numbers of each spring of threads within a substep, (s,) each."""
+
+    direction: Vectors
+    lower: Floats  # of the tridiagonal system, then its factors
+    diagonal: Floats  # of that system; then inverse mass of the node that the spring leads to [1/kg]
+    change: Floats  # of the multiplier
+    multiplier: Floats
+    tension: Floats  # too much of it, over the length
+    solved: Vectors  # [m]
+
+
+@bundle
+class Air(NamedTuple):
+    """Air at the triangles."""
+
+    velocity: Vectors  # [m/s], (k,)
+    inverse_mass: Floats  # area of cloth over mass of air [m²/kg], (k,)
+    drag: Vectors  # rho C_n / 2, rho C_t / 2 [kg/m³], mass of the triangle [kg], (k,)
+    share: Floats  # of each node in the force on its triangles [-], (n,)
+    force: Vectors  # [N], (k,)
+    impulse: Vectors  # [N s], (k,)
+
+
+@bundle
+class AirAtNodes(NamedTuple):
+    """Forces of the air as nodes gather them."""
+
+    force: Vectors  # on each triangle [N], (k,)
+    share: Floats  # [-], (n,)
+    triangle_start: Integers  # of each node in the list, (n + 1,)
+    triangle_list: Integers  # (3 k,)
+
+
+# --- rows of rectangles ---------------------------------------------------------------------------------------------
+
+
+@bundle
+class Rectangle(NamedTuple):
+    """A rectangle of nodes in rows."""
+
+    first: ti.i32  # number of its first node
+    columns: ti.i32
+    rows: ti.i32
+    strips: ti.i32  # upright blocks beside each other
+    turned_strips: ti.i32
+
+
+@bundle
+class Lines(NamedTuple):
+    """Lines of a rectangle along one direction."""
+
+    is_turned: ti.i32  # whether they run along x
+    length: ti.i32  # nodes of a line
+    strips: ti.i32  # blocks beside each other
+    other_strips: ti.i32  # those of the other direction
+
+
+@bundle
+class Wind(NamedTuple):
+    """Wind on a rectangle."""
+
+    velocity: ti.math.vec3  # [m/s]
+    drag: ti.f32  # rho C_n / 2 [kg/m³]
+    skin_drag: ti.f32  # rho C_t / 2 [kg/m³]
+    mass: ti.f32  # of a triangle [kg]
+
+
+# --- patches --------------------------------------------------------------------------------------------------------
+
+
+@bundle
+class PatchNodes(NamedTuple):
+    """Nodes in lists, one of each patch."""
+
+    count: ti.i32  # of the patches
+    first: Integers  # place of each patch's first node, and number of places, (m + 1,)
+    nodes: Integers
+
+
+@bundle
+class PatchElements(NamedTuple):
+    """Edges and triangles in lists, one of each patch."""
+
+    count: ti.i32  # of the patches
+    first_edge: Integers  # (m + 1,)
+    edges: Pairs
+    first_triangle: Integers  # (m + 1,)
+    triangles: Triples
+
+
+@bundle
+class TrackedNodes(NamedTuple):
+    """Nodes as patches follow them."""
+
+    position: Vectors  # [m], (n,)
+    displacement: Vectors  # [m], (n,)
+    expected: Vectors  # where the substep before should have led [m], (n,)
+
+
+@bundle
+class PatchMotion(NamedTuple):
+    """Rigid motion of each patch in the substep, which its displacements are near."""
+
+    centre: Vectors  # [m], (m,)
+    shift: Vectors  # [m], (m,)
+    turn: Vectors  # [rad], (m,)
+    radius: Floats  # largest distance of a corner from the centre [m], (m,)
+    rest: Floats  # largest difference of a displacement from that motion [m], (m,)
+
+
+@bundle
+class PatchBounds(NamedTuple):
+    """Boxes of the patches at the start of the substep, and their motion in it."""
+
+    low: Vectors  # [m], (m,)
+    high: Vectors
+    motion: PatchMotion
+
+
+@bundle
+class PatchBudget(NamedTuple):
+    """Distances that patches move, and that lists allow for [m], (m,) each."""
+
+    moves: Floats  # largest distance of a vertex from the middle of all displacements
+    change: Floats  # largest displacement by contacts
+    margin: Floats  # how far contacts may displace
+    more: Floats  # what of the margin is beyond half a thickness
+    spent: Floats  # sum over the substeps since the patches were paired
+    travel: Floats  # `spent`, with this substep and `more`
+    reach: Floats  # which `travel` may have until they are paired anew
+
+
+@bundle
+class SubstepEnd(NamedTuple):
+    """Limits by which patches finish a substep."""
+
+    is_changed: ti.i32  # whether contacts displaced anything
+    astray: ti.f32  # largest distance of a vertex from where it was expected [m]
+    still: ti.f32  # differences of displacements that are not fitted [m]
+    negligible: ti.f32  # displacement by contacts after which a patch is not fitted anew [m]
+    least_margin: ti.f32  # [m]
+    half_thickness: ti.f32  # [m]
+
+
+@bundle
+class BoxTree(NamedTuple):
+    """Boxes of a complete binary tree: 2 i and 2 i + 1 are below node i, 1 is the root."""
+
+    leaves: ti.i32  # leaf k is node `leaves` + k
+    low: Vectors  # [m], (2 leaves,)
+    high: Vectors
+
+
+@bundle
+class KnownPairs(NamedTuple):
+    """Pairs of patches of whose elements something is known, by their first patch."""
+
+    first: Integers  # those of patch i are known[first[2 i]:first[2 i + 1]], (2 m,)
+    known: Integers  # numbers of pairs
+    pairs: Pairs
+    slack: Floats
+
+
+@bundle
+class PatchPairArrays(NamedTuple):
+    """Pairs of patches; fields as the attributes of `PatchPairs`, (p,) each."""
+
+    count: ti.i32  # p
+    pairs: Pairs
+    slack: Floats  # [m]
+    wake: Floats  # what the patches of a sleeping pair spend until it wakes [m], or -1
+    left: Floats  # [m]
+    approach: Floats  # [m]
+    allowed: Floats  # [m]
+    reach: Floats  # [m]
+    due: Integers
+    expired: Integers
+
+
+@bundle
+class Searches(NamedTuple):
+    """Numbers of the pairs of patches that are searched, for vertices near triangles and for edges."""
+
+    count: ti.i32
+    numbers: Integers
+    edge_count: ti.i32
+    edge_numbers: Integers
+    lanes: ti.i32  # threads that share a pair
+
+
+# --- pairs of elements ----------------------------------------------------------------------------------------------
+
+
+@bundle
+class PairPieces(NamedTuple):
+    """A list of pairs of elements, in pieces; fields as the attributes of `PairList`."""
+
+    pieces: Quadruples  # first place, places, places taken, (p,)
+    piece_due: Floats  # [m], (p,)
+    pairs: Quadruples
+    wanted: Floats  # [m]
+    due: Floats  # [m]
+
+
+@bundle
+class PieceRoom(NamedTuple):
+    """Pieces of a list that may have to become longer."""
+
+    pieces: Quadruples  # (p,)
+    end: Integers  # of the list; how many pieces are searched again
+    again: Integers  # their numbers
+
+
+@bundle
+class EdgeBlocks(NamedTuple):
+    """Edges of patches in blocks; see `ElementBlocks`."""
+
+    first_block: Integers  # of each patch, (m + 1,)
+    edges: Pairs
+    mid_x: Floats  # of the midpoints [m]
+    mid_y: Floats
+    mid_z: Floats
+    half_x: Floats  # half the vectors along them [m]
+    half_y: Floats
+    half_z: Floats
+
+
+@bundle
+class TriangleBlocks(NamedTuple):
+    """Triangles of patches in blocks; see `ElementBlocks`."""
+
+    first_block: Integers  # of each patch, (m + 1,)
+    triangles: Triples
+    low_x: Floats  # of the boxes [m]
+    low_y: Floats
+    low_z: Floats
+    high_x: Floats
+    high_y: Floats
+    high_z: Floats
+
+
+# --- contacts -------------------------------------------------------------------------------------------------------
+
+
+@bundle
+class Contacts(NamedTuple):
+    """Contacts as they are found; fields as the attributes of `ContactList`, (c,) each."""
+
+    vertices: Quadruples
+    weights: Weights
+    normal: Vectors
+    floor: Floats  # [m]
+    kind: Integers
+    arm: Vectors  # [m]
+    friction: Floats  # [-]
+    counter: Integers  # (1,)
+    capacity: ti.i32
+
+
+@bundle
+class Impulses(NamedTuple):
+    """Impulses of contacts; fields as the attributes of `ContactList`."""
+
+    mobility: Floats  # [1/kg], (c,)
+    impulse: Vectors  # [kg m], (c,)
+    impulse_before: Vectors
+    impulse_given: Vectors
+    pushing: Integers  # (c,)
+    push: Vectors  # in units, (c,)
+    used_by: Integers  # (4 c,)
+    use_weight: Floats  # (4 c,)
+    unit: ti.f32  # of sums of impulses [kg m]
+
+
+@bundle
+class PushedNodes(NamedTuple):
+    """Nodes as contacts push them."""
+
+    displacement: Vectors  # [m], (n,)
+    inverse_mass: Floats  # [1/kg], (n,)
+    start: Vectors  # displacement where the iteration starts [m], (n,)
+    reached: Vectors  # displacement without momentum [m], (n,)
+    touched: Integers  # numbers of those that contacts push
+    uses: Integers  # first and last place of each node in `Impulses.used_by`, (2 n,)
+    support: Vectors  # see `continuous_response`, (n,)
+
+
+@bundle
+class NodeSums(NamedTuple):
+    """Numbers of each node that are found as contacts are weighed."""
+
+    counter: Integers  # contacts that push, nodes that they push, and how often, (3,)
+    predicted: Vectors  # displacement without contacts [m], (n,)
+    shares: Integers  # sum of weights, in 1 / `SHARES_PER_UNIT`, (n,)
+    held_sums: Integers  # of normals of what stands, then of what presses, (6 n,)
+    lever: Floats  # square root of the largest mobility of a body that presses [kg^(-1/2)], (n,)
+    pressing_body: Integers  # its number, or -1, (n,)
+
+
+@bundle
+class PushedBodies(NamedTuple):
+    """Bodies as contacts push them; fields as the attributes of `CollisionBodies`."""
+
+    may_move: ti.i32
+    count: ti.i32  # b
+    motion: Vectors  # [m] and [rad] in turn, (2 b,)
+    motion_start: Vectors
+    motion_reached: Vectors
+    inverse_mass: Floats  # [1/kg], (b,)
+    inverse_inertia: Matrices  # [1/(kg m²)], (b,)
+    gathered: LongIntegers  # (6 b,)
+    impulse: LongIntegers  # (6 b,)
+    load: LongIntegers  # (b,)
+    load_unit: ti.f32  # [kg^(-1/2)]
+
+
+@bundle
+class CollidingBodies(NamedTuple):
+    """Bodies as cloth looks for them; fields as the attributes of `CollisionBodies`, (b,) each."""
+
+    count: ti.i32  # b
+    shapes: Shapes
+    has_edges: Integers
+    centre_of_mass: Vectors  # [m]
+    radius: Floats  # [m]
+    step: Floats  # [m]
+    friction: Floats  # [-]
+    position: Vectors  # [m]
+    rotation: Matrices
+    motion: Vectors  # [m] and [rad] in turn, (2 b,)
+
+
+@bundle
+class Walls(NamedTuple):
+    """Closed faces of the domain, (w,) each."""
+
+    count: ti.i32  # w
+    plane: Planes  # normal into the domain, and its product with a point of the wall [m]
+    low: Vectors  # corners of the wall [m], infinite across it
+    high: Vectors
+    joined_low: Vectors  # 1 on axes on which another wall joins it, else 0
+    joined_high: Vectors

@@ -1,0 +1,92 @@
+"""Springs that have not converged: longer than their tension makes them, as the sweeps of XPBD leave them.
+
+Where a spring is solved, its multiplier is -k dt² times its stretch. What is solved after it moves its nodes on, and
+what that leaves is no stretch of the material: it falls with every sweep, and with the square of the step. Rubber that
+is drawn to twice its length has none of it.
+"""
+
+import taichi as ti
+
+from sim.cloth.bundles import Lines, Nodes, SpringArrays
+from sim.cloth.row_blocks import LANES
+from sim.core.arrays import Floats
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.core.reductions import runs_on_gpu
+
+LARGEST_RESIDUAL = 0.5
+"""Residual in rest lengths from which a spring counts as not converged: at a third of it cloth looks well still, as a
+rubber sheet does that a heavy ball falls into; a bag of water that hangs from four nodes is drawn out to spikes."""
+
+
+@func
+def is_unconverged(
+    i: ti.i32, j: ti.i32, rest: ti.f32, stiffness: ti.f32, multiplier: ti.f32, nodes: Nodes, dt_squared: ti.f32
+) -> ti.i32:
+    """Whether |d| - rest + l/(k dt²) > `LARGEST_RESIDUAL` rest, for a spring of which one node at least is free."""
+    d = nodes.quantum * ti.cast(nodes.lattice[i] - nodes.lattice[j], ti.f32) + (
+        nodes.displacement[i] - nodes.displacement[j]
+    )
+    excess = d.norm() - rest + multiplier / (stiffness * dt_squared)
+    return ti.cast(excess > LARGEST_RESIDUAL * rest and nodes.inverse_mass[i] + nodes.inverse_mass[j] > 0.0, ti.i32)
+
+
+@kernel
+def count_unconverged(
+    springs: SpringArrays, count: ti.i32, multiplier: Floats, nodes: Nodes, dt_squared: ti.f32
+) -> ti.i32:
+    """Number of springs of threads in lists that have not converged."""
+    if ti.static(not runs_on_gpu()):
+        ti.loop_config(serialize=True)
+    unconverged = 0
+    for s in range(count):
+        unconverged += is_unconverged(
+            springs.nodes[2 * s],
+            springs.nodes[2 * s + 1],
+            springs.law[s][0],
+            springs.law[s][1],
+            multiplier[s],
+            nodes,
+            dt_squared,
+        )
+    return unconverged
+
+
+@kernel
+def count_unconverged_in_lines(
+    blocks: ti.template(),
+    along: Lines,
+    lines: ti.i32,
+    first_node: ti.i32,
+    node_step: ti.i32,
+    line_step: ti.i32,
+    stiffness: Floats,
+    rest: ti.f32,
+    nodes: Nodes,
+    dt_squared: ti.f32,
+) -> ti.i32:
+    """Number of springs of a rectangle's threads along one direction that have not converged.
+
+    Args:
+        blocks: workspace right after the rectangle's step, with the multipliers; places as in `solve_lines`.
+        along: the lines.
+        lines: how many there are.
+        first_node: of the rectangle.
+        node_step, line_step: from a node to the next one of its line, and to the same of the next line.
+        stiffness: of the springs of each line [N/m].
+        rest: length of a spring [m].
+        nodes: of all cloths.
+        dt_squared: [s²].
+    """
+    ti.loop_config(serialize=True)
+    unconverged = 0
+    for line in range(lines):
+        for k in range(along.length - 1):
+            block = line // LANES + k * along.strips
+            if along.is_turned:
+                block += blocks.turned
+            i = first_node + line * line_step + k * node_step
+            unconverged += is_unconverged(
+                i, i + node_step, rest, stiffness[line], blocks.multiplier[block][line % LANES], nodes, dt_squared
+            )
+    return unconverged

@@ -1,0 +1,128 @@
+"""Bundles: arrays and numbers that belong together, as one argument of kernels and device functions.
+
+A bundle is a named tuple whose fields have types that kernels take, other bundles among them:
+
+    @bundle
+    class Particles(NamedTuple):
+        x: Vectors        # positions [m], (n,)
+        m: Floats         # masses [kg], (n,)
+
+    @func
+    def weight(p: Particles, i: ti.i32):
+        return 9.81 * p.m[i]
+
+    @kernel               # sim.core.launch
+    def fall(p: Particles, dt: ti.f32): ...
+
+    fall(Particles(x, m), dt)
+
+A kernel that takes bundles is compiled as if each of their fields were an argument of its own, so bundling changes
+neither what the device does nor a bit of the result. Taichi's own `argpack` reads the address of an array anew wherever
+the array is used (docs/decisions/0037-kernel-arguments.md).
+
+This relies on how Taichi 1.7 reads the source of a kernel, as `sim.core.tracing` does.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
+
+import taichi as ti
+from taichi.lang import kernel_impl
+
+SEPARATOR = "__"
+"""Between the name of a bundle and that of its field, in the name of the argument that the field becomes."""
+
+NamedTupleType = TypeVar("NamedTupleType", bound=type)
+
+
+def bundle(named_tuple: NamedTupleType) -> NamedTupleType:
+    """Make a named tuple of kernel types a type of arguments itself."""
+    named_tuple.__bundled__ = inspect.get_annotations(named_tuple, eval_str=True)  # type: ignore[attr-defined]
+    return named_tuple
+
+
+def is_bundle(kind: Any) -> bool:
+    """Whether a type was made by `bundle`."""
+    return hasattr(kind, "__bundled__")
+
+
+def flattened(values: tuple[Any, ...]) -> Iterator[Any]:
+    """Values with each bundle replaced by its fields, in order."""
+    for value in values:
+        if is_bundle(value):
+            yield from flattened(value)
+        else:
+            yield value
+
+
+def func(function: Callable[..., Any]) -> Any:
+    """Decorator in place of `ti.func`: the function may take bundles, all of them by reference."""
+    signature = inspect.signature(function, eval_str=True)
+    parameters = [
+        parameter.replace(annotation=ti.template()) if is_bundle(parameter.annotation) else parameter
+        for parameter in signature.parameters.values()
+    ]
+    function.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return ti.func(function)
+
+
+def with_fields_as_arguments(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Tell Taichi, before it makes a kernel of a function, that the fields of bundles are its arguments."""
+    signature = inspect.signature(function, eval_str=True)
+    annotations = [parameter.annotation for parameter in signature.parameters.values()]
+    kinds = tuple(kind if is_bundle(kind) else None for kind in annotations)
+    if any(kinds):
+        parameters = [
+            inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=kind)
+            for parameter in signature.parameters.values()
+            for name, kind in _leaves(parameter.name, parameter.annotation)
+        ]
+        function.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+        function.__bundles__ = kinds  # type: ignore[attr-defined]
+    return function
+
+
+def _leaves(name: str, kind: Any) -> Iterator[tuple[str, Any]]:
+    """Names and types of the arguments that an argument becomes."""
+    if is_bundle(kind):
+        for field, field_kind in kind.__bundled__.items():
+            yield from _leaves(f"{name}{SEPARATOR}{field}", field_kind)
+    else:
+        yield name, kind
+
+
+class _Fields:
+    """A bundle while a kernel is compiled: its fields are the kernel's arguments."""
+
+    def __init__(self, name: str, kind: Any, context: Any) -> None:
+        self._name, self._kinds, self._context = name, kind.__bundled__, context
+
+    def __getattr__(self, field: str) -> Any:
+        kind = self._kinds.get(field)
+        if kind is None:
+            raise AttributeError(f"{self._name.replace(SEPARATOR, '.')} has no field {field}")
+        name = f"{self._name}{SEPARATOR}{field}"
+        return _Fields(name, kind, self._context) if is_bundle(kind) else self._context.get_var_by_name(name)
+
+
+def _read_source(kernel: Any, *args: Any, **keywords: Any) -> tuple[ast.Module, Any]:
+    """As Taichi reads the source of a kernel, but with the fields of bundles as arguments."""
+    tree, context = _taichi_reads_source(kernel, *args, **keywords)
+    kinds = getattr(kernel.func, "__bundles__", ())
+    if kinds:
+        arguments = tree.body[0].args
+        written, arguments.args = arguments.args, []
+        for argument, kind in zip(written, kinds, strict=True):
+            for name, _ in _leaves(argument.arg, kind):
+                arguments.args.append(ast.copy_location(ast.arg(name, argument.annotation), argument))
+            if kind is not None:
+                context.global_vars[argument.arg] = _Fields(argument.arg, kind, context)
+    return tree, context
+
+
+_taichi_reads_source = kernel_impl._get_tree_and_ctx
+kernel_impl._get_tree_and_ctx = _read_source

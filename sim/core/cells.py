@@ -1,0 +1,233 @@
+"""Points sorted into the cells of a grid: a counting sort, the same whatever the number of threads.
+
+The cells are numbered along x first, so that the cells of a row are one contiguous range of the sorted points.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
+from sim.core.scan import scan_in_parallel, scan_scratch_length
+
+Cells = ti.types.vector(3, ti.i32)
+
+MAX_CELLS = 2**28
+"""Most cells of a grid: 1 GiB for each of its int32 arrays, however few the particles."""
+
+
+@bundle
+class Grid(NamedTuple):
+    """A grid of cells as kernels take it."""
+
+    origin: ti.math.vec3  # lower corner of the outermost cells [m]
+    inverse_cell_size: ti.f32  # [1/m]
+    shape: Cells  # number of cells along x, y, z
+    reach: ti.template()  # cells to either side that a search looks into
+
+
+@bundle
+class SortedPoints(NamedTuple):
+    """Points sorted by cell, as a search reads them; coordinates in separate arrays become vector code."""
+
+    x: Floats  # [m], (n,)
+    y: Floats
+    z: Floats
+    cell_start: Integers  # first point of each cell, as `CellSort` finds it, (cells + 2,)
+
+
+@bundle
+class SortArrays(NamedTuple):
+    """Arrays of a counting sort."""
+
+    cell_of: Integers  # cell of each point, (capacity,)
+    cursor: Integers  # next place in each cell, (cells + 1,)
+    scratch: Integers  # of the scan
+    cell_start: Integers  # first sorted point of each cell, (cells + 2,)
+    order: Integers  # index before the sort of each sorted point, (capacity,)
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """Cubic cells that cover a box, and a search radius around it.
+
+    Attributes:
+        origin: lower corner of the outermost cells [m].
+        cell_size: edge of a cell, at least the search radius over `reach` [m].
+        shape: number of cells along x, y, z.
+        reach: cells to either side that a search looks into.
+    """
+
+    origin: tuple[float, float, float]
+    cell_size: float
+    shape: tuple[int, int, int]
+    reach: int = 1
+
+    @classmethod
+    def covering(
+        cls, low: NDArray[np.floating], high: NDArray[np.floating], search_radius: float, *, reach: int = 1
+    ) -> "CellGrid":
+        """The grid for a box from `low` to `high` [m].
+
+        Args:
+            low: lower corner.
+            high: upper corner.
+            search_radius: within which neighbours are wanted [m].
+            reach: cells that it spans.
+
+        Raises:
+            ValueError: the box holds more than `MAX_CELLS` cells, wherever the points are.
+        """
+        cell_size = search_radius / reach
+        size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
+        shape = _shape_covering(size, search_radius, reach)
+        if not shape.prod() <= MAX_CELLS:
+            raise ValueError(
+                f"a box of {' x '.join(f'{edge:g}' for edge in size)} m has {shape.prod():.3g} neighbour cells of "
+                f"{cell_size:g} m, more than {MAX_CELLS}; give a smaller domain or a larger particle radius"
+            )
+        origin = np.asarray(low, dtype=np.float64) - search_radius
+        return cls(tuple(origin.tolist()), cell_size, tuple(shape.astype(int).tolist()), reach)
+
+    @classmethod
+    def covering_as_finely_as_fits(
+        cls, low: NDArray[np.floating], high: NDArray[np.floating], search_radius: float, *, reach: int
+    ) -> "CellGrid":
+        """As `covering`, but with cells as wide as the radius where those of the wanted reach would be too many.
+
+        Smaller cells are only faster; a box that can be searched at all is not to be refused for them.
+
+        Args:
+            low: lower corner.
+            high: upper corner.
+            search_radius: within which neighbours are wanted [m].
+            reach: cells that it is to span.
+
+        Raises:
+            ValueError: the box holds more than `MAX_CELLS` cells as wide as the radius.
+        """
+        size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
+        fits = _shape_covering(size, search_radius, reach).prod() <= MAX_CELLS
+        return cls.covering(low, high, search_radius, reach=reach if fits else 1)
+
+    @cached_property
+    def on_device(self) -> Grid:
+        """The grid for kernels."""
+        return Grid(self.origin, 1.0 / self.cell_size, self.shape, self.reach)
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells, the outer layers included."""
+        nx, ny, nz = self.shape
+        return nx * ny * nz
+
+
+def _shape_covering(size: NDArray[np.float64], search_radius: float, reach: int) -> NDArray[np.float64]:
+    """Cells along each axis, the outer layers included; floats, as their product may be beyond any integer."""
+    return np.maximum(np.ceil(size / (search_radius / reach)), 1.0) + 2.0 * reach
+
+
+class CellSort:
+    """Sort of points by cell, then by id, without those outside the box that they must stay in.
+
+    Attributes:
+        cell_start: first sorted point of each cell; entry `cell_count` is the number of points kept, (cells + 2,).
+        order: index before the sort of each sorted point, (capacity,).
+    """
+
+    def __init__(self, grid: CellGrid, capacity: int) -> None:
+        self.grid = grid
+        # One cell more than the grid has takes the points that are dropped.
+        self.cell_start = ti.ndarray(ti.i32, grid.cell_count + 2)
+        self.order = ti.ndarray(ti.i32, max(capacity, 1))
+        self._arrays = SortArrays(
+            cell_of=ti.ndarray(ti.i32, max(capacity, 1)),
+            cursor=ti.ndarray(ti.i32, grid.cell_count + 1),
+            scratch=ti.ndarray(ti.i32, scan_scratch_length(grid.cell_count + 1)),
+            cell_start=self.cell_start,
+            order=self.order,
+        )
+
+    def sort(
+        self,
+        positions: ti.Ndarray,
+        ids: ti.Ndarray,
+        count: int,
+        keep_low: tuple[float, float, float],
+        keep_high: tuple[float, float, float],
+    ) -> int:
+        """Order the first `count` points; returns how many of them are kept.
+
+        Args:
+            positions: points [m], at least (count,) of 3-vectors.
+            ids: distinct numbers that decide the order within a cell, at least (count,).
+            count: number of points.
+            keep_low: points below this on any axis are dropped [m].
+            keep_high: points above this on any axis are dropped [m].
+        """
+        dropped = sort_points_by_cell(positions, ids, count, self.grid.on_device, keep_low, keep_high, self._arrays)
+        return count - int(dropped)
+
+
+@func
+def cell_of_point(point: ti.math.vec3, grid: Grid) -> Cells:
+    """Cell of a point, moved inside the outer layers, so that all cells around it exist; a NaN lands there too."""
+    cell = ti.cast(ti.floor((point - grid.origin) * grid.inverse_cell_size), ti.i32)
+    return ti.max(ti.min(cell, grid.shape - 1 - grid.reach), grid.reach)
+
+
+@func
+def row_of_cell(cell: Cells, dy: ti.i32, dz: ti.i32, grid: Grid) -> ti.i32:
+    """Index of the cell next to `cell` by (0, dy, dz)."""
+    return ((cell[2] + dz) * grid.shape[1] + cell[1] + dy) * grid.shape[0] + cell[0]
+
+
+@kernel
+def sort_points_by_cell(
+    positions: Vectors,
+    ids: Integers,
+    count: ti.i32,
+    grid: Grid,
+    keep_low: ti.math.vec3,
+    keep_high: ti.math.vec3,
+    arrays: SortArrays,
+) -> ti.i32:
+    """Counting sort: points per cell, their sums, then the points of a cell next to each other, by id.
+
+    One cell more than the grid has takes the dropped points; returns how many. Threads race for the places in a cell,
+    the insertion sort settles it.
+    """
+    cell_count = grid.shape[0] * grid.shape[1] * grid.shape[2]
+    for cell in range(cell_count + 1):
+        arrays.cursor[cell] = 0
+    dropped = 0
+    for i in range(count):
+        x_i = positions[i]
+        cell = row_of_cell(cell_of_point(x_i, grid), 0, 0, grid)
+        if (x_i < keep_low).any() or (x_i > keep_high).any():
+            cell = cell_count
+            dropped += 1
+        arrays.cell_of[i] = cell
+        ti.atomic_add(arrays.cursor[cell], 1)
+    scan_in_parallel(arrays.cursor, cell_count + 1, arrays.scratch, arrays.cell_start)
+    for cell in range(cell_count + 1):
+        arrays.cursor[cell] = arrays.cell_start[cell]
+    for i in range(count):
+        slot = ti.atomic_add(arrays.cursor[arrays.cell_of[i]], 1)
+        arrays.order[slot] = i
+    for cell in range(cell_count):
+        first = arrays.cell_start[cell]
+        for k in range(first + 1, arrays.cell_start[cell + 1]):
+            point = arrays.order[k]
+            slot = k
+            while slot > first and ids[arrays.order[slot - 1]] > ids[point]:
+                arrays.order[slot] = arrays.order[slot - 1]
+                slot -= 1
+            arrays.order[slot] = point
+    return dropped

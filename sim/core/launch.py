@@ -1,0 +1,208 @@
+"""Kernel launches that cost little of the host's time.
+
+Taichi looks at every argument of every call several times: the launch of a kernel with 17 arguments takes 0.14 ms of
+Python, longer than the kernel itself runs on a GPU for 100 000 particles. `fast_launch` has Taichi check the types of
+a call once, and from then on hands the arguments of calls with the same types straight to the runtime. On a CPU it also
+keeps what the runtime has of the arrays of a call, as most calls come again with the same ones. Measurements:
+docs/performance.md.
+
+This relies on Taichi's internals, as `sim.core.tracing`, `sim.core.runtime` and `sim.core.reductions` do; the lock file
+pins the release that they belong to.
+"""
+
+import functools
+import weakref
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import taichi as ti
+from taichi.lang import impl
+from taichi.lang.matrix import VectorType
+from taichi.types import primitive_types
+from taichi.types.ndarray_type import NdarrayType
+
+from sim.core.bundles import flattened, with_fields_as_arguments
+
+_REAL_TYPES = frozenset(primitive_types.real_types)
+
+MOST_LAUNCHES = 256
+"""Of so many combinations of arrays at most a kernel remembers the arguments."""
+
+
+class _Launch(NamedTuple):
+    """A call that a kernel remembers, until nobody else has one of its arrays any more; `numbers` are what the context
+    has, by argument."""
+
+    compiled: Any
+    context: Any
+    arrays: tuple[weakref.ref[Any], ...]
+    numbers: list[Any]
+
+
+def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: object) -> None:
+    """Forget a call, one of whose arrays is gone: another may have its number from now on."""
+    launches.pop(key, None)
+
+
+class FastKernel:
+    """A kernel that remembers what Taichi compiled for the types of its arguments; called as the kernel itself.
+
+    Arguments are arrays made by Taichi, numbers, vectors and compile-time values, all of them by position; the result
+    is nothing, a number, or a list of a vector's numbers: Taichi's own vectors take 0.1 ms to make.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        functools.update_wrapper(self, kernel)
+        self._primal = kernel._primal
+        self._kinds = getattr(self._primal.func, "__bundles__", ())
+        self._program: Any = None
+        self._compiled: dict[tuple[Any, ...], tuple[Any, Any]] = {}
+        self._launches: dict[tuple[Any, ...], _Launch] = {}
+        self._on_cpu = False
+        self._templates: list[int] = []
+        self._arrays: list[tuple[int, tuple[int]]] = []
+        self._floats: list[tuple[int, tuple[int]]] = []
+        self._integers: list[tuple[int, tuple[int]]] = []
+        self._float_vectors: list[tuple[int, list[tuple[int, int]]]] = []
+        self._integer_vectors: list[tuple[int, list[tuple[int, int]]]] = []
+        for index, argument in enumerate(self._primal.arguments):
+            self._sort_argument(index, argument.annotation)
+
+    def __call__(self, *args: Any) -> Any:
+        """Launch; waits for the device only where the kernel returns something."""
+        program = impl.get_runtime().prog
+        if self._kinds:
+            args = self._flattened(args)
+        if program is not self._program:
+            self._program, self._compiled, self._launches = program, {}, {}
+            self._on_cpu = impl.current_cfg().arch in (ti.x64, ti.arm64)
+        if self._on_cpu:
+            return self._call_on_cpu(program, args)
+        compiled = self._compiled.get(self._key(args))
+        if compiled is None:
+            return self._first_call(program, args)
+        context = compiled[0].make_launch_context()
+        for index, place in self._arrays:
+            context.set_arg_ndarray(place, args[index].arr)
+        return self._launch(program, compiled[1], context, args, [None] * len(args))
+
+    def _flattened(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Arguments with each bundle replaced by its fields. Raises TypeError where one is of another type."""
+        for value, kind in zip(args, self._kinds, strict=True):
+            if kind is not None and type(value) is not kind:
+                raise TypeError(f"{self.__name__} takes a {kind.__name__}, got a {type(value).__name__}")
+        return tuple(flattened(args))
+
+    def _call_on_cpu(self, program: Any, args: tuple[Any, ...]) -> Any:
+        """Launch with what is known of these arrays from an earlier call.
+
+        Arrays are passed by their addresses, as those of other libraries are: Taichi's own it would have to look up in
+        every launch, and what it finds replaces what it was told. On a GPU the arguments do not outlive the launch.
+        """
+        arrays = [args[index] for index, _ in self._arrays]
+        key = (*[args[index] for index in self._templates], *map(id, arrays))
+        launch = self._launches.get(key)
+        if launch is None:
+            compiled = self._compiled.get(self._key(args))
+            if compiled is None:
+                return self._first_call(program, args)
+            context = compiled[0].make_launch_context()
+            for (_, place), array in zip(self._arrays, arrays, strict=True):
+                size = array.arr.nelement() * array.arr.element_size()
+                address = program.get_ndarray_data_ptr_as_int(array.arr)
+                context.set_arg_external_array_with_shape(place, address, size, list(array.shape), 0)
+            if len(self._launches) >= MOST_LAUNCHES:
+                self._launches.clear()
+            forget = functools.partial(_forget, self._launches, key)
+            references = tuple(weakref.ref(array, forget) for array in arrays)
+            launch = _Launch(compiled[1], context, references, [None] * len(args))
+            self._launches[key] = launch
+        return self._launch(program, launch.compiled, launch.context, args, launch.numbers)
+
+    def _key(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
+        """What a kernel is compiled for: compile-time values, and the types of arrays."""
+        types = [(args[index].element_type, len(args[index].shape)) for index, _ in self._arrays]
+        return (*[args[index] for index in self._templates], *types)
+
+    def _first_call(self, program: Any, args: tuple[Any, ...]) -> Any:
+        """Call as Taichi does, which checks the types, compiles, and says what is wrong."""
+        result = self._primal(*args)
+        kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*args)]
+        compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
+        self._compiled[self._key(args)] = kernel, compiled
+        return list(result) if self._returns_vector else result
+
+    def _launch(self, program: Any, compiled: Any, context: Any, args: tuple[Any, ...], passed: list[Any]) -> Any:
+        """Launch with arrays that the context has, and these numbers, of which it has those that are `passed`."""
+        self._pass_numbers(context, args, passed)
+        program.launch_kernel(compiled, context)
+        if self._primal.return_type is None:
+            return None
+        if not self._on_cpu:
+            program.synchronize()
+        kind = self._primal.return_type[0]
+        if self._returns_vector:
+            get = context.get_struct_ret_float if kind.dtype in _REAL_TYPES else context.get_struct_ret_int
+            return [get((0, axis)) for axis in range(kind.n)]
+        return self._primal.construct_kernel_ret(context, kind, (0,))
+
+    def __get__(self, owner: Any, kind: type | None = None) -> Any:
+        """As a method of a `ti.data_oriented` class: the owner is its first compile-time value."""
+        return self if owner is None else functools.partial(self, owner)
+
+    def _sort_argument(self, index: int, annotation: Any) -> None:
+        """Note how argument `index` is passed, and at which place among those that are not compile-time values."""
+        if isinstance(annotation, ti.template):
+            self._templates.append(index)
+            return
+        place = index - len(self._templates)
+        if isinstance(annotation, NdarrayType):
+            self._arrays.append((index, (place,)))
+        elif isinstance(annotation, VectorType):
+            vectors = self._float_vectors if annotation.dtype in primitive_types.real_types else self._integer_vectors
+            vectors.append((index, [(place, axis) for axis in range(annotation.n)]))
+        elif annotation in primitive_types.real_types:
+            self._floats.append((index, (place,)))
+        elif annotation in (ti.i32, ti.i64):
+            self._integers.append((index, (place,)))
+        else:
+            raise TypeError(f"fast_launch cannot pass arguments of type {annotation}")
+
+    @property
+    def _returns_vector(self) -> bool:
+        return self._primal.return_type is not None and isinstance(self._primal.return_type[0], VectorType)
+
+    def _pass_numbers(self, context: Any, args: tuple[Any, ...], passed: list[Any]) -> None:
+        """Numbers that are the same objects as those passed before are there already."""
+        for index, place in self._floats:
+            if args[index] is not passed[index]:
+                context.set_arg_float(place, args[index])
+                passed[index] = args[index]
+        for index, place in self._integers:
+            if args[index] is not passed[index]:
+                context.set_arg_int(place, args[index])
+                passed[index] = args[index]
+        for index, places in self._float_vectors:
+            for place, component in zip(places, args[index], strict=True):
+                context.set_struct_arg_float(place, component)
+        for index, places in self._integer_vectors:
+            for place, component in zip(places, args[index], strict=True):
+                context.set_struct_arg_int(place, component)
+
+
+def kernel(function: Callable[..., Any]) -> FastKernel:
+    """Decorator in place of `ti.kernel`: the kernel may take bundles, and its launches are fast.
+
+    Raises:
+        TypeError: it takes arguments of a type that cannot be passed fast.
+    """
+    return FastKernel(ti.kernel(with_fields_as_arguments(function)))
+
+
+def fast_launch(kernel: Any) -> FastKernel:
+    """Decorator that stands above `ti.kernel`.
+
+    Raises:
+        TypeError: the kernel takes arguments of a type that it cannot pass.
+    """
+    return FastKernel(kernel)

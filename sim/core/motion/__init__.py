@@ -1,0 +1,1 @@
+"""Rigid motion: rotations, paths through keyframes, and how long they are."""

@@ -1,0 +1,60 @@
+"""Keyframes as a job file names them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+from pydantic import Field
+
+from sim.core.parameters import NonNegative, Parameters, Vector3
+
+
+class KeyframeParameters(Parameters):
+    """Where something on a path is at one time."""
+
+    time_s: NonNegative = Field(description="Time [s]; later than that of the keyframe before.")
+    position: Vector3 = Field(description="World position of the shape's centre [m].")
+    rotation_deg: Vector3 = Field(
+        default=(0.0, 0.0, 0.0),
+        description="Rotation about x, then y, then z (world axes) [degrees]; "
+        "the way from one keyframe to the next is the shortest, below 180 degrees.",
+    )
+
+
+def placed_at_first_keyframe(data: Any, what: str) -> Any:
+    """What a job file says of something with keyframes, with the pose of the first as its place.
+
+    So everybody who asks where it starts gets that pose.
+
+    Args:
+        data: as it comes to a validator, before anything is known about it.
+        what: how to call the thing in messages.
+
+    Raises:
+        ValueError: it is placed elsewhere as well.
+    """
+    if not isinstance(data, dict) or not isinstance(data.get("keyframe"), list | tuple) or not data["keyframe"]:
+        return data
+    first = data["keyframe"][0]
+    placed = [key for key in ("position", "rotation_deg") if key in data]
+    if isinstance(first, KeyframeParameters):
+        first = first.model_dump()
+    if not isinstance(first, dict) or "position" not in first:
+        return data  # the keyframe's own validation says what is wrong with it
+    start = {key: first[key] for key in ("position", "rotation_deg") if key in first}
+    for key in placed:
+        if tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
+            raise ValueError(f"{key} differs from that of the first keyframe, which places the {what}; remove {key}")
+    return {**data, **start}
+
+
+def require_ascending_times(keyframes: Sequence[KeyframeParameters]) -> None:
+    """Raises ValueError unless each keyframe is later than the one before."""
+    for number, (before, after) in enumerate(pairwise(keyframes), start=1):
+        if after.time_s <= before.time_s:
+            raise ValueError(
+                f"keyframe[{number}].time_s must be after {before.time_s:g} s, that of the keyframe before, "
+                f"got {after.time_s:g} s"
+            )

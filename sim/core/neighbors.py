@@ -1,0 +1,434 @@
+"""Neighbours within a fixed radius: one compact list for all particles.
+
+The cells (`sim.core.cells`) are cubes as wide as the search radius, or half as wide (`cells_per_radius`). The list is
+counted before it is filled and grows when it must, so no particle and no cell has a limit of its own.
+
+The list reaches a skin farther than the kernel's support (Verlet 1967), and stays valid until a particle has moved
+half of that skin. The order of the particles, and so of every sum over neighbours, changes only when it is rebuilt;
+within a cell it is the order of the particle ids, whatever the number of threads.
+"""
+
+from typing import NamedTuple
+
+import taichi as ti
+
+from sim.core.arrays import Integers, Vectors
+from sim.core.bundles import bundle, func
+from sim.core.cells import CellGrid, Cells, Grid, SortedPoints, cell_of_point, row_of_cell
+from sim.core.launch import kernel
+from sim.core.reductions import runs_on_gpu
+from sim.core.scan import scan_in_parallel, scan_scratch_length
+
+GROWTH = 1.25
+WARP = 32
+"""Threads of a GPU that read memory together."""
+
+MAX_LIST_LENGTH = 2**31 - 1
+"""Most entries of a neighbour list, as their places are int32."""
+
+LEAST_FINE_SUPPORT = 3.0
+"""Support radius in particle spacings from which on a GPU searches in cells of half a radius."""
+
+MASK_BITS, MASKS_A_ROW = 32, 2
+"""Candidates that one int32 has bits for, and int32 for each row of cells."""
+
+ROUNDING_MARGIN = 1.0e-5
+"""Relative margin on a squared radius: far above the rounding of float32, far below the spacing of particles."""
+
+Lengths = ti.types.vector(2, ti.i32)
+
+
+@bundle
+class Neighbors(NamedTuple):
+    """The neighbour list as kernels read it; entry k of particle i is `indices[start[i] + k * stride]`."""
+
+    start: Integers  # place of the first entry of each particle, (capacity,)
+    fluid_count: Integers  # fluid neighbours of each particle, itself excluded, which come first, (capacity,)
+    boundary_count: Integers  # boundary samples near each particle, which follow, (capacity,)
+    indices: Integers  # the entries
+    stride: ti.template()  # distance of a particle's entries: 1, or the width of a warp on a GPU
+
+
+@bundle
+class Search(NamedTuple):
+    """Points among which neighbours are searched."""
+
+    points: SortedPoints  # the particles
+    fixed: SortedPoints  # boundary samples that never move; their place among the sorted is their index
+    moving: SortedPoints  # boundary samples that move
+    moving_index: Integers  # index of each of the sorted moving samples
+    with_moving: ti.template()  # whether there are any
+    grid: Grid
+    count: ti.i32  # number of particles
+    radius: ti.f32  # [m]
+
+
+@bundle
+class Slices(NamedTuple):
+    """Layout of the list: so many particles as the stride share a slice."""
+
+    count: ti.i32
+    room: Integers  # places of each slice, (slices,)
+    start: Integers  # place of its first entry, (slices + 1,)
+    scratch: Integers  # of the scan
+
+
+class NeighborList:
+    """For every particle the fluid particles, then the boundary samples, within a radius.
+
+    On a CPU the stride is 1 and the list is a compressed sparse row array. On a GPU it is 32, the lists of 32 particles
+    interleaved (sliced ELLPACK, Monakov et al. 2010): the threads of a warp then read neighbouring addresses, which
+    halves the time of a sum over neighbours.
+
+    Attributes:
+        stride: distance of a particle's entries, a power of two.
+        lists: the list as kernels read it; its `indices` are other ones when they had to grow.
+        length: places in use, the padding of a stride above 1 included.
+    """
+
+    def __init__(self, grid: CellGrid, capacity: int, *, stride: int) -> None:
+        self.grid, self.stride = grid, stride
+        start, fluid_count, boundary_count = (ti.ndarray(ti.i32, max(capacity, 1)) for _ in range(3))
+        self.lists = Neighbors(start, fluid_count, boundary_count, ti.ndarray(ti.i32, 1), stride)
+        self.length = 0
+        slices = _slice_count(capacity, stride)
+        self._slices = Slices(
+            count=slices,
+            room=ti.ndarray(ti.i32, slices),
+            start=ti.ndarray(ti.i32, slices + 1),
+            scratch=ti.ndarray(ti.i32, scan_scratch_length(slices)),
+        )
+
+    def build(
+        self,
+        radius: float,
+        points: SortedPoints,
+        count: int,
+        fixed: SortedPoints,
+        moving: SortedPoints | None,
+        moving_index: ti.Ndarray,
+    ) -> None:
+        """Find all neighbours of the first `count` particles, themselves excluded.
+
+        Args:
+            radius: search radius, at most the size of as many cells as the grid's reach [m].
+            points: the particles.
+            count: number of particles.
+            fixed: boundary samples that never move; their place among the sorted is their index.
+            moving: boundary samples that move, or None.
+            moving_index: index of each of the sorted moving samples.
+
+        Raises:
+            OverflowError: there are more neighbours than `MAX_LIST_LENGTH`.
+        """
+        # Kernels take no None: without moving samples the fixed ones stand in, and are not read.
+        search = Search(
+            points, fixed, moving or fixed, moving_index, moving is not None, self.grid.on_device, count, radius
+        )
+        slices = self._slices._replace(count=_slice_count(count, self.stride))
+        self.length, thousands = measure_lists(search, self.lists, slices)
+        # Past the largest int32 the sum is negative; twice as far it would be positive again.
+        if self.length < 0 or 1000.0 * thousands > 1.5 * MAX_LIST_LENGTH:
+            raise OverflowError(
+                f"{count} particles have more than {MAX_LIST_LENGTH} neighbours within {radius:g} m; "
+                "give fewer particles, or start them farther apart"
+            )
+        if self.length > self.lists.indices.shape[0]:
+            room = min(int(self.length * GROWTH), MAX_LIST_LENGTH)
+            self.lists = self.lists._replace(indices=ti.ndarray(ti.i32, room))
+        list_neighbors(search, self.lists, slices)
+
+    def pairs_within(self, radius: float, positions: ti.Ndarray, count: int) -> int:
+        """Ordered pairs of particles that are now nearer than `radius` [m], at most that of the list."""
+        return int(count_pairs(positions, count, self.lists, radius * radius))
+
+
+def list_stride() -> int:
+    """The stride that suits the device Taichi runs on: 1 on a CPU, the width of a warp on a GPU."""
+    return WARP if runs_on_gpu() else 1
+
+
+def cells_per_radius(support_in_spacings: float) -> int:
+    """Cells that a search radius spans to either side, as is fastest on the device Taichi runs on.
+
+    On a GPU half as large cells leave out a third of the candidates, and bring particles of a warp nearer together.
+    They pay where they still hold several particles.
+    """
+    return 2 if runs_on_gpu() and support_in_spacings >= LEAST_FINE_SUPPORT else 1
+
+
+def _slice_count(count: int, stride: int) -> int:
+    return max((count + stride - 1) // stride, 1)
+
+
+@func
+def cells_in_reach(
+    point: ti.math.vec3, cell: Cells, dy: ti.i32, dz: ti.i32, grid: Grid, radius_squared: ti.f32
+) -> ti.math.ivec2:
+    """Cells of a row that the sphere around a point touches: the first, and the one after the last, from its own."""
+    cell_size = 1.0 / grid.inverse_cell_size
+    y_in_cell = point[1] - grid.origin[1] - cell[1] * cell_size
+    z_in_cell = point[2] - grid.origin[2] - cell[2] * cell_size
+    gap_y = ti.max(ti.max(dy * cell_size - y_in_cell, y_in_cell - (dy + 1) * cell_size), 0.0)
+    gap_z = ti.max(ti.max(dz * cell_size - z_in_cell, z_in_cell - (dz + 1) * cell_size), 0.0)
+    touched = ti.math.ivec2(0)
+    half_width_squared = radius_squared - gap_y * gap_y - gap_z * gap_z
+    if half_width_squared > 0.0:
+        half_width = ti.sqrt(half_width_squared)
+        left = ti.cast(ti.floor((point[0] - half_width - grid.origin[0]) * grid.inverse_cell_size), ti.i32) - cell[0]
+        right = ti.cast(ti.floor((point[0] + half_width - grid.origin[0]) * grid.inverse_cell_size), ti.i32) - cell[0]
+        # Never right of the cell, nor left of it; said for a particle at NaN, which becomes any integer.
+        touched[0] = ti.max(ti.min(left, 0), -grid.reach)
+        touched[1] = ti.min(ti.max(right, 0), grid.reach) + 1
+    return touched
+
+
+@func
+def count_near(
+    point: ti.math.vec3, cell: Cells, points: SortedPoints, grid: Grid, radius_squared: ti.f32, on_gpu: ti.template()
+) -> ti.i32:
+    """Number of points within the radius; without a branch on the distance, so that it becomes vector code.
+
+    A CPU reads whole rows of cells: loops of uneven length cost it more than the points that they leave out.
+    """
+    near = 0
+    for dz in range(-grid.reach, grid.reach + 1):
+        for dy in range(-grid.reach, grid.reach + 1):
+            row = row_of_cell(cell, dy, dz, grid)
+            touched = ti.math.ivec2(-grid.reach, grid.reach + 1)
+            if ti.static(on_gpu):
+                touched = cells_in_reach(point, cell, dy, dz, grid, radius_squared)
+            for j in range(points.cell_start[row + touched[0]], points.cell_start[row + touched[1]]):
+                d_x, d_y, d_z = point[0] - points.x[j], point[1] - points.y[j], point[2] - points.z[j]
+                near += ti.cast(d_x * d_x + d_y * d_y + d_z * d_z < radius_squared, ti.i32)
+    return near
+
+
+@func
+def count_neighbors(search: Search, lists: Neighbors):
+    """Bounds on the numbers of neighbours of each particle, itself included, and of boundary samples.
+
+    The radius is a little larger than that of the list: there a distance may be rounded differently.
+    """
+    radius_squared = search.radius * search.radius * (1.0 + ROUNDING_MARGIN)
+    on_gpu = ti.static(lists.stride > 1)
+    ti.loop_config(block_dim=128)
+    for i in range(search.count):
+        x_i = ti.math.vec3(search.points.x[i], search.points.y[i], search.points.z[i])
+        cell = cell_of_point(x_i, search.grid)
+        lists.fluid_count[i] = count_near(x_i, cell, search.points, search.grid, radius_squared, on_gpu)
+        boundary_near = count_near(x_i, cell, search.fixed, search.grid, radius_squared, on_gpu)
+        if ti.static(search.with_moving):
+            boundary_near += count_near(x_i, cell, search.moving, search.grid, radius_squared, on_gpu)
+        lists.boundary_count[i] = boundary_near
+
+
+@kernel
+def measure_lists(search: Search, lists: Neighbors, slices: Slices) -> Lengths:
+    """Count neighbours, and lay out the list: each slice of `stride` particles gets `stride` times its longest list.
+
+    Returns the places of all slices, as int32, and roughly the thousands of them, which do not overflow.
+
+    The count includes the particle itself: the list uses that place to write before it knows whether to keep.
+    A particle at NaN is not even near itself, and needs the place too.
+    """
+    count_neighbors(search, lists)
+    total = 0.0
+    for s in range(slices.count):
+        longest = 1
+        for i in range(s * lists.stride, ti.min((s + 1) * lists.stride, search.count)):
+            longest = ti.max(longest, lists.fluid_count[i] + lists.boundary_count[i])
+        slices.room[s] = longest * lists.stride
+        total += ti.cast(longest * lists.stride, ti.f32)
+    length = scan_in_parallel(slices.room, slices.count, slices.scratch, slices.start)
+    return Lengths(length, ti.cast(total / 1000.0, ti.i32))
+
+
+@func
+def is_inside(point: ti.math.vec3, points: SortedPoints, j: ti.i32, own: ti.i32, radius_squared: ti.f32) -> ti.i32:
+    """Whether a candidate is within the radius, and not `own`."""
+    d_x, d_y, d_z = point[0] - points.x[j], point[1] - points.y[j], point[2] - points.z[j]
+    return ti.cast(d_x * d_x + d_y * d_y + d_z * d_z < radius_squared, ti.i32) & ti.cast(j != own, ti.i32)
+
+
+@func
+def mask_of_near(
+    point: ti.math.vec3, points: SortedPoints, first: ti.i32, last: ti.i32, own: ti.i32, radius_squared: ti.f32
+) -> ti.i32:
+    """Which of the first 32 points of a range are within the radius, but `own`, from the highest bit down."""
+    mask = 0
+    for k in range(ti.min(last - first, MASK_BITS)):
+        mask |= is_inside(point, points, first + k, own, radius_squared) << (MASK_BITS - 1 - k)
+    return mask
+
+
+@func
+def list_range(
+    point: ti.math.vec3,
+    points: SortedPoints,
+    first: ti.i32,
+    last: ti.i32,
+    own: ti.i32,
+    radius_squared: ti.f32,
+    lists: Neighbors,
+    start: ti.i32,
+    found: ti.i32,
+) -> ti.i32:
+    """Append the points of a range within the radius, but `own`; returns how many there are now.
+
+    A CPU writes every candidate, and the place moves on only for those inside: it would mispredict a branch for every
+    third. A GPU tests 32 candidates without a branch before it writes those inside.
+    """
+    n = found
+    if ti.static(lists.stride > 1):
+        group = first
+        while group < last:
+            mask = mask_of_near(point, points, group, last, own, radius_squared)
+            while mask != 0:
+                k = ti.math.clz(mask)
+                mask ^= 1 << (MASK_BITS - 1 - k)
+                lists.indices[start + n * lists.stride] = group + k
+                n += 1
+            group += MASK_BITS
+    else:
+        for j in range(first, last):
+            inside = is_inside(point, points, j, own, radius_squared)
+            lists.indices[start + n * lists.stride] = j
+            n += inside
+    return n
+
+
+@func
+def list_row_by_row(
+    point: ti.math.vec3,
+    cell: Cells,
+    points: SortedPoints,
+    grid: Grid,
+    radius_squared: ti.f32,
+    own: ti.i32,
+    lists: Neighbors,
+    start: ti.i32,
+    found: ti.i32,
+) -> ti.i32:
+    """Append the points within the radius, but `own`; returns how many entries there are now."""
+    n = found
+    for dz in range(-grid.reach, grid.reach + 1):
+        for dy in range(-grid.reach, grid.reach + 1):
+            touched = cells_in_reach(point, cell, dy, dz, grid, radius_squared)
+            row = row_of_cell(cell, dy, dz, grid)
+            first, last = points.cell_start[row + touched[0]], points.cell_start[row + touched[1]]
+            n = list_range(point, points, first, last, own, radius_squared, lists, start, n)
+    return n
+
+
+@func
+def list_in_step(
+    point: ti.math.vec3,
+    cell: Cells,
+    points: SortedPoints,
+    grid: Grid,
+    radius_squared: ti.f32,
+    own: ti.i32,
+    lists: Neighbors,
+    start: ti.i32,
+    found: ti.i32,
+) -> ti.i32:
+    """As `list_row_by_row`, for a GPU: all candidates are tested before those within the radius are written.
+
+    The threads of a warp, whose lists are interleaved, then write their first entries at one time and at neighbouring
+    addresses, then their second ones, and so on; written as they are found, every entry is an access of its own. This
+    pays from hundreds of neighbours on. Rows of more candidates than the masks hold take more than one turn.
+    """
+    width = ti.static(2 * grid.reach + 1)
+    n = found
+    passed = 0
+    while passed >= 0:
+        masks = ti.Vector([0] * (MASKS_A_ROW * width * width))
+        firsts = ti.Vector([0] * (width * width))
+        entries = 0
+        next_passed = -1
+        for r in range(width * width):
+            dy, dz = r % width - grid.reach, r // width - grid.reach
+            touched = cells_in_reach(point, cell, dy, dz, grid, radius_squared)
+            row = row_of_cell(cell, dy, dz, grid)
+            first, last = points.cell_start[row + touched[0]] + passed, points.cell_start[row + touched[1]]
+            firsts[r] = first
+            for part in ti.static(range(MASKS_A_ROW)):
+                mask = mask_of_near(point, points, first + part * MASK_BITS, last, own, radius_squared)
+                masks[r * MASKS_A_ROW + part] = mask
+                entries += ti.math.popcnt(mask)
+            if first + MASKS_A_ROW * MASK_BITS < last:
+                next_passed = passed + MASKS_A_ROW * MASK_BITS
+        group = -1
+        mask = 0
+        for _ in range(entries):
+            while mask == 0:
+                group += 1
+                mask = masks[group]
+            k = ti.math.clz(mask)
+            mask ^= 1 << (MASK_BITS - 1 - k)
+            lists.indices[start + n * lists.stride] = firsts[group // MASKS_A_ROW] + group % MASKS_A_ROW * MASK_BITS + k
+            n += 1
+        passed = next_passed
+    return n
+
+
+@func
+def list_near(
+    point: ti.math.vec3,
+    cell: Cells,
+    points: SortedPoints,
+    grid: Grid,
+    radius_squared: ti.f32,
+    own: ti.i32,
+    lists: Neighbors,
+    start: ti.i32,
+    found: ti.i32,
+) -> ti.i32:
+    """Append the points within the radius, but `own`; returns how many entries there are now."""
+    n = found
+    if ti.static(lists.stride > 1 and grid.reach > 1):
+        n = list_in_step(point, cell, points, grid, radius_squared, own, lists, start, found)
+    else:
+        n = list_row_by_row(point, cell, points, grid, radius_squared, own, lists, start, found)
+    return n
+
+
+@kernel
+def list_neighbors(search: Search, lists: Neighbors, slices: Slices):
+    """Write the neighbours of each particle; `boundary_count` holds an upper bound of its boundary samples before.
+
+    Candidates are those of the rows of cells, as far along x as the sphere reaches into the row.
+    """
+    radius_squared = search.radius * search.radius
+    ti.loop_config(block_dim=128)
+    for i in range(search.count):
+        x_i = ti.math.vec3(search.points.x[i], search.points.y[i], search.points.z[i])
+        cell = cell_of_point(x_i, search.grid)
+        first = slices.start[i // lists.stride] + i % lists.stride
+        fluid_found = list_near(x_i, cell, search.points, search.grid, radius_squared, i, lists, first, 0)
+        found = fluid_found
+        if lists.boundary_count[i] > 0:
+            found = list_near(x_i, cell, search.fixed, search.grid, radius_squared, -1, lists, first, fluid_found)
+            if ti.static(search.with_moving):
+                fixed_found = found
+                found = list_near(x_i, cell, search.moving, search.grid, radius_squared, -1, lists, first, fixed_found)
+                for k in range(fixed_found, found):
+                    place = first + k * lists.stride
+                    lists.indices[place] = search.moving_index[lists.indices[place]]
+        lists.start[i] = first
+        lists.fluid_count[i] = fluid_found
+        lists.boundary_count[i] = found - fluid_found
+
+
+@kernel
+def count_pairs(positions: Vectors, count: ti.i32, lists: Neighbors, radius_squared: ti.f32) -> ti.i64:
+    """Entries of the list that are within the radius."""
+    pairs = ti.cast(0, ti.i64)
+    for i in range(count):
+        near = 0
+        for k in range(lists.fluid_count[i]):
+            x_ij = positions[i] - positions[lists.indices[lists.start[i] + k * lists.stride]]
+            near += ti.cast(x_ij.norm_sqr() < radius_squared, ti.i32)
+        pairs += near
+    return pairs

@@ -1,0 +1,320 @@
+"""Start Taichi once, on a device that is known to work.
+
+A driver that is half there can end the process inside `ti.init`, without an exception. So a back end other than the
+CPU is first tried in a child process (`python -m sim.core.runtime --probe cuda`), and the answer is remembered.
+
+Importing this module does not load Taichi. Floating-point code is compiled with `fast_math`: `x != x` is optimized
+away in kernels; test for NaN with `sim.core.reductions.is_finite`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import io
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from sim.core.parameters import Device
+from sim.core.tracing import tell_positions_unwrapped
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+PREFERENCE = ("cuda", "metal", "vulkan", "cpu")
+"""The order in which `auto` takes a device."""
+
+PROBE_TIMEOUT_S = 120.0
+STALE_LOCK_S = 600.0
+
+KEPT_KERNELS_BYTES = 2**30
+"""What is kept of compiled kernels. By itself Taichi keeps 100 MiB, a few scenes: the next one would compile anew."""
+
+MOST_FIELD_TREES = 512
+"""Taichi's `kMaxNumSnodeTreesLlvm`: it does not count, and what comes after would overwrite its thread pool."""
+FIELD_TREES_OF_A_SOLVER = 12
+"""Fields that are made before any of them is used share a tree; a smoke with its couplings makes no more of these."""
+OK = "ok"
+
+_in_use: dict[str, Any] = {}
+"""Back end and thread count of this process once `initialize` has run."""
+
+
+class DeviceUnavailableError(RuntimeError):
+    """The device that was asked for does not work on this machine.
+
+    Attributes:
+        device: what was asked for.
+        reason: why it does not work.
+    """
+
+    def __init__(self, device: str, reason: str) -> None:
+        super().__init__(device, reason)
+        self.device, self.reason = device, reason
+
+    def __str__(self) -> str:
+        remedy = "" if self.device == "cpu" else '; use device = "auto" or "cpu"'
+        return f'device "{self.device}" is not available: {self.reason}{remedy}'
+
+
+def initialize(device: Device = "auto", *, threads: int | None = None) -> str:
+    """Start Taichi on a device; the only `ti.init` of the project.
+
+    A second call that asks for what runs already (or for "auto") changes nothing.
+
+    Args:
+        device: where to run; "auto" takes the first of `PREFERENCE` that works.
+        threads: CPU threads; those that the process may use if omitted. Results do not depend on it.
+
+    Returns:
+        The back end in use: "cpu", "cuda", "vulkan" or "metal".
+
+    Raises:
+        DeviceUnavailableError: that device does not work here, or Taichi itself does not load.
+        RuntimeError: Taichi runs already on another device or with another number of threads.
+    """
+    if _in_use:
+        _refuse_change(device, threads)
+        return str(_in_use["device"])
+    backend = resolve_device(device)
+    thread_count = threads if threads is not None else _usable_cores()
+    _start_taichi(backend, thread_count)
+    _in_use.update(device=backend, threads=thread_count)
+    return backend
+
+
+def resolve_device(device: Device) -> str:
+    """The back end that `initialize` would use for this device, without starting Taichi.
+
+    Raises:
+        DeviceUnavailableError: that device does not work here.
+    """
+    if device == "auto":
+        return _first_working_device()
+    if device != "cpu":
+        reason = available_devices().get(device, "unknown device")
+        if reason != OK:
+            raise DeviceUnavailableError(device, reason)
+    return device
+
+
+def available_devices() -> dict[str, str]:
+    """Every device by name: "ok", or the reason why it does not work on this machine.
+
+    Each back end is tried in a child process. The answers are kept in the user's cache folder until Taichi, the
+    driver or the visible devices change.
+    """
+    key = _machine_key()
+    path = cache_folder() / "devices.json"
+    remembered = _read_answers(path, key)
+    if remembered is not None:
+        return remembered
+    answers = _probe_all()
+    # An unwritable cache folder costs the next process a second probe, nothing else.
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{path.name}.{os.getpid()}")
+        part.write_text(json.dumps({"key": key, "devices": answers}, indent=2))
+        part.replace(path)
+    return answers
+
+
+def require_room_for_fields() -> None:
+    """See that a process can hold the fields of one more smoke, and of what is coupled to it.
+
+    Taichi keeps fields until the process ends. Scenes are simulated in processes of their own, so only one that builds
+    dozens of them, as tests do, can run out.
+
+    Raises:
+        RuntimeError: too many fields were made in this process.
+    """
+    from taichi.lang import impl
+
+    trees = impl.get_runtime().prog.get_snode_tree_size()
+    if trees + FIELD_TREES_OF_A_SOLVER > MOST_FIELD_TREES:
+        raise RuntimeError(
+            f"this process has made {trees} groups of Taichi fields, which are kept until it ends, and Taichi holds "
+            f"{MOST_FIELD_TREES}; build further scenes in another process"
+        )
+
+
+def import_taichi() -> ModuleType:
+    """Import Taichi, and say clearly what is missing where that fails.
+
+    Raises:
+        DeviceUnavailableError: Taichi is absent or a shared library that it needs is.
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            import taichi
+    except ImportError as error:
+        remedy = "; install it with: apt-get install libx11-6" if "libX11" in str(error) else ""
+        raise DeviceUnavailableError("cpu", f"Taichi does not load: {error}{remedy}") from error
+    return taichi  # type: ignore[no-any-return]
+
+
+def _refuse_change(device: str, threads: int | None) -> None:
+    if device not in ("auto", _in_use["device"]):
+        raise RuntimeError(f'Taichi runs on "{_in_use["device"]}" in this process already, asked for "{device}"')
+    if threads not in (None, _in_use["threads"]):
+        raise RuntimeError(
+            f"Taichi runs with {_in_use['threads']} threads in this process already, asked for {threads}"
+        )
+
+
+def _first_working_device() -> str:
+    devices = available_devices()
+    return next((name for name in PREFERENCE if devices.get(name) == OK), "cpu")
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _start_taichi(device: str, threads: int) -> None:
+    ti = import_taichi()
+    tell_positions_unwrapped()
+    kernel_cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or cache_folder() / "kernels")
+    _remove_stale_lock(kernel_cache)
+    # Taichi announces its back end with a bare print.
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(
+            arch=getattr(ti, device),
+            enable_fallback=False,
+            cpu_max_num_threads=threads,
+            offline_cache=True,
+            offline_cache_file_path=str(kernel_cache),
+            offline_cache_max_size_of_files=KEPT_KERNELS_BYTES,
+            default_fp=ti.f32,
+            default_ip=ti.i32,
+            random_seed=0,
+        )
+
+
+def _remove_stale_lock(kernel_cache: Path) -> None:
+    """Remove the lock of a process that was killed while it wrote; else no kernel would be kept any more."""
+    for lock in kernel_cache.glob("**/*.lock"):
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - lock.stat().st_mtime > STALE_LOCK_S:
+                lock.unlink()
+
+
+def cache_folder() -> Path:
+    """Of kernels and devices; a relative XDG_CACHE_HOME counts as none, as its specification has it."""
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (base if base.is_absolute() else Path.home() / ".cache") / "physics-pipeline"
+
+
+def _machine_key() -> str:
+    """Digest of all that decides which devices work, from files and environment alone."""
+    facts = [version("taichi"), platform.python_version(), platform.platform(), platform.node()]
+    facts += [
+        os.environ.get(name, "") for name in ("CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "VK_ICD_FILENAMES")
+    ]
+    nvidia_driver = Path("/proc/driver/nvidia/version")
+    if nvidia_driver.exists():
+        facts.append(nvidia_driver.read_text())
+    facts += sorted(str(path) for pattern in ("nvidia*", "dri/*") for path in Path("/dev").glob(pattern))
+    return hashlib.sha256("\n".join(facts).encode()).hexdigest()
+
+
+def _read_answers(path: Path, key: str) -> dict[str, str] | None:
+    """The remembered answers, or None where there are none for this machine as it is now."""
+    try:
+        remembered = json.loads(path.read_text())
+        if remembered["key"] == key:
+            return {str(name): str(answer) for name, answer in remembered["devices"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return None
+
+
+def _probe_all() -> dict[str, str]:
+    answers = {name: _reason_without_probe(name) for name in PREFERENCE}
+    children = {name: _start_probe(name) for name, reason in answers.items() if reason is None}
+    return {name: reason or _read_probe(children[name]) for name, reason in answers.items()}
+
+
+def _reason_without_probe(device: str) -> str | None:
+    """Why a device cannot work, as far as the operating system alone can tell."""
+    if device == "metal" and sys.platform != "darwin":
+        return "Metal exists on macOS only"
+    if device == "cuda" and sys.platform == "darwin":
+        return "CUDA does not exist on macOS"
+    # Software Vulkan answers a probe as well, and is far slower than the CPU back end.
+    if device == "vulkan" and sys.platform == "linux" and not list(Path("/dev").glob("dri/renderD*")):
+        return "no GPU for Vulkan: there is no /dev/dri/renderD*"
+    return None
+
+
+def _start_probe(device: str) -> subprocess.Popen[str]:
+    root = str(Path(__file__).resolve().parents[2])
+    search_path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    return subprocess.Popen(
+        [sys.executable, "-m", "sim.core.runtime", "--probe", device],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": search_path},
+    )
+
+
+def _read_probe(child: subprocess.Popen[str]) -> str:
+    try:
+        answer, complaint = child.communicate(timeout=PROBE_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.communicate()
+        return f"its driver does not answer within {PROBE_TIMEOUT_S:.0f} s"
+    if child.returncode == 0:
+        return OK
+    if child.returncode < 0:
+        return f"its driver ends the process with {signal.Signals(-child.returncode).name}"
+    lines = (answer.strip() or complaint.strip() or f"the probe ended with {child.returncode}").splitlines()
+    # Taichi's own words for a missing driver library are "Arch=[<Arch.cuda: 3>] is not supported".
+    return "no driver for it was found" if "is not supported" in lines[-1] else lines[-1]
+
+
+def _probe(device: str) -> None:
+    """Start the device and compute something on it, in this process."""
+    _start_taichi(device, 1)
+    import numpy as np
+
+    from sim.core.reductions import sum_integers
+
+    numbers = import_taichi().ndarray(int, 1000)
+    numbers.from_numpy(np.arange(1000, dtype=np.int32))
+    result = sum_integers(numbers)
+    if result != 499500:
+        raise DeviceUnavailableError(device, f"it computes wrongly: a sum is {result}, not 499500")
+
+
+def main() -> int:
+    """Entry of the child process that tries one device; prints the reason where it does not work."""
+    parser = argparse.ArgumentParser(description="Try one device in this process.")
+    parser.add_argument("--probe", choices=[name for name in get_args(Device) if name != "auto"], required=True)
+    arguments = parser.parse_args()
+    try:
+        _probe(arguments.probe)
+    # Whatever a driver raises is the answer.
+    except Exception as error:
+        reason = error.reason if isinstance(error, DeviceUnavailableError) else str(error) or type(error).__name__
+        sys.stdout.write(f"{reason.strip().splitlines()[0]}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""Prefix sums of integers, exact and so the same in any order."""
+
+import taichi as ti
+
+from sim.core.arrays import Integers
+from sim.core.bundles import func
+from sim.core.launch import kernel
+
+RUN = 32
+"""Values that a thread adds up: int32 of one cache line of a GPU, which its thread reads and no other."""
+
+LEVELS = 3
+"""Levels of the tree of runs, besides the values; what is left, 1 of 32768 sums, one thread adds up."""
+
+
+def scan_scratch_length(length: int) -> int:
+    """Numbers that a scan over so many values needs to work with."""
+    total, level = 0, length
+    for _ in range(LEVELS):
+        level = _runs_of(level)
+        total += level
+    return max(total, 1)
+
+
+def exclusive_scan(values: ti.Ndarray, length: int, scratch: ti.Ndarray, result: ti.Ndarray) -> int:
+    """result[k] = sum of values[:k] for k = 0 ... length; returns the last of them.
+
+    Args:
+        values: int32, at least (length,).
+        length: how many there are.
+        scratch: int32, at least (scan_scratch_length(length),).
+        result: int32, at least (length + 1,).
+    """
+    return int(scan_values(values, length, scratch, result))
+
+
+def _runs_of(length: int) -> int:
+    return (length + RUN - 1) // RUN
+
+
+@func
+def add_up(values: Integers, first: ti.i32, last: ti.i32) -> ti.i32:
+    """Sum of values[first:last]."""
+    total = 0
+    for k in range(first, last):
+        total += values[k]
+    return total
+
+
+@func
+def scan_run(values: Integers, first: ti.i32, last: ti.i32, before: ti.i32):
+    """Replace values[first:last] by the sums of those before each, which start at `before`."""
+    running = before
+    for k in range(first, last):
+        value = values[k]
+        values[k] = running
+        running += value
+
+
+@func
+def scan_in_parallel(values: Integers, length: ti.i32, scratch: Integers, result: Integers) -> ti.i32:
+    """As `exclusive_scan`, for the outermost level of a kernel: its loops then run in parallel, one after the other.
+
+    Sums of runs, of runs of runs and of runs of those, then all of them from the top down.
+    """
+    runs = (length + RUN - 1) // RUN
+    runs_of_runs = (runs + RUN - 1) // RUN
+    top = (runs_of_runs + RUN - 1) // RUN
+    second = runs
+    third = runs + runs_of_runs
+    for r in range(runs):
+        scratch[r] = add_up(values, r * RUN, ti.min((r + 1) * RUN, length))
+    for r in range(runs_of_runs):
+        scratch[second + r] = add_up(scratch, r * RUN, ti.min((r + 1) * RUN, runs))
+    for r in range(top):
+        scratch[third + r] = add_up(scratch, second + r * RUN, second + ti.min((r + 1) * RUN, runs_of_runs))
+    total = 0
+    ti.loop_config(serialize=True)
+    for r in range(top):
+        value = scratch[third + r]
+        scratch[third + r] = total
+        total += value
+    for r in range(top):
+        scan_run(scratch, second + r * RUN, second + ti.min((r + 1) * RUN, runs_of_runs), scratch[third + r])
+    for r in range(runs_of_runs):
+        scan_run(scratch, r * RUN, ti.min((r + 1) * RUN, runs), scratch[second + r])
+    for r in range(runs):
+        running = scratch[r]
+        for k in range(r * RUN, ti.min((r + 1) * RUN, length)):
+            result[k] = running
+            running += values[k]
+    result[length] = total
+    return total
+
+
+@kernel
+def scan_values(values: Integers, length: ti.i32, scratch: Integers, result: Integers) -> ti.i32:
+    """The scan alone."""
+    return scan_in_parallel(values, length, scratch, result)

@@ -1,0 +1,263 @@
+"""The world: every solver of a scene, advanced frame by frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from types import MappingProxyType
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.core.snapshots import Snapshot
+from sim.core.solver import Arrays, Coupling, Diagnostics, SimulationDivergedError, Solver
+
+MAX_SUBSTEPS_PER_FRAME = 200_000
+"""More than this in one frame is a step size that collapses, not a simulation (1/60 s / 2e5 is 83 ns)."""
+
+SUBSTEPS_BETWEEN_CHECKS = 64
+"""How often the state is looked over within a frame: often enough to stop early, too rarely to cost anything."""
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What computing one frame took.
+
+    Attributes:
+        frame: number of the frame just reached.
+        time_s: simulated time [s].
+        substeps: number of substeps of this frame, by solver.
+        smallest_dt_s: smallest substep of this frame [s], by solver.
+        diagnostics: physics and numerics after the frame, by solver.
+    """
+
+    frame: int
+    time_s: float
+    substeps: Mapping[str, int]
+    smallest_dt_s: Mapping[str, float]
+    diagnostics: Mapping[str, Diagnostics]
+
+
+class StaticBody(Protocol):
+    """What stands in the world and never moves."""
+
+    name: str
+
+    def snapshot(self) -> Snapshot:
+        """Where it stands: the same at every frame."""
+
+
+class World:
+    """Owns the loop over substeps; solvers own their arrays.
+
+    Solvers that a coupling connects share their substeps; the others advance at their own step. A substep takes the
+    solvers in the order given: a coupling exchanges impulses right before its second solver's turn, and tells the first
+    what became of the second when all have had theirs. The second solver of a loose coupling keeps its own steps: the
+    solvers that it is coupled to go ahead to the end of its step, in as many substeps as they need, then it takes it.
+
+    Attributes:
+        frame: number of the frame that was reached last.
+        max_substeps_per_frame: a frame that needs more counts as diverged; may be changed between frames.
+        watch: asked after every substep what is wrong with the frame, which counts as diverged then; None: nobody is.
+            What it raises leaves the frame half done: only `restore` goes on from there.
+
+    All land exactly on the frame: with dt_max stable, the rest of the frame is cut into n = ceil(rest / dt_max) equal
+    steps, one is taken, and the division is made anew for what is left; in the same way substeps land on a longer step.
+    """
+
+    def __init__(
+        self,
+        solvers: Sequence[Solver],
+        *,
+        frames_per_second: float,
+        couplings: Sequence[Coupling] = (),
+        static_bodies: Sequence[StaticBody] = (),
+    ) -> None:
+        self.frame = 0
+        self.max_substeps_per_frame = MAX_SUBSTEPS_PER_FRAME
+        self.watch: Callable[[], str | None] | None = None
+        self._frames_per_second = frames_per_second
+        self._solvers = {solver.name: solver for solver in solvers}
+        self._couplings = tuple(couplings)
+        self._static_bodies = tuple(static_bodies)
+        order = list(self._solvers)
+        for first, second in (coupling.bodies for coupling in self._couplings):
+            if order.index(first) >= order.index(second):
+                raise ValueError(f'"{first}" must stand before "{second}", which it is coupled to, among the solvers')
+        self._teams = _teams(self._solvers, self._couplings)
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time [s]; frame k is at k / fps, never a sum of steps."""
+        return self.frame / self._frames_per_second
+
+    @property
+    def solvers(self) -> Mapping[str, Solver]:
+        """All solvers by name; what they let change may be changed between frames."""
+        return MappingProxyType(self._solvers)
+
+    def tell_couplings(self) -> None:
+        """Tell the couplings what was changed between frames: how bodies move now, and how easily."""
+        for coupling in self._couplings:
+            coupling.resume()
+
+    def advance_frame(self) -> FrameReport:
+        """Advance to the next frame.
+
+        Raises:
+            SimulationDivergedError: the state became non-finite or ran away, the step size collapsed, or `watch` found
+                something.
+        """
+        substeps: dict[str, int] = {}
+        smallest_dt: dict[str, float] = {}
+        for solver in self._solvers.values():
+            solver.begin_frame(self.time_s)
+        for last in self._teams:
+            teams = [team for team in (last.ahead, last) if team is not None]
+            for team in teams:
+                team.begin_frame()
+            self._advance_team(last, 1.0 / self._frames_per_second, 0.0)
+            for team in teams:
+                substeps |= dict.fromkeys((solver.name for solver in team.solvers), team.taken)
+                smallest_dt |= dict.fromkeys((solver.name for solver in team.solvers), team.smallest_dt_s)
+        self.frame += 1
+        return FrameReport(self.frame, self.time_s, substeps, smallest_dt, self.diagnostics())
+
+    def diagnostics(self) -> dict[str, Diagnostics]:
+        """Physics and numerics of the frame just computed, by solver."""
+        return {name: solver.diagnostics() for name, solver in self._solvers.items()}
+
+    def snapshots(self) -> dict[str, Snapshot]:
+        """What rendering needs, by body."""
+        snapshots = {body.name: body.snapshot() for body in self._static_bodies}
+        for solver in self._solvers.values():
+            snapshots |= solver.snapshots()
+        return snapshots
+
+    def checkpoint(self) -> dict[str, NDArray[np.generic]]:
+        """All that `restore` needs to continue bit for bit; keys are `<solver>/<array>`."""
+        return {
+            f"{name}/{key}": array
+            for name, solver in self._solvers.items()
+            for key, array in solver.checkpoint().items()
+        }
+
+    def restore(self, frame: int, arrays: Arrays) -> None:
+        """Continue from a checkpoint taken at `frame`. Raises ValueError when it does not fit the scene."""
+        for name, solver in self._solvers.items():
+            prefix = f"{name}/"
+            own = {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
+            if not own:
+                raise ValueError(f'the checkpoint holds nothing for "{name}"')
+            solver.restore(own)
+        self.tell_couplings()
+        self.frame = frame
+
+    def _advance_team(self, team: _Team, duration_s: float, start_s: float) -> None:
+        """Advance a team by a duration [s] from a moment of the frame [s] on."""
+        remaining = duration_s
+        while remaining > 0.0:
+            elapsed_s = start_s + (duration_s - remaining)
+            left = self._steps_left(team, remaining, elapsed_s)
+            dt = remaining / left
+            if team.ahead is not None:
+                self._advance_team(team.ahead, dt, elapsed_s)
+            team.substep(dt)
+            remaining = remaining - dt if left > 1 else 0.0
+            self._ask_watch(team, start_s + (duration_s - remaining))
+            if team.taken % SUBSTEPS_BETWEEN_CHECKS == 0 or remaining == 0.0:
+                self._check(team, start_s + (duration_s - remaining))
+
+    def _steps_left(self, team: _Team, remaining: float, elapsed_s: float) -> int:
+        stable_dt, shortest = min(((solver.stable_dt(), solver) for solver in team.solvers), key=itemgetter(0))
+        if not stable_dt > 0.0 or team.taken + remaining / stable_dt > self.max_substeps_per_frame:
+            self._check(team, elapsed_s)
+            raise SimulationDivergedError(
+                " + ".join(solver.name for solver in team.solvers),
+                self.frame + 1,
+                self.time_s + elapsed_s,
+                f"the stable time step fell to {stable_dt:.3g} s",
+                shortest.remedies().short_steps,
+            )
+        return max(1, math.ceil(remaining / stable_dt * (1.0 - 1.0e-9)))
+
+    def _ask_watch(self, team: _Team, elapsed_s: float) -> None:
+        finding = None if self.watch is None else self.watch()
+        if finding is not None:
+            names = " + ".join(solver.name for solver in team.solvers)
+            raise SimulationDivergedError(names, self.frame + 1, self.time_s + elapsed_s, finding)
+
+    def _check(self, team: _Team, elapsed_s: float) -> None:
+        for solver in team.solvers:
+            quantity = solver.first_bad_quantity()
+            if quantity is not None:
+                raise SimulationDivergedError(
+                    solver.name,
+                    self.frame + 1,
+                    self.time_s + elapsed_s,
+                    quantity,
+                    solver.remedies().runaway,
+                )
+
+
+class _Team:
+    """Solvers that take the same substeps, and the couplings by which they get impulses.
+
+    Attributes:
+        solvers: in the order of their turns.
+        couplings: those whose second solver is one of them.
+        ahead: solvers that have to get to the end of a step before these take it.
+        taken: substeps in this frame.
+        smallest_dt_s: smallest of them [s].
+    """
+
+    def __init__(self, solvers: Sequence[Solver], couplings: Sequence[Coupling], ahead: _Team | None = None) -> None:
+        self.solvers, self.ahead = tuple(solvers), ahead
+        names = {solver.name for solver in solvers}
+        self.couplings = tuple(coupling for coupling in couplings if coupling.bodies[1] in names)
+        self.begin_frame()
+
+    def begin_frame(self) -> None:
+        self.taken, self.smallest_dt_s = 0, math.inf
+
+    def substep(self, dt: float) -> None:
+        for solver in self.solvers:
+            for coupling in self.couplings:
+                if coupling.bodies[1] == solver.name:
+                    coupling.exchange(dt)
+            solver.substep(dt)
+        for coupling in self.couplings:
+            coupling.follow(dt)
+        self.taken += 1
+        self.smallest_dt_s = min(self.smallest_dt_s, dt)
+
+
+def _teams(solvers: Mapping[str, Solver], couplings: Sequence[Coupling]) -> list[_Team]:
+    """A team for each connected component of the solvers under the couplings, in the order of the solvers.
+
+    Those of a component that a loose coupling leads to follow the others at their own steps.
+
+    Raises:
+        ValueError: such a solver is coupled to another one in a way that needs shared substeps.
+    """
+    component = {name: name for name in solvers}
+    for coupling in couplings:
+        kept, merged = (component[body] for body in coupling.bodies)
+        component = {name: kept if label == merged else label for name, label in component.items()}
+    late = {coupling.bodies[1] for coupling in couplings if coupling.is_loose}
+    for coupling in couplings:
+        for body in coupling.bodies[: 1 if coupling.is_loose else 2]:
+            if body in late:
+                first, second = coupling.bodies
+                raise ValueError(f'"{body}" has steps of its own and cannot share those of "{first}" and "{second}"')
+    teams = []
+    for label in dict.fromkeys(component.values()):
+        own = [solver for name, solver in solvers.items() if component[name] == label]
+        punctual = [solver for solver in own if solver.name not in late]
+        team = _Team(punctual, couplings)
+        following = [solver for solver in own if solver.name in late]
+        teams.append(_Team(following, couplings, ahead=team) if following else team)
+    return teams

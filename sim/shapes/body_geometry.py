@@ -1,0 +1,133 @@
+"""The shape of a rigid body about its centre of mass: its mass and its distances."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.shapes.balls import Balls, exact_balls, surface_balls
+from sim.shapes.level_set import LevelSet
+from sim.shapes.mass_properties import MassProperties, mass_properties_of_mesh, mass_properties_of_solid
+from sim.shapes.mesh_solid import MeshSolid
+from sim.shapes.parameters import WeightedPlacement
+from sim.shapes.placement import PlacedSolid, build_solid
+from sim.shapes.sampling import sample_surface
+from sim.shapes.solid import Points
+
+GRID_CELLS = 48
+"""Cells of a distance grid along the longest edge of a mesh."""
+
+GRID_PADDING = 0.1
+"""How far a distance grid reaches past its mesh, in longest edges."""
+
+
+class BodyGeometry:
+    """A body at rest, in its frame: origin at the centre of mass, axes those of its mesh.
+
+    Attributes:
+        solid: the scaled shape about its own origin, unturned.
+        centre_of_mass: in the frame of `solid` [m], (3,).
+        warnings: what was repaired or assumed to build the shape.
+    """
+
+    def __init__(self, parameters: WeightedPlacement) -> None:
+        """Build the shape; where it stands and its name have no part in it, its density only if there is ballast.
+
+        Raises:
+            ShapeError: it cannot be built, or is too thin to have an inside.
+        """
+        placed = build_solid(parameters)
+        self.solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
+        self._of_unit_density = _mass_properties(self.solid)
+        self._ballast = parameters.ballast
+        # Without ballast the centre is that of the shape, and bodies without mass have one too.
+        self.centre_of_mass = self.mass_properties(parameters.density or 1.0).centre_of_mass
+        self.warnings = self.solid.warnings
+
+    def mass_properties(self, density: float) -> MassProperties:
+        """Mass [kg], centre of mass [m] and inertia about it [kg m²], ballast included, in the frame of `solid`."""
+        unit = self._of_unit_density
+        properties = MassProperties(density * unit.mass, unit.centre_of_mass, density * unit.inertia)
+        for ballast in self._ballast:
+            properties = properties.with_point_mass(ballast.mass, ballast.position)
+        return properties
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lower and upper corner of its box [m], (2, 3)."""
+        return self.solid.bounds - self.centre_of_mass
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of its box's corners from the centre of mass [m]."""
+        return float(np.linalg.norm(np.abs(self.bounds).max(axis=0)))
+
+    @property
+    def shortest_edge(self) -> float:
+        """Shortest edge of its box [m]."""
+        return float(np.min(self.bounds[1] - self.bounds[0]))
+
+    def signed_distance(self, points: Points) -> NDArray[np.float64]:
+        """Exact distance to its surface [m], negative inside, (k,), of points (k, 3) in the body's frame."""
+        return self.solid.signed_distance(points + self.centre_of_mass)
+
+    def samples(self, spacing: float) -> Points:
+        """Evenly spread points on its surface [m], (m, 3), in the body's frame."""
+        return sample_surface(self.solid.rest_mesh(), spacing).astype(np.float64) - self.centre_of_mass
+
+    @cached_property
+    def is_analytic(self) -> bool:
+        """Whether its distance is a formula; that of a mesh is read from a grid in contacts."""
+        return not isinstance(self.solid.shape, MeshSolid)
+
+    @cached_property
+    def reach(self) -> float:
+        """How far outside of the body contact distances hold [m]."""
+        return np.inf if self.is_analytic else GRID_PADDING * float(np.max(self.bounds[1] - self.bounds[0]))
+
+    def contact_distance(self, points: Points) -> NDArray[np.float64]:
+        """Distance to its surface [m], negative inside, fast; up to `reach` outside."""
+        if self.is_analytic:
+            return self.signed_distance(points)
+        return self._grid.signed_distance(points + self.centre_of_mass)
+
+    def contact_normal(self, points: Points) -> Points:
+        """Unit gradient of the contact distance, (k, 3); away from the centre of mass where it has none."""
+        step = 1.0e-5 * self.shortest_edge if self.is_analytic else 0.5 * self._grid.spacing
+        offsets = step * np.concatenate([np.eye(3), -np.eye(3)])
+        values = self.contact_distance((points[:, None] + offsets).reshape(-1, 3)).reshape(-1, 6)
+        gradient = (values[:, :3] - values[:, 3:]) / (2.0 * step)
+        length = np.sqrt(np.square(gradient).sum(axis=1))
+        lost = length < 1.0e-3  # on a medial axis, such as the centre of a sphere
+        gradient[lost] = points[lost] + np.array([0.0, 0.0, 1.0e-9 * self.shortest_edge])
+        length[lost] = np.sqrt(np.square(gradient[lost]).sum(axis=1))
+        normal: Points = gradient / length[:, None]
+        return normal
+
+    @cached_property
+    def balls(self) -> Balls:
+        """The balls that stand for it in contacts, in the body's frame."""
+        found = exact_balls(self.solid)
+        balls = surface_balls(self.solid) if found is None else found
+        return replace(balls, centres=balls.centres - self.centre_of_mass[:, None])
+
+    def sees_all_contacts_with(self, other: BodyGeometry) -> bool:
+        """Whether its balls alone find every contact with another body."""
+        return self.balls.exact and bool(np.all(self.balls.radii <= other.reach))
+
+    @cached_property
+    def _grid(self) -> LevelSet:
+        longest = float(np.max(self.bounds[1] - self.bounds[0]))
+        return LevelSet.sample(self.solid, longest / GRID_CELLS, padding=GRID_PADDING * longest)
+
+
+def _mass_properties(solid: PlacedSolid) -> MassProperties:
+    """Mass properties at 1 kg/m³: from the mesh, scaled to the exact volume; from the inside of meshes with holes."""
+    if isinstance(solid.shape, MeshSolid) and not solid.shape.encloses_simply:
+        return mass_properties_of_solid(solid, 1.0)
+    facetted = mass_properties_of_mesh(solid.rest_mesh(), 1.0)
+    larger = solid.volume / facetted.mass  # facets cut off a little of what is round
+    return MassProperties(solid.volume, facetted.centre_of_mass, larger ** (5.0 / 3.0) * facetted.inertia)

@@ -1,0 +1,41 @@
+"""What `check` tells of the text of a job."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline.job.loading import read_job
+from pipeline.model.problems import Findings
+from pipeline.run.checked_job import check_job
+
+PLUME_FROM_A_BALL = """
+name = "air"
+frames = 24
+fps = 24
+[domain]
+min = [-0.5, -0.5, 0.0]
+max = [0.5, 0.5, 1.0]
+[[smoke]]
+name = "plume"
+cell_size = 0.02
+[[smoke.source]]
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.2]
+"""
+"""Smoke in a box of a metre, without bodies: its lines are 2 to 14."""
+
+
+class Checked(NamedTuple):
+    """Lines as a user reads them, and what was found beside them."""
+
+    errors: list[str]
+    warnings: list[str]
+    findings: Findings
+
+
+def checked(text: str, path: Path, *, memory_bytes: int | None = None) -> Checked:
+    """Write a job to a file and check it, on a machine with so much memory [bytes]."""
+    path.write_text(text)
+    loaded = read_job(path)
+    findings = check_job(loaded.job, memory_bytes=memory_bytes)
+    describe = loaded.source.describe_all
+    return Checked(describe(findings.errors), describe(findings.warnings), findings)

@@ -1,0 +1,337 @@
+"""Job files that are wrong, and the lines that say so; and that nothing but such lines ever comes out."""
+
+import random
+import tomllib
+from pathlib import Path
+from typing import get_args
+
+import pytest
+import tomlkit
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from places import PROJECT
+
+from pipeline.base.errors import JobFileError
+from pipeline.job.loading import load_job, read_job
+from pipeline.job.starter import TEMPLATES, starter
+from pipeline.model.job import Job
+from pipeline.model.problems import quoted_list
+from pipeline.run.checked_job import check_job
+from render.parameters import Look
+
+FLUID = """
+[[fluid]]
+name = "water"
+[[fluid.block]]
+shape = { type = "box", size = [0.2, 0.2, 0.2] }
+"""
+
+
+def problems_of(text: str, tmp_path: Path, *overrides: str, preview: bool = False) -> list[str]:
+    path = tmp_path / "dam.toml"
+    path.write_text(text)
+    with pytest.raises(JobFileError) as error:
+        read_job(path, overrides, preview=preview)
+    return error.value.problems
+
+
+BAD = {
+    "unknown key with a likely spelling": (
+        'name = "dam"\n[[fluid]]\nname = "w"\nviscocity = 1\n[[fluid.block]]\nshape = {type = "sphere", radius = 1}',
+        ['dam.toml:4 fluid[0].viscocity: unknown key "viscocity"; did you mean "viscosity"?'],
+    ),
+    "unknown key of a shape, judged by the shape's type": (
+        'name = "dam"\n[[rigid]]\nname = "r"\nshape = {type = "sphere", radius = 1, heigt = 2}',
+        ['dam.toml:4 rigid[0].shape.heigt: unknown key "heigt"; known here: type, radius'],
+    ),
+    "top-level key below a table": (
+        'name = "dam"\n[domain]\nfps = 60',
+        ['dam.toml:3 domain.fps: unknown key "fps"; it belongs to the top of the file, above the first [table]'],
+    ),
+    "key of another section": (
+        'name = "dam"\nquality = "final"',
+        ['dam.toml:2 quality: unknown key "quality"; it belongs to [render]'],
+    ),
+    "negative with a unit": (
+        f'name = "dam"\n{FLUID}'.replace('"water"', '"water"\nrest_density = -5'),
+        ["dam.toml:5 fluid[0].rest_density: must be > 0 kg/m³, got -5"],
+    ),
+    "component of a vector has the vector's unit": (
+        'name = "dam"\n[[rigid]]\nname = "r"\nshape = {type = "box", size = [1, 0, 1]}',
+        ["dam.toml:4 rigid[0].shape.size[1]: must be > 0 m, got 0"],
+    ),
+    "seed that Cycles cannot hold": (
+        'name = "dam"\n[render]\nseed = 3000000000',
+        ["dam.toml:3 render.seed: must be < 2147483648, got 3000000000"],
+    ),
+    "frames that stand for hours": (
+        'name = "dam"\n[movie]\nplayback_fps = 0.0001',
+        ["dam.toml:3 movie.playback_fps: must be >= 0.01, got 0.0001"],
+    ),
+    "zero frames": ('name = "dam"\nframes = 0', ["dam.toml:2 frames: must be >= 1, got 0"]),
+    "half a frame": ('name = "dam"\nframes = 2.5', ["dam.toml:2 frames: expected a whole number, got 2.5"]),
+    "number in quotes": ('name = "dam"\nfps = "60"', ['dam.toml:2 fps: expected a whole number, got the text "60"']),
+    "yes for true": (
+        'name = "dam"\n[render]\ndenoise = "yes"',
+        ['dam.toml:3 render.denoise: expected true or false, got the text "yes"'],
+    ),
+    "infinite": ('name = "dam"\nduration = inf', ["dam.toml:2 duration: must be finite, got inf"]),
+    "not a number": (
+        'name = "dam"\ngravity = [0, 0, nan]',
+        ["dam.toml:2 gravity[2]: must be finite, got nan"],
+    ),
+    "date": ('name = "dam"\nduration = 2020-02-29', ["dam.toml:2 duration: expected a number, got 2020-02-29"]),
+    "two components": ('name = "dam"\ngravity = [0, 1]', ["dam.toml:2 gravity: expected 3 values, got 2"]),
+    "four components": ('name = "dam"\ngravity = [0, 1, 2, 3]', ["dam.toml:2 gravity: expected 3 values, got 4"]),
+    "number for a vector": ('name = "dam"\ngravity = 9.81', ["dam.toml:2 gravity: expected a list, got 9.81"]),
+    "no name": ("frames = 3", ['dam.toml: missing key "name" (Name of the job and of its folder under renders/)']),
+    "name that is no file name": (
+        'name = "a/b"',
+        [
+            'dam.toml:1 name: must begin with a letter or digit and go on with letters, digits, ".", "_" or "-", '
+            '100 at most, got the text "a/b"'
+        ],
+    ),
+    "one bracket too few": (
+        'name = "dam"\n[smoke]\nname = "s"',
+        ["dam.toml:2 smoke: expected a list, got a table; write [[smoke]], in two brackets"],
+    ),
+    "unknown shape": (
+        'name = "dam"\n[[rigid]]\nname = "r"\nshape = {type = "spere", radius = 1}',
+        [
+            'dam.toml:4 rigid[0].shape: unknown type "spere", types are box, sphere, cylinder, capsule, torus, cone, '
+            'duck, bunny, mesh; did you mean "sphere"?'
+        ],
+    ),
+    "shape without type": (
+        'name = "dam"\n[[rigid]]\nname = "r"\nshape = {radius = 1}',
+        [
+            'dam.toml:4 rigid[0].shape: missing key "type"; types are box, sphere, cylinder, capsule, torus, cone, '
+            "duck, bunny, mesh"
+        ],
+    ),
+    "region, which may be left out, without type": (
+        'name = "dam"\n[[cloth]]\nname = "c"\nshape = {type = "rectangle", size = [1.0, 1.0], counts = [9, 9]}\n'
+        '[[cloth.pin]]\nregion = {typf = "box"}',
+        ['dam.toml:6 cloth[0].pin[0].region: missing key "type"; types are box, sphere'],
+    ),
+    "shape without its size": (
+        'name = "dam"\n[[rigid]]\nname = "r"\nshape = {type = "sphere"}',
+        ['dam.toml:4 rigid[0].shape: missing key "radius" (Radius [m])'],
+    ),
+    "text for a time step": (
+        f'name = "dam"\n{FLUID}'.replace('"water"', '"water"\ndt = "fast"'),
+        ['dam.toml:5 fluid[0].dt: expected "adaptive" or a number, got the text "fast"'],
+    ),
+    "negative time step": (
+        f'name = "dam"\n{FLUID}'.replace('"water"', '"water"\ndt = -1'),
+        ["dam.toml:5 fluid[0].dt: must be > 0 s, got -1"],
+    ),
+    "misspelt choice": (
+        'name = "dam"\n[render]\nquality = "fnal"',
+        [
+            'dam.toml:3 render.quality: expected "draft", "preview" or "final", got the text "fnal"; '
+            'did you mean "final"?'
+        ],
+    ),
+    "misspelt look": (
+        'name = "dam"\n[material.dam]\nlook = "hony"',
+        [
+            f'dam.toml:3 material.dam.look: expected {quoted_list(get_args(Look))}, got the text "hony"; '
+            'did you mean "honey"?'
+        ],
+    ),
+    "speed of sound for a solver without one": (
+        f'name = "dam"\n{FLUID}'.replace('"water"', '"water"\nsolver = "dfsph"\nsound_speed = 20'),
+        ['dam.toml:3 fluid[0]: sound_speed is for solver = "wcsph"; remove it, as "dfsph" has none'],
+    ),
+    "body without a density": (
+        'name = "dam"\n[[rigid]]\nname = "r"\nkind = "dynamic"\nshape = {type = "sphere", radius = 1}',
+        ["dam.toml:2 rigid[0]: density is missing; a dynamic body needs one, such as 600 kg/m³ for wood"],
+    ),
+    "cloth": (
+        'name = "dam"\n[[cloth]]\nname = "flag"\nmaterial = "wool"\nshape = {type = "rectangle", size = [1.0, 1.0]}',
+        [
+            'dam.toml:4 cloth[0].material: expected "cotton", "silk", "denim" or "rubber", got the text "wool"',
+            "dam.toml:5 cloth[0].shape: give counts or resolution, one of them",
+        ],
+    ),
+    "pin of a cloth": (
+        'name = "dam"\n[[cloth]]\nname = "flag"\nshape = {type = "rectangle", size = [1.0, 1.0], counts = [3, 3]}\n'
+        '[[cloth.pin]]\ncorner = "x-"',
+        [
+            'dam.toml:6 cloth[0].pin[0].corner: expected "x-y-", "x+y-", "x-y+" or "x+y+", '
+            'got the text "x-"; did you mean "x-y-"?'
+        ],
+    ),
+    "film without end": (
+        'name = "dam"\nduration = 1e300',
+        ["dam.toml: duration of 1e+300 s at 60 fps is more than 1,000,000 frames"],
+    ),
+    "frames and duration": ('name = "dam"\nframes = 3\nduration = 1', ["dam.toml: give frames or duration, not both"]),
+    "empty domain": (
+        'name = "dam"\n[domain]\nmin = [1, 0, 0]\nmax = [0, 1, 1]',
+        ["dam.toml:2 domain: max must be above min on every axis, got x from 1 to 0 m"],
+    ),
+    "fluid without a block": (
+        'name = "dam"\n[[fluid]]\nname = "w"\nblock = []',
+        ["dam.toml:2 fluid[0]: has neither a block nor an emitter; add [[fluid.block]] or [[fluid.emitter]]"],
+    ),
+    "text without quotes": (
+        "name = dam",
+        ['dam.toml:1:8 invalid value: name = dam; a text needs quotes: name = "dam"'],
+    ),
+    "string that never ends": (
+        'name = "dam',
+        ['dam.toml:1:12 unterminated string: name = "dam'],
+    ),
+    "key given twice": (
+        'name = "dam"\nname = "dam"',
+        ['dam.toml:2:13 cannot overwrite a value: name = "dam"; this key has a value already'],
+    ),
+    "nested beyond reason": ("a = " + "[" * 3000 + "]" * 3000, ["dam.toml: nested too deeply"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_job_file_gives_exactly_these_lines(case, tmp_path):
+    text, expected = BAD[case]
+    assert problems_of(text, tmp_path) == expected
+
+
+def test_all_problems_come_at_once_in_the_order_of_the_file(tmp_path):
+    text = "name = 3\nfps = 0\n[render]\nsampels = 4\n[camera]\nf_stop = -1\n[[light]]\n"
+    assert problems_of(text, tmp_path) == [
+        "dam.toml:1 name: expected a text, got 3",
+        "dam.toml:2 fps: must be >= 1, got 0",
+        'dam.toml:4 render.sampels: unknown key "sampels"; did you mean "samples"?',
+        "dam.toml:6 camera.f_stop: must be > 0, got -1",
+        'dam.toml:7 light[0]: missing key "position" (Where it stands [m]; of a sun only the direction counts)',
+    ]
+
+
+def test_missing_file_folder_and_binary_are_named(tmp_path):
+    binary = tmp_path / "film.toml"
+    binary.write_bytes(b"name = \xff\xfe")
+    for path, expected in (
+        (tmp_path / "absent.toml", "no such file; `pipeline new NAME` writes a starter"),
+        (tmp_path, "is a folder, not a job file"),
+        (binary, "not UTF-8 text (byte 7 is 0xff)"),
+    ):
+        with pytest.raises(JobFileError) as error:
+            read_job(path)
+        assert error.value.problems == [f"{path}: {expected}"]
+
+
+def test_windows_line_ends_and_byte_order_mark_do_not_matter(tmp_path):
+    path = tmp_path / "dam.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + b'name = "dam"\r\nframes = 3\r\n')
+    assert load_job(path) == Job(name="dam", frames=3)
+
+
+def test_a_blender_named_relative_to_the_job_file_is_found_from_anywhere(tmp_path):
+    path = tmp_path / "blender.toml"
+    path.write_text('name = "film"\n[render]\nblender = "tools/blender"  # mine\n')
+    loaded = read_job(path)
+    assert loaded.job.render.blender == (tmp_path / "tools" / "blender").as_posix()
+    elsewhere = tmp_path / "renders" / "film" / "job.toml"
+    elsewhere.parent.mkdir(parents=True)
+    elsewhere.write_text(loaded.text)
+    assert load_job(elsewhere) == loaded.job
+    assert "# mine" in loaded.text
+
+
+def test_mesh_files_are_absolute_in_the_job_and_in_its_text_and_comments_stay(tmp_path):
+    path = tmp_path / "dam.toml"
+    path.write_text(
+        'name = "dam" # mine\n[[rigid]]\nname = "r"\nshape = { type = "mesh", file = "m/duck.obj" } # duck\n'
+    )
+    loaded = read_job(path)
+    assert loaded.job.rigid[0].shape.file == (tmp_path / "m" / "duck.obj").as_posix()
+    assert "# mine" in loaded.text
+    assert "# duck" in loaded.text
+    elsewhere = tmp_path / "renders" / "job.toml"
+    elsewhere.parent.mkdir()
+    elsewhere.write_text(loaded.text)
+    assert read_job(elsewhere).job == loaded.job
+    assert read_job(elsewhere).text == loaded.text
+
+
+def test_text_of_an_unchanged_job_is_the_users_own(tmp_path):
+    path = tmp_path / "dam.toml"
+    path.write_text(starter("dam", "dam-break", file="dam.toml"))
+    assert read_job(path).text == path.read_text()
+
+
+JOBS = sorted((PROJECT / "jobs").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", JOBS, ids=lambda path: path.stem)
+def test_every_job_file_of_the_project_loads_and_is_named_after_its_file(path):
+    assert load_job(path).name == path.stem
+
+
+CHEAP_TEMPLATES = [template for template in TEMPLATES if template != "drop"]
+"""Building the duck takes a second, and mutations of it find nothing new."""
+
+
+def mutated(document: object, choose: random.Random) -> object:
+    """The document with one value somewhere replaced, removed, renamed or wrapped."""
+    junk = [0, -1, 1e308, float("nan"), "", "x", True, [], {}, [[1]], {"type": "box"}, 10**30, ["a"] * 5]
+    if isinstance(document, dict) and document:
+        key = choose.choice(sorted(document))
+        match choose.randrange(6):
+            case 0:
+                return {**document, key: choose.choice(junk)}
+            case 1:
+                return {name: value for name, value in document.items() if name != key}
+            case 2:
+                return {(f"{name}e" if name == key else name): value for name, value in document.items()}
+            case _:
+                return {**document, key: mutated(document[key], choose)}
+    if isinstance(document, list) and document and choose.random() < 0.8:
+        index = choose.randrange(len(document))
+        return [*document[:index], mutated(document[index], choose), *document[index + 1 :]]
+    return choose.choice(junk)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    template=st.sampled_from(CHEAP_TEMPLATES),
+    preview=st.booleans(),
+    count=st.integers(1, 4),
+)
+def test_whatever_values_a_job_holds_it_loads_or_gives_lines(tmp_path_factory, seed, template, preview, count):
+    choose = random.Random(seed)
+    document = tomllib.loads(starter("dam", template, file="dam.toml"))
+    for _ in range(count):
+        document = mutated(document, choose)
+    path = tmp_path_factory.getbasetemp() / "mutated.toml"
+    path.write_text(tomlkit.dumps(document if isinstance(document, dict) else {"name": document}))
+    assert_loads_or_gives_lines(path, preview=preview)
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.data(), template=st.sampled_from(CHEAP_TEMPLATES))
+def test_whatever_is_typed_into_a_job_file_it_loads_or_gives_lines(tmp_path_factory, data, template):
+    text = starter("dam", template, file="dam.toml")
+    at = data.draw(st.integers(0, len(text)))
+    removed = data.draw(st.integers(0, 20))
+    typed = data.draw(st.text(st.sampled_from(sorted("[]{}=.,\"'#\n\\ -_e0aé")), max_size=4))
+    path = tmp_path_factory.getbasetemp() / "typed.toml"
+    path.write_text(text[:at] + typed + text[at + removed :], encoding="utf-8")
+    assert_loads_or_gives_lines(path, preview=False)
+
+
+def assert_loads_or_gives_lines(path: Path, *, preview: bool) -> None:
+    try:
+        loaded = read_job(path, preview=preview)
+    except JobFileError as error:
+        assert error.problems
+        assert all(problem.startswith((path.name, str(path), "--preview")) for problem in error.problems)
+        assert not any("\n" in problem for problem in error.problems)
+    else:
+        findings = check_job(loaded.job, memory_bytes=20_000 * 1024)
+        lines = loaded.source.describe_all([*findings.errors, *findings.warnings])
+        assert not any("\n" in line for line in lines)

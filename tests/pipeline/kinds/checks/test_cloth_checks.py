@@ -1,0 +1,337 @@
+"""Cloths of a job: what is told before any work starts."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from checked_jobs import checked
+from cloth_jobs import BALL, SHEET, errors, warnings
+
+from pipeline.base.errors import JobFileError
+from pipeline.kinds.checks.cloth import BYTES_PER_NODE, MANY_SUBSTEPS
+from sim.core.world import MAX_SUBSTEPS_PER_FRAME
+
+SECOND = """
+[[cloth]]
+name = "second"
+shape = { type = "rectangle", size = [0.3, 0.3], counts = [7, 7] }
+position = [0.03, 0.0, 0.5]
+"""
+
+
+def test_a_cloth_over_a_ball_is_fine_and_its_nodes_are_counted(tmp_path):
+    findings = checked(SHEET + BALL, tmp_path / "drape.toml").findings
+    assert (findings.errors, findings.warnings) == ([], [])
+    assert findings.elements["cloth"] == 81
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            SHEET.replace("0.5]", "9.5]"),
+            "drape.toml:4 cloth[0]: is wholly outside the domain: it spans x -0.2..0.2 y -0.2..0.2 z 9.5..9.5 m, "
+            "not x -0.5..0.5 y -0.5..0.5 z 0..1 m",
+        ),
+        (
+            SHEET.replace('"x-", ', "").replace("[0.0,", "[-0.4,"),
+            "drape.toml:4 cloth[0]: passes through the wall x-, as at (-0.6, -0.2, 0.5) m; "
+            "move it, or name the face in domain.open_faces",
+        ),
+        (
+            SHEET + BALL.replace("0.3]", "0.45]"),
+            'drape.toml:4 cloth[0]: starts inside "ball", as at (-0.05, -0.05, 0.5) m; move one of them',
+        ),
+        (
+            # Smaller than a cell of the sheet: no node is inside, but the middle of a triangle is.
+            SHEET + BALL.replace("radius = 0.1", "radius = 0.01").replace("0.0, 0.0, 0.3]", "0.0335, 0.0165, 0.5]"),
+            'drape.toml:4 cloth[0]: starts inside "ball", as at (0.03333, 0.01667, 0.5) m; move one of them',
+        ),
+        (
+            SHEET + SECOND + "rotation_deg = [0.0, 90.0, 0.0]",
+            'drape.toml:9 cloth[1]: passes through or touches cloth "sheet" at (0.03, -0.15, 0.5) m; '
+            "move one of them, 0.0005 m or more apart",
+        ),
+        (
+            # Nothing passes through anything, and contacts would not know which of the two is above.
+            SHEET + SECOND + "rotation_deg = [0.0, 0.0, 27.0]\nthickness = 2e-3",
+            'drape.toml:9 cloth[1]: passes through or touches cloth "sheet" at (0.008998, -0.1791, 0.5) m; '
+            "move one of them, 0.002 m or more apart",
+        ),
+        (
+            SHEET + "[[cloth.pin]]\nindex = [3, 81]",
+            "drape.toml:8 cloth[0].pin[0]: index 81 does not exist; the sheet has nodes 0 to 80",
+        ),
+        (
+            SHEET + '[[cloth.pin]]\nregion = { type = "sphere", position = [0.0, 0.0, 0.9], radius = 0.1 }',
+            "drape.toml:8 cloth[0].pin[0]: no node starts in its region; "
+            "the cloth spans x -0.2..0.2 y -0.2..0.2 z 0.5..0.5 m",
+        ),
+        (
+            SHEET + '[[cloth.pin]]\nedge = "x-"\n[[cloth.pin]]\ncorner = "x-y-"\n'
+            "keyframe = [{ time_s = 0.0 }, { time_s = 1.0, offset = [0.1, 0.0, 0.0] }]",
+            "drape.toml:10 cloth[0].pin[1]: shares a node with pin[0], and one of them moves; pin each node once",
+        ),
+        (
+            SHEET + SECOND.replace("0.5]", "0.7]") + "substeps = 40",
+            'drape.toml:13 cloth[1].substeps: is 40, but omitted in cloth[0] "sheet"; all cloths share it',
+        ),
+        (
+            SHEET.replace('"rectangle", size = [0.4, 0.4], counts = [9, 9]', '"mesh", file = "shawl.ply"'),
+            "drape.toml:6 cloth[0].shape.file: no such file: FOLDER/shawl.ply",
+        ),
+        (
+            SHEET + '[material.sheet]\nlook = "smoke"',
+            'drape.toml:9 material.sheet.look: "smoke" is a look for [[smoke]]; "sheet" is in [[cloth]]',
+        ),
+        (
+            SHEET + BALL + '[material.ball]\nlook = "denim"',
+            'drape.toml:14 material.ball.look: "denim" is a look for [[cloth]]; "ball" is in [[rigid]]',
+        ),
+        (
+            SHEET + '[[smoke]]\nname = "cloth"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.2 }',
+            'drape.toml:9 smoke[0].name: "cloth" is what all cloths are called together; take another',
+        ),
+        (
+            SHEET + BALL.replace('"ball"', '"sheet"'),
+            'drape.toml:5 cloth[0].name: "sheet" is taken by rigid[0]; names are unique in a job',
+        ),
+    ],
+    ids=["outside", "wall", "inside", "inside a cell", "crossing", "in one plane", "pin index", "pin region",
+         "moving pins", "shared", "file", "smoke look", "woven look", "name of the solver", "name of a body"],
+)  # fmt: skip
+def test_what_cannot_start_is_refused_with_its_place(text, expected, tmp_path):
+    assert expected.replace("FOLDER", str(tmp_path)) in errors(text, tmp_path)
+
+
+def test_more_nodes_than_memory_holds_are_refused_with_the_number_that_fits(tmp_path):
+    text = SHEET.replace("[9, 9]", "[2000, 2000]")
+    (problem,) = errors(text, tmp_path, memory_bytes=10**9)
+    assert re.fullmatch(
+        r"drape\.toml:6 cloth\[0\]\.shape\.counts: 4 million nodes need \d+ GB, this machine has 1 GB; "
+        r"at most \d+ fit: divide it less finely",
+        problem,
+    )
+
+
+def test_cloths_that_fit_one_by_one_but_not_together_are_refused(tmp_path):
+    text = SHEET + SECOND.replace("0.5]", "0.7]")
+    assert errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * (81 + 49)) == []
+    (problem,) = errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * (81 + 49) - 1)
+    assert problem == (
+        "drape.toml:11 cloth[1].shape.counts: 49 nodes and 81 of the cloths before it need 0.00078 GB, "
+        "this machine has 0.00078 GB; at most 48 fit: divide it less finely"
+    )
+
+
+PLUME = """
+[[smoke]]
+name = "plume"
+cell_size = 0.05
+[[smoke.source]]
+shape = { type = "sphere", radius = 0.2 }
+position = [0.0, 0.0, 0.3]
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            SHEET + "thickness = 0.06",
+            "drape.toml:8 cloth[0].thickness: 0.06 m is more than the 0.05 m between neighbouring nodes",
+        ),
+        (SHEET + "wind = [1.0, 0.0, 0.0]\n" + PLUME,
+         'drape.toml:8 cloth[0].wind: does not blow in the box of smoke "plume", where the cloth starts'),
+        (SHEET + '[material.sheet]\nlook = "plastic"\nthread_spacing = 0.001',
+         'drape.toml:10 material.sheet.thread_spacing: has no effect on the look "plastic"'),
+    ],
+    ids=["thickness", "wind in smoke", "threads of plastic"],
+)  # fmt: skip
+def test_what_is_worth_a_look_is_said(text, expected, tmp_path):
+    assert any(line.startswith(expected) for line in warnings(text, tmp_path))
+
+
+def test_cloth_beside_smokes_whose_boxes_overlap_is_refused(tmp_path):
+    other = PLUME.replace("plume", "fog").replace("cell_size", "max = [0.5, 0.5, 0.4]\ncell_size")
+    apart = other.replace("max = [0.5, 0.5, 0.4]", "min = [0.5, -0.5, 0.0]\nmax = [1.5, 0.5, 1.0]").replace(
+        "[0.0,", "[0.8,"
+    )
+    with pytest.raises(JobFileError, match='the boxes of smoke "plume" and "fog" overlap'):
+        warnings(SHEET + PLUME + other, tmp_path)
+    assert warnings(SHEET + PLUME + apart, tmp_path) == []
+
+
+def test_cloths_of_two_airs_beside_smoke_are_refused(tmp_path):
+    other = SHEET[SHEET.index("[[cloth]]") :].replace('"sheet"', '"other"')
+    thin, none = "air_density = 0.6\n", "air_density = 0.0\n"
+    apart = other.replace("0.5]", "0.9]")
+    with pytest.raises(JobFileError, match=r'air_density of cloth "other" is 0\.6 kg/m³, but that of "sheet" 1\.2'):
+        warnings(SHEET + apart + thin + PLUME, tmp_path)
+    assert warnings(SHEET + apart + none + PLUME, tmp_path) == []
+    assert warnings(SHEET + apart + thin, tmp_path) == []
+
+
+def test_cloth_laid_onto_a_box_and_an_edge_pinned_inside_a_pole_are_fine(tmp_path):
+    table = BALL.replace('"sphere", radius = 0.1', '"box", size = [0.3, 0.3, 0.2]').replace("0.3]\n", "0.4]\n")
+    assert errors(SHEET + table, tmp_path) == []
+    pole = BALL.replace('"sphere", radius = 0.1', '"box", size = [0.02, 0.5, 0.5]').replace("[0.0,", "[-0.2,")
+    assert len(errors(SHEET + pole.replace("0.3]\n", "0.5]\n"), tmp_path)) == 1
+    assert errors(SHEET + '[[cloth.pin]]\nedge = "x-"\n' + pole.replace("0.3]\n", "0.5]\n"), tmp_path) == []
+
+
+def mesh_job(vertices, faces, folder: Path, suffix: str = "") -> str:
+    mesh = trimesh.Trimesh(np.asarray(vertices, dtype=float), np.asarray(faces), process=False)
+    mesh.export(folder / "shawl.ply")
+    shape = SHEET.replace('"rectangle", size = [0.4, 0.4], counts = [9, 9]', '"mesh", file = "shawl.ply"')
+    return shape + suffix
+
+
+SQUARE = [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, 0.0], [0.0, 0.2, 0.0]]
+
+
+def test_a_mesh_that_is_no_sheet_is_refused(tmp_path):
+    (problem,) = errors(mesh_job([*SQUARE, [0.1, 0.1, 0.1]], [[0, 1, 2], [0, 2, 3], [0, 2, 4]], tmp_path), tmp_path)
+    assert problem.startswith('drape.toml:6 cloth[0].shape: shape.file: 1 edges of "shawl.ply" have three triangles')
+
+
+def test_a_mesh_of_more_nodes_than_memory_holds_is_refused(tmp_path):
+    text = mesh_job(SQUARE, [[0, 1, 2], [0, 2, 3]], tmp_path)
+    assert errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * 4) == []
+    (problem,) = errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * 3)
+    assert problem == (
+        "drape.toml:6 cloth[0].shape.file: 4 nodes need 2.4e-05 GB, this machine has 1.8e-05 GB; "
+        "at most 3 fit: take a coarser mesh"
+    )
+
+
+def test_a_mesh_that_passes_through_itself_is_refused_unless_it_need_not_collide_with_itself(tmp_path):
+    spike = [[0.05, 0.1, -0.1], [0.15, 0.1, -0.1], [0.1, 0.1, 0.1]]
+    text = mesh_job([*SQUARE, *spike], [[0, 1, 2], [0, 2, 3], [4, 5, 6]], tmp_path)
+    (problem,) = errors(text, tmp_path)
+    assert problem == (
+        "drape.toml:6 cloth[0].shape: passes through or touches itself at (0, 0, 0.5) m; "
+        "take it apart by its thickness, or use self_collision = false"
+    )
+    assert errors(text + "self_collision = false", tmp_path) == []
+
+
+def test_what_was_repaired_in_a_mesh_is_said(tmp_path):
+    split = [*SQUARE[:3], SQUARE[0], SQUARE[2], SQUARE[3]]
+    (warning,) = warnings(mesh_job(split, [[0, 1, 2], [3, 4, 5]], tmp_path), tmp_path)
+    assert warning == 'drape.toml:6 cloth[0].shape: "shawl.ply": merged 2 split or unused vertices'
+
+
+def test_too_few_substeps_for_explicit_springs_are_refused_with_a_number_that_is_accepted(tmp_path):
+    def problems(substeps: int) -> list[str]:
+        return errors(f'{SHEET}integrator = "explicit"\nsubsteps = {substeps}', tmp_path)
+
+    (problem,) = problems(2)
+    place = r"drape\.toml:9 cloth\[0\]\.substeps: 2 substeps a frame are "
+    least = int(re.search(place + r".* give substeps = (\d+) or more", problem)[1])
+    assert problems(least) == []
+    assert len(problems(least - 1)) == 1
+
+
+def test_explicit_springs_without_substeps_are_told_how_many_they_take(tmp_path):
+    def told(found, stiffness: float) -> list[str]:
+        keys = f'integrator = "explicit"\nmass_per_area = 0.01\nstretch_stiffness = {stiffness:g}\n'
+        lines = found(SHEET + keys, tmp_path)
+        return [line for line in lines if "substeps a frame" in line]
+
+    assert told(warnings, 1.0e3) == told(errors, 1.0e7) == []
+    (slow,) = told(warnings, 1.0e7)
+    taken = int(re.search(r'cloth\[0\]\.integrator: "explicit" takes (\d+) substeps a frame', slow)[1])
+    assert taken > MANY_SUBSTEPS
+    # They grow with the root of the stiffness.
+    (endless,) = told(errors, 1.0e7 * (1.01 * MAX_SUBSTEPS_PER_FRAME / taken) ** 2)
+    assert "more than the 200000 at which a run ends: give a softer stretch_stiffness or a coarser sheet" in endless
+
+
+def test_explicit_springs_need_the_substeps_of_nodes_that_are_let_go_from_the_start(tmp_path):
+    """Nodes that are held bear steps of any length."""
+
+    def problems(release: str) -> list[str]:
+        pin = f"[[cloth.pin]]\nindex = {list(range(81))}\n{release}"
+        return errors(f'{SHEET}integrator = "explicit"\nsubsteps = 20\n{pin}', tmp_path)
+
+    assert problems("") == []
+    (problem,) = problems("release_s = 0.5")
+    assert re.search(r"cloth\[0\]\.substeps: 20 substeps a frame are .* give substeps = \d+ or more", problem)
+
+
+def test_bodies_that_fit_between_the_nodes_are_told(tmp_path):
+    small = BALL.replace("radius = 0.1", "radius = 0.06")
+    (warning,) = warnings(SHEET + small, tmp_path)
+    assert warning.startswith(
+        'drape.toml:6 cloth[0].shape: "ball" is 0.12 m across, less than two of the longest edges, 0.0707 m each'
+    )
+
+
+ROD = """
+[[rigid]]
+name = "rod"
+shape = { type = "cylinder", radius = 0.02, height = 0.5 }
+position = [-0.2, 0.0, 0.475]
+rotation_deg = [90.0, 0.0, 0.0]
+"""
+
+
+def test_a_rod_that_cloth_is_pinned_along_may_be_thinner_than_two_of_its_edges(tmp_path):
+    def told(*tables: str) -> list[str]:
+        return [line for line in warnings("".join((SHEET, *tables)), tmp_path) if '"rod" is 0.04 m across' in line]
+
+    pin = '[[cloth.pin]]\nedge = "x-"\n'
+    assert told(pin, ROD) == []
+    assert told(pin + "release_s = 1.0\n", ROD) == []
+    # Without pins it falls onto the rod, held by a corner it may come to it, and so may a sheet held elsewhere.
+    assert len(told(ROD)) == len(told(pin.replace('edge = "x-"', 'corner = "x-y-"'), ROD)) == 1
+    assert len(told(pin.replace("x-", "x+"), ROD)) == 1
+    # Another sheet may come to it too.
+    (of_the_other,) = told(pin, SECOND.replace("0.5]", "0.51]"), ROD)
+    assert "cloth[1].shape" in of_the_other
+
+
+LEAVES = "keyframe = [{ time_s = 0.0 }, { time_s = 0.5, offset = [-0.1, 0.0, 0.0] }]\n"
+GOES_ALONG = """kind = "kinematic"
+keyframe = [
+    { time_s = 0.0, position = [-0.2, 0.0, 0.475], rotation_deg = [90.0, 0.0, 0.0] },
+    { time_s = 0.5, position = [-0.3, 0.0, 0.475], rotation_deg = [90.0, 0.0, 0.0] },
+]
+"""
+
+
+@pytest.mark.parametrize(
+    ("pin", "body", "is_told"),
+    [
+        ('edge = "x-"\n' + LEAVES, ROD + GOES_ALONG, False),
+        ('edge = "x-"\n' + LEAVES, ROD, True),
+        ('edge = "x-"\nrelease_s = 0.001\n' + LEAVES.replace("0.0 }", "0.0005 }", 1), ROD, False),
+        ('edge = "x-"\n', ROD + GOES_ALONG, True),
+        ('edge = "x-"\n', ROD + 'kind = "kinematic"\nvelocity = [0.5, 0.0, 0.0]\n', True),
+        ('edge = "x-"\n', ROD + 'kind = "kinematic"\n', False),
+        ('edge = "x-"\n', ROD + 'kind = "dynamic"\ndensity = 600.0\n', True),
+        ("index = [36, 27]\n", ROD, True),  # two nodes in the middle of the edge
+        ("index = [0, 72]\n", ROD, True),  # its two ends
+        ('edge = "x-"\n', ROD.replace('"cylinder", radius = 0.02, height = 0.5', '"box", size = [0.5, 0.5, 0.04]')
+         .replace("-0.2, 0.0, 0.475", "0.0, 0.0, 0.475").replace("[90.0, 0.0", "[0.0, 0.0"), True),
+    ],
+    ids=["both move alike", "the pin leaves", "it lets go before", "the rod leaves", "it sweeps", "it rests",
+         "it falls", "two neighbours", "two ends", "a plate"],
+)  # fmt: skip
+def test_only_a_rod_that_stays_along_a_pin_may_be_thin(pin, body, is_told, tmp_path):
+    told = [line for line in warnings(f"{SHEET}[[cloth.pin]]\n{pin}{body}", tmp_path) if "may show or pass" in line]
+    assert len(told) == is_told
+
+
+@pytest.mark.parametrize(("wall", "is_told"), [(0.001, True), (0.004, False)])
+def test_shells_with_thinner_walls_than_cloth_can_feel_are_told(wall, is_told, tmp_path):
+    shell = trimesh.creation.icosphere(3, 0.2)
+    inner = trimesh.creation.icosphere(3, 0.2 - wall)
+    inner.invert()
+    trimesh.util.concatenate([shell, inner]).export(tmp_path / "shell.ply")
+    body = BALL.replace('"sphere", radius = 0.1', '"mesh", file = "shell.ply"').replace("0.3]", "0.25]")
+    told = [line for line in warnings(SHEET + body, tmp_path) if "m or thinner; the finest grid that" in line]
+    assert len(told) == is_told

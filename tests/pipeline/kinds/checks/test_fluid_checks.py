@@ -1,0 +1,290 @@
+"""Jobs whose fluids cannot be meant together, or whose emitters cannot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from checked_jobs import checked
+
+from pipeline.job.loading import read_job
+from pipeline.kinds.checks.fluid import MOST_CELLS, particle_room
+from pipeline.kinds.checks.jets import _longest_flight, check_jets
+from pipeline.model.problems import Findings
+from sim.fluid.opening import Opening
+from sim.shapes import build_solid
+from sim.shapes.placement import PlacedSolid
+
+HEAD = 'name = "tank"\nframes = 60\n'
+WATER = """
+[[fluid]]
+name = "water"
+particle_radius = 0.02
+[[fluid.block]]
+shape = { type = "box", size = [1.0, 1.0, 0.2] }
+position = [0.0, 0.0, 0.1]
+"""
+OIL = """
+[[fluid]]
+name = "oil"
+particle_radius = 0.02
+rest_density = 900.0
+[[fluid.block]]
+shape = { type = "box", size = [1.0, 1.0, 0.2] }
+position = [0.0, 0.0, 0.3]
+"""
+JET = """
+[[fluid]]
+name = "jet"
+particle_radius = 0.02
+[[fluid.emitter]]
+shape = { type = "disc", radius = 0.1 }
+position = [0.0, 0.0, 0.9]
+direction = [0.0, 0.0, -1.0]
+speed = 1.0
+"""
+
+
+@pytest.mark.parametrize("text", [HEAD + WATER + OIL, HEAD + JET, HEAD + WATER + JET])
+def test_fluids_that_go_together_pass_without_a_word(text, tmp_path):
+    errors, warnings, findings = checked(text, tmp_path / "tank.toml")
+    assert errors == warnings == []
+    assert findings.elements["fluid"] > 300
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            HEAD + WATER + OIL.replace("0.02", "0.01"),
+            'tank.toml:13 fluid[1].particle_radius: is 0.01, but 0.02 in fluid[0] "water"; '
+            "all fluids of a tank share it",
+        ),
+        (
+            HEAD + WATER + OIL.replace("900.0", "50.0"),
+            'tank.toml:14 fluid[1].rest_density: is 50 kg/m³, and 1000 kg/m³ in fluid[0] "water"; '
+            "densities in a tank may differ by a factor of 10 at most",
+        ),
+        (
+            HEAD + JET.replace("0.0, -1.0", "0.0, 1.0").replace("0.9]", "1.0]"),
+            "tank.toml:7 fluid[0].emitter[0]: 21 of the 21 places of its opening are outside the domain; "
+            "move it in, or let it point inwards",
+        ),
+        (
+            HEAD + JET.replace("radius = 0.1", "radius = 0.01"),
+            "tank.toml:8 fluid[0].emitter[0].shape: is too narrow for particles 0.04 m apart; "
+            "enlarge it or use a smaller particle_radius",
+        ),
+        (
+            HEAD + WATER + "[domain]\nmin = [-40, -40, 0]\nmax = [40, 40, 100]",
+            "tank.toml:10 domain: has 9.47e+08 cells for the search of neighbours of 0.02 m particles, "
+            "more than 2.68e+08; make it smaller, or particle_radius 0.032 m",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_with_a_remedy(text, expected, tmp_path):
+    errors, _, _ = checked(text, tmp_path / "tank.toml", memory_bytes=10**15)
+    assert expected in errors
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            HEAD + WATER + OIL.replace("0.3]", "0.22]"),
+            "tank.toml:15 fluid[1].block[0]: shares 40 % of its volume with fluid[0].block[0]; "
+            'that belongs to "water", the first of the two',
+        ),
+        (
+            HEAD + JET + "start_s = 3.0",
+            "tank.toml:12 fluid[0].emitter[0].start_s: starts at 3 s, after the film's end at 1 s",
+        ),
+        (
+            HEAD + JET.replace("speed = 1.0", "speed = 1000.0"),
+            "tank.toml:11 fluid[0].emitter[0].speed: 1000 m/s crosses the whole domain within a frame; "
+            "the time steps will be very short",
+        ),
+    ],
+)
+def test_what_is_hardly_meant_is_warned_of(text, expected, tmp_path):
+    _, warnings, _ = checked(text, tmp_path / "tank.toml")
+    assert expected in warnings
+
+
+def test_an_emitter_in_a_solid_body_is_refused(tmp_path):
+    ball = '[[rigid]]\nname = "ball"\nshape = { type = "sphere", radius = 0.2 }\nposition = [0.0, 0.0, 0.9]\n'
+    errors, _, _ = checked(HEAD + ball + JET, tmp_path / "tank.toml")
+    assert any("places of its opening are in a solid body; move it out" in error for error in errors)
+
+
+def test_emitters_in_each_others_way_are_refused_at_load(tmp_path):
+    again = JET.split("[[fluid.emitter]]")[1]
+    same = "[[fluid.emitter]]" + again
+    errors, _, _ = checked(HEAD + JET + same, tmp_path / "tank.toml")
+    assert [error.split("emitter[1]")[1] for error in errors] == [
+        ": is the same opening as fluid[0].emitter[0], at the same time; let one start when the other has ended"
+    ]
+    moved = same.replace("[0.0, 0.0, 0.9]", "[0.23, 0.0, 0.9]")
+    errors, _, _ = checked(HEAD + JET + moved, tmp_path / "tank.toml")
+    assert len(errors) == 1
+    assert "so near that the pipe around one is in the way of the other" in errors[0]
+    errors, _, _ = checked(HEAD + JET + "end_s = 0.5\n" + same + "start_s = 0.5\n", tmp_path / "tank.toml")
+    assert errors == []
+
+
+def emitter(position: str, direction: str, *, speed: float = 2.0, more: str = "") -> str:
+    return f"""
+[[fluid.emitter]]
+shape = {{ type = "disc", radius = 0.1 }}
+position = {position}
+direction = {direction}
+speed = {speed}
+{more}
+"""
+
+
+JETS = JET.partition("[[fluid.emitter]]")[0]
+ACROSS = emitter("[-0.45, 0.0, 0.5]", "[1, 0, 0]", speed=5.0)
+FOUNTAIN = emitter("[0.0, 0.0, 0.16]", "[0.17365, 0, 0.98481]", speed=3.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "arrival"),
+    [
+        # Straight ahead at 5 m/s to the edge of the other nozzle, 0.8 m away, and from above by a fall of half a metre.
+        (emitter("[0.45, 0.0, 0.5]", "[-1, 0, 0]", speed=5.0, more="start_s = 0.2") + ACROSS, "0.15"),
+        (emitter("[0.1, 0.0, 0.25]", "[0, 0, -1]") + emitter("[0.1, 0.0, 0.9]", "[0, 0, -1]"), "0.2"),
+        # On a parabola over 0.6 m, which is 9 cm lower there than a straight line.
+        (emitter("[0.3, 0.0, 0.22]", "[0, 0, -1]") + emitter("[-0.4, 0.0, 0.55]", "[1, 0, 0]", speed=3.0), "0.2"),
+        # Up at 80 degrees through a nozzle of 8 cm, which takes 0.03 s, and down again after 2 v sin(80°)/g = 0.60 s,
+        # 0.31 m away: 1.6 times as long as it would take to the far corner without gravity.
+        (emitter("[0.3, 0.0, 0.16]", "[0, 0, 1]", more="start_s = 0.9") + FOUNTAIN, "0.63"),
+    ],
+    ids=["head-on", "from above", "on a parabola", "fountain"],
+)
+def test_a_jet_that_runs_into_another_nozzle_is_warned_of(text, arrival, tmp_path):
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
+    assert errors == []
+    hits = [warning for warning in warnings if "its jet runs into the nozzle of fluid[0].emitter[0]" in warning]
+    assert len(hits) == 1
+    seconds = float(hits[0].partition("emitter[0] ")[2].partition(" s ")[0])
+    assert seconds == pytest.approx(float(arrival), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        emitter("[-0.2, 0.0, 0.9]", "[0, 0, -1]") + emitter("[0.2, 0.0, 0.9]", "[0, 0, -1]"),
+        # It would meet the other one without the pool between, or without the post.
+        emitter("[0.1, 0.0, 0.1]", "[0, 0, 1]") + emitter("[0.1, 0.0, 0.9]", "[0, 0, -1]") + WATER.replace(
+            "0.1]", "0.35]").replace('name = "water"', 'name = "pool"'),
+        emitter("[0.45, 0.0, 0.5]", "[-1, 0, 0]") + emitter("[-0.45, 0.0, 0.5]", "[1, 0, 0]")
+        + '[[rigid]]\nname = "post"\nshape = { type = "box", size = [0.1, 0.4, 0.9] }\nposition = [0, 0, 0.5]\n',
+        # It falls below the other one before it is there.
+        emitter("[0.4, 0.0, 0.6]", "[-1, 0, 0]", more="start_s = 0.9")
+        + emitter("[-0.4, 0.0, 0.6]", "[1, 0, 0]", speed=1.0),
+    ],
+    ids=["side by side", "pool between", "post between", "too slow"],
+)  # fmt: skip
+def test_jets_that_meet_something_else_first_pass_without_a_word(text, tmp_path):
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
+    assert errors == []
+    assert not [warning for warning in warnings if "its jet" in warning or "before its opening" in warning]
+
+
+@pytest.mark.parametrize("gravity", [0.0, 1e-9, 1.62, 9.81])
+@pytest.mark.parametrize("speed", [0.5, 3.0, 6.0])
+def test_a_jet_is_followed_until_it_has_left_whatever_its_direction_and_hardly_longer(speed, gravity):
+    """Through a distance of 1.1 m, in directions from straight down to straight up, of which the last takes longest."""
+    end_s = _longest_flight(speed, gravity, 1.1)
+    up = np.linspace(-1.0, 1.0, 41)[:, None]
+    t = np.linspace(0.0, end_s, 5001)
+    across = np.sqrt(1.0 - up**2) * speed * t
+    away = np.hypot(across, up * speed * t - 0.5 * gravity * t**2)
+    # The last step alone is as short as 0.02 % of the way.
+    assert (away.max(axis=1) >= 1.1 * (1.0 - 1e-9)).all()
+    assert away[-1, :-1].max() < 1.1
+
+
+def test_a_body_out_of_a_jets_way_is_not_asked_for_distances(tmp_path, monkeypatch):
+    """Those of a mesh take long, and thousands of places are looked at."""
+    bodies = {"plate": "[0.0, 0.0, 0.3]", "far": "[0.4, 0.4, 0.5]"}
+    text = "".join(
+        f'[[rigid]]\nname = "{name}"\nshape = {{ type = "box", size = [0.1, 0.1, 0.1] }}\nposition = {position}\n'
+        for name, position in bodies.items()
+    )
+    path = tmp_path / "tank.toml"
+    path.write_text(HEAD + JET + text)
+    job = read_job(path).job
+    solids = {("rigid", index): build_solid(body) for index, body in enumerate(job.rigid)}
+    asked = []
+    distance = PlacedSolid.signed_distance
+
+    def record(solid, points):
+        asked.append(solid)
+        return distance(solid, points)
+
+    monkeypatch.setattr(PlacedSolid, "signed_distance", record)
+    opening = Opening.of(job.fluid[0].emitter[0], 0.04, 0.04**3, 2.0)
+    check_jets(job, solids, {("fluid", 0, "emitter", 0): opening}, 0.04, Findings())
+    assert {id(solid) for solid in asked} == {id(solids["rigid", 0])}
+
+
+PLATE = '[[rigid]]\nname = "plate"\nshape = {{ type = "box", size = [0.5, 0.5, 0.02] }}\nposition = [0, 0, {height}]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "room"),
+    [
+        (emitter("[0.0, 0.0, 0.1]", "[0, 0, -1]"), "0.1"),  # the floor
+        (emitter("[0.0, 0.0, 0.9]", "[0, 0, -1]") + PLATE.format(height=0.78), "0.11"),
+        (emitter("[0.44, 0.0, 0.5]", "[1, 0, 0]"), "0.06"),
+    ],
+    ids=["floor", "plate", "side wall"],
+)
+def test_an_opening_right_before_a_wall_is_warned_of(text, room, tmp_path):
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
+    assert errors == []
+    (warning,) = (each for each in warnings if "before its opening" in each)
+    assert float(warning.partition("body is ")[2].partition(" m ")[0]) == pytest.approx(float(room), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        emitter("[0.0, 0.0, 0.16]", "[0, 0, -1]"),  # a nozzle of 8 cm, and a quarter of its width
+        emitter("[0.0, 0.0, 0.9]", "[0, 0, -1]") + PLATE.format(height=0.7),
+        # A thin post takes less than half of the jet.
+        emitter("[0.0, 0.0, 0.9]", "[0, 0, -1]") + PLATE.format(height=0.75).replace("0.5, 0.5", "0.05, 0.5"),
+        emitter("[0.44, 0.0, 0.5]", "[1, 0, 0]") + '[domain]\nopen_faces = ["x+"]\n',
+    ],
+    ids=["high enough", "plate below", "thin", "open"],
+)
+def test_an_opening_with_room_before_it_passes_without_a_word(text, tmp_path):
+    errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
+    assert errors == []
+    assert not [warning for warning in warnings if "before its opening" in warning]
+
+
+def test_memory_counts_what_emitters_may_add(tmp_path):
+    # The domain of 1 m³ holds 15,625 particles of 4 cm, and an endless jet may fill it.
+    endless, _, _ = checked(HEAD + JET, tmp_path / "tank.toml", memory_bytes=8_000_000)
+    assert any("or give emitters an end_s, or the fluid max_particles" in error for error in endless)
+    capped, _, _ = checked(
+        HEAD + JET.replace("[[fluid.e", "max_particles = 3000\n[[fluid.e"),
+        tmp_path / "tank.toml",
+        memory_bytes=8_000_000,
+    )
+    assert capped == []
+
+
+def test_the_room_is_that_of_the_simulation(tmp_path):
+    _, _, _ = checked(HEAD + JET + "end_s = 0.5", tmp_path / "tank.toml")
+    job = read_job(tmp_path / "tank.toml").job
+    # 1 m/s through pi 0.1² m² for half a second, in particles of 0.04³ m³; whole layers of 21.
+    assert particle_room(job, job.fluid[0], 0.0) == pytest.approx(np.pi * 0.01 * 0.5 / 0.04**3, abs=21)
+
+
+def test_the_limit_is_that_of_the_simulation():
+    from sim.core.cells import MAX_CELLS
+
+    assert MOST_CELLS == MAX_CELLS

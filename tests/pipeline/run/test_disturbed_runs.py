@@ -1,0 +1,173 @@
+"""Runs that somebody disturbs: who interrupts them, takes them over, or loses what they told or made."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from synthetic_jobs import Recorder, contents, job_text, run_recorded, run_synthetic
+from synthetic_stages import write_faults
+
+from pipeline.base.errors import JobBusyError, LeaseLostError
+from pipeline.base.layout import JobLayout
+from pipeline.base.lease import Lease
+from pipeline.base.task import ArtifactPath, FailureKind, TaskId
+from pipeline.record.manifest import Manifest
+from pipeline.run.control import RunControl
+from pipeline.run.events import Committed, Failed, Finished, JobOutcome, RunEvent, RunStarted, TaskEvent
+from pipeline.run.executors.base import Assignment
+from pipeline.run.executors.inline import InlineExecutor
+from pipeline.run.executors.processes import ProcessExecutor
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return tmp_path / "job"
+
+
+class Reacting(Recorder):
+    """Does something whenever the run tells of an event of a kind."""
+
+    def __init__(self, kind: type[RunEvent], act: Callable[[Any], None]) -> None:
+        super().__init__()
+        self.kind, self.act = kind, act
+
+    def notify(self, event: RunEvent) -> None:
+        super().notify(event)
+        if isinstance(event, self.kind):
+            self.act(event)
+
+
+@pytest.mark.parametrize(("times", "kind"), [(1, JobOutcome.DRAINED), (2, JobOutcome.CANCELLED)])
+def test_an_interrupted_run_is_continued_by_the_next(root: Path, times: int, kind: JobOutcome) -> None:
+    write_faults(root, {}, pause_s=0.05)
+    control = RunControl()
+
+    def interrupt(commit: Committed) -> None:
+        if commit.receipt.artifact == "steps/000002.bin":
+            for _ in range(times):
+                control.interrupt()
+
+    interrupter = Reacting(Committed, interrupt)
+    text = job_text(frames=40)  # two seconds of simulation: enough to be interrupted in
+    with ProcessExecutor() as executor:
+        outcome = run_synthetic(root, executor, text, observer=interrupter, control=control)
+    assert (outcome.kind, outcome.exit_code, outcome.failures) == (kind, 130, ())
+    done = {event.receipt.artifact for event in interrupter.of(Committed)}
+    assert 3 <= len(done) < 81
+    write_faults(root, {})
+    outcome, recorder = run_recorded(root, text)
+    assert outcome.kind is JobOutcome.SUCCEEDED
+    assert not done & {event.receipt.artifact for event in recorder.of(Committed)}
+    run_recorded(root.parent / "undisturbed", text)
+    assert contents(root) == contents(root.parent / "undisturbed")
+
+
+def test_a_job_that_runs_already_is_left_alone(root: Path) -> None:
+    root.mkdir()
+    with Lease.acquire(JobLayout(root).lease), pytest.raises(JobBusyError, match=f"process {os.getpid()} "):
+        run_recorded(root)
+    assert not JobLayout(root).job_file.exists()
+
+
+def test_the_lease_is_renewed_while_the_run_is_planned(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.base.lease.HEARTBEAT_INTERVAL_S", 0.01)
+    lease = JobLayout(root).lease
+
+    def take_time_until_the_lease_is_renewed(_: RunStarted) -> None:
+        os.utime(lease, (0, 0))
+        until = time.monotonic() + 30.0
+        while lease.stat().st_mtime == 0:
+            assert time.monotonic() < until, "no heartbeat while the run is planned"
+            time.sleep(0.01)
+
+    with InlineExecutor() as executor:
+        observer = Reacting(RunStarted, take_time_until_the_lease_is_renewed)
+        outcome = run_synthetic(root, executor, observer=observer)
+    assert outcome.kind is JobOutcome.SUCCEEDED
+
+
+def test_a_run_whose_lease_was_taken_over_stops(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.base.lease.HEARTBEAT_INTERVAL_S", 0.01)
+    write_faults(root, {}, pause_s=0.1)
+    lease = JobLayout(root).lease
+
+    def take_over_from_elsewhere(_: Committed) -> None:
+        holder = json.loads(lease.read_text())
+        part = lease.with_name("new.lease")
+        part.write_text(json.dumps(holder | {"token": "another", "host": "elsewhere"}))
+        part.replace(lease)
+
+    with InlineExecutor() as executor, pytest.raises(LeaseLostError, match=r"taken over by process \d+ on elsewhere"):
+        run_synthetic(root, executor, observer=Reacting(Committed, take_over_from_elsewhere))
+    assert lease.exists()
+
+
+class LosingExecutor(InlineExecutor):
+    """Loses all word of one commit: the worker is killed between the receipt and the message."""
+
+    def __init__(self, artifact: str, kind: FailureKind) -> None:
+        super().__init__()
+        self.artifact, self.kind = artifact, kind
+        self.lost: TaskId | None = None
+        self.submitted: list[TaskId] = []
+
+    def submit(self, assignment: Assignment) -> None:
+        self.submitted.append(assignment.task.id)
+        super().submit(assignment)
+
+    def wait(self, timeout_s: float) -> list[TaskEvent]:
+        events: list[TaskEvent] = []
+        for event in super().wait(timeout_s):
+            if isinstance(event, Committed) and event.receipt.artifact == self.artifact:
+                self.lost = event.task_id
+                events.append(Failed(event.task_id, event.attempt, self.kind, "killed"))
+            elif event.task_id != self.lost:
+                events.append(event)
+        return events
+
+
+@pytest.mark.parametrize("kind", [FailureKind.WORKER_LOST, FailureKind.STALLED, FailureKind.CANCELLED])
+def test_a_commit_whose_word_was_lost_is_adopted_and_not_made_again(root: Path, kind: FailureKind) -> None:
+    recorder = Recorder()
+    with LosingExecutor("double/000002.bin", kind) as executor:
+        outcome = run_synthetic(root, executor, observer=recorder)
+    assert (outcome.kind, outcome.ran, outcome.failures) == (JobOutcome.SUCCEEDED, 8, ())
+    assert executor.submitted.count(TaskId("double/000002")) == 1
+    assert "double/000002.bin" in {event.receipt.artifact for event in recorder.of(Committed)}
+    with Manifest(JobLayout(root).manifest) as manifest:
+        (attempt,) = manifest.history(TaskId("double/000002"))
+        assert (attempt.outcome, attempt.message) == ("succeeded", "after its last commit: killed")
+    assert run_recorded(root)[1].ran() == []
+
+
+def test_after_an_end_by_force_the_next_run_looks_for_receipts_that_nobody_told_of(root: Path) -> None:
+    write_faults(root, {"double/000001": ["segfault"]})
+    with ProcessExecutor() as executor:
+        run_synthetic(root, executor)
+    with Manifest(JobLayout(root).manifest) as manifest:
+        manifest.forget_artifacts([ArtifactPath("double/000003.bin")])
+    _, recorder = run_recorded(root)
+    assert recorder.ran() == []  # its receipt was adopted
+
+
+def test_a_file_that_vanishes_while_its_task_ends_fails_the_task(root: Path) -> None:
+    """Its stage found the frames there; the record did not know of them, and one is gone before it is told."""
+    run_recorded(root)
+    with Manifest(JobLayout(root).manifest) as manifest:
+        manifest.forget_artifacts(manifest.artifacts())
+
+    def remove(end: Finished) -> None:
+        if end.task_id == "steps":
+            (root / "steps/000003.bin").unlink()
+
+    with InlineExecutor() as executor:
+        outcome = run_synthetic(root, executor, observer=Reacting(Finished, remove))
+    assert outcome.kind is JobOutcome.FAILED
+    assert "steps/000003.bin was there when its task ended" in outcome.failures[0].message
+    assert run_recorded(root)[0].kind is JobOutcome.SUCCEEDED

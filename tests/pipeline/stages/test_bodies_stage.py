@@ -1,0 +1,72 @@
+"""Meshes of bodies, and which of them keep the texture coordinates of their files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from inline_tasks import run_task
+from trimesh.visual import TextureVisuals
+
+from pipeline.base.layout import JobLayout
+from pipeline.base.task import Task
+from pipeline.job.loading import load_job
+from pipeline.run.events import Finished
+from pipeline.stages.bodies import BodiesStage
+from render.meshes import read_ply
+
+JOB = """
+name = "film"
+[[rigid]]
+name = "box"
+shape = {{ type = "mesh", file = "box.glb" }}
+scale = 0.1
+[[rigid]]
+name = "ball"
+shape = {{ type = "sphere", radius = 0.1 }}
+position = [0.4, 0.0, 0.0]
+[material.box]
+{box}
+[material.ball]
+{ball}
+"""
+LOOK, BLEND = 'look = "metal"', 'blend = "own.blend:Bricks"'
+
+
+@pytest.fixture
+def layout(tmp_path: Path) -> JobLayout:
+    box = trimesh.creation.box()
+    box.visual = TextureVisuals(uv=box.vertices[:, :2] + 0.5)
+    box.export(tmp_path / "box.glb")
+    (tmp_path / "own.blend").write_bytes(b"BLENDER")
+    return JobLayout(tmp_path)
+
+
+def planned(layout: JobLayout, *, box: str, ball: str = LOOK) -> dict[str, Task]:
+    layout.job_file.write_text(JOB.format(box=box, ball=ball))
+    return {str(task.subject): task for task in BodiesStage().plan(load_job(layout.job_file), layout)}
+
+
+def test_only_a_mesh_with_a_material_of_a_blend_file_is_made_with_texture_coordinates(layout):
+    plain, own = planned(layout, box=LOOK), planned(layout, box=BLEND, ball=BLEND)
+    assert plain["ball"].parameters.digest == own["ball"].parameters.digest
+    assert plain["box"].parameters.digest != own["box"].parameters.digest
+    for box, textured in ((LOOK, False), (BLEND, True)):
+        assert isinstance(run_task(planned(layout, box=box)["box"], layout), Finished)
+        mesh = read_ply(layout.path(layout.body_mesh("box", "body")))
+        assert np.ptp(mesh.vertices, axis=0) == pytest.approx([0.1] * 3)
+        if not textured:
+            assert mesh.corner_uv is None
+            continue
+        np.testing.assert_allclose(mesh.corner_uv, mesh.vertices[mesh.faces][..., :2] * 10.0 + 0.5, atol=1e-6)
+
+
+def test_texture_coordinates_that_are_not_there_change_no_mesh(layout):
+    trimesh.creation.box().export(layout.root / "box.glb")
+    contents = []
+    for box in (LOOK, BLEND):
+        assert isinstance(run_task(planned(layout, box=box)["box"], layout), Finished)
+        contents.append(layout.path(layout.body_mesh("box", "body")).read_bytes())
+    assert contents[0] == contents[1]

@@ -1,0 +1,170 @@
+"""Several browsers at a session, one that does not read, one that goes and comes again, and what blows up meanwhile."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+
+import pytest
+import viser
+from browser import PATIENCE_S, needs_browser, open_page, until
+from live_jobs import BALL_OVER_SHEET, served
+from playwright.sync_api import Page
+from websockets.sync.client import connect
+
+from pipeline.web.live.loop import run
+from pipeline.web.live.session import Session
+
+pytestmark = pytest.mark.usefixtures("taichi")
+
+STATE_BYTES = 40_000
+"""Messages that are longer have the positions of a sheet of 61 x 61 nodes; no others do."""
+
+FLUID = """
+name = "pool"
+[domain]
+min = [0.0, 0.0, 0.0]
+max = [0.4, 0.2, 0.4]
+[[fluid]]
+name = "water"
+particle_radius = 0.02
+[[fluid.block]]
+shape = { type = "box", size = [0.16, 0.16, 0.2] }
+position = [0.1, 0.1, 0.12]
+"""
+
+
+def opened(page: Page, address: str) -> Page:
+    page.set_default_timeout(1e3 * PATIENCE_S)
+    page.goto(address)
+    page.get_by_role("button", name="Reset").wait_for()
+    return page
+
+
+def two_play(address: str, session: Session) -> None:
+    """What two people do at once."""
+    with open_page(760, 480) as first:
+        browser = first.context.browser
+        other_place = browser.new_context(viewport={"width": 760, "height": 480})
+        other = opened(other_place.new_page(), address)
+        opened(first, address)
+        before = session.values["cloth.sheet.stretch_stiffness"]
+        first.get_by_role("slider").nth(1).focus()
+        for _ in range(5):
+            first.keyboard.press("ArrowLeft")
+        until(lambda: session.values["cloth.sheet.stretch_stiffness"] < 0.9 * before, "the slider does nothing")
+        turned = session.values["cloth.sheet.stretch_stiffness"]
+        other.get_by_text(f"stretch stiffness {turned:.3g} N/m").wait_for()
+
+        other.get_by_role("button", name="Go on").click()
+        first.get_by_role("button", name="Pause").wait_for()
+        until(lambda: session.world.frame > 2, "time stands still")
+
+        first.get_by_role("slider").nth(1).focus()
+        first.keyboard.press("End")
+        for page in (first, other):
+            page.get_by_text("It blew up").wait_for()
+            page.get_by_text("Changed last: cloth.sheet.stretch_stiffness = 100000").wait_for()
+            page.get_by_role("button", name="Go on").wait_for()  # at the start, with the job's values
+        first.get_by_text("stretch stiffness 500 N/m").wait_for()
+
+        other_place.close()  # gone in the middle, with everything that it was shown
+        frame = session.world.frame
+        first.get_by_role("button", name="Step").click()
+        until(lambda: session.world.frame == frame + 1, "the page is dead")
+        again = opened(browser.new_context().new_page(), address)
+        again.get_by_role("button", name="Step").click()
+        until(lambda: session.world.frame == frame + 2, "the page that came again is dead")
+
+
+@needs_browser
+def test_two_browsers_share_knobs_and_outlive_a_blow_up_and_each_other(tmp_path):
+    # Explicit springs take the steps that they need: some 180 a frame, but 2500 for the stiffest, which is a blow-up.
+    coarse = BALL_OVER_SHEET.replace("counts = [17, 17]", "counts = [9, 9]")
+    light = coarse.replace("substeps = 8", 'integrator = "explicit"\nmass_per_area = 0.03')
+    with served(tmp_path, light) as (session, page, server), ThreadPoolExecutor(1) as browser:
+        playing = browser.submit(two_play, f"http://127.0.0.1:{server.get_port()}", session)
+        run(session, page, ends=playing.done)
+        playing.result()
+
+
+def watch(address: str, session: Session) -> None:
+    with open_page(760, 480) as page:
+        opened(page, address)
+        page.get_by_role("button", name="Go on").click()
+        until(lambda: session.world.frame > 5, "the water stands still")
+        page.get_by_text("substeps: water").wait_for()
+
+
+@needs_browser
+def test_a_small_fluid_runs_in_a_browser(tmp_path):
+    with served(tmp_path, FLUID) as (session, page, server):
+        with ThreadPoolExecutor(1) as browser:
+            watching = browser.submit(watch, f"http://127.0.0.1:{server.get_port()}", session)
+            run(session, page, ends=watching.done)
+            watching.result()
+        water = session.bodies()["water"].arrays["position"]
+        assert server.scene._handle_from_node_name["/fluid/water"].points.shape == water.shape
+        assert water[:, 0].max() > 0.2  # it has run out over the floor
+
+
+def test_a_browser_that_never_reads_holds_up_neither_the_scene_nor_another_browser(tmp_path):
+    ball, post = BALL_OVER_SHEET.index("[[rigid]]"), BALL_OVER_SHEET.rindex("[[rigid]]")
+    quick = "counts = [61, 61]", "substeps = 2\nself_collision = false"
+    sheet = BALL_OVER_SHEET[post:].replace("counts = [17, 17]", quick[0]).replace("substeps = 8", quick[1])
+    with served(tmp_path, BALL_OVER_SHEET[:ball] + sheet) as (session, page, server):
+        address, protocol = f"ws://127.0.0.1:{server.get_port()}", f"viser-v{viser.__version__}"
+        full = socket.create_connection(("127.0.0.1", server.get_port()))
+        full.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        received: list[int] = []
+        ended = threading.Event()
+
+        def states() -> int:
+            return sum(size > STATE_BYTES for size in received)
+
+        def read() -> None:
+            with connect(address, subprotocols=[protocol], max_size=None, compression=None) as client:
+                while not ended.is_set():
+                    try:
+                        received.append(len(client.recv(timeout=0.2)))
+                    except TimeoutError:
+                        continue
+
+        reader = threading.Thread(target=read)
+        with connect(
+            address, sock=full, subprotocols=[protocol], max_size=None, compression=None, max_queue=1
+        ) as stuck:
+            reader.start()
+            try:
+                longest = 0.0
+                for _ in range(150):  # of 45 kB each, faster than browsers get them: the newest replaces the others
+                    session.advance()
+                    began = time.perf_counter()
+                    page.show()
+                    longest = max(longest, time.perf_counter() - began)
+                quiet = time.monotonic()
+                count = len(received)
+                while time.monotonic() < quiet + 1.0:  # until the other browser has all that it will get of these
+                    if len(received) != count:
+                        quiet, count = time.monotonic(), len(received)
+                    time.sleep(0.05)
+                for _ in range(30):
+                    before = states()
+                    session.advance()
+                    page.show()
+                    until(lambda before=before: states() > before, "a picture does not reach the other browser")
+            finally:
+                ended.set()
+                reader.join()
+            late = 0
+            with suppress(TimeoutError):
+                while True:
+                    late += len(stuck.recv(timeout=1.0)) > STATE_BYTES
+            # What its connection keeps, and the newest: 1. The other one gets each of the last 30 at least, and so does
+            # one that reads with a buffer of the usual size.
+            assert late < states() / 2, "it was not held up at all"
+        # A picture takes 3 ms; a wait for a full connection would end with the timeout of a ping, after 20 s.
+        assert longest < 2.0

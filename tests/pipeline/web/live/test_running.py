@@ -1,0 +1,50 @@
+"""The command puts a session and its page together."""
+
+import math
+
+import pytest
+from click.testing import CliRunner
+from live_jobs import loaded
+
+from pipeline.cli.main import main
+from pipeline.web.live import running
+from pipeline.web.live.frame_timer import LONGEST_FRAME_S
+
+pytestmark = pytest.mark.usefixtures("taichi")
+
+
+@pytest.mark.parametrize(("options", "longest_s"), [([], LONGEST_FRAME_S), (["--anyway"], math.inf)])
+def test_a_frame_may_take_long_only_anyway_and_the_end_does_not_wait_for_it(tmp_path, monkeypatch, options, longest_s):
+    found = []
+    monkeypatch.setattr(
+        running, "run", lambda session, _page, *, ends: found.append((session._timer.longest_s, session.ends is ends))
+    )
+    loaded(tmp_path)
+    arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path), *options]
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert found == [(longest_s, True)]
+
+
+@pytest.mark.parametrize("where", ["run", "Session", "Recorder"])
+@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 9 GiB"), RuntimeError("CUDA: out of memory")])
+def test_live_ends_with_a_line_where_no_memory_is_left(tmp_path, monkeypatch, where, error):
+    def fails(*_arguments: object, **_options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(running, where, fails)
+    loaded(tmp_path)
+    arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path)]
+    ended = CliRunner().invoke(main, arguments)
+    assert ended.exit_code == 1
+    told = f"error: drape cannot go on, as no memory is left: {type(error).__name__}: {error}"
+    assert told in ended.output.splitlines()
+
+
+def test_errors_of_the_program_keep_their_traceback(tmp_path, monkeypatch):
+    def fails(*_arguments: object, **_options: object) -> None:
+        raise RuntimeError("Event loop is closed")
+
+    monkeypatch.setattr(running, "run", fails)
+    loaded(tmp_path)
+    arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path)]
+    assert isinstance(CliRunner().invoke(main, arguments).exception, RuntimeError)

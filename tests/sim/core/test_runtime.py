@@ -1,0 +1,174 @@
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from places import PROJECT
+
+from sim.core import runtime
+from sim.core.domain import DomainParameters
+from sim.core.runtime import DeviceUnavailableError, available_devices, initialize
+from sim.smoke.parameters import SmokeParameters
+from sim.smoke.solver import SmokeSolver
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(PROJECT), **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_second_initialization_on_the_same_device_changes_nothing(taichi_cpu):
+    assert initialize("cpu") == "cpu"
+    assert initialize("auto") == "cpu"
+
+
+def test_second_initialization_on_another_device_is_refused(taichi_cpu):
+    with pytest.raises(RuntimeError, match='runs on "cpu" in this process already'):
+        initialize("vulkan")
+
+
+def test_second_initialization_with_other_threads_is_refused(taichi_cpu):
+    with pytest.raises(RuntimeError, match="threads in this process already"):
+        initialize("cpu", threads=977)
+
+
+def test_importing_runtime_does_not_load_taichi():
+    assert run_python("import sys, sim.core.runtime; print('taichi' in sys.modules)").stdout.strip() == "False"
+
+
+def test_starting_on_the_cpu_prints_nothing():
+    started = run_python("import sim.core.runtime as r; r.initialize('cpu')")
+    assert (started.returncode, started.stdout, started.stderr) == (0, "", "")
+
+
+def test_more_groups_of_fields_than_taichi_holds_are_refused_before_they_break_it(taichi_cpu, monkeypatch):
+    runtime.require_room_for_fields()
+    monkeypatch.setattr(runtime, "MOST_FIELD_TREES", 5)
+    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 1.0, 1.0))
+    source = {"shape": {"type": "sphere", "radius": 0.2}, "position": (0.5, 0.5, 0.5)}
+    fog = SmokeParameters.model_validate({"name": "fog", "cell_size": 0.1, "source": [source]})
+    with pytest.raises(RuntimeError, match="build further scenes in another process"):
+        SmokeSolver(fog, domain=domain, gravity=(0.0, 0.0, -9.81))
+
+
+def test_probe_answers_by_exit_code():
+    assert runtime._read_probe(runtime._start_probe("cpu")) == "ok"
+
+
+def test_probe_that_crashes_names_the_signal():
+    child = subprocess.Popen(
+        [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert runtime._read_probe(child) == "its driver ends the process with SIGSEGV"
+
+
+def test_devices_are_remembered_until_the_machine_changes(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = tmp_path / "physics-pipeline" / "devices.json"
+    path.parent.mkdir()
+    answers = {"cuda": "from an earlier probe", "cpu": "ok"}
+    path.write_text(json.dumps({"key": runtime._machine_key(), "devices": answers}))
+    assert available_devices() == answers
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "none of them")
+    monkeypatch.setattr(runtime, "_probe_all", lambda: {"cpu": "probed again"})
+    assert available_devices() == {"cpu": "probed again"}
+    assert available_devices() == {"cpu": "probed again"}
+
+
+@pytest.mark.parametrize(("named", "base"), [("/elsewhere", "/elsewhere"), ("beside", "~/.cache"), ("", "~/.cache")])
+def test_a_relative_cache_home_counts_as_none(monkeypatch, named, base):
+    monkeypatch.setenv("XDG_CACHE_HOME", named)
+    assert runtime.cache_folder() == Path(base).expanduser() / "physics-pipeline"
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 1}'])
+def test_unreadable_memory_of_devices_counts_as_none(tmp_path, content):
+    path = tmp_path / "devices.json"
+    path.write_text(content)
+    assert runtime._read_answers(path, "key") is None
+
+
+def test_device_that_does_not_work_is_refused_with_its_reason():
+    code = """
+import sys
+import sim.core.runtime as r
+r.available_devices = lambda: {"cuda": "no driver"}
+try:
+    r.initialize("cuda")
+except r.DeviceUnavailableError as error:
+    print(error)
+"""
+    assert run_python(code).stdout.strip() == (
+        'device "cuda" is not available: no driver; use device = "auto" or "cpu"'
+    )
+
+
+def test_auto_takes_the_cpu_where_nothing_else_works():
+    code = """
+import sim.core.runtime as r
+r.available_devices = lambda: {"cuda": "no driver", "metal": "no", "vulkan": "no", "cpu": "ok"}
+print(r.initialize("auto"))
+"""
+    assert run_python(code).stdout.strip() == "cpu"
+
+
+def test_missing_x11_library_is_named_with_the_remedy():
+    code = """
+import sys, types
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name == "taichi":
+            raise ImportError("libX11.so.6: cannot open shared object file: No such file or directory")
+sys.meta_path.insert(0, Refuse())
+import sim.core.runtime as r
+try:
+    r.initialize("cpu")
+except r.DeviceUnavailableError as error:
+    print(error)
+"""
+    assert run_python(code).stdout.strip().endswith("install it with: apt-get install libx11-6")
+
+
+def test_stale_lock_of_the_kernel_cache_is_removed_and_a_live_one_kept(tmp_path):
+    stale, live = tmp_path / "ticache.lock", tmp_path / "other.lock"
+    for lock in (stale, live):
+        lock.touch()
+    an_hour_ago = time.time() - 3600.0
+    os.utime(stale, (an_hour_ago, an_hour_ago))
+    runtime._remove_stale_lock(tmp_path)
+    assert not stale.exists()
+    assert live.exists()
+
+
+def test_processes_that_fill_a_new_kernel_cache_at_the_same_time_do_no_harm(tmp_path):
+    """As the processes of a test run do; what they leave serves the next one."""
+    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path), "PYTHONPATH": str(PROJECT)}
+
+    def start() -> subprocess.Popen[bytes]:
+        # It compiles a kernel, and checks what that computes.
+        return subprocess.Popen([sys.executable, "-m", "sim.core.runtime", "--probe", "cpu"], env=environment)
+
+    assert [process.wait(120) for process in [start() for _ in range(3)]] == [0, 0, 0]
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("**/*.tic")}
+    assert kept
+    assert not list(tmp_path.glob("**/*.lock"))
+    assert start().wait(120) == 0
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("**/*.tic")} == kept
+
+
+def test_device_error_survives_pickling():
+    import pickle
+
+    error = DeviceUnavailableError("cuda", "no driver")
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)

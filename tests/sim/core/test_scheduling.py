@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+import taichi as ti
+from thread_counts import outputs_by_threads
+
+from sim.core import scheduling
+from sim.core.arrays import Integers
+from sim.core.scheduling import begin_sharing, next_item, workers_for
+
+SHARE = 4
+
+PATIENCE = 500_000_000
+"""Looks at another item's mark until that counts as not come, some ten seconds: a thread may wait for a processor."""
+
+
+@ti.kernel
+def count_visits(count: ti.i32, workers: ti.i32, taken: Integers, visits: Integers):
+    begin_sharing(taken, 0)
+    begin_sharing(taken, 1)
+    for worker in range(workers):
+        item = next_item(-1, worker, taken, 0, SHARE)
+        while item < count:
+            ti.atomic_add(visits[item], 1)
+            item = next_item(item, worker, taken, 0, SHARE)
+    for worker in range(workers):
+        item = next_item(-1, worker, taken, 1, 1)
+        while item < count:
+            ti.atomic_add(visits[item], 10)
+            item = next_item(item, worker, taken, 1, 1)
+
+
+@ti.kernel
+def meet(workers: ti.i32, taken: Integers, marks: Integers):
+    """Two items, each of which waits for the other."""
+    begin_sharing(taken, 0)
+    for worker in range(workers):
+        item = next_item(-1, worker, taken, 0, 1)
+        while item < 2:
+            ti.atomic_add(marks[item], 1)
+            looks = 0
+            while looks < PATIENCE and ti.atomic_add(marks[1 - item], 0) == 0:
+                looks += 1
+            ti.atomic_add(marks[2], ti.cast(looks < PATIENCE, ti.i32))
+            item = next_item(item, worker, taken, 0, 1)
+
+
+@pytest.mark.parametrize("count", [0, 1, SHARE - 1, SHARE, 513, 5000])
+def test_every_item_is_taken_once_by_each_loop_whatever_their_number(taichi_cpu, count):
+    taken, visits = ti.ndarray(ti.i32, 2), ti.ndarray(ti.i32, count + SHARE)
+    for _ in range(2):  # what the call before took is forgotten
+        visits.fill(0)
+        count_visits(count, workers_for(count), taken, visits)
+        np.testing.assert_array_equal(visits.to_numpy(), np.repeat([11, 0], [count, SHARE]))
+
+
+MEET = """
+import sys
+from sim.core.runtime import initialize
+initialize("cpu", threads=int(sys.argv[1]))
+import taichi as ti
+from test_scheduling import meet
+from sim.core.scheduling import workers_for
+taken, marks = ti.ndarray(ti.i32, 1), ti.ndarray(ti.i32, 3)
+marks.fill(0)
+meet(workers_for(2), taken, marks)
+print(*marks.to_numpy())
+"""
+
+
+def test_two_items_are_done_at_the_same_time_by_two_threads():
+    """Taichi by itself gives a thread 512 items at least, so that one thread would have both, one after the other."""
+    assert outputs_by_threads(MEET, beside=__file__, counts=(2,)) == ["1 1 2\n"]
+
+
+def test_a_loop_is_short_by_its_work_and_never_on_a_gpu(monkeypatch):
+    items = int(scheduling.LONGEST_NS / 10.0)
+    monkeypatch.setattr(scheduling, "runs_on_gpu", lambda: False)
+    assert scheduling.is_short(items, 10.0)
+    assert not scheduling.is_short(items + 1, 10.0)
+    monkeypatch.setattr(scheduling, "runs_on_gpu", lambda: True)
+    assert not scheduling.is_short(1, 1.0)

@@ -1,0 +1,1 @@
+"""Small jobs whose outputs are held against those of another version."""
