@@ -200,6 +200,6 @@ def test_a_simulation_that_diverges_says_where_and_a_smaller_step_mends_it(empty
     assert '"water"' in failed.err
     assert "frame" in failed.err
     assert [history[-1].outcome for task, history in empty.histories().items() if task == "simulate"] == ["diverged"]
-    assert "upstream failed" in empty.run("status", "tiny").out
+    assert '(simulate: "water" diverged at frame' in empty.run("status", "tiny").out
     empty.submit()
     empty.assert_whole(like=reference)

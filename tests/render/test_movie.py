@@ -239,7 +239,7 @@ def test_pictures_of_two_sizes_are_refused(tmp_path, pictures):
 def test_segments_of_two_encodings_are_refused(tmp_path, pictures):
     one = encode(tmp_path / "one.mp4", pictures[:3])
     other = encode(tmp_path / "other.mp4", pictures[:3], fps=24)
-    with pytest.raises(InvalidFileError, match=r"other\.mp4: was encoded otherwise than .*one\.mp4"):
+    with pytest.raises(InvalidFileError, match=r"other\.mp4: was not encoded as .*one\.mp4"):
         join_segments([one, other], tmp_path / "film.mp4")
 
 

@@ -6,11 +6,12 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kinds.table import material_of
 from pipeline.model.looks import BODY, parts_of
 from pipeline.store.cache import read_frame, read_smoke_density
 from pipeline.web.drawing.canvas import Canvas, Rgb
@@ -21,7 +22,7 @@ from pipeline.web.drawing.smoke_pictures import cut, points
 
 if TYPE_CHECKING:
     from pipeline.model.job import Job
-    from sim.core.snapshots import BodyKind, Snapshot
+    from sim.core.snapshots import Snapshot
 
 MeshOf = Callable[[str, str], tuple[NDArray[Any], NDArray[Any]] | None]
 """Vertices [m] and faces of a part of a rigid body, by their names; None before they are made."""
@@ -213,7 +214,7 @@ def read_bodies(path: Path, kinds: Mapping[str, str], most: int) -> dict[str, Bo
         if drawer.read is not None:
             found |= {name: drawer.read(path, name) for name in names}
         elif names:
-            snapshots = read_frame(path, kind=cast("BodyKind", kind)).bodies
+            snapshots = read_frame(path, kind=kind).bodies
             found |= {name: drawer.of(snapshot, most) for name, snapshot in snapshots.items()}
     return found
 
@@ -230,7 +231,7 @@ def draw_bodies(
 
 def color_of(job: Job, body: str, part: str, usual: Rgb) -> Rgb:
     """The colour that the job gives a body, else the usual one, which tells kinds of bodies apart."""
-    color = job.material_of(body, part).color
+    color = material_of(job, body, part).color
     return usual if color is None else srgb(color)
 
 

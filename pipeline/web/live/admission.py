@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 from pipeline.base.errors import PipelineError
 from pipeline.kinds.cloth import count_cloth_nodes
+from pipeline.kinds.table import KINDS
 from pipeline.web.live.frame_cost import fewest_for_bodies, frame_s, steps_a_frame
 from pipeline.web.live.parameters import PARAMETERS, with_substeps
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
-from sim.core.snapshots import BodyKind
 
 if TYPE_CHECKING:
     from pipeline.model.job import Job
@@ -32,7 +32,7 @@ def live_job(job: Job, *, substeps: int | None = None) -> Job:
     Raises:
         PipelineError: live does not run what the job has.
     """
-    for kind in get_args(BodyKind):
+    for kind in KINDS:
         if getattr(job, kind) and kind not in PARAMETERS:
             raise PipelineError(f"{job.name}: {kind} does not run live; `pipeline animatic` draws it fast")
     if not (job.cloth or job.fluid or job.moving_bodies):

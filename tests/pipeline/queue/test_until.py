@@ -119,7 +119,7 @@ def test_submitted_until_a_stage_where_nothing_can_be_rendered_and_later_to_its_
     Path("small.toml").write_text(f'{SCENE}[render]\nblender = "{absent}"\nresolution = [32, 18]\nsamples = 1\n')
     refused = pipeline("submit", "small")
     assert (refused.exit_code, str(absent) in refused.stderr) == (3, True)
-    made = pipeline("submit", "small", "--until", "simulate", "--executor", "inline")
+    made = pipeline("submit", "small", "--until", "simulate")
     assert made.exit_code == 0, made.output
     assert "renders/small (until simulate): done" in made.stdout
     layout = JobLayout(tmp_path / "renders" / "small")
@@ -132,7 +132,7 @@ def test_submitted_until_a_stage_where_nothing_can_be_rendered_and_later_to_its_
     assert "no stage" in pipeline("rerun", "small", "--stage", "surface").stderr
     # More of it, and then all of it: what is there is kept.
     times = {path: path.stat().st_mtime_ns for path in layout.root.glob("cache/*.h5")}
-    assert pipeline("submit", "small", "--until", "surface", "--executor", "inline").exit_code == 0
+    assert pipeline("submit", "small", "--until", "surface").exit_code == 0
     assert len([*layout.root.glob("surfaces/*/*.ply")]) == 2
     assert {path: path.stat().st_mtime_ns for path in times} == times
     assert pipeline("submit", "small").exit_code == 3
