@@ -104,7 +104,7 @@ def run_noops(
         executor=executor,
         job_text=JOB.format(frames=tasks),
         stages="benchmarks.dispatch:STAGES",
-        observer=clock,
+        observers=[clock.notify],
         rerun=rerun,
         capacity=Resources(cores=workers),
     )
@@ -149,8 +149,8 @@ def bare_commit_ms(root: Path, count: int) -> float:
     began = time.perf_counter()
     for frame in range(count):
         task = _task("bare", frame, ())
-        commit = artifacts.committing(layout, task.outputs[0], task=task, attempt=1, fingerprint="", validate=accept)
-        with commit:
+        output = task.outputs[0]
+        with artifacts.committing(layout, output, task=task, attempt=1, fingerprint="", validate=accept) as commit:
             commit.path.write_bytes(b"x")
     return (time.perf_counter() - began) / count * 1e3
 

@@ -63,7 +63,7 @@ def make_dam(solver: str, particles: int, support_in_spacings: float, **paramete
 
 def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[str, Any]:
     """One dam: steps per second, and what a step consists of."""
-    from sim.fluid.memory import estimate_bytes
+    import taichi as ti
 
     tolerances = dict.fromkeys(("density_tolerance", "divergence_tolerance"), arguments.tolerance)
     fluid = make_dam(
@@ -77,20 +77,13 @@ def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[
     fluid.begin_frame(simulated)
     seconds, processor_seconds = [], []
     for _ in range(arguments.blocks):
-        fluid.synchronize()
+        ti.sync()
         wall, processor = timed(lambda: take_steps(fluid, arguments.steps))
         seconds.append(wall / arguments.steps)
         processor_seconds.append(processor / arguments.steps)
     if bad := fluid.first_bad_quantity():
         raise RuntimeError(f"{solver} with {particles} particles diverged: {bad}")
     state, count = fluid.diagnostics(), fluid.particle_count
-    planned = estimate_bytes(
-        count,
-        fluid.boundary.count,
-        fluid.tank.grid.cell_count,
-        support_in_spacings=arguments.support,
-        extra_bytes=TRAITS[solver].extra_bytes,
-    )
     return {
         "solver": solver,
         "particles": count,
@@ -106,15 +99,17 @@ def measure(solver: str, particles: int, arguments: argparse.Namespace) -> dict[
         "step_processor_ms": spread(processor_seconds, scale=1e3),
         "million_particle_steps_per_s": count / statistics.median(seconds) / 1e6,
         "million_particle_steps_per_core_s": count / statistics.median(processor_seconds) / 1e6,
-        "bytes_per_particle": {"planned": planned / count, "arrays": array_bytes() / count},
+        "bytes_per_particle": {"arrays": array_bytes() / count},
         "max_compression": state["max_compression"],
     }
 
 
 def take_steps(fluid: SPHFluid, count: int) -> None:
+    import taichi as ti
+
     for _ in range(count):
         fluid.substep(fluid.stable_dt())
-    fluid.synchronize()
+    ti.sync()
 
 
 def mean_neighbors(fluid: SPHFluid) -> float:

@@ -25,11 +25,11 @@ from typing import Any
 from benchmarks.compare import arguments_of, machine, run
 from pipeline.job.loading import read_job
 from pipeline.web.live.admission import live_job
-from pipeline.web.live.loop import run as run_loop
 from pipeline.web.live.page import LivePage
 from pipeline.web.live.recording import Recorder
+from pipeline.web.live.running import run as run_loop
 from pipeline.web.live.session import Session, Status
-from pipeline.web.serving import close_server, open_server
+from pipeline.web.serving import page_server
 from sim.core.runtime import initialize
 
 JOB = """
@@ -151,24 +151,23 @@ def main() -> dict[str, Any]:
             session.advance()  # kernels, of contacts as well
         session.reset()
         recorder = Recorder(loaded, session, Path(), device=device)
-        server = open_server("127.0.0.1", 0)
-        page = LivePage(server, session, recorder, Path())
-        address = f"ws://127.0.0.1:{server.get_port()}"
-        viewer = None
-        if not arguments.without_viewer:
-            viewer = subprocess.Popen([sys.executable, "-c", CLIENT, address], stdout=subprocess.PIPE, text=True)
-            assert viewer.stdout is not None
-            viewer.stdout.readline()  # it has got the scene
-        counted = Counted(page)
-        try:
-            falls = measure(session, counted, arguments.seconds, drags=False)
-            dragged = measure(session, counted, arguments.seconds, drags=True)
-        finally:
-            sent = []
-            if viewer is not None:
-                viewer.terminate()
-                sent = [int(line) for line in viewer.communicate()[0].split()]
-            close_server(server)
+        with page_server() as server:
+            page = LivePage(server, session, recorder, Path())
+            address = f"ws://127.0.0.1:{server.get_port()}"
+            viewer = None
+            if not arguments.without_viewer:
+                viewer = subprocess.Popen([sys.executable, "-c", CLIENT, address], stdout=subprocess.PIPE, text=True)
+                assert viewer.stdout is not None
+                viewer.stdout.readline()  # it has got the scene
+            counted = Counted(page)
+            try:
+                falls = measure(session, counted, arguments.seconds, drags=False)
+                dragged = measure(session, counted, arguments.seconds, drags=True)
+            finally:
+                sent = []
+                if viewer is not None:
+                    viewer.terminate()
+                    sent = [int(line) for line in viewer.communicate()[0].split()]
         result = {"substeps": substeps, "falls": falls, "dragged": dragged}
         results.append({**result, "messages_to_viewer": len(sent), "bytes_to_viewer": sum(sent)})
     return {

@@ -18,13 +18,15 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from blender_scripts.look_table import CLOTHS, LOOK_TABLE, looks_for
 from render.blender import open_renderer
 from render.camera_path import CameraPath
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters, RenderParameters, SetParameters
+from render.point_clouds import KINDS
 from render.spec import Camera, MeshObject, MeshSequenceObject, RenderSpec
-from sim.shapes import build_solid
 from sim.shapes.parameters import BunnyShape, Placement, SphereShape
+from sim.shapes.placement import build_solid
 
 WIDTH, HEIGHT = 240, 180
 BESIDE = (-1.1, 0.05, 1.2)
@@ -32,9 +34,9 @@ BESIDE = (-1.1, 0.05, 1.2)
 SHEETS_BESIDE = (-1.08, -0.04, 1.0)
 """Where three sheets do, which are wider [m]."""
 LOW, HIGH = (-0.5, -0.5, 0.0), (0.5, 0.5, 1.0)
-SOLID_LOOKS = ("ceramic", "rubber", "plastic", "metal", "stone", "wood", "glass")
-LIQUID_LOOKS = ("water", "honey", "milk")
-CLOTH_LOOKS = ("cotton", "silk", "denim")
+CLOTH_LOOKS = tuple(name for name, row in LOOK_TABLE.items() if row.bodies == CLOTHS)
+LIQUID_LOOKS = tuple(name for name in looks_for("fluid") if "density" in LOOK_TABLE[name].keys)
+SOLID_LOOKS = tuple(name for name in looks_for("rigid") if name not in (*LIQUID_LOOKS, *KINDS))
 CLOTH_COLORS = (None, (0.02, 0.02, 0.022), (0.72, 0.70, 0.66))
 """Of a cloth's three sheets: its own, a dark and a light one."""
 STAGES = {

@@ -60,9 +60,12 @@ def measure_surface(particles: int, repeats: int) -> dict[str, Any]:
 
     def direct() -> None:
         pysplashsurf.reconstruction_pipeline(
-            positions, attributes_to_interpolate={"velocity": velocities}, particle_radius=RADIUS,
-            multi_threading=False, **pipeline_options(parameters),
-        )  # fmt: skip
+            positions,
+            attributes_to_interpolate={"velocity": velocities},
+            particle_radius=RADIUS,
+            multi_threading=False,
+            **pipeline_options(parameters),
+        )
 
     def ours() -> SurfaceMesh:
         return reconstruct_surface(positions, velocities, particle_radius=RADIUS, parameters=parameters, threads=1)

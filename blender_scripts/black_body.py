@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 LUMINANCE_EXPONENT_K = 24_000.0
-"""Luminance grows with temperature as exp(-24000 K / T): Wien's law at 600 nm, where eyes see most of a flame's light.
-From 900 to 2000 K, over which it grows a million-fold, that is within 10 % of Planck's law weighted by the CIE's
-luminous efficiency. T^4 is the law of all radiation, most of which is infrared."""
+"""Luminance grows with temperature as exp(-24000 K / T): Wien's law at 600 nm, where eyes see most of a flame's light,
+from 900 to 2000 K within 10 % of Planck's law weighted by the CIE's luminous efficiency."""
 
 _LINEAR_REC709_OF_XYZ = np.array(
     [[3.2404542, -1.5371385, -0.4985314], [-0.9692660, 1.8760108, 0.0415560], [0.0556434, -0.2040259, 1.0572252]]
@@ -15,23 +14,14 @@ _LINEAR_REC709_OF_XYZ = np.array(
 
 
 def relative_luminance(temperature: np.ndarray, reference: float) -> np.ndarray:
-    """Luminance of black bodies over that of one at the reference temperature [-].
-
-    Args:
-        temperature: [K], any shape; all above zero.
-        reference: [K].
-    """
+    """Luminance of black bodies of any temperatures [K] over that of one at the reference temperature [K]."""
     return np.exp(LUMINANCE_EXPONENT_K * (1.0 / reference - 1.0 / temperature))
 
 
 def black_body_color(temperature: np.ndarray) -> np.ndarray:
-    """Linear Rec. 709 colour of black bodies at luminance 1, by Krystek's fit of the Planckian locus (1985).
+    """Linear Rec. 709 colours (n, 3) of black bodies (n,) [K] at luminance 1, by Krystek's fit (1985).
 
-    Args:
-        temperature: [K], (n,); what is below 1000 K looks as at 1000 K, where the fit ends and hardly anything glows.
-
-    Returns:
-        Colours, (n, 3). Reds beyond the gamut have their negative channels at zero.
+    What is below 1000 K looks as at 1000 K, where the fit ends. Negative channels of reds beyond the gamut are zero.
     """
     kelvin = np.maximum(temperature, 1000.0)
     u = (0.860117757 + 1.54118254e-4 * kelvin + 1.28641212e-7 * kelvin**2) / (

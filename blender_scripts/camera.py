@@ -10,17 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-import numpy as np
 from mathutils import Vector
 
-from blender_scripts.documents import read_document
+from blender_scripts.documents import numbers_of, read_document
 from blender_scripts.errors import RenderInputError
 from blender_scripts.keyframes import forget_keyframes
 
 SENSOR_WIDTH_MM = 36.0
 VIEWS_VERSION = 1
-_NEAREST_M = 1e-3
-"""A body that is looked at may pass through the camera, but its picture needs a near and a far plane."""
+_NEAREST_M = 1e-3  # a body that is looked at may pass through the camera, but its picture needs a near and a far plane
 _LENGTHS = {"offset": 1, "position": 3, "look_at": 3, "focal_length_mm": 1, "focus_distance": 1}
 
 
@@ -45,11 +43,7 @@ def add_camera(parameters: dict[str, Any]) -> Any:
 
 
 def place_camera(blender_object: Any, path: Path, *, frame: int) -> None:
-    """Put the camera where the document of a frame says, and let it move while the shutter is open.
-
-    Raises:
-        RenderInputError: the file is missing, of another version, or holds something else than views.
-    """
+    """Put the camera where the document of a frame says, and let it move while the shutter is open."""
     camera = blender_object.data
     for animated in (blender_object, camera):
         forget_keyframes(animated)
@@ -77,10 +71,7 @@ def read_views(path: Path) -> list[dict[str, Any]]:
     if not isinstance(views, list) or not views:
         raise RenderInputError(f"the views {path} hold none")
     for view in views:
-        for key, length in _LENGTHS.items():
-            values = np.atleast_1d(np.asarray(view.get(key, ()), dtype=np.float64))
-            if values.shape != (length,) or not np.isfinite(values).all():
-                raise RenderInputError(f"the views {path}: {key} must be {length} finite numbers")
+        numbers_of(view, _LENGTHS, f"the views {path}")
     return views
 
 

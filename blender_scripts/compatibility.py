@@ -6,11 +6,6 @@ no case distinction.
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import bpy
@@ -42,28 +37,6 @@ def set_file_format(image_settings: Any, file_format: str) -> None:
         image_settings.use_exr_interleave = True
 
 
-def import_openvdb() -> ModuleType:
-    """Blender's own binding of OpenVDB. An executable has it on its path; the bpy wheel brings it and leaves it off.
-
-    Raises:
-        RuntimeError: this build of Blender has none.
-    """
-    if importlib.util.find_spec("openvdb") is None:
-        folders = Path(bpy.utils.resource_path("LOCAL")).glob("python/lib/python3.*/site-packages")
-        files = [folder / f"openvdb{suffix}" for folder in sorted(folders) for suffix in EXTENSION_SUFFIXES]
-        file = next((file for file in files if file.is_file()), None)
-        if file is None:
-            raise RuntimeError(f"Blender {blender_version()} comes without openvdb for Python, which fire needs")
-        spec = importlib.util.spec_from_loader("openvdb", ExtensionFileLoader("openvdb", str(file)))
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        sys.modules["openvdb"] = module
-    import openvdb
-
-    return openvdb
-
-
 def node_tree_of(owner: Any) -> Any:
     """The emptied node tree of a material or world. Before 5.0 nodes had to be switched on first."""
     if bpy.app.version < (5, 0, 0):
@@ -73,13 +46,7 @@ def node_tree_of(owner: Any) -> Any:
 
 
 def set_physical_sky(sky: Any, *, sun_elevation: float, sun_rotation: float) -> None:
-    """Make a sky texture physically based, without its sun disc (the sun is a light of its own).
-
-    Args:
-        sky: a `ShaderNodeTexSky`.
-        sun_elevation: above the horizon [rad].
-        sun_rotation: around the zenith [rad].
-    """
+    """Make a sky texture physically based, without its sun disc; the sun's angles are in radians."""
     # 5.0 replaced Nishita's model by one with multiple scattering.
     sky.sky_type = "MULTIPLE_SCATTERING" if bpy.app.version >= (5, 0, 0) else "NISHITA"
     sky.sun_disc = False

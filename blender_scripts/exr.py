@@ -13,21 +13,14 @@ from pathlib import Path
 
 _MAGIC = b"\x76\x2f\x31\x01"
 _MULTI_PART = 0x1000
-_ZIP = frozenset({b"\x02", b"\x03"})
-"""Values of `compression`: zlib by line, and by 16 lines."""
+_ZIP = frozenset({b"\x02", b"\x03"})  # values of `compression`: zlib by line, and by 16 lines
 # Blender stamps when and where it drew, and Cycles how long that took.
 _VARYING = re.compile(rb"Date|Time|RenderTime|File|Hostname|Memory|cycles\..*_time")
 
 
 @dataclass(frozen=True)
 class Attribute:
-    """One of a header.
-
-    Attributes:
-        name: its name.
-        kind: name of its type.
-        value: its bytes.
-    """
+    """An attribute of a header: its name, the name of its type, and its bytes."""
 
     name: bytes
     kind: bytes
@@ -42,11 +35,7 @@ class Attribute:
 class ExrLayout:
     """What comes before the pixels.
 
-    Attributes:
-        version: version and flags.
-        parts: attributes of each part.
-        tables_at: where the tables of chunk offsets begin.
-        offsets: where each chunk begins.
+    That is version and flags, attributes of each part, where the tables of chunk offsets begin, and where chunks do.
     """
 
     version: int

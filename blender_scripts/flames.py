@@ -15,15 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from blender_scripts.black_body import black_body_color, relative_luminance
-from blender_scripts.compatibility import import_openvdb
 from blender_scripts.errors import RenderInputError
+from blender_scripts.openvdb_binding import import_openvdb
+from blender_scripts.shading import SmokeBox
 
 BLOCKS_ALONG_EDGE = 4
 """Blocks along the longest edge of the smoke's box. They stand still, so that no lamp jumps from frame to frame."""
-_DIMMEST_SHARE = 2.0e-3
-"""Of all the light; a block that gives less gets no lamp."""
-_COLDEST_K = 700.0
-"""Below this nothing glows: a ninety-millionth of the light at 1500 K [K]."""
+_DIMMEST_SHARE = 2.0e-3  # of all the light; a block that gives less gets no lamp
+_COLDEST_K = 700.0  # below this nothing glows: a ninety-millionth of the light at 1500 K [K]
 _SLAB_CELLS = 32
 
 
@@ -35,31 +34,22 @@ class Glow:
         extinction: per metre at density 1 [1/m].
         emission: radiance of a thick flame at the flame temperature [-].
         flame_temperature: [K].
-        ambient_temperature: of the air, which the `temperature` grid is counted from [K].
-        box_min: lower corner of the smoke's box [m].
-        box_max: upper corner of the smoke's box [m].
-        open_faces: sides of the box towards which the look fades, of `x-`, `x+` to `z+`.
+        box: of the smoke; the look fades towards its open faces.
         fade_width: distance from them on which it fades [m]; 0: it does not.
     """
 
     extinction: float
     emission: float
     flame_temperature: float
-    ambient_temperature: float
-    box_min: tuple[float, float, float]
-    box_max: tuple[float, float, float]
-    open_faces: tuple[str, ...] = ()
+    box: SmokeBox
     fade_width: float = 0.0
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A ball that shines as a block of flames does.
+    """A ball that shines as a block of flames does: its centre and radius [m], and power in all directions.
 
-    Attributes:
-        position: of its centre [m].
-        radius: [m].
-        power: in all directions, linear Rec. 709 [W where a radiance of 1 is 1 W/(m² sr)].
+    The power is in W where a radiance of 1 is 1 W/(m² sr), linear Rec. 709.
     """
 
     position: tuple[float, float, float]
@@ -84,18 +74,17 @@ def lamps_of_grids(density: Any, temperature: Any, glow: Glow) -> list[Lamp]:
     """The lamps for a pair of OpenVDB grids of one transform: density [-] and temperature above ambient [K].
 
     Each cell of volume dV at density rho and temperature T emits 4 pi rho extinction emission L(T) / L(T_flame) dV in
-    the colour of a black body, less the fade at open faces: the source of the light that the look's shader adds up
-    along a ray. What the smoke absorbs on the way out is left to the renderer. A block's ball has the glow's own
-    centre, and half its radius. A look without emission has no lamps.
+    the colour of a black body, less the fade at open faces, as the look's shader has it. What the smoke absorbs on the
+    way out is left to the renderer. A block's ball has the glow's own centre, and half its radius.
     """
     if glow.emission == 0.0 or temperature.activeVoxelCount() == 0:
         return []
     cell_size = temperature.transform.voxelSize()[0]
     origin = np.array(temperature.transform.indexToWorld((0, 0, 0)))
     low, high = (np.array(corner) for corner in temperature.evalActiveVoxelBoundingBox())
-    box_min = np.array(glow.box_min)
-    block_size = float((np.array(glow.box_max) - box_min).max()) / BLOCKS_ALONG_EDGE
-    shape = np.ceil((np.array(glow.box_max) - box_min) / block_size - 1e-6).astype(int)
+    box_min = np.array(glow.box.box_min)
+    block_size = float((np.array(glow.box.box_max) - box_min).max()) / BLOCKS_ALONG_EDGE
+    shape = np.ceil((np.array(glow.box.box_max) - box_min) / block_size - 1e-6).astype(int)
     sums = np.zeros((int(shape.prod()), 8))  # light, light x, y, z, light |x|², red, green, blue
     for first in range(low[0], high[0] + 1, _SLAB_CELLS):
         start = np.array((first, low[1], low[2]))
@@ -103,8 +92,8 @@ def lamps_of_grids(density: Any, temperature: Any, glow: Glow) -> list[Lamp]:
         smoke, heat = np.zeros(cells, np.float32), np.zeros(cells, np.float32)
         density.copyToArray(smoke, ijk=tuple(map(int, start)))
         temperature.copyToArray(heat, ijk=tuple(map(int, start)))
-        hot = (heat > _COLDEST_K - glow.ambient_temperature) & (smoke > 0)
-        kelvin = heat[hot].astype(np.float64) + glow.ambient_temperature
+        hot = (heat > _COLDEST_K - glow.box.ambient_temperature) & (smoke > 0)
+        kelvin = heat[hot].astype(np.float64) + glow.box.ambient_temperature
         position = origin + cell_size * (np.argwhere(hot) + start)
         light = smoke[hot] * relative_luminance(kelvin, glow.flame_temperature) * _fade(position, glow)
         block = np.clip(((position - box_min) / block_size).astype(int), 0, shape - 1)
@@ -128,14 +117,13 @@ def lamps_of_grids(density: Any, temperature: Any, glow: Glow) -> list[Lamp]:
 
 def _fade(position: NDArray[np.float64], glow: Glow) -> NDArray[np.float64]:
     """Share of the smoke that the look's fade leaves at positions [m] (n, 3): from 0 at open faces to 1 [-], (n,)."""
-    distance = np.full(len(position), np.inf)
-    for axis, name in enumerate("xyz"):
-        if f"{name}-" in glow.open_faces:
-            distance = np.minimum(distance, position[:, axis] - glow.box_min[axis])
-        if f"{name}+" in glow.open_faces:
-            distance = np.minimum(distance, glow.box_max[axis] - position[:, axis])
     if glow.fade_width == 0.0:
         return np.ones(len(position))
+    distance = np.full(len(position), np.inf)
+    for axis, name in enumerate("xyz"):
+        if f"{name}-" in glow.box.open_faces:
+            distance = np.minimum(distance, position[:, axis] - glow.box.box_min[axis])
+        if f"{name}+" in glow.box.open_faces:
+            distance = np.minimum(distance, glow.box.box_max[axis] - position[:, axis])
     part = np.clip(distance / glow.fade_width, 0.0, 1.0)
-    # Smoothstep, as the shader has it.
-    return part * part * (3.0 - 2.0 * part)
+    return part * part * (3.0 - 2.0 * part)  # smoothstep, as the shader has it

@@ -15,8 +15,7 @@ from typing import Any
 
 import bpy
 
-BACKENDS = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
-"""The order in which `auto` and `gpu` take them."""
+BACKENDS = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")  # the order in which `auto` and `gpu` take them
 
 
 def gpus_of(backend: str) -> list[Any]:

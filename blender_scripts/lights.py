@@ -13,36 +13,29 @@ import numpy as np
 from mathutils import Vector
 
 from blender_scripts.camera import aim, pixel_angle
-from blender_scripts.compatibility import node_tree_of, set_physical_sky
+from blender_scripts.compatibility import set_physical_sky
 from blender_scripts.errors import RenderInputError
-from blender_scripts.geometry import TriangleMesh, new_mesh_object
+from blender_scripts.geometry import new_mesh_object
 from blender_scripts.looks import new_material
-from blender_scripts.shading import Color, LookContext, NodeBuilder, mix_shaders, or_default
+from blender_scripts.ply import SurfaceMesh
+from blender_scripts.shading import Color, LookContext, NodeBuilder, or_default
 
-_REFERENCE_SIZE_M = math.sqrt(3.0)
-"""Diagonal of the domain that the lights' powers are written for."""
+_REFERENCE_SIZE_M = math.sqrt(3.0)  # diagonal of the domain that the lights' powers are written for
 
-_SKY_MAP_PIXELS = 256
-"""Across the map by which light samples choose their way into the sky: 1.4 degrees each."""
-_HDRI_MAP_PIXELS = 1024
-"""The same for an HDRI, where a sun of half a degree may be: 0.35 degrees each."""
+_SKY_MAP_PIXELS = 256  # across the map by which light samples choose their way into the sky: 1.4 degrees each
+_HDRI_MAP_PIXELS = 1024  # the same for an HDRI, where a sun of half a degree may be: 0.35 degrees each
 
-GREY: Color = (0.22, 0.25, 0.29)
-"""Of the ground and backdrop of a set that has no colour of its own."""
-_CATCHER_REACH = 2.1
-"""Radius of the shadow catcher where there is no background, in diagonals of the domain."""
+GREY: Color = (0.22, 0.25, 0.29)  # of the ground and backdrop of a set that has no colour of its own
+_CATCHER_REACH = 2.1  # radius of the shadow catcher where there is no background, in diagonals of the domain
 
-_SUNLIGHT: Color = (1.0, 0.94, 0.86)
-"""Of the sun outdoors at its usual height, linear RGB."""
+_SUNLIGHT: Color = (1.0, 0.94, 0.86)  # of the sun outdoors at its usual height, linear RGB
 _USUAL_ELEVATION_DEG = 38.0
 _OPTICAL_DEPTH: Color = (0.04, 0.10, 0.24)
 """Of clean air overhead, by Rayleigh scattering, at 680, 550 and 440 nm (Bucholtz 1995)."""
 
-_WINDOW_DISTANCE = 1.7
-"""Of the window of a room, from the domain's middle, in diagonals of the domain."""
+_WINDOW_DISTANCE = 1.7  # of the window of a room, from the domain's middle, in diagonals of the domain
 
-PLASTER: Color = (0.56, 0.52, 0.46)
-"""Of the walls and the floor of the room."""
+PLASTER: Color = (0.56, 0.52, 0.46)  # of the walls and the floor of the room
 
 
 @dataclass(frozen=True)
@@ -91,11 +84,7 @@ class SetGeometry:
 
 
 def build_set(spec: dict[str, Any], folder: Path) -> None:
-    """Build the set that a specification names, and its extra lights.
-
-    Args:
-        spec: the specification.
-        folder: that paths in it are relative to.
+    """Build the set that a specification names, and its extra lights; paths in it are relative to the folder.
 
     Raises:
         RenderInputError: the picture around the scene cannot be read.
@@ -128,15 +117,11 @@ def _build_studio(parameters: dict[str, Any], geometry: SetGeometry) -> None:
         ("rim", {"right": 0.45, "towards_camera": -1.45, "above_floor": 1.3}, 0.8, 95.0, 105.0, (0.86, 0.93, 1.0)),
         ("kicker", {"right": -1.3, "towards_camera": -0.8, "above_floor": 0.7}, 0.5, 95.0, 34.0, (1.0, 0.93, 0.84)),
     ):
-        light = _new_light(name, "AREA", power * strength, color)
-        light.shape = "SQUARE"
-        light.size = size * geometry.size
+        place = geometry.place(**placement)
+        lamp = _add_square(name, power * strength, color, size * geometry.size, place=place, target=target)
         # A pool of light that fades around the domain; a lamp of 180° would draw its own plane across the backdrop.
-        light.spread = math.radians(spread_deg)
-        _add_light_object(name, light, geometry.place(**placement), target)
+        lamp.spread = math.radians(spread_deg)
     _set_gradient_world(parameters["strength"])
-    # The dome is dim and smooth: found by chance it adds no noise worth a light sample at every bounce.
-    bpy.context.scene.world.cycles.sampling_method = "NONE"
 
 
 def _build_outdoor(parameters: dict[str, Any], geometry: SetGeometry) -> None:
@@ -153,28 +138,22 @@ def _build_outdoor(parameters: dict[str, Any], geometry: SetGeometry) -> None:
     else:
         horizontal = Vector((math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg)), 0.0))
     towards_sun = Vector((horizontal.x * math.cos(elevation), horizontal.y * math.cos(elevation), math.sin(elevation)))
-    sun = _new_light("sun", "SUN", 5.5 * parameters["strength"], _sunlight(elevation_deg))
-    sun.angle = math.radians(0.7)
-    _add_light_object("sun", sun, geometry.centre + 3 * geometry.size * towards_sun, geometry.centre)
+    place = geometry.centre + 3 * geometry.size * towards_sun
+    _add_sun("sun", 5.5 * parameters["strength"], _sunlight(elevation_deg), 0.7, place=place, target=geometry.centre)
 
-    tree = _new_world_tree()
-    sky = tree.nodes.new("ShaderNodeTexSky")
+    builder = _new_world()
+    sky = builder.node("ShaderNodeTexSky")
     # The sky's rotation is measured from +y, clockwise seen from above.
     set_physical_sky(sky, sun_elevation=elevation, sun_rotation=math.atan2(towards_sun.x, towards_sun.y))
-    _connect_background(tree, sky.outputs["Color"], 0.14 * parameters["strength"])
     # Without its sun the sky is smooth. Cycles' own map of where it is bright is made anew for each frame, and so fine
     # that it takes a third of a draft's time.
-    settings = bpy.context.scene.world.cycles
-    settings.sampling_method, settings.sample_map_resolution = "MANUAL", _SKY_MAP_PIXELS
+    _shine(builder, sky.outputs["Color"], 0.14 * parameters["strength"], map_pixels=_SKY_MAP_PIXELS)
 
 
 def _sunlight(elevation_deg: float) -> Color:
     """Colour of the sun's light after its way through the air: a low sun is dim and red.
 
     I = I_0 exp(-tau m) for each channel; the air mass m is that of Kasten & Young 1989, eq. 3.
-
-    Args:
-        elevation_deg: above the horizon [degrees].
     """
     longer = _air_mass(elevation_deg) - _air_mass(_USUAL_ELEVATION_DEG)
     red, green, blue = (
@@ -191,12 +170,10 @@ def _air_mass(elevation_deg: float) -> float:
 def _build_night(parameters: dict[str, Any], geometry: SetGeometry) -> None:
     """Ground to the horizon under a dark sky, for what glows; a moon from behind draws rims on what does not."""
     _add_ground(_plain(geometry), "ground", parameters, geometry)
-    moon = _new_light("moon", "SUN", 0.4 * parameters["strength"], (0.66, 0.80, 1.0))
+    place = geometry.place(right=0.8, towards_camera=-1.2, above_floor=1.0)
     # Wider than the real one, of half a degree: its shadows are soft, as those of a night in a film are.
-    moon.angle = math.radians(4.0)
-    _add_light_object("moon", moon, geometry.place(right=0.8, towards_camera=-1.2, above_floor=1.0), geometry.centre)
+    _add_sun("moon", 0.4 * parameters["strength"], (0.66, 0.80, 1.0), 4.0, place=place, target=geometry.centre)
     _set_gradient_world(0.05 * parameters["strength"])
-    bpy.context.scene.world.cycles.sampling_method = "NONE"
 
 
 def _build_window(parameters: dict[str, Any], geometry: SetGeometry) -> None:
@@ -221,19 +198,18 @@ def _build_window(parameters: dict[str, Any], geometry: SetGeometry) -> None:
     power = (210.0 if geometry.camera_circle is None else 115.0) * scale**2
     power *= parameters["strength"] * geometry.power_scale
     for number, (across, up) in enumerate(((-1, -1), (1, -1), (-1, 1), (1, 1))):
-        pane = _new_light(f"pane {number}", "AREA", power, (0.86, 0.93, 1.0))
-        pane.shape, pane.size = "SQUARE", 0.95 * scale * geometry.size
         height, forward = scale * (1.15 + 0.5 * up), scale * (0.15 + 0.5 * across)
         place = geometry.place(right=left + 0.01, towards_camera=forward, above_floor=height)
         inwards = geometry.place(right=0.0, towards_camera=forward, above_floor=height)
-        window = _add_light_object(f"pane {number}", pane, place, inwards)
-        window.visible_camera = parameters["background"] == "set"  # a window in the picture is what one expects
-    bounce = _new_light("bounce", "AREA", 14.0 * parameters["strength"] * geometry.power_scale, (1.0, 0.86, 0.70))
-    bounce.shape, bounce.size = "SQUARE", 2.2 * geometry.size
+        name, size = f"pane {number}", 0.95 * scale * geometry.size
+        _add_square(name, power, (0.86, 0.93, 1.0), size, place=place, target=inwards)
+        # A window in the picture is what one expects.
+        bpy.data.objects[name].visible_camera = parameters["background"] == "set"
+    power = 14.0 * parameters["strength"] * geometry.power_scale
+    place = geometry.place(right=2.2, towards_camera=0.6, above_floor=1.2)
     target = geometry.place(right=0.0, towards_camera=0.0, above_floor=0.35)
-    _add_light_object("bounce", bounce, geometry.place(right=2.2, towards_camera=0.6, above_floor=1.2), target)
+    _add_square("bounce", power, (1.0, 0.86, 0.70), 2.2 * geometry.size, place=place, target=target)
     _set_gradient_world(0.35 * parameters["strength"])
-    bpy.context.scene.world.cycles.sampling_method = "NONE"
 
 
 def _build_under_hdri(parameters: dict[str, Any], geometry: SetGeometry, path: Path) -> None:
@@ -245,17 +221,14 @@ def _build_under_hdri(parameters: dict[str, Any], geometry: SetGeometry, path: P
         raise RenderInputError(f"cannot read the picture {path}: {error}") from error
     if not all(image.size):
         raise RenderInputError(f"cannot read the picture {path}: Blender finds no pixels in it")
-    tree = _new_world_tree()
-    coordinates, mapping = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeMapping")
+    builder = _new_world()
     # What lies in a direction shows the picture at the direction turned back.
-    mapping.inputs["Rotation"].default_value = (0.0, 0.0, -math.radians(parameters["rotation_deg"]))
-    texture = tree.nodes.new("ShaderNodeTexEnvironment")
+    turn = (0.0, 0.0, -math.radians(parameters["rotation_deg"]))
+    directions = builder.node("ShaderNodeTexCoord").outputs["Generated"]
+    mapping = builder.node("ShaderNodeMapping", Vector=directions, Rotation=turn)
+    texture = builder.node("ShaderNodeTexEnvironment", Vector=mapping.outputs["Vector"])
     texture.image = image
-    tree.links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
-    tree.links.new(mapping.outputs["Vector"], texture.inputs["Vector"])
-    _connect_background(tree, texture.outputs["Color"], parameters["strength"])
-    settings = bpy.context.scene.world.cycles
-    settings.sampling_method, settings.sample_map_resolution = "MANUAL", _HDRI_MAP_PIXELS
+    _shine(builder, texture.outputs["Color"], parameters["strength"], map_pixels=_HDRI_MAP_PIXELS)
 
 
 SETS: dict[str, Callable[[dict[str, Any], SetGeometry], None]] = {
@@ -267,32 +240,28 @@ SETS: dict[str, Callable[[dict[str, Any], SetGeometry], None]] = {
 """The function that builds each set, by its name in specifications."""
 
 
-def _plain(geometry: SetGeometry) -> TriangleMesh:
+def _plain(geometry: SetGeometry) -> SurfaceMesh:
     """A floor as far as the eye sees."""
     half = 60.0 * geometry.size
     corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
     positions = np.array(
         [(geometry.centre.x + x, geometry.centre.y + y, geometry.floor_z) for x, y in corners], dtype=np.float32
     )
-    return TriangleMesh(positions, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
+    return SurfaceMesh(positions, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
 
 
-def _walls(geometry: SetGeometry, corners: list[tuple[float, float]], *, height: float) -> TriangleMesh:
+def _walls(geometry: SetGeometry, corners: list[tuple[float, float]], *, height: float) -> SurfaceMesh:
     """Upright walls from corner to corner, each (right, towards the camera), in diagonals of the domain."""
     positions = [
         geometry.place(right=right, towards_camera=forward, above_floor=up)
         for up in (0.0, height)
         for right, forward in corners
     ]
-    count = len(corners)
-    here = np.arange(count - 1)
-    triangles = np.concatenate(
-        [np.stack([here, here + 1, here + 1 + count], axis=1), np.stack([here, here + 1 + count, here + count], axis=1)]
-    )
-    return TriangleMesh(np.array(positions, dtype=np.float32), triangles.astype(np.int32))
+    here = np.arange(len(corners) - 1)
+    return _mesh(np.array(positions), _quads(here, here + 1, here + 1 + len(corners), here + len(corners)))
 
 
-def _cyclorama(geometry: SetGeometry) -> TriangleMesh:
+def _cyclorama(geometry: SetGeometry) -> SurfaceMesh:
     """A floor that curves up into a wall behind the domain, square to the camera's direction."""
     size = geometry.size
     radius, wall_distance, height, front, half_width = 1.6 * size, 3.0 * size, 9.0 * size, 12.0 * size, 14.0 * size
@@ -305,16 +274,12 @@ def _cyclorama(geometry: SetGeometry) -> TriangleMesh:
     base = np.array((geometry.centre.x, geometry.centre.y, geometry.floor_z))
     middle = base + profile[:, :1] * away + profile[:, 1:] * np.array((0.0, 0.0, 1.0))
     positions = np.concatenate([middle - half_width * rightwards, middle + half_width * rightwards])
-    count = len(profile)
-    left = np.arange(count - 1)
-    right = left + count
-    triangles = np.concatenate(
-        [np.stack([left, right, right + 1], axis=1), np.stack([left, right + 1, left + 1], axis=1)]
-    )
-    return TriangleMesh(positions.astype(np.float32), triangles.astype(np.int32))
+    left = np.arange(len(profile) - 1)
+    right = left + len(profile)
+    return _mesh(positions, _quads(left, right, right + 1, left + 1))
 
 
-def _round_cyclorama(geometry: SetGeometry) -> TriangleMesh:
+def _round_cyclorama(geometry: SetGeometry) -> SurfaceMesh:
     """A floor that curves up into a wall all round, behind wherever the camera goes."""
     assert geometry.camera_circle is not None
     size = geometry.size
@@ -326,33 +291,34 @@ def _round_cyclorama(geometry: SetGeometry) -> TriangleMesh:
     profile = np.concatenate([curve, [(wall_distance, height)]])
     headings = np.linspace(0.0, 2 * np.pi, 128, endpoint=False)
     directions = np.stack([np.cos(headings), np.sin(headings)], axis=1)
-    rings = np.concatenate(
-        [
-            profile[:, None, :1] * directions,
-            np.broadcast_to(profile[:, None, 1:], (len(profile), len(headings), 1)),
-        ],
-        axis=2,
-    )
+    heights = np.broadcast_to(profile[:, None, 1:], (len(profile), len(headings), 1))
+    rings = np.concatenate([profile[:, None, :1] * directions, heights], axis=2)
     base = np.array((geometry.centre.x, geometry.centre.y, geometry.floor_z))
     positions = np.concatenate([rings.reshape(-1, 3), np.zeros((1, 3))]) + base
     count, middle = len(headings), len(profile) * len(headings)
     here = np.arange(count)
     beside = np.roll(here, -1)
     triangles = [np.stack([np.full(count, middle), here, beside], axis=1)]
-    for ring in range(len(profile) - 1):
-        inner, outer = ring * count, (ring + 1) * count
-        triangles += [
-            np.stack([inner + here, outer + here, outer + beside], axis=1),
-            np.stack([inner + here, outer + beside, inner + beside], axis=1),
-        ]
-    return TriangleMesh(positions.astype(np.float32), np.concatenate(triangles).astype(np.int32))
+    for inner in range(0, middle - count, count):
+        outer = inner + count
+        triangles.append(_quads(inner + here, outer + here, outer + beside, inner + beside))
+    return _mesh(positions, np.concatenate(triangles))
+
+
+def _quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Two triangles for each quadrilateral of four vertices."""
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def _mesh(positions: np.ndarray, triangles: np.ndarray) -> SurfaceMesh:
+    return SurfaceMesh(positions.astype(np.float32), triangles.astype(np.int32))
 
 
 def _add_ground(
-    mesh: TriangleMesh, name: str, parameters: dict[str, Any], geometry: SetGeometry, own: Color = GREY
+    mesh: SurfaceMesh, name: str, parameters: dict[str, Any], geometry: SetGeometry, own: Color = GREY
 ) -> None:
     # A hair below the domain's floor: surfaces that lie on the floor would otherwise flicker against it.
-    drop = 2e-6 * float(np.ptp(mesh.positions, axis=0).max())
+    drop = 2e-6 * float(np.ptp(mesh.vertices, axis=0).max())
     ground = _add_surface(mesh, name, _ground_material(name, parameters, geometry, own), parameters)
     ground.location.z = -drop
     if parameters["background"] != "set":
@@ -376,31 +342,25 @@ def _add_shadow_catcher(geometry: SetGeometry, color: Color, *, drop: float) -> 
 
     It fades out before a backdrop would begin to rise.
     """
-    reach, fade_from = _CATCHER_REACH * geometry.size, 0.5 * _CATCHER_REACH * geometry.size
+    reach = _CATCHER_REACH * geometry.size
     middle = geometry.place(right=0.0, towards_camera=_CATCHER_REACH - 1.4, above_floor=0.0)
     corners = [middle + reach * Vector((x, y, 0.0)) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    mesh = TriangleMesh(np.array(corners, dtype=np.float32), np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
+    mesh = SurfaceMesh(np.array(corners, dtype=np.float32), np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32))
     catcher = new_mesh_object("shadows", mesh)
-    builder = NodeBuilder(bpy.data.materials.new("shadows"))
+    material = bpy.data.materials.new("shadows")
+    builder = NodeBuilder(material)
     place = builder.node("ShaderNodeNewGeometry").outputs["Position"]
-    distance = builder.node("ShaderNodeVectorMath")
-    distance.operation = "DISTANCE"
-    builder.link(place, distance.inputs[0])
-    distance.inputs[1].default_value = middle
-    fade = builder.node("ShaderNodeMapRange")
-    fade.interpolation_type = "SMOOTHSTEP"
-    builder.link(distance.outputs["Value"], fade.inputs["Value"])
-    fade.inputs["From Min"].default_value, fade.inputs["From Max"].default_value = fade_from, reach
+    fade = builder.smoothstep(builder.vector_math("DISTANCE", place, middle), 0.5 * reach, reach)
     matt = builder.node("ShaderNodeBsdfDiffuse", Color=color)
-    builder.surface(mix_shaders(builder, fade.outputs[0], matt, builder.node("ShaderNodeBsdfTransparent")))
-    catcher.data.materials.append(builder.material)
+    builder.surface(builder.mix_shaders(fade, matt, builder.node("ShaderNodeBsdfTransparent")))
+    catcher.data.materials.append(material)
     catcher.is_shadow_catcher = True
     catcher.location.z = -drop
     for kind in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
         setattr(catcher, f"visible_{kind}", False)
 
 
-def _add_surface(mesh: TriangleMesh, name: str, material: Any, parameters: dict[str, Any]) -> Any:
+def _add_surface(mesh: SurfaceMesh, name: str, material: Any, parameters: dict[str, Any]) -> Any:
     """A surface of the set, which light and reflections meet whatever stands behind the picture."""
     surface = new_mesh_object(name, mesh)
     surface.data.materials.append(material)
@@ -413,11 +373,8 @@ def _add_surface(mesh: TriangleMesh, name: str, material: Any, parameters: dict[
 def _matt(name: str, color: Color) -> Any:
     """A matt material. Most of the picture and of all bounces end on one: it is a tenth cheaper than a Principled."""
     material = bpy.data.materials.new(name)
-    tree = node_tree_of(material)
-    shader = tree.nodes.new("ShaderNodeBsdfDiffuse")
-    shader.inputs["Color"].default_value = (*color, 1.0)
-    output = tree.nodes.new("ShaderNodeOutputMaterial")
-    tree.links.new(shader.outputs["BSDF"], output.inputs["Surface"])
+    builder = NodeBuilder(material)
+    builder.surface(builder.node("ShaderNodeBsdfDiffuse", Color=color))
     return material
 
 
@@ -428,56 +385,55 @@ def _ground_color(parameters: dict[str, Any], own: Color) -> Color:
 
 def _set_gradient_world(strength: float) -> None:
     """A dim dome, brighter overhead: something for water, glass and metal to reflect."""
-    tree = _new_world_tree()
-    coordinates = tree.nodes.new("ShaderNodeTexCoord")
-    separate = tree.nodes.new("ShaderNodeSeparateXYZ")
-    ramp = tree.nodes.new("ShaderNodeValToRGB")
-    ramp.color_ramp.elements[0].position = 0.0
-    ramp.color_ramp.elements[0].color = (0.10, 0.13, 0.17, 1.0)
-    ramp.color_ramp.elements[1].position = 0.9
-    ramp.color_ramp.elements[1].color = (0.72, 0.84, 1.0, 1.0)
-    tree.links.new(coordinates.outputs["Generated"], separate.inputs["Vector"])
-    tree.links.new(separate.outputs["Z"], ramp.inputs[0])
-    _connect_background(tree, ramp.outputs["Color"], 0.35 * strength)
+    builder = _new_world()
+    height = builder.split(builder.node("ShaderNodeTexCoord").outputs["Generated"])[2]
+    color = builder.ramp(height, (0.0, (0.10, 0.13, 0.17)), (0.9, (0.72, 0.84, 1.0)))
+    # It is smooth: found by chance it adds no noise worth a light sample at every bounce.
+    _shine(builder, color, 0.35 * strength, map_pixels=None)
 
 
-def _new_world_tree() -> Any:
+def _new_world() -> NodeBuilder:
     world = bpy.data.worlds.new("world")
     bpy.context.scene.world = world
-    return node_tree_of(world)
+    return NodeBuilder(world, "ShaderNodeOutputWorld")
 
 
-def _connect_background(tree: Any, color: Any, strength: float) -> None:
-    background = tree.nodes.new("ShaderNodeBackground")
-    background.inputs["Strength"].default_value = strength
-    output = tree.nodes.new("ShaderNodeOutputWorld")
-    tree.links.new(color, background.inputs["Color"])
-    tree.links.new(background.outputs["Background"], output.inputs["Surface"])
+def _shine(builder: NodeBuilder, color: Any, strength: float, *, map_pixels: int | None) -> None:
+    """Let the world shine; samples find where it is bright by a map of this width, or by chance."""
+    builder.surface(builder.node("ShaderNodeBackground", Color=color, Strength=strength))
+    settings = bpy.context.scene.world.cycles
+    settings.sampling_method = "NONE" if map_pixels is None else "MANUAL"
+    if map_pixels is not None:
+        settings.sample_map_resolution = map_pixels
 
 
-def _new_light(name: str, kind: str, energy: float, color: tuple[float, float, float]) -> Any:
+def _add_light(name: str, kind: str, energy: float, color: Color, *, place: Vector, target: Vector) -> Any:
     light = bpy.data.lights.new(name, kind)
-    light.energy = energy
-    light.color = color
-    return light
-
-
-def _add_light_object(name: str, light: Any, position: Vector, target: Vector) -> Any:
+    light.energy, light.color = energy, color
     blender_object = bpy.data.objects.new(name, light)
-    aim(blender_object, position, target)
+    aim(blender_object, place, target)
     # Lamps are reflected and refracted, but a glowing square in the picture itself would look like a mistake.
     blender_object.visible_camera = False
     bpy.context.scene.collection.objects.link(blender_object)
-    return blender_object
+    return light
 
 
-def _add_extra_light(name: str, parameters: dict[str, Any]) -> None:
-    light = _new_light(name, parameters["type"].upper(), parameters["power"], tuple(parameters["color"]))
-    if parameters["type"] == "area":
-        light.shape = "SQUARE"
-        light.size = parameters["size"]
-    elif parameters["type"] == "point":
-        light.shadow_soft_size = parameters["size"]
+def _add_square(name: str, power: float, color: Color, size: float, *, place: Vector, target: Vector) -> Any:
+    light = _add_light(name, "AREA", power, color, place=place, target=target)
+    light.shape, light.size = "SQUARE", size
+    return light
+
+
+def _add_sun(name: str, irradiance: float, color: Color, angle_deg: float, *, place: Vector, target: Vector) -> None:
+    _add_light(name, "SUN", irradiance, color, place=place, target=target).angle = math.radians(angle_deg)
+
+
+def _add_extra_light(name: str, light: dict[str, Any]) -> None:
+    power, color, size = light["power"], tuple(light["color"]), light["size"]
+    place, target = Vector(light["position"]), Vector(light["look_at"])
+    if light["type"] == "area":
+        _add_square(name, power, color, size, place=place, target=target)
+    elif light["type"] == "point":
+        _add_light(name, "POINT", power, color, place=place, target=target).shadow_soft_size = size
     else:
-        light.angle = math.radians(parameters["size"])
-    _add_light_object(name, light, Vector(parameters["position"]), Vector(parameters["look_at"]))
+        _add_sun(name, power, color, size, place=place, target=target)

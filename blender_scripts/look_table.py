@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 SURFACES = ("rigid", "fluid", "cloth")
 VOLUMES = ("smoke",)
-CLOTHS = ("cloth",)
-"""Threads run along coordinates on the sheet at rest, which only cloths have."""
+CLOTHS = ("cloth",)  # threads run along coordinates on the sheet at rest, which only cloths have
 NOTHING: tuple[str, ...] = ()
 
 MATERIAL_KEYS = (

@@ -12,34 +12,27 @@ import bpy
 
 from blender_scripts import smoke_looks, weaves, wood  # noqa: F401 - they register their looks
 from blender_scripts.geometry import WET
-from blender_scripts.shading import LOOKS, Color, LookContext, NodeBuilder, draws, mix_shaders, or_default
+from blender_scripts.shading import LOOKS, Color, LookContext, NodeBuilder, draws, or_default
 
 WATER_IOR = 1.333
 WATER_ABSORPTION_PER_M: Color = (0.30, 0.055, 0.009)
-"""Absorption of pure water for red, green and blue light [1/m] (Pope & Fry 1997, rounded)."""
-_WATER_ABSORPTION_BY_SIZE = 7.0
-"""A domain this many metres across needs no exaggeration to look like deep water."""
+"""Of pure water for red, green and blue light [1/m] (Pope & Fry 1997, rounded)."""
+_WATER_ABSORPTION_BY_SIZE = 7.0  # a domain this many metres across needs no exaggeration to look like deep water
 
-HONEY_IOR = 1.49
-"""Of honey with 18 % water (Chataway's table has 1.4915 at 20 °C)."""
+HONEY_IOR = 1.49  # of honey with 18 % water (Chataway's table has 1.4915 at 20 °C)
 HONEY_TINT: Color = (0.80, 0.59, 0.045)
-"""What absorption in a centimetre of honey makes of white light: an amber between clover's and heather's, chosen by
-eye. Absorbance of honey falls about exponentially from blue to red, and from one honey to another by more than a
-factor of ten."""
+"""What a centimetre of honey makes of white light: an amber between clover's and heather's, chosen by eye."""
 HONEY_SCATTERING_PER_M = 40.0
 HONEY_ANISOTROPY = 0.8
-"""Pollen, wax and fine crystals scatter forwards, some of the light of every centimetre [1/m], chosen by eye. Without
-them a thin stream shows what is behind it, in a dark room an olive, and no gold."""
-_HONEY_SIZE = 0.075
-"""A domain this many metres across needs no thinner honey: larger ones would look like tar."""
+"""Pollen, wax and fine crystals scatter forwards, chosen by eye: without them a thin stream in a dark room is olive."""
+_HONEY_SIZE = 0.075  # a domain this many metres across needs no thinner honey: larger ones would look like tar
 
 MILK_REFLECTANCE: Color = (0.91, 0.88, 0.76)
 """Diffuse reflectance of whole milk for red, green and blue light [-] (Jensen et al. 2001, fig. 5)."""
 MILK_PATH_M: Color = (10.9e-3, 6.6e-3, 2.5e-3)
 """How far light spreads in whole milk [m]: 1 / sqrt(3 a (a + s)) with the absorption a = (0.0011, 0.0024, 0.014)/mm
-and the reduced scattering s = (2.55, 3.21, 3.77)/mm that Jensen et al. 2001, fig. 5, measured."""
-_MILK_SIZE = 0.5
-"""A domain this many metres across needs no exaggeration to look like milk, and not like plaster."""
+and the reduced scattering s = (2.55, 3.21, 3.77)/mm (Jensen et al. 2001, fig. 5)."""
+_MILK_SIZE = 0.5  # a domain this many metres across needs no exaggeration to look like milk, and not like plaster
 
 
 def new_material(name: str, look: str, context: LookContext) -> Any:
@@ -85,8 +78,8 @@ def _honey(builder: NodeBuilder, context: LookContext) -> None:
         Anisotropy=HONEY_ANISOTROPY,
     )
     both = builder.node("ShaderNodeAddShader")
-    builder.link(_homogeneous_absorption(builder, per_metre).outputs[0], both.inputs[0])
-    builder.link(scattering.outputs[0], both.inputs[1])
+    for shader, socket in zip((_homogeneous_absorption(builder, per_metre), scattering), both.inputs, strict=True):
+        builder.link(shader.outputs[0], socket)
     builder.volume(both)
 
 
@@ -143,26 +136,24 @@ def _metal(builder: NodeBuilder, context: LookContext) -> None:
 @draws("stone")
 def _stone(builder: NodeBuilder, context: LookContext) -> None:
     """Grey rock: mottled colour and a rough surface from noise in the body's own coordinates, so it does not swim."""
-    base = or_default(context.color, (0.32, 0.30, 0.28))
-    coordinates = builder.node("ShaderNodeTexCoord")
+    red, green, blue = or_default(context.color, (0.32, 0.30, 0.28))
+    coordinates = builder.node("ShaderNodeTexCoord").outputs
     # The mottling has the same number of spots on a pebble as on a boulder: 'Generated' spans the body's box. Ground
     # that reaches to the horizon has as many in the domain's size.
     is_ground = context.surface == "ground"
+    place = coordinates["Object" if is_ground else "Generated"]
     scale = 7.0 / context.domain_size if is_ground else 7.0
-    noise = builder.node("ShaderNodeTexNoise", Scale=scale, Detail=6.0, Roughness=0.62)
-    builder.link(coordinates.outputs["Object" if is_ground else "Generated"], noise.inputs["Vector"])
-    ramp = builder.node("ShaderNodeValToRGB")
-    ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.3, 0.72
-    ramp.color_ramp.elements[0].color = (*(0.55 * channel for channel in base), 1.0)
-    ramp.color_ramp.elements[1].color = (*(min(1.0, 1.35 * channel) for channel in base), 1.0)
-    builder.link(noise.outputs[0], ramp.inputs[0])
-    bump = builder.node("ShaderNodeBump", Strength=0.35, Distance=0.006 * context.domain_size)
-    builder.link(noise.outputs[0], bump.inputs["Height"])
+    noise = builder.noise(place, Scale=scale, Detail=6.0, Roughness=0.62)
+    dark = (0.55 * red, 0.55 * green, 0.55 * blue)
+    light = (min(1.0, 1.35 * red), min(1.0, 1.35 * green), min(1.0, 1.35 * blue))
+    bump = builder.node("ShaderNodeBump", Strength=0.35, Distance=0.006 * context.domain_size, Height=noise)
     shader = builder.node(
-        "ShaderNodeBsdfPrincipled", Roughness=or_default(context.roughness, 0.8), Specular_IOR_Level=0.3
+        "ShaderNodeBsdfPrincipled",
+        Base_Color=builder.ramp(noise, (0.3, dark), (0.72, light)),
+        Roughness=or_default(context.roughness, 0.8),
+        Specular_IOR_Level=0.3,
+        Normal=bump.outputs["Normal"],
     )
-    builder.link(ramp.outputs["Color"], shader.inputs["Base Color"])
-    builder.link(bump.outputs["Normal"], shader.inputs["Normal"])
     builder.surface(shader)
 
 
@@ -172,11 +163,8 @@ def _spray(builder: NodeBuilder, context: LookContext) -> None:
     white = _scattering(builder, or_default(context.color, (0.96, 0.98, 1.0)))
     glint = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.25))
     fresnel = builder.node("ShaderNodeFresnel", IOR=WATER_IOR)
-    droplet = mix_shaders(builder, fresnel.outputs[0], white, glint)
-    through = builder.node("ShaderNodeBsdfTransparent")
-    share = builder.node("ShaderNodeValue")
-    share.outputs[0].default_value = 0.45
-    builder.surface(mix_shaders(builder, share.outputs[0], droplet, through))
+    droplet = builder.mix_shaders(fresnel.outputs[0], white, glint)
+    builder.surface(builder.mix_shaders(0.45, droplet, builder.node("ShaderNodeBsdfTransparent")))
 
 
 @draws("foam")
@@ -194,7 +182,7 @@ def _bubbles(builder: NodeBuilder, context: LookContext) -> None:
     fresnel = builder.node("ShaderNodeFresnel", IOR=1.0 / WATER_IOR)
     mirror = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.0))
     through = builder.node("ShaderNodeBsdfTransparent", Color=or_default(context.color, (0.97, 0.985, 1.0)))
-    builder.surface(mix_shaders(builder, fresnel.outputs[0], through, mirror))
+    builder.surface(builder.mix_shaders(fresnel.outputs[0], through, mirror))
 
 
 @draws("tank_glass")
@@ -203,12 +191,9 @@ def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
     fresnel = builder.node("ShaderNodeFresnel", IOR=1.35)
     reflection = builder.node("ShaderNodeBsdfGlossy", Roughness=or_default(context.roughness, 0.0))
     through = builder.node("ShaderNodeBsdfTransparent", Color=or_default(context.color, (0.975, 0.99, 0.985)))
-    light_path = builder.node("ShaderNodeLightPath")
-    seen = builder.node("ShaderNodeMath")
-    seen.operation = "MULTIPLY"
-    builder.link(fresnel.outputs[0], seen.inputs[0])
-    builder.link(light_path.outputs["Is Camera Ray"], seen.inputs[1])
-    builder.surface(mix_shaders(builder, seen.outputs[0], through, reflection))
+    is_camera_ray = builder.node("ShaderNodeLightPath").outputs["Is Camera Ray"]
+    seen = builder.math("MULTIPLY", fresnel.outputs[0], is_camera_ray)
+    builder.surface(builder.mix_shaders(seen, through, reflection))
 
 
 @draws("tank_edge")
@@ -231,11 +216,8 @@ def _even(builder: NodeBuilder, context: LookContext, *, color: Color, roughness
 
 def _scattering(builder: NodeBuilder, color: Color) -> Any:
     """White that glows through: half of the light that meets a particle leaves it on the other side."""
-    half = builder.node("ShaderNodeValue")
-    half.outputs[0].default_value = 0.5
     back = builder.node("ShaderNodeBsdfDiffuse", Color=color)
-    forth = builder.node("ShaderNodeBsdfTranslucent", Color=color)
-    return mix_shaders(builder, half.outputs[0], back, forth)
+    return builder.mix_shaders(0.5, back, builder.node("ShaderNodeBsdfTranslucent", Color=color))
 
 
 def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint: Color) -> Any:
@@ -250,7 +232,7 @@ def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint
     for_light = _asks_for_light(builder)
     if not context.caustics:
         clear = builder.node("ShaderNodeBsdfTransparent", Color=tint)
-        shader = mix_shaders(builder, for_light, shader, clear)
+        shader = builder.mix_shaders(for_light, shader, clear)
     if not context.wets:
         return shader
     wet = builder.node("ShaderNodeAttribute")
@@ -258,7 +240,7 @@ def _refracting(builder: NodeBuilder, context: LookContext, shader: Any, *, tint
     straight = wet.outputs[2]
     if context.caustics:
         straight = builder.math("MULTIPLY", straight, builder.math("SUBTRACT", 1.0, for_light))
-    return mix_shaders(builder, straight, shader, builder.node("ShaderNodeBsdfTransparent"))
+    return builder.mix_shaders(straight, shader, builder.node("ShaderNodeBsdfTransparent"))
 
 
 def _asks_for_light(builder: NodeBuilder) -> Any:

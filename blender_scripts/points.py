@@ -1,8 +1,4 @@
-"""Whitewater: points from PLY files into Blender, drawn as spheres.
-
-The PLY files are binary little endian: per vertex float32 `x y z vx vy vz radius lifetime` (position [m], velocity
-[m/s], radius [m], what is left of its life [s]) and uchar `kind` (0 spray, 1 foam, 2 bubbles).
-"""
+"""Whitewater: points from PLY files into Blender, drawn as spheres."""
 
 from __future__ import annotations
 
@@ -13,28 +9,19 @@ from typing import Any
 import bpy
 import numpy as np
 
+from blender_scripts.documents import content_of
 from blender_scripts.errors import RenderInputError
-
-KINDS = {"spray": 0, "foam": 1, "bubbles": 2}
-"""Values of `kind` in the files."""
+from blender_scripts.geometry import set_attribute
+from blender_scripts.ply import KINDS, POINT
+from blender_scripts.ply import read_points as read_rows
 
 FADE_S = 0.25
 """Over the end of its life a particle shrinks to nothing, instead of vanishing from one frame to the next [s]."""
 
-_FLOATS = ("x", "y", "z", "vx", "vy", "vz", "radius", "lifetime")
-_ROW = np.dtype([*((name, "<f4") for name in _FLOATS), ("kind", "u1")])
-_LONGEST_HEADER = 4096
-
 
 @dataclass(frozen=True)
 class Points:
-    """Spheres in world space.
-
-    Attributes:
-        positions: [m], (n, 3), float32.
-        velocities: [m/s], (n, 3), float32.
-        radii: [m], (n,), float32.
-    """
+    """Spheres in world space: positions [m] (n, 3), velocities [m/s] (n, 3) and radii [m] (n,), float32."""
 
     positions: np.ndarray
     velocities: np.ndarray
@@ -48,26 +35,13 @@ def read_points(path: Path, kind: str) -> Points:
         RenderInputError: the file is missing, truncated, of another layout, or holds values that are not finite.
     """
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise RenderInputError(f"cannot read the points {path}: {error.strerror}") from error
-    marker = b"end_header\n"
-    end = content.find(marker, 0, _LONGEST_HEADER)
-    lines = content[: max(end, 0)].decode("ascii", errors="replace").split("\n")[:-1]
-    count = _count(lines)
-    if count is None:
-        raise RenderInputError(f"{path} is not a PLY of whitewater points (docs/guide/formats.md)")
-    start = end + len(marker)
-    if len(content) != start + count * _ROW.itemsize:
-        raise RenderInputError(
-            f"the points {path} have {len(content)} bytes; {count} points make {start + count * _ROW.itemsize}: "
-            "the file is truncated"
-        )
-    rows = np.frombuffer(content, _ROW, count, start)
-    bad = sum(int(np.count_nonzero(~np.isfinite(rows[name]))) for name in _FLOATS)
+        rows = read_rows(content_of(path, "points"))
+    except ValueError as error:
+        raise RenderInputError(f"the points {path}: {error}") from error
+    bad = sum(int(np.count_nonzero(~np.isfinite(rows[name]))) for name in POINT.names or ())
     if bad:
         raise RenderInputError(f"the points {path} have {bad} values that are not finite")
-    chosen = rows[rows["kind"] == KINDS[kind]]
+    chosen = rows[rows["kind"] == KINDS.index(kind)]
     return Points(
         positions=np.stack([chosen[name] for name in ("x", "y", "z")], axis=1).astype(np.float32),
         velocities=np.stack([chosen[name] for name in ("vx", "vy", "vz")], axis=1).astype(np.float32),
@@ -92,29 +66,13 @@ def new_points_object(name: str, material: Any) -> Any:
 def fill_points(mesh: Any, points: Points) -> None:
     """Replace the points of an object's mesh."""
     mesh.clear_geometry()
-    for name in ("velocity", "radius"):
-        existing = mesh.attributes.get(name)
-        if existing is not None:
-            mesh.attributes.remove(existing)
     mesh.vertices.add(len(points.positions))
-    if len(points.positions):
+    is_empty = not len(points.positions)
+    if not is_empty:
         mesh.attributes["position"].data.foreach_set("vector", points.positions.ravel())
-        velocity = mesh.attributes.new("velocity", "FLOAT_VECTOR", "POINT")
-        velocity.data.foreach_set("vector", points.velocities.ravel())
-        radius = mesh.attributes.new("radius", "FLOAT", "POINT")
-        radius.data.foreach_set("value", points.radii)
+    set_attribute(mesh, "velocity", None if is_empty else points.velocities)
+    set_attribute(mesh, "radius", None if is_empty else points.radii)
     mesh.update()
-
-
-def _count(lines: list[str]) -> int | None:
-    """The number of points, if these are the lines of the one header that is known; comments are passed over."""
-    lines = [line for line in lines if not line.startswith("comment ")]
-    words = lines[2].split() if len(lines) > 2 else []
-    if len(words) != 3 or not words[2].isdecimal():
-        return None
-    expected = ["ply", "format binary_little_endian 1.0", f"element vertex {words[2]}"]
-    expected += [f"property float {name}" for name in _FLOATS] + ["property uchar kind"]
-    return int(words[2]) if lines == expected else None
 
 
 def _spheres(name: str, material: Any) -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from blender_scripts.documents import read_document
+from blender_scripts.documents import numbers_of, read_document
 from blender_scripts.errors import RenderInputError
 from blender_scripts.keyframes import forget_keyframes, reach_of_motion
 
@@ -24,14 +24,7 @@ _LENGTHS = {"position": 3, "orientation": 4, "velocity": 3, "angular_velocity": 
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose and velocity of a body.
-
-    Attributes:
-        position: of its mesh's origin [m], (3,).
-        orientation: unit quaternion w, x, y, z, (4,).
-        velocity: of its mesh's origin [m/s], (3,).
-        angular_velocity: about the world's axes [rad/s], (3,).
-    """
+    """Pose and velocity of a body, as in the document."""
 
     position: np.ndarray
     orientation: np.ndarray
@@ -79,12 +72,7 @@ def place(blender_object: Any, pose: Pose, *, frame: int) -> None:
 
 
 def _pose(path: Path, name: str, values: dict[str, Any]) -> Pose:
-    arrays = {}
-    for key, length in _LENGTHS.items():
-        array = np.asarray(values.get(key, ()), dtype=np.float64)
-        if array.shape != (length,) or not np.isfinite(array).all():
-            raise RenderInputError(f'the poses {path}: {key} of "{name}" must be {length} finite numbers')
-        arrays[key] = array
+    arrays = numbers_of(values, _LENGTHS, f"the poses {path}", f' of "{name}"')
     if not 0.99 < np.linalg.norm(arrays["orientation"]) < 1.01:
         raise RenderInputError(f'the poses {path}: the orientation of "{name}" is no unit quaternion')
     return Pose(**arrays)

@@ -1,13 +1,12 @@
-"""Draw frames of a RenderSpec with Cycles: as a class inside the bpy module, as a script of a Blender executable.
+"""Draw frames of a RenderSpec: as a class inside the bpy module, as a script that is asked for them.
 
-    blender --background --factory-startup --python render_frames.py -- SPEC --frames 1-10 --output '{frame:06d}.png'
-    blender --background --factory-startup --python render_frames.py -- SPEC --serve
+    blender --background --factory-startup --python render_frames.py -- SPEC --threads 4 --gpu none
 
-Both forms write one line per frame to standard output, `FRAME_DONE 12 /path` or `FRAME_FAILED 12 reason`, among the
-lines that Blender itself writes. With `--serve` the frames are asked for on standard input, one `12 /path` a line
-(after a tab, the path of the EXR that is wanted too), after a line `PICTURES_BY_UV ["object", ...]`, see SceneRenderer,
-and a line `RENDERER_READY version device`; the process ends with its input, so it cannot outlive who started it.
-`set 12 96x54 /path` asks for the empty set of that frame, at that resolution.
+Frames are asked for on standard input, one `12 /path` a line (after a tab, the path of the EXR that is wanted too);
+`set 12 96x54 /path` asks for the empty set of a frame at that resolution. The answers are lines of standard output,
+among those that Blender itself writes: first `PICTURES_BY_UV ["object", ...]`, see SceneRenderer, and
+`RENDERER_READY version device`, or `RENDERER_FAILED reason`; then for each frame `FRAME_DONE 12 /path` or `FRAME_FAILED
+12 reason`. The process ends with its input, so it cannot outlive who started it.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import queue
 import sys
 import threading
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NoReturn, TextIO
 
 if __package__ in (None, ""):
     # Run by a Blender executable: the package is not on its path.
@@ -49,11 +48,11 @@ from blender_scripts.compatibility import blender_version, require_supported_ver
 from blender_scripts.documents import read_document
 from blender_scripts.errors import RenderFailedError, RenderInputError
 from blender_scripts.look_table import LOOK_TABLE
+from blender_scripts.ply import SurfaceMesh
 from blender_scripts.shading import LookContext, SmokeBox
 from blender_scripts.smoke_looks import glow_of
 
 SPEC_VERSION = 4
-EXIT_FRAME_FAILED = 1
 
 
 class SceneRenderer:
@@ -63,8 +62,7 @@ class SceneRenderer:
 
     Attributes:
         device: what Cycles renders on, e.g. `CPU`; `Workbench` for that engine.
-        pictures_by_uv: names of the objects, as the specification has them, with pictures in their material that lie by
-            the texture coordinates of the mesh.
+        pictures_by_uv: names of the objects with pictures in their material that lie by texture coordinates.
     """
 
     _current: SceneRenderer | None = None
@@ -88,8 +86,7 @@ class SceneRenderer:
         SceneRenderer._current = self
         settings.apply_render_settings(spec["render"], fps=spec["fps"], threads=threads)
         self._has_alpha = spec["set"]["background"] != "set"
-        if self._has_alpha:
-            settings.leave_out_background()
+        bpy.context.scene.render.film_transparent = self._has_alpha
         self._behind = lights.plain_background(spec["set"])
         self.device: str = gpus.choose_device(spec["render"]["device"], gpu)
         self._camera = camera.add_camera(spec["camera"])
@@ -102,7 +99,7 @@ class SceneRenderer:
         self._fires: dict[str, volumes.FireLight] = {}
         self._bodies: list[tuple[dict[str, Any], Any]] = []
         self._fluids: list[tuple[dict[str, Any], Any]] = []
-        self._touched = wetting.TouchedBodies()
+        self._touched: list[tuple[dict[str, Any], wetting.Touchable]] = []
         # Workbench sees through nothing.
         is_plain = spec.get("engine") == "workbench"
         self._has_wet = not is_plain and any(_wets(description) for description in spec["objects"])
@@ -118,12 +115,9 @@ class SceneRenderer:
             self.device = "Workbench"
 
     def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
-        """Draw one frame into a PNG file of any name. The same input gives the same bytes.
+        """Draw one frame into a PNG file of any name, and as an EXR with its passes if one is named.
 
-        Args:
-            frame: which frame.
-            output_path: the PNG.
-            master_path: gets the same frame as an EXR with its passes.
+        The same input gives the same bytes.
 
         Raises:
             RenderInputError: a file of this frame is missing or unfit.
@@ -151,18 +145,9 @@ class SceneRenderer:
         self._draw(frame, output_path, master_path)
 
     def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
-        """Draw what a frame shows without any body: ground, backdrop, tank and their light, in a small size.
+        """Draw what a frame's camera sees without any body: ground, backdrop, tank and their light, in another size.
 
-        Frames that are drawn afterwards are the same as without it.
-
-        Args:
-            frame: whose camera looks.
-            output_path: a PNG file of any name.
-            resolution: width and height [pixels].
-
-        Raises:
-            RenderInputError: a file of this frame is missing or unfit.
-            RenderFailedError: Blender did not finish.
+        Frames that are drawn afterwards are the same as without it. Raises as `render` does.
         """
         self._require_current()
         self._place_camera(frame)
@@ -223,8 +208,12 @@ class SceneRenderer:
             poses.place(blender_object, places[description["name"]], frame=frame)
         return places
 
-    def _fill_fluids(self, frame: int, places: dict[str, poses.Pose], sheets: list[geometry.TriangleMesh]) -> None:
-        solids = self._touched.at({name: pose.after(0.0) for name, pose in places.items()}, sheets)
+    def _fill_fluids(self, frame: int, places: dict[str, poses.Pose], sheets: list[SurfaceMesh]) -> None:
+        solids = [wetting.Touchable.of(sheet, is_closed=False) for sheet in sheets]
+        for description, body in self._touched:
+            pose = places.get(description["name"])
+            place = (description["position"], description["orientation"]) if pose is None else pose.after(0.0)
+            solids.append(body.placed(*place))
         surfaces = [_read_surface(self._file(description["file"], frame)) for description, _ in self._fluids]
         for (description, blender_object), surface in zip(self._fluids, surfaces, strict=True):
             # Cycles follows light through one surface on its way to the floor, and not through two that are parallel.
@@ -234,10 +223,11 @@ class SceneRenderer:
                 for other in surfaces
                 if other is not surface
             ]
-            touching = wetting.wetted(
-                surface, reach=reach, floor_z=self._floor_z, touchables=[*solids, *others], dips=dips
+            touchables = [*solids, *others]
+            mesh, wetness = wetting.wetted(
+                surface, reach=reach, floor_z=self._floor_z, touchables=touchables, dips=dips
             )
-            geometry.fill_mesh(blender_object.data, touching)
+            geometry.fill_mesh(blender_object.data, mesh, wetness)
 
     def _place_camera(self, frame: int) -> None:
         if self._views is None:
@@ -250,13 +240,17 @@ class SceneRenderer:
         name, kind = description["name"], description["type"]
         look = description["material"]["look"]
         at_rest = geometry.read_ply(self._folder / description["file"]) if kind in ("mesh", "moving_mesh") else None
+        smoke_box = None
+        if kind == "volume_sequence":
+            low, high, faces = (tuple(description[key]) for key in ("box_min", "box_max", "open_faces"))
+            smoke_box = SmokeBox(low, high, faces, description["ambient_temperature"])
         context = LookContext.of(
             description["material"],
             domain_size=_domain_size(spec),
             pixel_angle=camera.pixel_angle(spec),
-            smoke_box=_smoke_box(description) if kind == "volume_sequence" else None,
+            smoke_box=smoke_box,
             surface="sheet" if kind == "mesh_sequence" else "body",
-            edges=None if at_rest is None else at_rest.edges(),
+            edges=None if at_rest is None else geometry.edges_of(at_rest),
             wets=_wets(description),
         )
         if description["material"]["blend"] is None:
@@ -276,7 +270,7 @@ class SceneRenderer:
                 self._bodies.append((description, blender_object))
             geometry.keep_sharp_edges(blender_object.data, description["shade_smooth_angle_deg"])
             if self._is_touched(description):
-                self._touched.add_body(description, at_rest)
+                self._touched.append((description, wetting.Touchable.of(at_rest, is_closed=True)))
         elif kind == "mesh_sequence":
             blender_object = geometry.new_mesh_object(name, geometry.EMPTY_MESH)
             (self._fluids if self._has_wet and _wets(description) else self._sequences).append(
@@ -294,7 +288,7 @@ class SceneRenderer:
         return blender_object
 
 
-def _read_surface(path: Path) -> geometry.TriangleMesh:
+def _read_surface(path: Path) -> SurfaceMesh:
     """A fluid's surface.
 
     Raises:
@@ -319,66 +313,17 @@ def _domain_size(spec: dict[str, Any]) -> float:
     return sum((high - low) ** 2 for low, high in zip(spec["domain_min"], spec["domain_max"], strict=True)) ** 0.5
 
 
-def _smoke_box(description: dict[str, Any]) -> SmokeBox:
-    return SmokeBox(
-        tuple(description["box_min"]),
-        tuple(description["box_max"]),
-        tuple(description["open_faces"]),
-        description["ambient_temperature"],
-    )
-
-
-def _parse_frames(text: str) -> list[int]:
-    """Frames of `3`, `1-10` or `1-4,8`."""
-    frames: list[int] = []
-    for part in text.split(","):
-        first, _, last = part.partition("-")
-        frames.extend(range(int(first), int(last or first) + 1))
-    return frames
-
-
-def _parse_gpu(text: str) -> int | None:
-    return None if text == "none" else int(text)
-
-
 def _parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="render_frames.py", description="Draw frames of a RenderSpec.")
     parser.add_argument("spec", type=Path, help="the RenderSpec document")
-    parser.add_argument("--frames", type=_parse_frames, help="which frames, e.g. 3 or 1-10 or 1-4,8")
-    parser.add_argument("--output", help="path of a picture, with {frame} or {frame:06d}")
-    parser.add_argument("--serve", action="store_true", help="read `frame path` lines from standard input instead")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="CPU threads (default: all)")
-    parser.add_argument("--gpu", type=_parse_gpu, default=0, help="which GPU, counted from 0, or none (default: 0)")
-    parsed = parser.parse_args(arguments)
-    if not parsed.serve and (parsed.frames is None or parsed.output is None):
-        parser.error("give --frames and --output, or --serve")
-    return parsed
+    parser.add_argument("--gpu", default="0", help="which GPU, counted from 0, or none (default: 0)")
+    return parser.parse_args(arguments)
 
 
 def _report(line: str) -> None:
     sys.stdout.write(line.replace("\n", " ") + "\n")
     sys.stdout.flush()
-
-
-def _render_and_report(
-    renderer: SceneRenderer,
-    frame: int,
-    output_path: Path,
-    master_path: Path | None = None,
-    *,
-    empty_set: tuple[int, int] | None = None,
-) -> bool:
-    """Draw a frame, or its empty set at a resolution, and report the result."""
-    try:
-        if empty_set is None:
-            renderer.render(frame, output_path, master_path)
-        else:
-            renderer.render_set(frame, output_path, resolution=empty_set)
-    except (RenderInputError, RenderFailedError, OSError, RuntimeError, ValueError) as error:
-        _report(f"FRAME_FAILED {frame} {error}")
-        return False
-    _report(f"FRAME_DONE {frame} {output_path}")
-    return True
 
 
 def _follow(stream: TextIO, requests: queue.SimpleQueue[str | None]) -> None:
@@ -388,37 +333,45 @@ def _follow(stream: TextIO, requests: queue.SimpleQueue[str | None]) -> None:
     os._exit(0)
 
 
-def _serve(renderer: SceneRenderer) -> None:
+def _serve(renderer: SceneRenderer) -> NoReturn:
     requests: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     threading.Thread(target=_follow, args=(sys.stdin, requests), daemon=True).start()
     _report(f"PICTURES_BY_UV {json.dumps(renderer.pictures_by_uv)}")
     _report(f"RENDERER_READY {blender_version()} {renderer.device}")
     while True:
-        request = requests.get().rstrip("\n")
-        if request.startswith("set "):
-            _, frame, size, output_path = request.split(" ", 3)
-            width, _, height = size.partition("x")
-            _render_and_report(renderer, int(frame), Path(output_path), empty_set=(int(width), int(height)))
+        _answer(renderer, requests.get().rstrip("\n"))
+
+
+def _answer(renderer: SceneRenderer, request: str) -> None:
+    """Draw what is asked for, and report the result."""
+    empty_set = request.startswith("set ")
+    if empty_set:
+        _, frame, size, path = request.split(" ", 3)
+    else:
+        frame, _, paths = request.partition(" ")
+        path, _, master_path = paths.partition("\t")
+    try:
+        if empty_set:
+            width, height = map(int, size.split("x"))
+            renderer.render_set(int(frame), Path(path), resolution=(width, height))
         else:
-            frame, _, paths = request.partition(" ")
-            output_path, _, master_path = paths.partition("\t")
-            _render_and_report(renderer, int(frame), Path(output_path), Path(master_path) if master_path else None)
+            renderer.render(int(frame), Path(path), Path(master_path) if master_path else None)
+    except (RenderInputError, RenderFailedError, OSError, RuntimeError, ValueError) as error:
+        _report(f"FRAME_FAILED {frame} {error}")
+    else:
+        _report(f"FRAME_DONE {frame} {path}")
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; returns the exit code of what cannot begin."""
     options = _parse_arguments(arguments)
+    gpu = None if options.gpu == "none" else int(options.gpu)
     try:
-        renderer = SceneRenderer(options.spec, threads=options.threads, gpu=options.gpu)
+        renderer = SceneRenderer(options.spec, threads=options.threads, gpu=gpu)
     except (RenderInputError, RuntimeError) as error:
         _report(f"RENDERER_FAILED {error}")
-        return EXIT_FRAME_FAILED
-    if options.serve:
-        _serve(renderer)
-    succeeded = [
-        _render_and_report(renderer, frame, Path(options.output.format(frame=frame))) for frame in options.frames
-    ]
-    return 0 if all(succeeded) else EXIT_FRAME_FAILED
+        return 1
+    return _serve(renderer)
 
 
 if __name__ == "__main__":

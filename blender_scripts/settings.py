@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import bpy
@@ -13,58 +12,30 @@ from mathutils import Vector
 
 from blender_scripts.compatibility import set_file_format
 
-
-@dataclass(frozen=True)
-class QualityPreset:
-    """The knobs that trade time for quality; docs/guide/rendering.md has what each was measured to give.
-
-    Attributes:
-        samples: most samples per pixel.
-        noise_threshold: a pixel whose estimated error is below this gets no more samples.
-        denoising_quality: of OpenImageDenoise.
-        denoising_prefilter: how the albedo and normal guides are cleaned; at few samples noisy guides print their
-            noise into the picture, and cleaning them is cheap.
-        light_tree: choose lights by what they contribute; pays for itself from some dozen samples on.
-        volume_step_rate: length of the steps that rays march through volumes in, as a factor on the voxel size.
-        volume_bounces: scattering events inside volumes after the first.
-        max_bounces: of all kinds together.
-        diffuse_bounces: off matt surfaces.
-        transmission_bounces: through refracting surfaces.
-    """
-
-    samples: int
-    noise_threshold: float
-    denoising_quality: str
-    denoising_prefilter: str
-    light_tree: bool
-    volume_step_rate: float
-    volume_bounces: int
-    max_bounces: int
-    diffuse_bounces: int
-    transmission_bounces: int
-
-
-QUALITY_PRESETS = {
-    "draft": QualityPreset(6, 0.1, "FAST", "ACCURATE", False, 2.0, 0, 6, 1, 6),
-    "preview": QualityPreset(48, 0.05, "BALANCED", "ACCURATE", True, 2.0, 1, 10, 2, 10),
-    "final": QualityPreset(256, 0.02, "HIGH", "ACCURATE", True, 1.0, 3, 24, 4, 16),
+QUALITIES = ("draft", "preview", "final")
+_CYCLES_BY_QUALITY: dict[str, tuple[float | str, float | str, float | str]] = {
+    "samples": (6, 48, 256),
+    # A pixel whose estimated error is below this gets no more samples.
+    "adaptive_threshold": (0.1, 0.05, 0.02),
+    "denoising_quality": ("FAST", "BALANCED", "HIGH"),
+    # Choosing lights by what they contribute pays for itself from some dozen samples on.
+    "use_light_tree": (False, True, True),
+    "volume_step_rate": (2.0, 2.0, 1.0),
+    "volume_bounces": (0, 1, 3),
+    "max_bounces": (6, 10, 24),
+    "diffuse_bounces": (1, 2, 4),
+    "transmission_bounces": (6, 10, 16),
 }
+"""Cycles' settings that trade time for quality; docs/guide/rendering.md has what each was measured to give."""
 
-_CLEAN_SAMPLES = 16
-"""Of an empty set, which is smooth: what is left of the noise after denoising is below a grey level or two."""
+_CLEAN_SAMPLES = 16  # of an empty set, which is smooth
 
 _FAR_DISC = 300.0
 """Distance of what stands for a sun, in diagonals of the domain: its light falls off by 1 % across two of them."""
 
 
 def apply_render_settings(parameters: dict[str, Any], *, fps: float, threads: int) -> None:
-    """Set resolution, time, motion blur, film, colour management and Cycles for the current scene.
-
-    Args:
-        parameters: `render` of the specification.
-        fps: frames per second; shutter times and velocities depend on it.
-        threads: CPU threads to render with.
-    """
+    """Set all that `render` of the specification says for the current scene, whose colours are AgX's."""
     scene = bpy.context.scene
     render = scene.render
     render.engine = "CYCLES"
@@ -89,12 +60,7 @@ def apply_render_settings(parameters: dict[str, Any], *, fps: float, threads: in
 
 
 def choose_png(picture_format: str, *, with_alpha: bool) -> None:
-    """Save the next picture as a PNG in display values.
-
-    Args:
-        picture_format: `render.format`; what an EXR accompanies has 8 bits.
-        with_alpha: whether it tells where nothing of the scene is seen.
-    """
+    """Save the next picture as a PNG in display values; of 16 bits if that is the format that the job asks for."""
     image = bpy.context.scene.render.image_settings
     set_file_format(image, "PNG")
     image.color_mode = "RGBA" if with_alpha else "RGB"
@@ -125,28 +91,23 @@ def _enable_passes(view_layer: Any, passes: frozenset[str]) -> None:
 
 
 def _apply_cycles_settings(cycles: Any, parameters: dict[str, Any]) -> None:
-    preset = QUALITY_PRESETS[parameters["quality"]]
-    cycles.samples = preset.samples if parameters["samples"] is None else parameters["samples"]
+    for name, values in _CYCLES_BY_QUALITY.items():
+        setattr(cycles, name, values[QUALITIES.index(parameters["quality"])])
+    if parameters["samples"] is not None:
+        cycles.samples = parameters["samples"]
     cycles.use_adaptive_sampling = True
-    cycles.adaptive_threshold = preset.noise_threshold
     # The same pattern in every frame: with a still camera, what noise is left stands still instead of boiling.
     cycles.seed = parameters["seed"]
     cycles.use_animated_seed = False
     cycles.use_denoising = parameters["denoise"]
     cycles.denoiser = "OPENIMAGEDENOISE"
-    cycles.denoising_quality = preset.denoising_quality
-    cycles.denoising_prefilter = preset.denoising_prefilter
+    # At few samples noisy guides print their noise into the picture, and cleaning them is cheap.
+    cycles.denoising_prefilter = "ACCURATE"
     cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
-    cycles.use_light_tree = preset.light_tree
     # Unbiased tracking takes a third of the time a sample, but cuts the blur of fast smoke off
     # (docs/guide/rendering.md), and prepares each frame for up to a minute of processor time.
     cycles.volume_biased = True
-    cycles.volume_step_rate = preset.volume_step_rate
-    cycles.volume_bounces = preset.volume_bounces
-    cycles.max_bounces = preset.max_bounces
-    cycles.diffuse_bounces = preset.diffuse_bounces
     cycles.glossy_bounces = 4
-    cycles.transmission_bounces = preset.transmission_bounces
     cycles.transparent_max_bounces = 16
     # Looks let light through refracting bodies themselves; sampled caustics would only add fireflies.
     cycles.caustics_reflective = False
@@ -158,11 +119,7 @@ def _apply_cycles_settings(cycles: Any, parameters: dict[str, Any]) -> None:
 
 @contextmanager
 def small_and_clean(resolution: tuple[int, int]) -> Iterator[None]:
-    """Draw in another size, with few samples that are denoised and without blur; then as before.
-
-    Args:
-        resolution: width and height [pixels].
-    """
+    """Draw in another size [pixels], with few samples that are denoised and without blur; then as before."""
     render, cycles = bpy.context.scene.render, bpy.context.scene.cycles
     changes = [
         (render, "resolution_x", resolution[0]),
@@ -210,8 +167,3 @@ def _become_far_disc(sun: Any, distance: float, middle: Vector) -> None:
     disc.energy = sun.data.energy * math.pi * distance**2
     sun.data = disc
     sun.location = middle + distance * (sun.rotation_quaternion @ Vector((0.0, 0.0, 1.0)))
-
-
-def leave_out_background() -> None:
-    """Give what is drawn an alpha channel, 0 where nothing of the scene is seen."""
-    bpy.context.scene.render.film_transparent = True

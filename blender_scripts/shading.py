@@ -1,10 +1,12 @@
-"""Building blocks of looks: a material's node tree, the context of a look, and the registry of their functions."""
+"""Building blocks of looks: node trees, the context of a look, and the registry of their functions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
+
+import bpy
 
 from blender_scripts.compatibility import node_tree_of
 from blender_scripts.look_table import LOOK_TABLE, MATERIAL_KEYS
@@ -21,8 +23,7 @@ class SmokeBox:
     """Box and air of a volume.
 
     Attributes:
-        box_min: lower corner of the smoke's grid [m].
-        box_max: upper corner [m].
+        box_min, box_max: corners of the smoke's grid [m].
         open_faces: sides that smoke may leave by, of `x-`, `x+` to `z+`.
         ambient_temperature: of the air, which the `temperature` grid is counted from [K].
     """
@@ -35,86 +36,59 @@ class SmokeBox:
 
 @dataclass(frozen=True)
 class LookContext:
-    """Context of a look; values from the job are None where the job leaves them to the look.
+    """What a look depends on; values of the job's material are None where the job leaves them to the look.
 
     Attributes:
         domain_size: diagonal of the domain [m].
         pixel_angle: width of a pixel at a distance of 1 m [m/m].
-        smoke_box: of a volume; None for everything else.
-        surface: what a texture hangs on; see `SurfaceKind`.
-        edges: of the box around a body at rest, in its own axes [m]; None for what is no body.
+        smoke_box: of a volume.
+        surface: what a texture hangs on.
+        edges: of the box around a body at rest, in its own axes [m].
         wets: whether the mesh tells where it touches solids, as a fluid's does (`wetting`).
-        color: base colour or tint from the job, linear RGB.
-        roughness: from the job [-].
-        caustics: whether light of lamps is bent, from the job.
-        density: from the job; see `render.parameters.MaterialParameters`.
-        thread_spacing: of woven cloth, from the job [m].
-        anisotropy: of smoke, from the job [-].
-        edge_fade: of smoke, from the job [m].
-        emission: of fire, from the job [-].
-        flame_temperature: of fire, from the job [K].
+
+    The others are as in `render.parameters.MaterialParameters`.
     """
 
     domain_size: float
     pixel_angle: float
-    smoke_box: SmokeBox | None
-    surface: SurfaceKind
-    edges: tuple[float, float, float] | None
-    wets: bool
-    color: Color | None
-    roughness: float | None
-    caustics: bool | None
-    density: float | None
-    thread_spacing: float | None
-    anisotropy: float | None
-    edge_fade: float | None
-    emission: float | None
-    flame_temperature: float | None
+    smoke_box: SmokeBox | None = None
+    surface: SurfaceKind = "body"
+    edges: tuple[float, float, float] | None = None
+    wets: bool = False
+    color: Color | None = None
+    roughness: float | None = None
+    caustics: bool | None = None
+    density: float | None = None
+    thread_spacing: float | None = None
+    anisotropy: float | None = None
+    edge_fade: float | None = None
+    emission: float | None = None
+    flame_temperature: float | None = None
 
     @classmethod
-    def of(
-        cls,
-        parameters: dict[str, Any],
-        *,
-        domain_size: float,
-        pixel_angle: float,
-        smoke_box: SmokeBox | None = None,
-        surface: SurfaceKind = "body",
-        edges: tuple[float, float, float] | None = None,
-        wets: bool = False,
-    ) -> LookContext:
-        """The context for a material of the specification; keys that it does not have are left to the look."""
-        own = {name: parameters.get(name) for name in _FROM_THE_JOB}
+    def of(cls, material: dict[str, Any], **scene: Any) -> LookContext:
+        """The context for a material of the specification; `scene` are the fields that it does not decide."""
+        own = {name: material.get(name) for name in ("color", *MATERIAL_KEYS)}
         if own["color"] is not None:
             own["color"] = tuple(own["color"])
-        return cls(
-            domain_size=domain_size,
-            pixel_angle=pixel_angle,
-            smoke_box=smoke_box,
-            surface=surface,
-            edges=edges,
-            wets=wets,
-            **own,
-        )
-
-
-_FROM_THE_JOB = ("color", *MATERIAL_KEYS)
+        return cls(**scene, **own)
 
 
 class NodeBuilder:
-    """A material's node tree, with the steps that looks take made short."""
+    """Builds the node tree of a material or a world.
 
-    def __init__(self, material: Any) -> None:
-        self.material = material
-        self.tree = node_tree_of(material)
-        self.output = self.tree.nodes.new("ShaderNodeOutputMaterial")
+    Inputs of nodes are numbers, vectors, colours as three numbers, and output sockets of other nodes.
+    """
 
-    def node(self, kind: str, **inputs: float | Color) -> Any:
-        """A new node; inputs by socket name with underscores for blanks, colours as three numbers."""
+    def __init__(self, owner: Any, output: str = "ShaderNodeOutputMaterial") -> None:
+        self.tree = node_tree_of(owner)
+        self._output = self.tree.nodes.new(output)
+
+    def node(self, kind: str, **inputs: Any) -> Any:
+        """A new node; inputs by socket name with underscores for blanks."""
         node = self.tree.nodes.new(kind)
         for name, value in inputs.items():
-            socket = node.inputs[name.replace("_", " ")]
-            socket.default_value = (*value, 1.0) if isinstance(value, tuple) and socket.type == "RGBA" else value
+            self._set(node.inputs[name.replace("_", " ")], value)
         return node
 
     def link(self, source: Any, target: Any) -> None:
@@ -122,53 +96,91 @@ class NodeBuilder:
         self.tree.links.new(source, target)
 
     def math(self, operation: str, *operands: Any) -> Any:
-        """The output socket of a calculation; operands are numbers and output sockets."""
-        node = self.tree.nodes.new("ShaderNodeMath")
-        node.operation = operation
-        for operand, socket in zip(operands, node.inputs, strict=False):
-            if isinstance(operand, int | float):
-                socket.default_value = operand
-            else:
-                self.link(operand, socket)
-        return node.outputs[0]
+        """The output socket of a calculation with numbers."""
+        return self._calculation("ShaderNodeMath", operation, operands).outputs[0]
 
     def vector_math(self, operation: str, *operands: Any) -> Any:
-        """The output socket of a calculation with vectors; operands are tuples and output sockets."""
-        node = self.tree.nodes.new("ShaderNodeVectorMath")
-        node.operation = operation
-        for operand, socket in zip(operands, node.inputs, strict=False):
-            if isinstance(operand, tuple):
-                socket.default_value = operand
-            else:
-                self.link(operand, socket)
+        """The output socket of a calculation with vectors."""
+        outputs = self._calculation("ShaderNodeVectorMath", operation, operands).outputs
+        return outputs["Value" if operation in ("DISTANCE", "DOT_PRODUCT", "LENGTH") else "Vector"]
+
+    def scaled(self, vector: Any, factor: Any) -> Any:
+        """The output socket of a vector or colour times a factor."""
+        node = self._calculation("ShaderNodeVectorMath", "SCALE", (vector,))
+        self._set(node.inputs["Scale"], factor)
         return node.outputs[0]
+
+    def split(self, vector: Any) -> list[Any]:
+        """The output sockets of a vector's three components."""
+        return list(self.node("ShaderNodeSeparateXYZ", Vector=vector).outputs)
+
+    def combined(self, x: Any, y: Any, z: Any = 0.0) -> Any:
+        """The output socket of the vector of three components."""
+        return self.node("ShaderNodeCombineXYZ", X=x, Y=y, Z=z).outputs[0]
+
+    def noise(self, place: Any, **inputs: float) -> Any:
+        """The output socket of a noise, about 0.5."""
+        return self.node("ShaderNodeTexNoise", Vector=place, **inputs).outputs[0]
+
+    def smoothstep(self, value: Any, low: float, high: float, *, start: float = 0.0, end: float = 1.0) -> Any:
+        """The output socket of what goes smoothly from `start` at `low` to `end` at `high`."""
+        node = self.node("ShaderNodeMapRange", Value=value, From_Min=low, From_Max=high, To_Min=start, To_Max=end)
+        node.interpolation_type = "SMOOTHSTEP"
+        return node.outputs[0]
+
+    def ramp(self, factor: Any, *stops: tuple[float, tuple[float, ...]]) -> Any:
+        """The output socket of a colour by a number: at least two places with their colours, in order."""
+        node = self.tree.nodes.new("ShaderNodeValToRGB")
+        elements = node.color_ramp.elements
+        for place, _ in stops[1:-1]:
+            elements.new(place)
+        for element, (place, color) in zip(elements, stops, strict=True):
+            element.position, element.color = place, (*color, 1.0)
+        self._set(node.inputs[0], factor)
+        return node.outputs["Color"]
 
     def mix_colors(self, factor: Any, first: Any, second: Any) -> Any:
         """The output socket of the first colour where the factor is 0, the second where it is 1."""
         node = self.tree.nodes.new("ShaderNodeMix")
         node.data_type = "RGBA"
         # The node has a socket for every type of data, with equal names.
-        first_socket, second_socket = (socket for socket in node.inputs if socket.type == "RGBA")
-        for value, socket in ((factor, node.inputs[0]), (first, first_socket), (second, second_socket)):
-            if isinstance(value, tuple):
-                socket.default_value = (*value, 1.0)
-            else:
-                self.link(value, socket)
+        colors = [socket for socket in node.inputs if socket.type == "RGBA"]
+        for value, socket in zip((factor, first, second), (node.inputs[0], *colors), strict=True):
+            self._set(socket, value)
         return next(socket for socket in node.outputs if socket.type == "RGBA")
+
+    def mix_shaders(self, factor: Any, first: Any, second: Any) -> Any:
+        """The node of the first shader where the factor is 0, the second where it is 1."""
+        mix = self.tree.nodes.new("ShaderNodeMixShader")
+        for value, socket in zip((factor, first.outputs[0], second.outputs[0]), mix.inputs, strict=True):
+            self._set(socket, value)
+        return mix
 
     def surface(self, shader: Any) -> None:
         """Use a node's first output as the surface."""
-        self.link(shader.outputs[0], self.output.inputs["Surface"])
+        self.link(shader.outputs[0], self._output.inputs["Surface"])
 
     def volume(self, shader: Any) -> None:
         """Use a node's first output as the inside."""
-        self.link(shader.outputs[0], self.output.inputs["Volume"])
+        self.link(shader.outputs[0], self._output.inputs["Volume"])
+
+    def _calculation(self, kind: str, operation: str, operands: tuple[Any, ...]) -> Any:
+        node = self.tree.nodes.new(kind)
+        node.operation = operation
+        for operand, socket in zip(operands, node.inputs, strict=False):
+            self._set(socket, operand)
+        return node
+
+    def _set(self, socket: Any, value: Any) -> None:
+        if isinstance(value, bpy.types.NodeSocket):
+            self.link(value, socket)
+        else:
+            socket.default_value = (*value, 1.0) if socket.type == "RGBA" else value
 
 
 DrawLook = Callable[[NodeBuilder, LookContext], None]
 
-LOOKS: dict[str, DrawLook] = {}
-"""The function that builds each look, by its name."""
+LOOKS: dict[str, DrawLook] = {}  # the function that builds each look, by its name
 
 
 def draws(name: str) -> Callable[[DrawLook], DrawLook]:
@@ -186,12 +198,3 @@ def draws(name: str) -> Callable[[DrawLook], DrawLook]:
 def or_default(value: Value | None, default: Value) -> Value:
     """The value, or a look's own where the job gives none."""
     return default if value is None else value
-
-
-def mix_shaders(builder: NodeBuilder, factor: Any, first: Any, second: Any) -> Any:
-    """The first shader where the factor is 0, the second where it is 1."""
-    mix = builder.node("ShaderNodeMixShader")
-    builder.link(factor, mix.inputs[0])
-    builder.link(first.outputs[0], mix.inputs[1])
-    builder.link(second.outputs[0], mix.inputs[2])
-    return mix

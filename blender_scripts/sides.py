@@ -15,12 +15,7 @@ wide, as the normal of an edge tells the sides of what is right beside it, too."
 
 
 class Pseudonormals:
-    """Outward directions at every place on a closed mesh with outward triangles.
-
-    Args:
-        positions: [m], (n, 3).
-        triangles: vertex indices, (m, 3).
-    """
+    """Outward directions at every place on a closed mesh: positions (n, 3) [m] and outward triangles (m, 3)."""
 
     def __init__(self, positions: np.ndarray, triangles: np.ndarray) -> None:
         # Vertices in the same place are one: what has flat normals has them split.
@@ -40,12 +35,7 @@ class Pseudonormals:
         self._of_vertices = _unit(_sums(triangles.ravel(), weighed))
 
     def at(self, numbers: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Unit vectors outwards, (k, 3).
-
-        Args:
-            numbers: of triangles, (k,).
-            places: on them [m], (k, 3).
-        """
+        """Unit vectors outwards (k, 3) at places (k, 3) [m] on the triangles of these numbers (k,)."""
         outwards, corners = self._of_triangles[numbers], self._positions[self._triangles[numbers]]
         from_corners = places[:, None] - corners
         distances = np.linalg.norm(from_corners, axis=2)

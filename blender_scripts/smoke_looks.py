@@ -6,16 +6,12 @@ from typing import Any
 
 from blender_scripts.black_body import LUMINANCE_EXPONENT_K
 from blender_scripts.flames import Glow
-from blender_scripts.shading import LookContext, NodeBuilder, SmokeBox, draws, or_default
+from blender_scripts.shading import Color, LookContext, NodeBuilder, SmokeBox, draws, or_default
 
-_OPTICAL_SIZE = 22.0
-"""Optical depth of smoke of density 1 across the whole domain."""
-_EDGE_FADE = 0.08
-"""Width of the fade at open faces, in shortest edges of the box."""
-_FAR = 1.0e6
-"""Distance of a face that does not fade [m]."""
-DEFAULT_FLAME_TEMPERATURE_K = 1500.0
-"""Of wood fires: 1100 to 1600 K where they glow."""
+_OPTICAL_SIZE = 22.0  # optical depth of smoke of density 1 across the whole domain
+_EDGE_FADE = 0.08  # width of the fade at open faces, in shortest edges of the box
+_FAR = 1.0e6  # distance of a face that does not fade [m]
+DEFAULT_FLAME_TEMPERATURE_K = 1500.0  # of wood fires: 1100 to 1600 K where they glow
 DEFAULT_EMISSION = 30.0
 """Flames are thin: some tenth of this reaches the eye, a few times what white paper does in a studio."""
 
@@ -23,7 +19,7 @@ DEFAULT_EMISSION = 30.0
 @draws("smoke")
 def _smoke(builder: NodeBuilder, context: LookContext) -> None:
     """Light smoke that scatters forwards a little; extinction follows the `density` grid."""
-    _principled(builder, context, color=(0.86, 0.88, 0.90), anisotropy=0.3)
+    _principled(builder, context, color=(0.86, 0.88, 0.90))
 
 
 @draws("fire")
@@ -35,13 +31,12 @@ def _fire(builder: NodeBuilder, context: LookContext) -> None:
     temperature whatever their density.
     """
     glow = glow_of(context)
-    shader, extinction = _principled(builder, context, color=(0.42, 0.40, 0.38), anisotropy=0.3)
-    kelvin = builder.math("ADD", _grid(builder, "temperature"), glow.ambient_temperature)
+    shader, extinction = _principled(builder, context, color=(0.42, 0.40, 0.38))
+    kelvin = builder.math("ADD", _grid(builder, "temperature"), glow.box.ambient_temperature)
     exponent = builder.math("MULTIPLY_ADD", builder.math("DIVIDE", 1.0, kelvin), -LUMINANCE_EXPONENT_K, 0.0)
     shift = LUMINANCE_EXPONENT_K / glow.flame_temperature
     luminance = builder.math("EXPONENT", builder.math("ADD", exponent, shift))
-    color = builder.node("ShaderNodeBlackbody")
-    builder.link(kelvin, color.inputs[0])
+    color = builder.node("ShaderNodeBlackbody", Temperature=kelvin)
     # Lamps stand in for the glow (`flames`) where a ray would find it by chance only.
     path = builder.node("ShaderNodeLightPath")
     by_chance = builder.math("MAXIMUM", path.outputs["Is Diffuse Ray"], path.outputs["Is Volume Scatter Ray"])
@@ -54,37 +49,28 @@ def _fire(builder: NodeBuilder, context: LookContext) -> None:
 
 def glow_of(context: LookContext) -> Glow:
     """The light of a fire, as its look has it."""
-    box = _box(context)
     return Glow(
         extinction=_extinction(context),
         emission=or_default(context.emission, DEFAULT_EMISSION),
         flame_temperature=or_default(context.flame_temperature, DEFAULT_FLAME_TEMPERATURE_K),
-        ambient_temperature=box.ambient_temperature,
-        box_min=box.box_min,
-        box_max=box.box_max,
-        open_faces=box.open_faces,
+        box=_box(context),
         fade_width=_fade_width(context),
     )
 
 
-def _principled(
-    builder: NodeBuilder, context: LookContext, *, color: tuple[float, float, float], anisotropy: float
-) -> tuple[Any, Any]:
+def _principled(builder: NodeBuilder, context: LookContext, *, color: Color) -> tuple[Any, Any]:
     """A volume that scatters and absorbs: its node, and its extinction at density 1 [1/m] as a number or socket."""
     extinction: Any = _extinction(context)
     fade = _fade(builder, context)
     if fade is not None:
         extinction = builder.math("MULTIPLY", fade, extinction)
+    # The node multiplies its density by the grid of the name in "Density Attribute", `density` unless changed.
     shader = builder.node(
         "ShaderNodeVolumePrincipled",
         Color=or_default(context.color, color),
-        Anisotropy=or_default(context.anisotropy, anisotropy),
+        Anisotropy=or_default(context.anisotropy, 0.3),
+        Density=extinction,
     )
-    # The node multiplies its density by the grid of the name in "Density Attribute", `density` unless changed.
-    if fade is None:
-        shader.inputs["Density"].default_value = extinction
-    else:
-        builder.link(extinction, shader.inputs["Density"])
     builder.volume(shader)
     return shader, extinction
 
@@ -105,14 +91,9 @@ def _fade(builder: NodeBuilder, context: LookContext) -> Any | None:
     high = tuple(x if f"{axis}+" in box.open_faces else _FAR for axis, x in zip("xyz", box.box_max, strict=True))
     position = builder.node("ShaderNodeNewGeometry").outputs["Position"]
     inwards = builder.vector_math("SUBTRACT", position, low), builder.vector_math("SUBTRACT", high, position)
-    separate = builder.node("ShaderNodeSeparateXYZ")
-    builder.link(builder.vector_math("MINIMUM", *inwards), separate.inputs[0])
-    distance = builder.math("MINIMUM", builder.math("MINIMUM", *separate.outputs[:2]), separate.outputs[2])
-    fade = builder.node("ShaderNodeMapRange")
-    fade.interpolation_type = "SMOOTHSTEP"
-    builder.link(distance, fade.inputs["Value"])
-    fade.inputs["From Max"].default_value = width
-    return fade.outputs[0]
+    x, y, z = builder.split(builder.vector_math("MINIMUM", *inwards))
+    distance = builder.math("MINIMUM", builder.math("MINIMUM", x, y), z)
+    return builder.smoothstep(distance, 0.0, width)
 
 
 def _fade_width(context: LookContext) -> float:

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 
 from blender_scripts.camera import pixel_angle
-from blender_scripts.geometry import TriangleMesh, new_mesh_object
+from blender_scripts.geometry import new_mesh_object
 from blender_scripts.looks import new_material
+from blender_scripts.ply import SurfaceMesh
 from blender_scripts.shading import LookContext
 
-_WALL_THICKNESS = 0.008
-"""In domain diagonals."""
-_GAP = 0.002
-"""Between water and glass, in domain diagonals: coinciding surfaces would shade each other at random."""
+_WALL_THICKNESS = 0.008  # in domain diagonals
+_GAP = 0.002  # between water and glass, in domain diagonals: coinciding surfaces would shade each other at random
 
 
 def add_tank(spec: dict[str, Any]) -> Any | None:
@@ -60,7 +59,7 @@ def add_tank(spec: dict[str, Any]) -> Any | None:
     return made[0]
 
 
-def _boxes(extents: list[tuple[tuple[float, ...], tuple[float, ...]]], *, open_below: bool = False) -> TriangleMesh:
+def _boxes(extents: list[tuple[tuple[float, ...], tuple[float, ...]]], *, open_below: bool = False) -> SurfaceMesh:
     """Axis-aligned boxes as one mesh, faces outwards; without their lower sides if they are open below."""
     unit = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
     quads = np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
@@ -68,4 +67,4 @@ def _boxes(extents: list[tuple[tuple[float, ...], tuple[float, ...]]], *, open_b
     triangles = np.concatenate([quads[:, (0, 1, 2)], quads[:, (0, 2, 3)]])
     positions = [np.array(low) + unit * (np.array(high) - np.array(low)) for low, high in extents]
     indices = [triangles + 8 * number for number in range(len(extents))]
-    return TriangleMesh(np.concatenate(positions).astype(np.float32), np.concatenate(indices).astype(np.int32))
+    return SurfaceMesh(np.concatenate(positions).astype(np.float32), np.concatenate(indices).astype(np.int32))

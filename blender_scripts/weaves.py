@@ -16,12 +16,13 @@ are on average: far away a woven cloth is a matt sheet of their mean colour.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from blender_scripts.geometry import REST_UV
-from blender_scripts.shading import Color, LookContext, NodeBuilder, draws, mix_shaders, or_default
+from blender_scripts.shading import Color, LookContext, NodeBuilder, draws, or_default
 
 
 @dataclass(frozen=True)
@@ -69,26 +70,7 @@ DENIM = Weave(4, 1, 1, 0.8e-3, (0.012, 0.030, 0.100), (0.15, 0.16, 0.18), 0.9, 0
 RESOLVED, UNRESOLVED = 0.5, 1.0
 """Threads per pixel: up to the first, Nyquist's, threads are drawn as they are; from the second on there are none."""
 
-HALF_UNDULATION = 0.5
-"""How far a thread goes up and down, in its radii."""
-
-
-@draws("cotton")
-def _cotton(builder: NodeBuilder, context: LookContext) -> None:
-    """Matt plain weave."""
-    _build(builder, context, COTTON)
-
-
-@draws("silk")
-def _silk(builder: NodeBuilder, context: LookContext) -> None:
-    """Shining satin."""
-    _build(builder, context, SILK)
-
-
-@draws("denim")
-def _denim(builder: NodeBuilder, context: LookContext) -> None:
-    """Coarse twill in two colours."""
-    _build(builder, context, DENIM)
+HALF_UNDULATION = 0.5  # how far a thread goes up and down, in its radii
 
 
 def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
@@ -99,31 +81,32 @@ def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
     shows_weft = builder.math("GREATER_THAN", weft_height, warp_height)
     detail = _detail(builder, context.pixel_angle / spacing)
     weft_share, brightness = mean_appearance(weave)
-    color = _colors(
-        builder, weave, or_default(context.color, weave.warp), _faded(builder, shows_weft, weft_share, detail)
-    )
-    color = _scaled(builder, color, _faded(builder, _brightness(builder, weave, height, (u, v)), brightness, detail))
-
-    bump = builder.node("ShaderNodeBump", Distance=0.5 * spacing)
-    builder.link(builder.math("MULTIPLY", detail, 0.7), bump.inputs["Strength"])
-    builder.link(height, bump.inputs["Height"])
+    shown_weft = _faded(builder, shows_weft, weft_share, detail)
+    color = _colors(builder, weave, or_default(context.color, weave.warp), shown_weft)
+    light = _faded(builder, _brightness(builder, weave, height, u, v), brightness, detail)
+    color = builder.scaled(color, light)
+    strength = builder.math("MULTIPLY", detail, 0.7)
+    bump = builder.node("ShaderNodeBump", Distance=0.5 * spacing, Strength=strength, Height=height)
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
+        Base_Color=color,
         Roughness=or_default(context.roughness, weave.roughness),
         Specular_IOR_Level=weave.specular,
         Anisotropic=weave.anisotropy,
         Sheen_Weight=weave.sheen,
         Sheen_Roughness=0.5,
+        # Fibres are dyed as their threads are; white ones would make every dark cloth pale where light grazes it.
+        Sheen_Tint=color,
+        Normal=bump.outputs["Normal"],
     )
-    builder.link(color, shader.inputs["Base Color"])
-    # Fibres are dyed as their threads are; white ones would make every dark cloth pale where light grazes it.
-    builder.link(color, shader.inputs["Sheen Tint"])
-    builder.link(bump.outputs["Normal"], shader.inputs["Normal"])
     if weave.anisotropy:
         tangent = builder.node("ShaderNodeTangent")
         tangent.direction_type, tangent.uv_map = "UV_MAP", REST_UV
         builder.link(tangent.outputs[0], shader.inputs["Tangent"])
-    builder.surface(_with_light_through(builder, shader, color, weave.translucency))
+    if weave.translucency:
+        through = builder.node("ShaderNodeBsdfTranslucent", Color=color)
+        shader = builder.mix_shaders(weave.translucency, shader, through)
+    builder.surface(shader)
 
 
 def mean_appearance(weave: Weave, *, samples: int = 64) -> tuple[float, float]:
@@ -153,20 +136,12 @@ def _detail(builder: NodeBuilder, threads_per_pixel_at_1_m: float) -> Any:
 
     A pixel's footprint on the sheet is that of its angle at this distance, longer where the sheet is seen aslant.
     """
-    geometry = builder.node("ShaderNodeNewGeometry")
-    facing = builder.node("ShaderNodeVectorMath")
-    facing.operation = "DOT_PRODUCT"
-    builder.link(geometry.outputs["Normal"], facing.inputs[0])
-    builder.link(geometry.outputs["Incoming"], facing.inputs[1])
-    cosine = builder.math("MAXIMUM", builder.math("ABSOLUTE", facing.outputs["Value"]), 1.0e-3)
+    geometry = builder.node("ShaderNodeNewGeometry").outputs
+    facing = builder.vector_math("DOT_PRODUCT", geometry["Normal"], geometry["Incoming"])
+    cosine = builder.math("MAXIMUM", builder.math("ABSOLUTE", facing), 1.0e-3)
     distance = builder.node("ShaderNodeCameraData").outputs["View Distance"]
     threads = builder.math("DIVIDE", builder.math("MULTIPLY", distance, threads_per_pixel_at_1_m), cosine)
-    fade = builder.node("ShaderNodeMapRange")
-    fade.interpolation_type = "SMOOTHSTEP"
-    builder.link(threads, fade.inputs["Value"])
-    for socket, value in (("From Min", RESOLVED), ("From Max", UNRESOLVED), ("To Min", 1.0), ("To Max", 0.0)):
-        fade.inputs[socket].default_value = value
-    return fade.outputs[0]
+    return builder.smoothstep(threads, RESOLVED, UNRESOLVED, start=1.0, end=0.0)
 
 
 def _faded(builder: NodeBuilder, value: Any, mean: float, detail: Any) -> Any:
@@ -178,10 +153,8 @@ def _thread_numbers(builder: NodeBuilder, spacing: float) -> tuple[Any, Any]:
     """u and v: where a point is, counted in threads."""
     coordinates = builder.node("ShaderNodeUVMap")
     coordinates.uv_map = REST_UV
-    separate = builder.node("ShaderNodeSeparateXYZ")
-    builder.link(coordinates.outputs[0], separate.inputs[0])
-    u, v = (builder.math("DIVIDE", separate.outputs[axis], spacing) for axis in ("X", "Y"))
-    return u, v
+    s, t, _ = builder.split(coordinates.outputs[0])
+    return builder.math("DIVIDE", s, spacing), builder.math("DIVIDE", t, spacing)
 
 
 def _heights(builder: NodeBuilder, weave: Weave, u: Any, v: Any) -> tuple[Any, Any]:
@@ -215,42 +188,21 @@ def _colors(builder: NodeBuilder, weave: Weave, warp: Color, shows_weft: Any) ->
     return builder.mix_colors(shown, warp, weave.weft or warp)
 
 
-def _brightness(builder: NodeBuilder, weave: Weave, height: Any, place: tuple[Any, Any]) -> Any:
+def _brightness(builder: NodeBuilder, weave: Weave, height: Any, u: Any, v: Any) -> Any:
     """A factor on colours, which are uneven along threads and darker between them."""
-    u, v = place
     # Thick and thin places of a thread are some forty spacings long.
-    streaks = [_streaks(builder, *scaled) for scaled in ((u, 1.0, v, 0.025), (u, 0.025, v, 1.0))]
-    uneven = builder.math("ADD", *streaks)
+    uneven = builder.math("ADD", _streaks(builder, u, 1.0, v, 0.025), _streaks(builder, u, 0.025, v, 1.0))
     uneven = builder.math("MULTIPLY_ADD", builder.math("SUBTRACT", uneven, 1.0), 2.0 * weave.unevenness, 1.0)
     light = builder.math("MINIMUM", builder.math("MULTIPLY_ADD", height, 1.0 - weave.gaps, weave.gaps), 1.0)
     return builder.math("MULTIPLY", uneven, builder.math("MAXIMUM", light, 0.0))
 
 
-def _scaled(builder: NodeBuilder, color: Any, factor: Any) -> Any:
-    """A colour times a factor."""
-    product = builder.node("ShaderNodeVectorMath")
-    product.operation = "SCALE"
-    builder.link(color, product.inputs[0])
-    builder.link(factor, product.inputs["Scale"])
-    return product.outputs[0]
-
-
 def _streaks(builder: NodeBuilder, u: Any, u_scale: float, v: Any, v_scale: float) -> Any:
     """Noise [0, 1] about 0.5 that is drawn out along one direction of threads."""
-    place = builder.node("ShaderNodeCombineXYZ")
-    builder.link(builder.math("MULTIPLY", u, u_scale), place.inputs[0])
-    builder.link(builder.math("MULTIPLY", v, v_scale), place.inputs[1])
-    noise = builder.node("ShaderNodeTexNoise", Scale=0.7, Detail=2.0)
-    builder.link(place.outputs[0], noise.inputs["Vector"])
-    return noise.outputs[0]
+    place = builder.combined(builder.math("MULTIPLY", u, u_scale), builder.math("MULTIPLY", v, v_scale))
+    return builder.noise(place, Scale=0.7, Detail=2.0)
 
 
-def _with_light_through(builder: NodeBuilder, shader: Any, color: Any, translucency: float) -> Any:
-    """Let a share of the light through to the other side of the sheet."""
-    if translucency == 0.0:
-        return shader
-    through = builder.node("ShaderNodeBsdfTranslucent")
-    builder.link(color, through.inputs["Color"])
-    factor = builder.node("ShaderNodeValue")
-    factor.outputs[0].default_value = translucency
-    return mix_shaders(builder, factor.outputs[0], shader, through)
+draws("cotton")(partial(_build, weave=COTTON))
+draws("silk")(partial(_build, weave=SILK))
+draws("denim")(partial(_build, weave=DENIM))

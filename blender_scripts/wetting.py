@@ -8,7 +8,7 @@ Where two clear fluids meet, the surfaces of both do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,8 @@ import numpy as np
 from mathutils import Quaternion
 from mathutils.bvhtree import BVHTree
 
-from blender_scripts.geometry import EMPTY_MESH, TriangleMesh
+from blender_scripts.geometry import EMPTY_MESH
+from blender_scripts.ply import SurfaceMesh
 from blender_scripts.sides import Pseudonormals
 
 _TOUCHES_WITHIN, _FREE_BEYOND = 2.0 / 3.0, 4.0 / 3.0
@@ -25,11 +26,9 @@ _ALONG, _TOWARDS = 0.1, 0.5
 """Cosines between the outward normal and the way to the solid: free below the first, touching above the second. A free
 surface that ends at a wall, and the outside of a film, do not face the solid although they are near it."""
 
-_NO_WAY = 1.0e-3
-"""A distance too short to have a direction, in `reach`."""
+_NO_WAY = 1.0e-3  # a distance too short to have a direction, in `reach`
 
-_DIP = 0.2
-"""How deep a surface that may be moved dips into what it touches, in `reach`."""
+_DIP = 0.2  # how deep a surface that may be moved dips into what it touches, in `reach`
 
 
 @dataclass(frozen=True)
@@ -56,70 +55,39 @@ class Touchable:
     rotation: np.ndarray
 
     @classmethod
-    def of(cls, mesh: TriangleMesh, *, is_closed: bool) -> Touchable:
+    def of(cls, mesh: SurfaceMesh, *, is_closed: bool) -> Touchable:
         """A mesh at the origin. Building its tree is most of the work: a rigid body needs one for all frames."""
         low, high = np.zeros(3), np.zeros(3)
         tree = outwards = None
-        if len(mesh.triangles):
-            low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
-            tree = BVHTree.FromPolygons(mesh.positions.tolist(), mesh.triangles.tolist(), all_triangles=True)
-            outwards = Pseudonormals(mesh.positions, mesh.triangles) if is_closed else None
+        if len(mesh.faces):
+            low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+            tree = BVHTree.FromPolygons(mesh.vertices.tolist(), mesh.faces.tolist(), all_triangles=True)
+            outwards = Pseudonormals(mesh.vertices, mesh.faces) if is_closed else None
         return cls(tree, low, high, outwards, is_closed, np.zeros(3), np.eye(3))
 
     @classmethod
-    def of_fluid(cls, surface: TriangleMesh, *, near: TriangleMesh, reach: float) -> Touchable:
+    def of_fluid(cls, surface: SurfaceMesh, *, near: SurfaceMesh, reach: float) -> Touchable:
         """The surface of another fluid, as far as one that wets it within this distance [m] may be near it."""
-        if not len(near.positions):
+        if not len(near.vertices):
             return cls.of(EMPTY_MESH, is_closed=True)
         farthest = _FREE_BEYOND * reach
-        low, high = near.positions.min(axis=0) - farthest, near.positions.max(axis=0) + farthest
-        corners = surface.positions[surface.triangles]
+        low, high = near.vertices.min(axis=0) - farthest, near.vertices.max(axis=0) + farthest
+        corners = surface.vertices[surface.faces]
         touching = (corners.max(axis=1) >= low).all(axis=1) & (corners.min(axis=1) <= high).all(axis=1)
-        used, triangles = np.unique(surface.triangles[touching], return_inverse=True)
-        part = TriangleMesh(surface.positions[used], triangles.reshape(-1, 3))
+        used, triangles = np.unique(surface.faces[touching], return_inverse=True)
+        part = SurfaceMesh(surface.vertices[used], triangles.reshape(-1, 3))
         return replace(cls.of(part, is_closed=True), can_be_entered=False)
 
     def placed(self, position: Sequence[float], orientation: Sequence[float]) -> Touchable:
-        """The same somewhere else.
-
-        Args:
-            position: of its origin [m], (3,).
-            orientation: unit quaternion (w, x, y, z).
-        """
+        """The same with its origin elsewhere [m], and turned by a unit quaternion (w, x, y, z)."""
         rotation = np.array(Quaternion(orientation).to_matrix())
         return replace(self, position=np.array(position), rotation=rotation)
 
 
-class TouchedBodies:
-    """The bodies of a scene that fluids wet."""
-
-    def __init__(self) -> None:
-        self._bodies: list[tuple[dict[str, Any], Touchable]] = []
-
-    def add_body(self, description: dict[str, Any], mesh: TriangleMesh) -> None:
-        """Take in a `mesh` or `moving_mesh` of the specification."""
-        self._bodies.append((description, Touchable.of(mesh, is_closed=True)))
-
-    def at(self, places: Mapping[str, tuple[Any, Any]], sheets: Sequence[TriangleMesh]) -> list[Touchable]:
-        """The touchable objects of a frame, other than fluids.
-
-        Args:
-            places: position and orientation of the bodies that move, by name.
-            sheets: cloths as they are in this frame.
-        """
-        bodies = []
-        for description, body in self._bodies:
-            if description["name"] in places:
-                bodies.append(body.placed(*places[description["name"]]))
-            else:
-                bodies.append(body.placed(description["position"], description["orientation"]))
-        return bodies + [Touchable.of(sheet, is_closed=False) for sheet in sheets]
-
-
 def wetted(
-    mesh: TriangleMesh, *, reach: float, floor_z: float, touchables: Sequence[Touchable], dips: bool = False
-) -> TriangleMesh:
-    """A fluid's surface with how far each vertex touches the floor or a solid: 1 where it does, 0 where it is free.
+    mesh: SurfaceMesh, *, reach: float, floor_z: float, touchables: Sequence[Touchable], dips: bool = False
+) -> tuple[SurfaceMesh, np.ndarray]:
+    """A fluid's surface, and how far each vertex touches the floor or a solid: 1 where it does, 0 where it is free.
 
     Args:
         mesh: the surface, with outward normals.
@@ -130,26 +98,21 @@ def wetted(
         dips: move what touches a body or the floor into it.
     """
     assert mesh.normals is not None
-    height = mesh.positions[:, 2] - floor_z
-    down = np.broadcast_to((0.0, 0.0, -1.0), mesh.positions.shape)
-    touch = _Touch(np.zeros(len(mesh.positions)), np.zeros(mesh.positions.shape), reach)
+    height = mesh.vertices[:, 2] - floor_z
+    down = np.broadcast_to((0.0, 0.0, -1.0), mesh.vertices.shape)
+    touch = _Touch(np.zeros(len(mesh.vertices)), np.zeros(mesh.vertices.shape), reach)
     touch.add(np.arange(len(height)), np.maximum(height, 0.0), down, -mesh.normals[:, 2], moves=True)
     for touchable in touchables:
         if touchable.tree is not None:
             _add(touch, touchable, mesh)
-    positions = (mesh.positions + touch.moves).astype(np.float32) if dips else mesh.positions
-    return replace(mesh, positions=positions, wetness=touch.wet.astype(np.float32))
+    if dips:
+        mesh = replace(mesh, vertices=(mesh.vertices + touch.moves).astype(np.float32))
+    return mesh, touch.wet.astype(np.float32)
 
 
 @dataclass
 class _Touch:
-    """Contact of the vertices found so far.
-
-    Attributes:
-        wet: how far each touches something [-], (n,).
-        moves: the ways into what they touch [m], (n, 3).
-        reach: as for `wetted` [m].
-    """
+    """Contact of the vertices found so far: how far each touches something (n,), and its way into that (n, 3) [m]."""
 
     wet: np.ndarray
     moves: np.ndarray
@@ -158,10 +121,10 @@ class _Touch:
     def add(
         self, numbers: np.ndarray, distance: np.ndarray, inwards: np.ndarray, facing: np.ndarray, *, moves: bool
     ) -> None:
-        """Take a solid into account.
+        """Take a solid into account, of which these vertices (m,) are near.
 
         Args:
-            numbers: of the vertices near it, (m,).
+            numbers: of the vertices.
             distance: from it [m], 0 inside, (m,).
             inwards: unit vectors into it, (m, 3).
             facing: cosines of the angles between these and the normals, (m,).
@@ -175,10 +138,10 @@ class _Touch:
         self.moves[numbers[more]] = depth[more, None] * inwards[more]
 
 
-def _add(touch: _Touch, touchable: Touchable, mesh: TriangleMesh) -> None:
+def _add(touch: _Touch, touchable: Touchable, mesh: SurfaceMesh) -> None:
     """Take a body, a cloth or a fluid into account, for the vertices that are near it."""
     farthest = _FREE_BEYOND * touch.reach
-    own = (mesh.positions - touchable.position) @ touchable.rotation
+    own = (mesh.vertices - touchable.position) @ touchable.rotation
     candidates = np.flatnonzero(((own > touchable.low - farthest) & (own < touchable.high + farthest)).all(axis=1))
     near, places, triangles = [], [], []
     find = touchable.tree.find_nearest

@@ -12,16 +12,12 @@ from blender_scripts.geometry import REST_UV
 from blender_scripts.shading import Color, LookContext, NodeBuilder, draws, or_default
 
 OILED_OAK: Color = (0.36, 0.19, 0.085)
-_RINGS = 9.0
-"""In a trunk's width."""
+_RINGS = 9.0  # in a trunk's width
 _PITH = (0.42, 0.31)
 """Where the rings have their middle, from the middle of the body [trunks]: rings are bows, not targets."""
-_BOARD_WIDTH, _BOARD_LENGTH = 0.15, 1.35
-"""Of the ground, in diagonals of the domain."""
-_JOINT = 0.018
-"""Half the width of the gap between boards [boards' widths]."""
-_SHEET_TRUNK = 0.25
-"""Width of the trunk that a sheet is cut from, in diagonals of the domain."""
+_BOARD_WIDTH, _BOARD_LENGTH = 0.15, 1.35  # of the ground, in diagonals of the domain
+_JOINT = 0.018  # half the width of the gap between boards [boards' widths]
+_SHEET_TRUNK = 0.25  # width of the trunk that a sheet is cut from, in diagonals of the domain
 
 
 @draws("wood")
@@ -30,37 +26,25 @@ def _wood(builder: NodeBuilder, context: LookContext) -> None:
     base = or_default(context.color, OILED_OAK)
     position, tone, joint = _boards(builder, context) if context.surface == "ground" else _trunk(builder, context)
     # Trunks are not round: a slow noise, drawn out along the grain, bends the rings.
-    slow = builder.vector_math("MULTIPLY", position, (1.1, 1.1, 0.32))
-    bend = _noise(builder, slow, detail=2.0)
+    bend = _noise(builder, position, (1.1, 1.1, 0.32), detail=2.0)
     across = builder.vector_math("MULTIPLY", position, (1.0, 1.0, 0.0))
-    from_pith = builder.vector_math("ADD", across, (*_PITH, 0.0))
-    length = builder.node("ShaderNodeVectorMath")
-    length.operation = "LENGTH"
-    builder.link(from_pith, length.inputs[0])
-    radius = builder.math("ADD", length.outputs["Value"], builder.math("MULTIPLY", bend, 0.45))
+    distance = builder.vector_math("LENGTH", builder.vector_math("ADD", across, (*_PITH, 0.0)))
+    radius = builder.math("ADD", distance, builder.math("MULTIPLY", bend, 0.45))
     phase = builder.math("FRACT", builder.math("MULTIPLY", radius, _RINGS))
     # Early wood darkens towards late wood slowly; the next year begins sharply.
-    ramp = builder.node("ShaderNodeValToRGB")
-    ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.0, 1.0
-    for place, shade in ((0.45, 1.02), (0.82, 0.52), (0.9, 0.5)):
-        ramp.color_ramp.elements.new(place).color = _shaded(base, shade)
-    ramp.color_ramp.elements[0].color = ramp.color_ramp.elements[-1].color = _shaded(base, 1.22)
-    builder.link(phase, ramp.inputs[0])
-    fibres = _noise(builder, builder.vector_math("MULTIPLY", position, (34.0, 34.0, 1.3)), detail=3.0)
-    pores = _noise(builder, builder.vector_math("MULTIPLY", position, (62.0, 62.0, 3.1)), detail=1.0)
+    shades = ((0.0, 1.22), (0.45, 1.02), (0.82, 0.52), (0.9, 0.5), (1.0, 1.22))
+    color = builder.ramp(phase, *((place, _shaded(base, shade)) for place, shade in shades))
+    fibres = _noise(builder, position, (34.0, 34.0, 1.3), detail=3.0)
+    pores = _noise(builder, position, (62.0, 62.0, 3.1), detail=1.0)
     pore = builder.math("MULTIPLY", builder.math("GREATER_THAN", pores, 0.62), 0.28)
     shade = builder.math("MULTIPLY_ADD", fibres, 0.5, 0.75)
     shade = builder.math("MULTIPLY", builder.math("SUBTRACT", shade, pore), builder.math("MULTIPLY", tone, joint))
-    color = builder.node("ShaderNodeVectorMath")
-    color.operation = "SCALE"
-    builder.link(ramp.outputs["Color"], color.inputs[0])
-    builder.link(shade, color.inputs["Scale"])
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
+        Base_Color=builder.scaled(color, shade),
         Roughness=or_default(context.roughness, 0.42),
         Specular_IOR_Level=0.35,
     )
-    builder.link(color.outputs[0], shader.inputs["Base Color"])
     builder.surface(shader)
 
 
@@ -75,70 +59,44 @@ def _trunk(builder: NodeBuilder, context: LookContext) -> tuple[Any, Any, Any]:
         edges = context.edges or (context.domain_size,) * 3
         order = sorted(range(3), key=lambda axis: edges[axis])  # the trunk runs along the longest, as wide as the next
         width = edges[order[1]]
-    scaled = builder.node("ShaderNodeVectorMath")
-    scaled.operation = "SCALE"
-    builder.link(place, scaled.inputs[0])
-    scaled.inputs["Scale"].default_value = 1.0 / max(width, 1e-9)
-    separate, combine = builder.node("ShaderNodeSeparateXYZ"), builder.node("ShaderNodeCombineXYZ")
-    builder.link(scaled.outputs[0], separate.inputs[0])
-    for target, source in enumerate(order):
-        builder.link(separate.outputs[source], combine.inputs[target])
-    return combine.outputs[0], 1.0, 1.0
+    parts = builder.split(builder.scaled(place, 1.0 / max(width, 1e-9)))
+    return builder.combined(*(parts[axis] for axis in order)), 1.0, 1.0
 
 
 def _boards(builder: NodeBuilder, context: LookContext) -> tuple[Any, Any, Any]:
     """The place in the trunk that a board was sawn from [trunks], how light the board is, and 0 in the joints."""
     size = context.domain_size
-    separate = builder.node("ShaderNodeSeparateXYZ")
-    builder.link(builder.node("ShaderNodeTexCoord").outputs["Object"], separate.inputs[0])
-    row = builder.math("DIVIDE", separate.outputs[0], _BOARD_WIDTH * size)
+    x, y, _ = builder.split(builder.node("ShaderNodeTexCoord").outputs["Object"])
+    row = builder.math("DIVIDE", x, _BOARD_WIDTH * size)
     number = builder.math("FLOOR", row)
     across = builder.math("SUBTRACT", row, number)
     # Boards of neighbouring rows end at different places.
     start, _ = _random(builder, number, 0.0, 0.0)
-    along = builder.math("ADD", builder.math("DIVIDE", separate.outputs[1], _BOARD_LENGTH * size), start)
+    along = builder.math("ADD", builder.math("DIVIDE", y, _BOARD_LENGTH * size), start)
     which = builder.math("FLOOR", along)
     fraction = builder.math("SUBTRACT", along, which)
     lightness, shift = _random(builder, number, which, 1.0)
-    combine = builder.node("ShaderNodeCombineXYZ")
-    builder.link(across, combine.inputs[0])
-    builder.link(builder.math("DIVIDE", separate.outputs[1], _BOARD_WIDTH * size), combine.inputs[2])
-    moved = builder.node("ShaderNodeVectorMath")
-    moved.operation = "MULTIPLY_ADD"
-    builder.link(shift, moved.inputs[0])
-    moved.inputs[1].default_value = (2.4, 1.2, 40.0)
-    builder.link(combine.outputs[0], moved.inputs[2])
+    place = builder.combined(across, 0.0, builder.math("DIVIDE", y, _BOARD_WIDTH * size))
+    moved = builder.vector_math("MULTIPLY_ADD", shift, (2.4, 1.2, 40.0), place)
     # Distance from the nearest joint, in boards' widths.
     to_side = builder.math("MINIMUM", across, builder.math("SUBTRACT", 1.0, across))
     to_end = builder.math("MINIMUM", fraction, builder.math("SUBTRACT", 1.0, fraction))
     distance = builder.math("MINIMUM", to_side, builder.math("MULTIPLY", to_end, _BOARD_LENGTH / _BOARD_WIDTH))
-    joint = builder.node("ShaderNodeMapRange")
-    joint.interpolation_type = "SMOOTHSTEP"
-    builder.link(distance, joint.inputs["Value"])
-    joint.inputs["From Min"].default_value, joint.inputs["From Max"].default_value = 0.3 * _JOINT, _JOINT
-    joint.inputs["To Min"].default_value = 0.25
-    return moved.outputs[0], builder.math("MULTIPLY_ADD", lightness, 0.5, 0.75), joint.outputs[0]
+    joint = builder.smoothstep(distance, 0.3 * _JOINT, _JOINT, start=0.25)
+    return moved, builder.math("MULTIPLY_ADD", lightness, 0.5, 0.75), joint
 
 
-def _random(builder: NodeBuilder, *numbers: Any) -> tuple[Any, Any]:
+def _random(builder: NodeBuilder, x: Any, y: Any, z: Any) -> tuple[Any, Any]:
     """A number and a vector from 0 to 1 for each triple of whole numbers."""
-    combine, noise = builder.node("ShaderNodeCombineXYZ"), builder.node("ShaderNodeTexWhiteNoise")
-    for number, socket in zip(numbers, combine.inputs, strict=True):
-        if isinstance(number, float):
-            socket.default_value = number
-        else:
-            builder.link(number, socket)
-    builder.link(combine.outputs[0], noise.inputs["Vector"])
+    noise = builder.node("ShaderNodeTexWhiteNoise", Vector=builder.combined(x, y, z))
     return noise.outputs["Value"], noise.outputs["Color"]
 
 
-def _noise(builder: NodeBuilder, place: Any, *, detail: float) -> Any:
-    """Noise of one feature a unit, about 0.5."""
-    noise = builder.node("ShaderNodeTexNoise", Scale=1.0, Detail=detail, Roughness=0.55)
-    builder.link(place, noise.inputs["Vector"])
-    return noise.outputs[0]
+def _noise(builder: NodeBuilder, place: Any, scale: Color, *, detail: float) -> Any:
+    """Noise about 0.5 with `scale` features a unit along each axis."""
+    return builder.noise(builder.vector_math("MULTIPLY", place, scale), Scale=1.0, Detail=detail, Roughness=0.55)
 
 
-def _shaded(color: Color, factor: float) -> tuple[float, float, float, float]:
+def _shaded(color: Color, factor: float) -> Color:
     red, green, blue = (min(1.0, factor * channel) for channel in color)
-    return red, green, blue, 1.0
+    return red, green, blue

@@ -12,19 +12,17 @@ from typing import Any
 
 import bpy
 
+from blender_scripts.look_table import LOOK_TABLE
+
 _ALPHA_OF_CLEAR_BODIES = 0.45
-_WATER_COLOR = (0.10, 0.36, 0.62)
-"""Of a body that lets light through and has no colour of its own."""
+_WATER_COLOR = (0.10, 0.36, 0.62)  # of a body that lets light through and has no colour of its own
 _FIRE_COLOR = (0.95, 0.35, 0.05)
 
-_SMOKE_DENSITY = 12.0
-"""Extinction [1/m], where the job leaves it to the look."""
+_SMOKE_DENSITY = 12.0  # extinction [1/m], where the job leaves it to the look
 
 
 def apply_workbench_settings(bodies: Sequence[tuple[dict[str, Any], Any]], *, panes: Any | None) -> None:
-    """Make the current scene one that Workbench draws: flat colours like those of the looks, studio light, shadows.
-
-    Call it when the scene is built: it reads the materials that are there.
+    """Make the finished scene one that Workbench draws: flat colours like those of the looks, studio light, shadows.
 
     Args:
         bodies: descriptions from the render specification, each with the object that was made of it. Not by name:
@@ -50,15 +48,10 @@ def apply_workbench_settings(bodies: Sequence[tuple[dict[str, Any], Any]], *, pa
         material.diffuse_color = _viewport_color(material, looks.get(material.name, {}))
     for described, made in bodies:
         if made.type == "VOLUME":
-            made.data.display.density = _density(described["material"])
+            made.data.display.density = described["material"].get("density") or _SMOKE_DENSITY
     # Workbench sorts no panes behind each other; the rims alone tell where the tank is.
     if panes is not None:
         panes.hide_render = True
-
-
-def _density(described: dict[str, Any]) -> float:
-    """Extinction of smoke per metre at density 1 [1/m]."""
-    return described.get("density") or _SMOKE_DENSITY
 
 
 def _viewport_color(material: Any, described: dict[str, Any]) -> tuple[float, float, float, float]:
@@ -66,7 +59,8 @@ def _viewport_color(material: Any, described: dict[str, Any]) -> tuple[float, fl
     nodes = [] if material.node_tree is None else material.node_tree.nodes
     shader = next((node for node in nodes if node.type == "BSDF_PRINCIPLED"), None)
     color = described.get("color")
-    if described.get("look") == "fire":
+    look = LOOK_TABLE.get(described.get("look"))
+    if look is not None and look.glows:
         return (*(color or _FIRE_COLOR), 1.0)
     if shader is None:
         return (*(color or (0.8, 0.8, 0.8)), 1.0)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from render.blender import run_script, script_argv
+from render.blender import early_end, run_script, script_argv
 from render.errors import InvalidFileError
 
 _TIMEOUT_S = 120.0
@@ -22,21 +22,15 @@ class Texture(NamedTuple):
 
 
 def read_textures(path: Path, name: str, blender: str | None) -> list[Texture]:
-    """The pictures in a material of a .blend file, each once; empty if it is not there.
-
-    Args and Raises as of `read_material_names`.
-    """
+    """The pictures in a material of a .blend file, each once; empty if it is not there. See `read_material_names`."""
     told = json.loads(_ask(path, blender, [name], "TEXTURES"))
     return [Texture(int(each["width"]), int(each["height"]), bool(each["float"])) for each in told]
 
 
 def read_material_names(path: Path, blender: str | None, *, tried: Sequence[str] = ()) -> list[str]:
-    """Names of the materials in a .blend file, in any order.
+    """Names of the materials in a .blend file, by a Blender executable, or the bpy module if None.
 
-    Args:
-        path: the file.
-        blender: a Blender executable; the bpy module if None.
-        tried: materials that are appended as for a picture, if they are there.
+    Those that are tried are appended as for a picture, if they are there.
 
     Raises:
         BlenderUnavailableError: Blender does not answer.
@@ -55,5 +49,4 @@ def _ask(path: Path, blender: str | None, tried: Sequence[str], wanted: str) -> 
             return rest
         if word == "MATERIALS_FAILED":
             raise InvalidFileError(path, rest)
-    last = (completed.stdout + completed.stderr).strip().rpartition("\n")[2]
-    raise InvalidFileError(path, f"Blender ended with exit code {completed.returncode} while it read it: {last}")
+    raise InvalidFileError(path, early_end(completed, "read it"))

@@ -1,7 +1,4 @@
-"""Blender as a renderer: the bpy module in this process, or a Blender executable as a child process.
-
-Both draw with `blender_scripts`; the executable is started once and asked for frame after frame.
-"""
+"""Blender as a renderer: the bpy module in this process, or a child process that is asked for frame after frame."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from render.system_libraries import install_line, missing_libraries, missing_packages
 from render.temporary_folder import environment_of_child
@@ -23,11 +20,11 @@ from render.temporary_folder import environment_of_child
 logger = logging.getLogger(__name__)
 
 MINIMUM_BLENDER_VERSION = (4, 5)
-TEMPORARY_PREFIX = "blender-"
-"""Of the temporary folders of Blenders in processes of their own."""
+TEMPORARY_PREFIX = "blender-"  # of the temporary folders of Blenders in processes of their own
 _STARTUP_VERSION_TIMEOUT_S = 120.0
 _TERMINATE_TIMEOUT_S = 10.0
 _LOG_TAIL_LINES = 30
+_TEXT: Any = {"encoding": "utf-8", "errors": "replace"}
 
 
 class BlenderUnavailableError(RuntimeError):
@@ -39,11 +36,7 @@ class BlenderKilledError(BlenderUnavailableError):
 
 
 class BlenderHungError(BlenderUnavailableError):
-    """A script did not end in time.
-
-    Attributes:
-        told: what it had written to its standard output by then.
-    """
+    """A script did not end in time; `told` is what it had written to its standard output by then."""
 
     def __init__(self, message: str, told: str = "") -> None:
         super().__init__(message, told)
@@ -54,12 +47,7 @@ class BlenderHungError(BlenderUnavailableError):
 
 
 class FrameRenderError(RuntimeError):
-    """A frame could not be drawn.
-
-    Attributes:
-        frame: which.
-        reason: why, with the last lines of the child's output where there is a child.
-    """
+    """A frame could not be drawn."""
 
     def __init__(self, frame: int, reason: str) -> None:
         super().__init__(frame, reason)
@@ -70,9 +58,7 @@ class FrameRenderError(RuntimeError):
 
 
 class BlenderDiedError(FrameRenderError):
-    """The Blender executable ended, or was ended, while it was needed: no fault of the frame that it was to draw.
-
-    The renderer is of no more use; another one may draw the frame.
+    """The Blender executable ended while it was needed: no fault of the frame, which another renderer may draw.
 
     Attributes:
         returncode: exit code of the child; negative for the signal that ended it.
@@ -84,44 +70,21 @@ class BlenderDiedError(FrameRenderError):
         self.returncode = returncode
 
 
-class Renderer(Protocol):
-    """Draws frames of one RenderSpec."""
-
-    device: str
-    """The device that Cycles renders on, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`."""
-    pictures_by_uv: frozenset[str]
-    """Names of the objects with pictures in their material that lie by the texture coordinates of the mesh."""
-
-    def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
-        """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
-
-    def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
-        """Draw the view of a frame's camera without any body, at this width and height [pixels].
-
-        Raises:
-            FrameRenderError: it cannot be drawn.
-        """
-
-    def close(self) -> None:
-        """Close Blender; idempotent."""
-
-
 def open_renderer(spec_path: Path, *, threads: int, blender: str | None, gpu: int | None = 0) -> Renderer:
-    """Open a renderer for many frames of one specification.
+    """Open a renderer for many frames of a RenderSpec document.
 
     Args:
-        spec_path: the RenderSpec document.
+        spec_path: the document.
         threads: CPU threads to render with.
         blender: path of a Blender executable, or None for the bpy module.
-        gpu: which GPU to render on if the document leaves a choice, counted from 0 as `render.gpus` lists them; None:
-            none of them.
+        gpu: which one if the document leaves a choice, counted from 0 as `render.gpus` lists them; None: none of them.
 
     Raises:
         BlenderUnavailableError: there is no usable Blender, or it refuses the specification.
     """
     if blender is None:
         return ModuleRenderer(spec_path, threads=threads, gpu=gpu)
-    return ExecutableRenderer(spec_path, threads=threads, blender=blender, gpu=gpu)
+    return ChildRenderer(spec_path, threads=threads, blender=blender, gpu=gpu)
 
 
 def require_bpy() -> None:
@@ -144,7 +107,12 @@ def require_bpy() -> None:
 
 
 class ModuleRenderer:
-    """Draws with the bpy module in this process. Blender has one scene per process: a new one closes the last."""
+    """Draws frames of one RenderSpec with the bpy module in this process; a new one closes the last.
+
+    Attributes:
+        device: that Cycles renders on, e.g. `CPU` or `OPTIX: NVIDIA RTX 4090`.
+        pictures_by_uv: names of the objects with pictures in their material that lie by texture coordinates.
+    """
 
     def __init__(self, spec_path: Path, *, threads: int, gpu: int | None = 0) -> None:
         require_bpy()
@@ -160,36 +128,33 @@ class ModuleRenderer:
 
     def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
         """Draw a frame into a PNG file of any name, and into an EXR if one is named. Raises FrameRenderError."""
-        with _told_of(frame):
+        with _errors_of(frame):
             self._scene.render(frame, output_path, master_path)
 
     def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
-        """Draw what the camera of a frame sees without any body. Raises FrameRenderError."""
-        with _told_of(frame):
+        """Draw the view of a frame's camera without any body. Raises FrameRenderError."""
+        with _errors_of(frame):
             self._scene.render_set(frame, output_path, resolution=resolution)
 
     def close(self) -> None:
         """Nothing to do: the module stays loaded, and the next scene replaces this one."""
 
 
-class ExecutableRenderer:
-    """Draws with a Blender executable, started once; asks it for frames over its standard input."""
+class ChildRenderer:
+    """Draws with a Blender executable or the bpy module in a child process, which it asks for frame after frame.
 
-    def __init__(self, spec_path: Path, *, threads: int, blender: str, gpu: int | None = 0) -> None:
-        require_supported_executable(blender)
+    Attributes as of `ModuleRenderer`.
+    """
+
+    def __init__(self, spec_path: Path, *, threads: int, blender: str | None, gpu: int | None = 0) -> None:
+        if blender is not None:
+            require_supported_executable(blender)
         self._log_tail: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
         self._argv = build_argv(blender, spec_path.resolve(), threads=threads, gpu=gpu)
         with contextlib.ExitStack() as on_failure:
             environment = on_failure.enter_context(environment_of_child(TEMPORARY_PREFIX))
-            self._process = subprocess.Popen(
-                self._argv,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                encoding="utf-8",
-                errors="replace",
-                env=environment,
-            )
+            pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+            self._process: subprocess.Popen[str] = subprocess.Popen(self._argv, env=environment, **pipes, **_TEXT)
             self._leftovers = on_failure.pop_all()
         try:
             self.pictures_by_uv: frozenset[str] = frozenset()
@@ -197,30 +162,24 @@ class ExecutableRenderer:
             while (answer := self._read_answer(words)) is not None and answer.startswith("PICTURES_BY_UV"):
                 self.pictures_by_uv = frozenset(json.loads(answer.partition(" ")[2]))
             if answer is None:
-                code = self._exit_code()
-                raise (BlenderKilledError if code < 0 else BlenderUnavailableError)(
-                    f"Blender did not start: exit code {code} of {' '.join(self._argv)}; "
-                    f"its last lines:\n{self._last_lines()}"
-                )
+                raise self._not_started()
             if answer.startswith("RENDERER_FAILED"):
                 raise BlenderUnavailableError(answer.partition(" ")[2])
         except BaseException:
             self.close()
             raise
-        _, self.version, self.device = answer.split(" ", 2)
+        self.device = answer.split(" ", 2)[2]
 
     def render(self, frame: int, output_path: Path, master_path: Path | None = None) -> None:
         """Draw a frame into a PNG file of any name, and into an EXR if one is named.
 
-        Raises:
-            FrameRenderError: this frame cannot be drawn.
-            BlenderDiedError: the executable is gone; this renderer is of no more use.
+        Raises FrameRenderError, of which a BlenderDiedError says that this renderer is of no more use.
         """
         master = "" if master_path is None else f"\t{master_path.resolve()}"
         self._ask(frame, f"{frame} {output_path.resolve()}{master}")
 
     def render_set(self, frame: int, output_path: Path, *, resolution: tuple[int, int]) -> None:
-        """Draw what the camera of a frame sees without any body. Raises as `render` does."""
+        """Draw the view of a frame's camera without any body. Raises as `render` does."""
         width, height = resolution
         self._ask(frame, f"set {frame} {width}x{height} {output_path.resolve()}")
 
@@ -245,13 +204,12 @@ class ExecutableRenderer:
                 # What is still buffered for a dead child cannot be flushed, and need not be.
                 with contextlib.suppress(BrokenPipeError):
                     stream.close()
-        if self._process.poll() is None:
-            self._process.terminate()
-            try:
-                self._process.wait(_TERMINATE_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+        self._process.terminate()
+        try:
+            self._process.wait(_TERMINATE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
         self._leftovers.close()
 
     def _read_answer(self, prefixes: tuple[str, ...]) -> str | None:
@@ -265,12 +223,15 @@ class ExecutableRenderer:
             logger.debug("blender: %s", text)
         return None
 
-    def _exit_code(self) -> int:
-        """How a child that has closed its output ends, by itself if it does so soon; negative for a signal."""
+    def _not_started(self) -> BlenderUnavailableError:
+        """The error of a child that has closed its output, and ends by itself if it does so soon."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            return self._process.wait(_TERMINATE_TIMEOUT_S)
+            self._process.wait(_TERMINATE_TIMEOUT_S)
         self.close()
-        return self._process.wait()
+        code = self._process.returncode
+        return (BlenderKilledError if code < 0 else BlenderUnavailableError)(
+            f"Blender did not start: exit code {code} of {' '.join(self._argv)}; its last lines:\n{self._last_lines()}"
+        )
 
     def _died(self, frame: int) -> BlenderDiedError:
         self.close()
@@ -280,8 +241,11 @@ class ExecutableRenderer:
         return "\n".join(self._log_tail) or "(it wrote nothing)"
 
 
+Renderer = ModuleRenderer | ChildRenderer
+
+
 @contextlib.contextmanager
-def _told_of(frame: int) -> Iterator[None]:
+def _errors_of(frame: int) -> Iterator[None]:
     """Errors of the scripts in this process as those of a frame."""
     from blender_scripts.errors import RenderFailedError, RenderInputError
 
@@ -291,15 +255,15 @@ def _told_of(frame: int) -> Iterator[None]:
         raise FrameRenderError(frame, str(error)) from error
 
 
-def build_argv(blender: str, spec_path: Path, *, threads: int, gpu: int | None) -> list[str]:
-    """Arguments that make a Blender executable serve frames of a specification. Pure."""
+def build_argv(blender: str | None, spec_path: Path, *, threads: int, gpu: int | None) -> list[str]:
+    """Arguments that make Blender draw frames of a specification on demand."""
     words = ["--threads", str(threads)]
-    options = [str(spec_path), "--serve", *words, "--gpu", "none" if gpu is None else str(gpu)]
+    options = [str(spec_path), *words, "--gpu", "none" if gpu is None else str(gpu)]
     return script_argv(blender, "render_frames.py", options, own=words)
 
 
 def script_argv(blender: str | None, script: str, options: Sequence[str], *, own: Sequence[str] = ()) -> list[str]:
-    """Arguments that run a script of `blender_scripts`. Pure.
+    """Arguments that run a script of `blender_scripts`.
 
     `--factory-startup` keeps the user's preferences and add-ons out of the pictures, `--disable-autoexec` what .blend
     files would run.
@@ -326,27 +290,14 @@ def script_argv(blender: str | None, script: str, options: Sequence[str], *, own
 def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subprocess.CompletedProcess[str]:
     """Run a script to its end, whatever that is; its output is text.
 
-    Args:
-        argv: of `script_argv`.
-        timeout_s: when it is given up [s].
-        purpose: what it was to do, to be told then.
-
     Raises:
-        BlenderHungError: it does not end in time.
+        BlenderHungError: it does not end in time [s], and so has not done its purpose.
         BlenderUnavailableError: it cannot be started.
         OSError: there is no place for its temporary files.
     """
     with environment_of_child(TEMPORARY_PREFIX) as environment:
         try:
-            return subprocess.run(
-                argv,
-                capture_output=True,
-                encoding="utf-8",
-                errors="replace",
-                timeout=timeout_s,
-                check=False,
-                env=environment,
-            )
+            return subprocess.run(argv, capture_output=True, timeout=timeout_s, check=False, env=environment, **_TEXT)
         except OSError as error:
             raise BlenderUnavailableError(f"cannot start {argv[0]}: {error.strerror}") from error
         except subprocess.TimeoutExpired as error:
@@ -354,8 +305,14 @@ def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subpro
             raise BlenderHungError(f"Blender took more than {timeout_s:g} s to {purpose}", told) from error
 
 
+def early_end(completed: subprocess.CompletedProcess[str], purpose: str) -> str:
+    """What to say of a script that ended, with its last line, while it did something: "looked for GPUs"."""
+    last = (completed.stdout + completed.stderr).strip().rpartition("\n")[2]
+    return f"Blender ended with exit code {completed.returncode} while it {purpose}: {last}"
+
+
 def parse_blender_version(text: str) -> tuple[int, int, int] | None:
-    """The version in the first lines that `blender --version` prints, or None. Pure."""
+    """The version in the first lines that `blender --version` prints, or None."""
     match = re.search(r"^Blender (\d+)\.(\d+)\.(\d+)", text, flags=re.MULTILINE)
     return (int(match[1]), int(match[2]), int(match[3])) if match else None
 
@@ -368,12 +325,7 @@ def require_supported_executable(blender: str) -> tuple[int, int, int]:
     """
     try:
         completed = subprocess.run(
-            [blender, "--version"],
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=_STARTUP_VERSION_TIMEOUT_S,
-            check=False,
+            [blender, "--version"], capture_output=True, timeout=_STARTUP_VERSION_TIMEOUT_S, check=False, **_TEXT
         )
     except OSError as error:
         raise BlenderUnavailableError(f"cannot start the Blender executable {blender}: {error.strerror}") from error

@@ -23,10 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from render.errors import InvalidFileError
 
-Box = NDArray[np.float64]
-"""Lower and upper corner [m], (2, 3)."""
-Reach = NDArray[np.float64]
-"""Largest d . x for each d of DIRECTIONS [m], (50,)."""
+Box = NDArray[np.float64]  # lower and upper corner [m], (2, 3)
+Reach = NDArray[np.float64]  # largest d . x for each d of DIRECTIONS [m], (50,)
 
 DIRECTIONS = np.array(
     [d for d in itertools.product(range(-2, 3), repeat=3) if max(map(abs, d)) == 1 or sorted(map(abs, d)) == [0, 1, 2]],
@@ -36,8 +34,7 @@ DIRECTIONS = np.array(
 normalized, so that a coordinate times a component is exact. The n-th from the end is the opposite of the n-th."""
 _LENGTHS = np.sqrt((DIRECTIONS**2).sum(axis=1))
 _UPWARDS = np.array([int(np.flatnonzero((axis == DIRECTIONS).all(axis=1))[0]) for axis in np.eye(3)])
-_DOWNWARDS = len(DIRECTIONS) - 1 - _UPWARDS
-"""Where the axes are among the directions, and their opposites."""
+_DOWNWARDS = len(DIRECTIONS) - 1 - _UPWARDS  # where the axes are among the directions, and their opposites
 
 LEFT_OUT = 0.002
 """Share of a fluid or a smoke that its box leaves out on each side [-]: the crown of a splash holds some percent of the
@@ -45,12 +42,11 @@ water, the droplets that fly off hold less than that."""
 _CELL_IN_RADII = 8.0
 _DENSE_CELL = 8
 """Particles that make a cell of four of their spacings dense, an eighth of those that fill it: as much as the corner of
-a block has in a cell that it half reaches into. By a share of the mass alone such corners, of little mass, would go."""
+a block has in a cell that it half reaches into."""
 LEAST_EDGE = 0.1
 """Shortest edge of what is framed, in diagonals of the domain [-]: the set around it has the domain's size, too."""
 
-BOUNDS_VERSION = 2
-"""1: boxes along the axes."""
+BOUNDS_VERSION = 2  # 1: boxes along the axes
 
 _SAME_PLACE = 1.0e-9
 """In metres, or largest reaches: what is nearer to a plane lies in it. Planes of a smaller determinant do not meet."""
@@ -69,14 +65,10 @@ def reach_of_box(box: Box) -> Reach:
 
 
 def reach_of_particles(position: ArrayLike, radius: float) -> Reach:
-    """Reach of a fluid's particles, without the outliers.
+    """Reach of a fluid's particles with centres (n, 3) [m], n at least 1, without the outliers.
 
     Along the axes it leaves `LEFT_OUT` of them out on each side. Between them it does, too, but takes in what of the
     rest is dense.
-
-    Args:
-        position: of their centres [m], (n, 3), n at least 1.
-        radius: of a particle [m].
     """
     rows = np.asarray(position, dtype=np.float64)
     low, high = np.quantile(rows, [LEFT_OUT, 1.0 - LEFT_OUT], axis=0)
@@ -126,9 +118,8 @@ def box_of_smoke(density: NDArray[np.float32], lower: ArrayLike, cell_size: floa
     """The box around a smoke, without the thin rest on each side; None where there is no smoke.
 
     Args:
-        density: of its cells [-], (nx, ny, nz).
+        density: of its cells of edge `cell_size` [m], (nx, ny, nz).
         lower: lower corner of the first cell [m], (3,).
-        cell_size: edge of a cell [m].
     """
     if not density.size or not density.any():
         return None

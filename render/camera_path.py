@@ -19,9 +19,8 @@ Array = NDArray[np.float64]
 
 SENSOR_WIDTH_MM = 36.0
 AZIMUTH = math.radians(-62.0)
-ELEVATION = math.radians(17.0)
-"""A three-quarter view from slightly above: both sides of a box and its top are seen."""
-MARGIN = 0.05
+ELEVATION = math.radians(17.0)  # a three-quarter view from slightly above: both sides of a box and its top are seen
+MARGIN = 0.05  # share of the picture that stays free on each side
 
 TURNS_FROM_DEG = 45.0
 """A camera that goes farther around the scene than this sees beside a backdrop that stands behind it."""
@@ -33,11 +32,10 @@ VIEWS_VERSION = 1
 
 @dataclass(frozen=True)
 class View:
-    """The camera's view at one time.
+    """The view at one time.
 
     Attributes:
-        position: of the camera [m].
-        look_at: point in the middle of the picture [m].
+        position, look_at: of the camera, and the point in the middle of the picture [m].
         focal_length_mm: on a sensor 36 mm wide [mm].
         focus_distance: of the plane in focus, along the view [m].
     """
@@ -48,38 +46,8 @@ class View:
     focus_distance: float
 
 
-def frame_box(
-    box_min: Sequence[float],
-    box_max: Sequence[float],
-    *,
-    focal_length_mm: float,
-    aspect: float,
-    azimuth: float = AZIMUTH,
-    elevation: float = ELEVATION,
-    margin: float = MARGIN,
-) -> tuple[Vector3, Vector3]:
-    """The closest view from a given direction that shows a whole box, centred; see `frame_points`."""
-    corners = np.array(list(itertools.product(*zip(box_min, box_max, strict=True))), dtype=np.float64)
-    return frame_points(
-        corners,
-        focal_length_mm=focal_length_mm,
-        aspect=aspect,
-        azimuth=azimuth,
-        elevation=elevation,
-        margin=margin,
-    )
-
-
-def frame_points(
-    points: Array,
-    *,
-    focal_length_mm: float,
-    aspect: float,
-    azimuth: float = AZIMUTH,
-    elevation: float = ELEVATION,
-    margin: float = MARGIN,
-) -> tuple[Vector3, Vector3]:
-    """The closest view from a given direction that shows all points, centred.
+def frame_points(points: Array, *, focal_length_mm: float, aspect: float) -> tuple[Vector3, Vector3]:
+    """The closest view from the direction (`AZIMUTH`, `ELEVATION`) that shows all points, centred.
 
     In camera axes (right x, up y, forward z) a point is inside the frustum of a camera at (a, b, -d) if
     |x - a| <= t_x (z + d) and |y - b| <= t_y (z + d), where t is the tangent of half the field of view. For one axis
@@ -90,16 +58,13 @@ def frame_points(
         points: that are shown [m], (n, 3).
         focal_length_mm: of the lens, on a 36 mm sensor.
         aspect: width over height of the picture.
-        azimuth: direction from the points to the camera, around z from +x [rad].
-        elevation: of the camera above the horizon [rad].
-        margin: share of the picture that stays free on each side.
 
     Returns:
         Where the camera stands and what it looks at [m].
     """
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     forward = -np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+        [math.cos(ELEVATION) * math.cos(AZIMUTH), math.cos(ELEVATION) * math.sin(AZIMUTH), math.sin(ELEVATION)]
     )
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -108,8 +73,8 @@ def frame_points(
 
     # Blender's sensor fits the longer side of the picture.
     tangent_long = SENSOR_WIDTH_MM / 2 / focal_length_mm
-    tangent_x = tangent_long * min(1.0, aspect) * (1 - 2 * margin)
-    tangent_y = tangent_long / max(1.0, aspect) * (1 - 2 * margin)
+    tangent_x = tangent_long * min(1.0, aspect) * (1 - 2 * MARGIN)
+    tangent_y = tangent_long / max(1.0, aspect) * (1 - 2 * MARGIN)
     distances, shifts = [], []
     for offset, tangent in ((x, tangent_x), (y, tangent_y)):
         positive, negative = np.max(offset / tangent - z), np.max(-offset / tangent - z)
@@ -120,10 +85,9 @@ def frame_points(
 
 
 def _frame_all_round(points: Array, *, focal_length_mm: float, aspect: float) -> tuple[Vector3, Vector3]:
-    """The closest view from which all points stay in the picture on the way around the vertical axis in their middle.
+    """The closest view from which all points stay in the picture as it turns about the vertical axis in their middle.
 
-    Each turns in a circle, and all of these are framed. The point looked at is moved along the view onto the axis,
-    which the way leads around.
+    Each turns in a circle, and all of these are framed. The point looked at is moved along the view onto the axis.
     """
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     # The corners of the polygon around a circle, so that no part of it is left out.
@@ -172,13 +136,10 @@ class CameraPath:
         self._centre = (np.asarray(box_min, dtype=np.float64) + np.asarray(box_max, dtype=np.float64)) / 2
         look_at = None if isinstance(camera.look_at, str) else camera.look_at
         if camera.position is None and not camera.keyframe:
-            focal_length = camera.focal_length_mm
+            frame = frame_points if framed is None or not camera.orbit_deg_per_s else _frame_all_round
             if framed is None:
-                position, middle = frame_box(box_min, box_max, focal_length_mm=focal_length, aspect=aspect)
-            elif camera.orbit_deg_per_s:
-                position, middle = _frame_all_round(framed, focal_length_mm=focal_length, aspect=aspect)
-            else:
-                position, middle = frame_points(framed, focal_length_mm=focal_length, aspect=aspect)
+                framed = np.array([*itertools.product(*zip(box_min, box_max, strict=True))], dtype=np.float64)
+            position, middle = frame(framed, focal_length_mm=camera.focal_length_mm, aspect=aspect)
         else:
             position, middle = camera.position or camera.keyframe[0].position, _vector(self._centre)
         self._position, self._look_at = np.array(position), np.array(middle if look_at is None else look_at)
@@ -216,10 +177,9 @@ class CameraPath:
         return max(keyframes, default=self._camera.focal_length_mm)
 
     def distance_all_round(self) -> float | None:
-        """How far from the domain's middle it gets [m], if it goes so far around that it sees behind its first place.
+        """How far from the domain's middle it gets [m], if it sees behind its first place, or None.
 
-        Otherwise None. That of an orbit does, however slow: it is not known here how long the film is. Bodies are taken
-        to be where they start.
+        That of an orbit does, however slow: it is not known here how long the film is. Bodies stand where they start.
         """
         if self._interpolate is not None:
             times = np.unique([t for a, b in pairwise(self._times) for t in np.linspace(a, b, 17)] or self._times)
@@ -237,11 +197,10 @@ class CameraPath:
 
     def _through_keyframes(self) -> _Interpolation:
         camera = self._camera
-        rows = [
-            (*key.position, *(self._look_at if key.look_at is None else key.look_at),
-             key.focal_length_mm or camera.focal_length_mm)
-            for key in camera.keyframe
-        ]  # fmt: skip
+        rows = []
+        for key in camera.keyframe:
+            look_at = self._look_at if key.look_at is None else key.look_at
+            rows.append((*key.position, *look_at, key.focal_length_mm or camera.focal_length_mm))
         return _Interpolation(self._times, np.array(rows, dtype=np.float64), eases=camera.easing == "smooth")
 
 
@@ -268,13 +227,7 @@ class _Interpolation:
 
 
 def write_views(path: Path, frame: int, views: Mapping[float, View]) -> None:
-    """Write where the camera is while the shutter of one frame is open; docs/guide/formats.md.
-
-    Args:
-        path: the document; the same views give the same bytes.
-        frame: its number.
-        views: by time from the frame's [frames], ascending.
-    """
+    """Write the views while a frame's shutter is open, by time from the frame's [frames]; docs/guide/formats.md."""
     document = {
         "version": VIEWS_VERSION,
         "frame": frame,

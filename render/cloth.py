@@ -9,17 +9,11 @@ from render.meshes import Float32Array
 
 
 def vertex_normals(vertices: ArrayLike, faces: ArrayLike) -> Float32Array:
-    """Unit normals of the vertices: means over the triangles around them, weighted by area.
+    """Unit normals (n, 3) float32 of vertices (n, 3) [m]: means over the triangles around them, weighted by area.
 
     Twice the area of a triangle is the length of the cross product of its sides, so these are just added, in float64
-    and in the order of the faces: the same mesh gives the same bits.
-
-    Args:
-        vertices: [m], (n, 3).
-        faces: (k, 3) vertex indices.
-
-    Returns:
-        (n, 3) float32; a vertex whose triangles have no area, or that is of none, gets (0, 0, 1).
+    and in the order of the faces: the same mesh gives the same bits. A vertex whose triangles have no area, or that is
+    of none, gets (0, 0, 1).
     """
     positions, triangles = np.asarray(vertices, np.float64), np.asarray(faces)
     a, b, c = np.moveaxis(positions[triangles], 1, 0)

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-BLOCKS_ACROSS = 160
-"""Blocks along the longer side, at most: 12 pixels of a picture in full HD."""
+BLOCKS_ACROSS = 160  # blocks along the longer side, at most: 12 pixels of a picture in full HD
 
 VISIBLE = 0.01
 """Difference of luma [-], of 1 for black against white, over the whole picture, from which a pop or a jump counts: a
@@ -22,22 +21,18 @@ MOVING = 0.004
 by up to 0.0035, as its pictures are encoded anew (crf 16)."""
 RETURNS = 0.5
 """A picture pops if those beside it differ from each other by less than this share of what it differs from each ..."""
-POPS = 2.5
-"""... and if that is more than the differences around by this factor: at a bounce, too, a motion returns."""
+POPS = 2.5  # ... and if that is more than the differences around by this factor: at a bounce, too, a motion returns
 STANDS_STILL = 0.25
 """A picture repeats if it differs from the one before by less than this share of the differences around; by nothing
 where it was drawn, but a new segment of the film makes it a fifth of those of a slow motion."""
-JUMPS = 5.0
-"""A jump is larger than the two differences before and the two after by this factor."""
+JUMPS = 5.0  # a jump is larger than the two differences before and the two after by this factor
 
 
 @dataclass(frozen=True)
 class Break:
-    """A break in a film's continuity.
+    """A break in a film's continuity: a `pop`, a `repeat` of the frame before, or a `jump` to this frame.
 
     Attributes:
-        kind: `pop`, `repeat` or `jump`.
-        frame: that pops up, repeats the one before, or follows the jump.
         difference: from the frame before [-].
         usual: difference that it is held against: between the frames beside a pop, of the neighbours otherwise [-].
     """

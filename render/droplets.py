@@ -1,8 +1,7 @@
 """Droplets of a fluid's surface: what stands for spray is drawn finer than the particles that it was computed with.
 
-The contour gives a lone particle a ball of its whole volume. Such balls are all of one size, 2.5 particle radii wide,
-and look like marbles: where water breaks up into single particles, it would break up into much finer drops, which
-these particles stand for.
+The contour gives a lone particle a ball of its whole volume. Such balls are all of one size and look like marbles,
+where real water would break up into much finer drops.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ DROPLET_PARTICLES = 8
 """A part of this many particles keeps its size: it is two particles thick, and the smoothing may round it off."""
 
 _LARGEST_DROPLET = 3.0
-"""Parts larger than this many times `DROPLET_PARTICLES` are none, whatever is in them: the defaults give a lone
-particle 0.7 of its volume, and a wide smoothing length up to three times as much."""
+"""Parts larger than this many times `DROPLET_PARTICLES` are none, whatever is in them: a wide smoothing length gives a
+lone particle up to three times its volume."""
 
 
 def shrink_droplets(mesh: SurfaceMesh, positions: ArrayLike, *, particle_radius: float, size: float) -> SurfaceMesh:
@@ -30,13 +29,10 @@ def shrink_droplets(mesh: SurfaceMesh, positions: ArrayLike, *, particle_radius:
     Cavities stay as they are.
 
     Args:
-        mesh: a closed surface.
+        mesh: a closed surface; it is returned as it is where `size` is 1 or there is no droplet.
         positions: of the particles [m], (n, 3), float32.
         particle_radius: [m], half the spacing of the particles at rest.
         size: of a droplet of one particle, relative to its contour [-], in (0, 1].
-
-    Returns:
-        The mesh with other vertices; the same mesh where `size` is 1 or there is no droplet.
     """
     if size == 1.0 or len(mesh.faces) == 0:
         return mesh

@@ -8,9 +8,7 @@ from pathlib import Path
 
 from render.errors import InvalidFileError
 
-SUFFIXES = (".hdr", ".exr")
-"""Formats whose pixels are radiances: a PNG or JPEG of a sky has no sun."""
-
+SUFFIXES = (".hdr", ".exr")  # formats whose pixels are radiances: a PNG or JPEG of a sky has no sun
 
 _HEADER_BYTES = 1 << 16
 """The headers of such pictures have some hundred bytes; of a longer one the size is not looked for further on."""
@@ -36,10 +34,7 @@ def environment_pixels(path: Path) -> int | None:
 
 
 def read_environment_size(path: Path) -> tuple[int, int]:
-    """Decode the picture.
-
-    Returns:
-        Width and height [pixels].
+    """Decode the picture; its width and height [pixels].
 
     Raises:
         InvalidFileError: it is of another format, or damaged.

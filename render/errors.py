@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -19,6 +21,15 @@ class InvalidFileError(Exception):
 
     def __str__(self) -> str:
         return f"{self.path}: {self.reason}"
+
+
+@contextmanager
+def invalid_if_refused(path: Path) -> Iterator[None]:
+    """A ValueError about a file's content as an InvalidFileError."""
+    try:
+        yield
+    except ValueError as error:
+        raise InvalidFileError(path, str(error)) from error
 
 
 class VolumeUnavailableError(Exception):

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from render.blender import BlenderHungError, BlenderUnavailableError, run_script, script_argv
+from render.blender import BlenderHungError, BlenderUnavailableError, early_end, run_script, script_argv
 
 PROBE_TIMEOUT_S = 120.0
 ANY_KIND = ("auto", "gpu")
@@ -14,12 +14,9 @@ ANY_KIND = ("auto", "gpu")
 
 @dataclass(frozen=True, slots=True)
 class Gpu:
-    """A device of Cycles. One GPU may be several: NVIDIA's are one of OptiX and one of CUDA.
+    """A device of Cycles: its back end (OPTIX, CUDA, HIP, ONEAPI or METAL), its driver's name for it, and its id.
 
-    Attributes:
-        backend: what Cycles drives it by: OPTIX, CUDA, HIP, ONEAPI or METAL.
-        name: what its driver calls it.
-        id: tells it from others of that name.
+    NVIDIA's GPUs are one of OptiX and one of CUDA each.
     """
 
     backend: str
@@ -51,11 +48,7 @@ class Probe:
 
 
 def find_gpus(blender: str | None) -> Probe:
-    """Ask Blender for the GPUs of this machine; takes a second or two.
-
-    Args:
-        blender: path of a Blender executable, or None for the bpy module.
-    """
+    """Ask Blender, an executable or the bpy module, for the GPUs of this machine; takes a second or two."""
     try:
         completed = run_script(script_argv(blender, "gpus.py", []), timeout_s=PROBE_TIMEOUT_S, purpose="look for GPUs")
     except BlenderHungError as error:
@@ -65,14 +58,11 @@ def find_gpus(blender: str | None) -> Probe:
     lines = completed.stdout.splitlines()
     if any(line.startswith("GPUS_DONE ") for line in lines):
         return Probe(read_answer(lines))
-    last = (completed.stdout + completed.stderr).strip().rpartition("\n")[2]
-    return Probe(
-        read_answer(lines), f"Blender ended with exit code {completed.returncode} while it looked for GPUs: {last}"
-    )
+    return Probe(read_answer(lines), early_end(completed, "looked for GPUs"))
 
 
 def read_answer(lines: Sequence[str]) -> tuple[Gpu, ...]:
-    """The GPUs in the script's output, those of the preferred back end first. Pure."""
+    """The GPUs in the script's output, those of the preferred back end first."""
     gpus: list[Gpu] = []
     for line in lines:
         if line.startswith("GPUS "):

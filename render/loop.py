@@ -7,27 +7,22 @@ from pathlib import Path
 
 from PIL import Image
 
-from render.pictures import read_rgb8
+from render.pictures import read_image
 
 FORMATS = (".webp", ".gif")
-_GIF_TICK_MS = 10
-"""A GIF counts time in hundredths of a second, and browsers show less than two of them as ten."""
+_GIF_TICK_MS = 10  # a GIF counts time in hundredths of a second, and browsers show less than two of them as ten
 _LARGEST_GIF_FPS = 50.0
 _WEBP_QUALITY = 80
 
 
 def write_loop(pictures: Sequence[Path], output: Path, *, fps: float, width: int, loop_fps: float) -> int:
-    """Write a film that starts again.
+    """Write a film that starts again, .webp or .gif, and return the number of its frames.
 
     Args:
-        pictures: PNG files, one a frame.
-        output: the file to write, .webp or .gif.
-        fps: at which the pictures follow each other [1/s].
-        width: of the loop at most [pixels]: pictures are never enlarged.
+        pictures: PNG files, `fps` a second; they are never enlarged.
+        output: the file to write.
+        width: of the loop at most [pixels].
         loop_fps: frames a second of the loop [1/s]; no more than there are pictures for.
-
-    Returns:
-        The number of its frames.
 
     Raises:
         InvalidFileError: a picture is damaged.
@@ -42,7 +37,7 @@ def write_loop(pictures: Sequence[Path], output: Path, *, fps: float, width: int
         raise ValueError(f"a GIF has at most {_LARGEST_GIF_FPS:g} frames a second, not {loop_fps:g}")
     count = max(1, round(len(pictures) / fps * loop_fps))
     chosen = [pictures[min(int(number * fps / loop_fps + 1e-6), len(pictures) - 1)] for number in range(count)]
-    frames = [_fitted(path, width) for path in chosen]
+    frames = [read_image(path, width) for path in chosen]
     for path, frame in zip(chosen, frames, strict=True):
         if frame.size != frames[0].size:
             raise ValueError(f"{path} is of another size than {chosen[0]}")
@@ -67,14 +62,6 @@ def write_loop(pictures: Sequence[Path], output: Path, *, fps: float, width: int
     except RuntimeError as error:  # what Pillow raises where libwebp refuses
         raise ValueError(f"the pictures do not make a loop: {error}") from error
     return count
-
-
-def _fitted(path: Path, width: int) -> Image.Image:
-    picture = Image.fromarray(read_rgb8(path))
-    if picture.width > width:
-        height = max(1, round(picture.height * width / picture.width))
-        picture = picture.resize((width, height), Image.Resampling.LANCZOS)
-    return picture
 
 
 def _palette_of(frames: Sequence[Image.Image]) -> Image.Image:

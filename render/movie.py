@@ -11,10 +11,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,21 +25,18 @@ from render.pictures import Pixels, read_rgb8, read_rgb16
 if TYPE_CHECKING:
     import av
 
-SEGMENT_FRAMES = 30
-"""Pictures a segment: a changed picture costs half a second of film at 60 fps."""
+SEGMENT_FRAMES = 30  # pictures a segment: a changed picture costs half a second of film at 60 fps
 
-_LARGEST_RATE_DENOMINATOR = 1001
-"""Of the frame rates in use, 24000/1001 and its kin have the largest denominator."""
+_LARGEST_RATE_DENOMINATOR = 1001  # of the frame rates in use, 24000/1001 and its kin have the largest denominator
 
 _X265_PARAMETERS = f"open-gop=0:keyint={SEGMENT_FRAMES}:info=0:pools=none:frame-threads=1:log-level=error"
 """info=0: no version and options in the stream. One thread, as what several make may depend on their timing."""
 
 _X265_REORDERED = 2
-"""By how many frames decoding may run ahead of showing, with B-frames that refer to B-frames."""
+"""By how many frames decoding may run ahead of showing, with B-frames that refer to B-frames; x265 leaves the times at
+which packets are decoded to chance in a segment of a frame or two."""
 
-_SVT_AV1_PARAMETERS = "lp=1:enable-overlays=0"
-"""lp=1: one thread, as for x265."""
-
+_SVT_AV1_PARAMETERS = "lp=1:enable-overlays=0"  # lp=1: one thread, as for x265
 _SVT_AV1_SPEEDS = {"ultrafast": 12, "veryfast": 10, "fast": 9, "medium": 8, "slow": 6, "veryslow": 4}
 
 _X264_PARAMETERS = "open-gop=0:cpu-independent=1"
@@ -48,17 +44,10 @@ _X264_PARAMETERS = "open-gop=0:cpu-independent=1"
 memory past the end of narrow pictures, whose content is random."""
 
 
-@dataclass(frozen=True)
-class _Encoder:
-    """Encoder settings of a codec.
+class _Encoder(NamedTuple):
+    """FFmpeg's encoder of a codec, its label for people, pixel format, bits a channel, and muxer.
 
-    Attributes:
-        name: of FFmpeg's encoder.
-        label: for people.
-        pixels: FFmpeg's pixel format.
-        bits: a channel.
-        container: FFmpeg's muxer.
-        tag: four characters by which players know the codec; None: the muxer's own.
+    By `tag`, of four characters, players know the codec; None: the muxer's own.
     """
 
     name: str
@@ -136,10 +125,7 @@ def encode_frames(
     Args:
         frames: pixels of each frame, (height, width, 3), uint8 or uint16; at least one.
         size: even width and height [pixels].
-        output: the MP4 to write, or the QuickTime film for ProRes.
-        fps: frames a second [1/s].
-        parameters: codec, quality and speed.
-        threads: of H.264's encoder; part of what decides the bytes.
+        output, fps, parameters, threads: as for `encode_segment`.
     """
     import av
 
@@ -156,12 +142,19 @@ def encode_frames(
         encoder.gop_size = SEGMENT_FRAMES
         encoder.thread_count = threads if parameters.codec == "h264" else 1
         _tag_bt709(encoder)
-        clock = _DecodingClock(_X265_REORDERED if parameters.codec == "h265" else None)
-        for index, pixels in enumerate(frames):
-            frame = _to_yuv(pixels, encoder_of.pixels)
-            frame.pts, frame.time_base = index, 1 / rate
-            container.mux(clock.timed(stream.encode(frame)))
-        container.mux(clock.timed(stream.encode(None)))
+        for number, packet in enumerate(_encoded(frames, stream, encoder_of.pixels, rate)):
+            if parameters.codec == "h265":
+                packet.dts = number - _X265_REORDERED
+            container.mux(packet)
+
+
+def _encoded(frames: Iterable[Pixels], stream: Any, pixel_format: str, rate: Fraction) -> Iterator[Any]:
+    """Packets of frames, in decoding order."""
+    for index, pixels in enumerate(frames):
+        frame = _to_yuv(pixels, pixel_format)
+        frame.pts, frame.time_base = index, 1 / rate
+        yield from stream.encode(frame)
+    yield from stream.encode(None)
 
 
 def join_segments(segments: Sequence[Path], output: Path) -> None:
@@ -244,6 +237,11 @@ def validate_movie(path: Path, frames: int, *, see: Callable[[NDArray[np.uint8]]
         raise InvalidFileError(path, f"has {count} frames, expected {frames}")
 
 
+def even(number: int) -> int:
+    """A width or height [pixels] that the encoders take: this one, or one more."""
+    return number + number % 2
+
+
 def frame_rate(fps: float) -> Fraction:
     """Frames a second as the fraction that a film stores; 23.976 is 2997/125."""
     return Fraction(fps).limit_denominator(_LARGEST_RATE_DENOMINATOR)
@@ -261,26 +259,6 @@ def _options(parameters: MovieParameters) -> dict[str, str]:
             os.environ["SVT_LOG"] = "1"  # errors only; it would tell its settings for every segment
             return {**rate, "preset": str(_SVT_AV1_SPEEDS[preset]), "svtav1-params": _SVT_AV1_PARAMETERS}
     return {"profile": "3"}  # 422 HQ
-
-
-class _DecodingClock:
-    """Sets the times at which packets are decoded; x265 leaves them to chance in a segment of a frame or two.
-
-    Args:
-        reordered: by how many frames decoding runs ahead of showing; None: leave the times as they are.
-    """
-
-    def __init__(self, reordered: int | None) -> None:
-        self._reordered = reordered
-        self._count = 0
-
-    def timed(self, packets: list[Any]) -> list[Any]:
-        """The packets, which come in decoding order."""
-        if self._reordered is not None:
-            for number, packet in enumerate(packets, start=self._count):
-                packet.dts = number - self._reordered
-            self._count += len(packets)
-        return packets
 
 
 def _pixels(pictures: Sequence[Path], first: Pixels, read: Callable[[Path], Pixels]) -> Iterator[Pixels]:

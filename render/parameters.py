@@ -418,14 +418,6 @@ class MovieParameters(Parameters):
         """The constant rate factor that counts; None for a codec that has none."""
         return USUAL_CRF.get(self.codec) if self.crf is None else self.crf
 
-    def deciding(self) -> dict[str, str | int | float | None]:
-        """What decides the film's bytes; for H.264 the keys and values from before there were other codecs."""
-        if self.codec == "prores":
-            return {"codec": self.codec, "playback_fps": self.playback_fps}
-        common: dict[str, str | int | float | None] = {"crf": self.rate_factor, "preset": self.preset}
-        common["playback_fps"] = self.playback_fps
-        return common if self.codec == "h264" else {"codec": self.codec, **common}
-
     @model_validator(mode="after")
     def _codec_has_these_keys(self) -> Self:
         if self.codec == "prores":

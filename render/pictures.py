@@ -6,13 +6,14 @@ import io
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from blake3 import blake3
 from numpy.typing import NDArray
 from PIL import Image
 
-from render.errors import InvalidFileError
+from render.errors import InvalidFileError, invalid_if_refused
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -40,26 +41,16 @@ _BT709_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])
 
 @dataclass(frozen=True)
 class PictureStatistics:
-    """Statistics of a picture; display values from 0 to 1.
+    """Statistics of a picture.
 
     Attributes:
-        width: [pixels].
-        height: [pixels].
         bit_depth: bits a channel.
-        mean_luminance: BT.709 weights on display values [-].
-        luminance_deviation: standard deviation of the luminance [-].
-        darkest: smallest luminance [-].
-        brightest: largest luminance [-].
+        mean_luminance: BT.709 weights on display values from 0 to 1 [-].
         white_share: of the pixels whose least channel is at `WHITE_LEVEL` or above [-].
     """
 
-    width: int
-    height: int
     bit_depth: int
     mean_luminance: float
-    luminance_deviation: float
-    darkest: float
-    brightest: float
     white_share: float
 
 
@@ -92,6 +83,15 @@ def read_picture(path: Path) -> Pixels:
 def read_rgb8(path: Path) -> NDArray[np.uint8]:
     """Pixels as (height, width, 3) uint8; 16-bit channels are rounded, what has alpha is laid over black."""
     return _rgb8(read_picture(path))
+
+
+def read_image(path: Path, largest_width: int, *, reducing_gap: float | None = None) -> Image.Image:
+    """A picture as 8 bits a channel, made smaller where it is wider; see `Image.resize`."""
+    image = Image.fromarray(read_rgb8(path))
+    if image.width > largest_width:
+        height = max(1, round(image.height * largest_width / image.width))
+        image = image.resize((largest_width, height), Image.Resampling.LANCZOS, reducing_gap=reducing_gap)
+    return image
 
 
 def read_rgb16(path: Path) -> NDArray[np.uint16]:
@@ -150,19 +150,13 @@ def check_pixels(
 ) -> PictureStatistics:
     """Check that the decoded pixels of a picture show something; arguments and errors as for `validate_picture`."""
     height, width, channels = pixels.shape
-    if (width, height) != tuple(resolution):
-        raise InvalidFileError(path, f"is {width}x{height} pixels, but {resolution[0]}x{resolution[1]} were asked for")
+    _require_size(path, (width, height), resolution)
     scale = float(np.iinfo(pixels.dtype).max)
     luminance = pixels[..., :3] @ _BT709_WEIGHTS / scale if channels >= 3 else pixels[..., 0] / scale
     color = pixels[..., :3] if channels >= 3 else pixels[..., :1]
     statistics = PictureStatistics(
-        width=width,
-        height=height,
         bit_depth=8 * pixels.dtype.itemsize,
         mean_luminance=float(luminance.mean()),
-        luminance_deviation=float(luminance.std()),
-        darkest=float(luminance.min()),
-        brightest=float(luminance.max()),
         white_share=float((color.min(axis=2) >= WHITE_LEVEL * scale).mean()),
     )
     if may_be_empty:
@@ -211,28 +205,13 @@ def validate_exr(path: Path, resolution: tuple[int, int], *, layer: str = "", ma
         InvalidFileError: it is damaged, of another size, black, or has values that are not finite.
         OSError: it cannot be read.
     """
-    import av
-
     from blender_scripts.exr import require_whole
 
     content = path.read_bytes()
-    try:
+    with invalid_if_refused(path):
         require_whole(content)  # FFmpeg leaves out what it cannot decode
-    except ValueError as error:
-        raise InvalidFileError(path, str(error)) from error
-    decoder = av.CodecContext.create("exr", "r")
-    decoder.options = {"layer": layer} if layer else {}
-    try:
-        frames = [*decoder.decode(av.Packet(content)), *decoder.decode(None)]
-    except av.FFmpegError as error:
-        raise InvalidFileError(path, f"cannot be decoded: {error}") from error
-    if len(frames) != 1:
-        raise InvalidFileError(path, "is not an EXR of one picture")
-    frame = frames[0]
-    if (frame.width, frame.height) != tuple(resolution):
-        raise InvalidFileError(
-            path, f"is {frame.width}x{frame.height} pixels, but {resolution[0]}x{resolution[1]} were asked for"
-        )
+    frame = _decoded(path, content, "exr", {"layer": layer} if layer else {})
+    _require_size(path, (frame.width, frame.height), resolution)
     planes = [
         np.frombuffer(memoryview(plane), np.float16 if "f16" in frame.format.name else np.float32)
         .reshape(frame.height, -1)[:, : frame.width]
@@ -254,19 +233,32 @@ def pixel_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
+def _require_size(path: Path, size: tuple[int, int], asked_for: tuple[int, int]) -> None:
+    if size != tuple(asked_for):
+        raise InvalidFileError(path, f"is {size[0]}x{size[1]} pixels, but {asked_for[0]}x{asked_for[1]} were asked for")
+
+
 def _read_16_bit(path: Path, content: bytes, channels: int) -> NDArray[np.uint16]:
     """Pillow keeps 8 bits of a 16-bit picture; FFmpeg keeps all."""
+    frame = _decoded(path, content, "png", {})
+    layout = {1: "gray16be", 2: "ya16be", 3: "rgb48be", 4: "rgba64be"}[channels]
+    if frame.format.name != layout:
+        raise InvalidFileError(path, f"cannot be decoded as {layout} pixels")
+    plane = frame.planes[0]
+    rows = np.frombuffer(memoryview(plane), ">u2").reshape(frame.height, plane.line_size // 2)
+    return rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels).astype(np.uint16)
+
+
+def _decoded(path: Path, content: bytes, codec: str, options: dict[str, str]) -> Any:
+    """The one frame that FFmpeg finds in a picture."""
     import av
 
-    decoder = av.CodecContext.create("png", "r")
+    decoder: Any = av.CodecContext.create(codec, "r")
+    decoder.options = options
     try:
         frames = [*decoder.decode(av.Packet(content)), *decoder.decode(None)]
     except av.FFmpegError as error:
         raise InvalidFileError(path, f"cannot be decoded: {error}") from error
-    layout = {1: "gray16be", 2: "ya16be", 3: "rgb48be", 4: "rgba64be"}[channels]
-    if [frame.format.name for frame in frames] != [layout]:
-        raise InvalidFileError(path, f"cannot be decoded as one picture of {layout} pixels")
-    frame = frames[0]
-    plane = frame.planes[0]
-    rows = np.frombuffer(memoryview(plane), ">u2").reshape(frame.height, plane.line_size // 2)
-    return rows[:, : frame.width * channels].reshape(frame.height, frame.width, channels).astype(np.uint16)
+    if len(frames) != 1:
+        raise InvalidFileError(path, "is not one picture")
+    return frames[0]

@@ -13,16 +13,10 @@ POSES_VERSION = 1
 
 
 def write_poses(path: Path, frame: int, bodies: Mapping[str, Mapping[str, NDArray[np.generic]]]) -> None:
-    """Write the poses of one frame; the same poses give the same bytes.
+    """Write the poses of one frame; the same poses give the same bytes. A number that is not finite raises ValueError.
 
-    Args:
-        path: the document.
-        frame: number of the frame.
-        bodies: for each body `position` (3,) of its mesh's origin [m], `orientation` (4,) as a unit quaternion w, x,
-            y, z, `velocity` (3,) of that origin [m/s], `angular_velocity` (3,) about the world's axes [rad/s].
-
-    Raises:
-        ValueError: a number is not finite.
+    Of each body `position` (3,) of its mesh's origin [m], `orientation` (4,) as a unit quaternion w, x, y, z,
+    `velocity` (3,) of that origin [m/s], `angular_velocity` (3,) about the world's axes [rad/s].
     """
     document = {
         "version": POSES_VERSION,

@@ -16,16 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from render.movie import encode_frames, validate_movie
+from render.movie import encode_frames, even, validate_movie
 from render.parameters import MovieParameters
-from render.pictures import read_rgb8
+from render.pictures import read_image
 
-LARGEST_WIDTH = 640
-"""Of the film [pixels]; pictures are never enlarged."""
+LARGEST_WIDTH = 640  # of the film [pixels]; pictures are never enlarged
 
 _QUALITY = MovieParameters(crf=25, preset="veryfast")
-_COPY_QUALITY = 92
-"""Of the small copies, which are JPEG: they are encoded once more."""
+_COPY_QUALITY = 92  # of the small copies, which are JPEG: they are encoded once more
 
 _GROUND = np.array([18, 18, 20], np.float64)
 _MISSING = np.array([46, 46, 50], np.float64)
@@ -56,8 +54,8 @@ def write_preview_movie(pictures: Mapping[int, Path], frames: int, output: Path,
     for frame in drawn:
         _make_copy(pictures[frame], _copy_of(frame, copies))
     with Image.open(_copy_of(drawn[0], copies)) as first:
-        size = _even(first.width), _even(first.height)
-    strip = _Strip(drawn, frames, width=size[0], height=max(4, _even(size[1] // 45)))
+        size = even(first.width), even(first.height)
+    strip = _Strip(drawn, frames, width=size[0], height=max(4, even(size[1] // 45)))
     whole = (size[0], size[1] + strip.height)
     encode_frames(_frames(drawn, frames, copies, size, strip), whole, output, fps=fps, parameters=_QUALITY)
     validate_movie(output, frames)
@@ -70,10 +68,7 @@ def _copy_of(frame: int, copies: Path) -> Path:
 def _make_copy(picture: Path, copy: Path) -> None:
     if copy.exists():
         return
-    image = Image.fromarray(read_rgb8(picture))
-    if image.width > LARGEST_WIDTH:
-        height = max(1, round(image.height * LARGEST_WIDTH / image.width))
-        image = image.resize((LARGEST_WIDTH, height), Image.Resampling.LANCZOS, reducing_gap=3.0)
+    image = read_image(picture, LARGEST_WIDTH, reducing_gap=3.0)
     part = copy.with_suffix(f".{os.getpid()}")
     image.save(part, format="JPEG", quality=_COPY_QUALITY, subsampling=0)
     part.replace(copy)
@@ -120,7 +115,3 @@ class _Strip:
         left = min(max(0, left), width - thickness)
         strip[:, left : left + thickness] = _MARK_OF_STAND_IN if stands_in else _MARK
         return strip
-
-
-def _even(number: int) -> int:
-    return number + number % 2

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from render.movie import encode_frames, validate_movie
+from render.movie import encode_frames, even, validate_movie
 from render.parameters import MovieParameters
 from render.pictures import read_rgb8
 
@@ -20,15 +20,8 @@ _BACKGROUND = (24, 24, 26)
 _INK = (235, 235, 235)
 
 
-@dataclass(frozen=True)
-class Film:
-    """One of those that are compared.
-
-    Attributes:
-        name: shown under it.
-        pictures: PNG files, one a frame.
-        fps: frames a second [1/s].
-    """
+class Film(NamedTuple):
+    """One of those that are compared: the name shown under it, PNG files, one a frame, and frames a second [1/s]."""
 
     name: str
     pictures: Sequence[Path]
@@ -36,16 +29,13 @@ class Film:
 
 
 def compare_films(films: Sequence[Film], output: Path, *, width: int, threads: int) -> int:
-    """Put films into one, side by side at equal times, as long as the shortest of them.
+    """Put films into one, side by side at equal times, as long as the shortest of them; returns the number of frames.
 
     Args:
         films: at least one, each with at least one picture; the first decides the proportions.
         output: the MP4 to write.
         width: of the film at most [pixels]; no picture gets more than the widest of them has.
         threads: of the encoder.
-
-    Returns:
-        The number of frames.
 
     Raises:
         InvalidFileError: a picture is damaged.
@@ -75,7 +65,7 @@ class _Board:
         self._cell = cell
         font_size = max(11, min(28, height // 14))
         caption = round(1.8 * font_size)
-        self.size = _even(len(names) * (width + _GAP) - _GAP), _even(height + caption)
+        self.size = even(len(names) * (width + _GAP) - _GAP), even(height + caption)
         self._empty = Image.new("RGB", self.size, _BACKGROUND)
         draw, font = ImageDraw.Draw(self._empty), ImageFont.load_default(size=font_size)
         for column, name in enumerate(names):
@@ -103,7 +93,3 @@ def _shortened(
     while len(shown) > 1 and draw.textlength(shown, font) > width:
         shown = shown.removesuffix("…")[:-1] + "…"
     return shown
-
-
-def _even(number: int) -> int:
-    return number + number % 2

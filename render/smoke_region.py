@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 Box = tuple[slice, slice, slice]
 
-_SLAB = 8
-"""Cells along x that are looked at together: their velocities in float64 take little room."""
+_SLAB = 8  # cells along x that are looked at together: their velocities in float64 take little room
 
 
 def bounding_box(mask: NDArray[np.bool_]) -> Box | None:
@@ -28,16 +27,14 @@ def bounding_box(mask: NDArray[np.bool_]) -> Box | None:
 def blur_reach(velocity: NDArray[np.float32], mask: NDArray[np.bool_], *, shutter_s: float, cell_size: float) -> int:
     """Cells around the smoke in which a renderer looks up velocities: max|v| shutter / 2, and one to interpolate.
 
-    A frame is at the middle of the time that the shutter is open, so smoke is drawn up to half of it away.
+    A frame is at the middle of the time that the shutter is open [s], so smoke is drawn up to half of it away. No more
+    than the longest side of the grid, which reaches everything.
 
     Args:
         velocity: (nx, ny, nz, 3) [m/s].
         mask: (nx, ny, nz), where there is smoke.
         shutter_s: how long the shutter is open [s].
         cell_size: edge of a cell [m].
-
-    Returns:
-        The reach [cells]; no more than the longest side of the grid, which reaches everything.
     """
     fastest = 0.0
     for start in range(0, mask.shape[0], _SLAB):

@@ -127,13 +127,7 @@ class Camera(Parameters):
 
     @classmethod
     def on(cls, path: CameraPath, *, f_stop: float | None, views: str) -> Camera:
-        """The camera on a path.
-
-        Args:
-            path: where it goes.
-            f_stop: aperture; None: everything is in focus.
-            views: path of the documents, for one that moves.
-        """
+        """The camera on a path; `views` is the path of the documents of one that moves."""
         return cls(
             **asdict(path.first()),
             f_stop=f_stop,

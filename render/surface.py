@@ -9,7 +9,6 @@ splashsurf does the work; droplets of a few particles are then drawn finer than 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -35,8 +34,7 @@ def reconstruct_surface(
     """Mesh the surface of a fluid.
 
     One thread gives the same bytes for the same particles, in every process; with more, the order of the vertices
-    depends on the scheduling and the last bits of the positions on that order. Frames are independent of each other,
-    so a farm gains more from one frame a core than from several cores a frame.
+    depends on the scheduling and the last bits of the positions on that order.
 
     Args:
         positions: particle positions [m], (n, 3).
@@ -52,26 +50,6 @@ def reconstruct_surface(
         ValueError: the arrays do not fit together, or the number of threads differs from the process's first call.
         SurfaceReconstructionError: positions or velocities are not finite, or splashsurf fails.
     """
-    return reconstruct_with_options(
-        positions,
-        velocities,
-        particle_radius=particle_radius,
-        options=pipeline_options(parameters),
-        droplet_size=parameters.droplet_size,
-        threads=threads,
-    )
-
-
-def reconstruct_with_options(
-    positions: ArrayLike,
-    velocities: ArrayLike,
-    *,
-    particle_radius: float,
-    options: Mapping[str, Any],
-    droplet_size: float,
-    threads: int = 1,
-) -> SurfaceMesh:
-    """As `reconstruct_surface`, with arguments of `pysplashsurf.reconstruction_pipeline` that no job changes, too."""
     position_rows = _particle_rows("positions", positions)
     velocity_rows = _particle_rows("velocities", velocities)
     if len(position_rows) != len(velocity_rows):
@@ -86,7 +64,7 @@ def reconstruct_with_options(
             attributes_to_interpolate={"velocity": velocity_rows},
             particle_radius=particle_radius,
             multi_threading=threads > 1,
-            **options,
+            **pipeline_options(parameters),
         )
     except RuntimeError as error:
         raise SurfaceReconstructionError(f"splashsurf failed on {len(position_rows)} particles: {error}") from error
@@ -99,15 +77,14 @@ def reconstruct_with_options(
             velocities=np.array(attributes["velocity"], np.float32),
         )
     )
-    return shrink_droplets(mesh, position_rows, particle_radius=particle_radius, size=droplet_size)
+    return shrink_droplets(mesh, position_rows, particle_radius=particle_radius, size=parameters.droplet_size)
 
 
 def without_collapsed_parts(mesh: SurfaceMesh) -> SurfaceMesh:
     """Drop the parts of a surface that have no volume, and make sure that every normal is a unit vector.
 
-    Mesh cleanup now and then collapses a cavity of a single cell to two triangles back to back. Their area vectors
-    cancel, so splashsurf gives their vertices no normal (NaN), and there is nothing to see of them. A vertex without a
-    normal in a part that does have volume takes the mean of its triangles.
+    Mesh cleanup now and then collapses a cavity to two triangles back to back, and splashsurf gives their vertices no
+    normal (NaN). A vertex without a normal in a part that does have volume takes the mean of its triangles.
 
     Raises:
         SurfaceReconstructionError: a vertex of a part with volume has triangles of no area only.

@@ -18,9 +18,6 @@ def environment_of_child(prefix: str) -> Iterator[dict[str, str]]:
 
     Blender makes a folder in it, and removes that only if it ends by itself.
 
-    Args:
-        prefix: that its name begins with.
-
     Raises:
         OSError: there is no place for it.
     """

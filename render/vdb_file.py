@@ -86,9 +86,10 @@ class _Reader:
         self.position += struct.calcsize(layout)
         return int(value)
 
-    def skip_string(self) -> None:
-        size = self.number("<I")
-        self.position += size
+    def skip_three_strings(self) -> None:
+        for _ in range(3):
+            size = self.number("<I")
+            self.position += size
 
 
 def _promised_size(content: bytes) -> int | None:
@@ -96,13 +97,9 @@ def _promised_size(content: bytes) -> int | None:
     reader = _Reader(content, _UUID.stop)
     try:
         for _ in range(reader.number("<I")):  # metadata of the file: name, type, value
-            reader.skip_string()
-            reader.skip_string()
-            reader.skip_string()
+            reader.skip_three_strings()
         for _ in range(reader.number("<I")):  # grids: name, type, instance parent
-            reader.skip_string()
-            reader.skip_string()
-            reader.skip_string()
+            reader.skip_three_strings()
             grid_start, values_start, end = (reader.number("<q") for _ in range(3))
             if not reader.position <= grid_start <= values_start <= end:
                 return None  # they are filled in last

@@ -16,20 +16,15 @@ Array = NDArray[np.float64]
 
 CLIP_START, CLIP_END = 1.0e-3, 1.0e3
 """Nearest and farthest that is drawn, in distances to the point looked at; see `blender_scripts/camera.py`."""
-GRID = 9
-"""Points along each edge of a box that stand for it: what lies between them is an eighth of the box."""
+GRID = 9  # points along each edge of a box that stand for it: what lies between them is an eighth of the box
 STRAIGHT_DOWN = 1.0e-9
-MOST_TRIANGLES = 100_000
-"""Of a mesh that are projected; of more, every second, third, ..."""
+MOST_TRIANGLES = 100_000  # of a mesh that are projected; of more, every second, third, ...
 
 
 def screen_positions(view: View, points: Array, *, aspect: float) -> Array:
-    """Positions of points in the picture: (n, 2), -1 and 1 are its edges, y points up; NaN behind the camera.
+    """Positions (n, 2) of points (n, 3) [m] in a picture of this width over height.
 
-    Args:
-        view: of the camera.
-        points: [m], (n, 3).
-        aspect: width over height of the picture.
+    -1 and 1 are its edges, y points up; NaN behind the camera.
     """
     offset = np.asarray(points, dtype=np.float64) - view.position
     forward = np.subtract(view.look_at, view.position)
@@ -64,16 +59,8 @@ def covered_cells(
 ) -> tuple[NDArray[np.bool_], float]:
     """The cells of a coarse picture that a mesh covers, and the share of the picture it covers, approximately.
 
-    Args:
-        view: of the camera.
-        vertices: [m], (n, 3).
-        faces: triangles, (k, 3).
-        shape: rows and columns of cells.
-        aspect: width over height of the picture.
-
-    Returns:
-        The cells that triangles have their middle or a corner in, and half of the area of all triangles, as a share of
-        the picture: of a closed mesh that is what it covers, and somewhat more where parts of it hide each other.
+    That is the cells that triangles have their middle or a corner in, and half of the area of all triangles: of a
+    closed mesh what it covers, and somewhat more where parts of it hide each other.
     """
     cells = np.zeros(shape, np.bool_)
     every = 1 + len(faces) // MOST_TRIANGLES
@@ -106,15 +93,8 @@ def is_inside(point: Sequence[float], vertices: NDArray[Any], faces: NDArray[np.
 
     Solid angles of the triangles as seen from the point (van Oosterom & Strackee 1983), 4 pi in all inside and 0
     outside; halfway between for a mesh with holes.
-
-    Args:
-        point: [m], (3,).
-        vertices: [m], (n, 3).
-        faces: triangles, (k, 3).
     """
-    if not len(faces):
-        return False
-    if (vertices.min(axis=0) > point).any() or (vertices.max(axis=0) < point).any():
+    if not len(faces) or (vertices.min(axis=0) > point).any() or (vertices.max(axis=0) < point).any():
         return False
     towards = np.asarray(vertices, dtype=np.float64) - np.asarray(point, dtype=np.float64)
     a, b, c = (towards[faces[:, corner]] for corner in range(3))

@@ -1,18 +1,14 @@
 """Smoke volumes as OpenVDB files: `density`, `temperature` and `velocity` on one grid of cells.
 
-The OpenVDB binding is the one inside the bpy wheel; it is loaded by itself, without importing bpy. Equal arrays give
-equal bytes, and a file that was changed is noticed (`vdb_file`). Layout and conventions: docs/guide/formats.md. Grids
+Equal arrays give equal bytes, and a file that was changed is noticed (`vdb_file`). Layout: docs/guide/formats.md. Grids
 are filled column by column: beside the arrays that are written only masks, and what OpenVDB makes of them, take memory.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader, ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from blender_scripts import openvdb_binding
 from render import vdb_file
 from render.errors import InvalidFileError, VolumeUnavailableError
 from render.parameters import VolumeParameters
@@ -32,26 +29,20 @@ TEMPERATURE_TOLERANCE_K = 0.5
 """Air this close to the ambient temperature [K] is stored as ambient; it emits and lifts nothing visible."""
 
 CREATOR = "physics-pipeline"
-HALF_MAX = 65504.0
-"""Largest number of 16 bits; OpenVDB would silently make infinity of a larger one."""
+HALF_MAX = 65504.0  # largest number of 16 bits; OpenVDB would silently make infinity of a larger one
 
-_SLAB = 32
-"""Cells along x that are looked at together."""
-_COLUMN = 32
-"""Cells along x and y that are given to OpenVDB together; whole leaves of its tree, which are 8 wide."""
+_SLAB = 32  # cells along x that are looked at together
+_COLUMN = 32  # cells along x and y that are given to OpenVDB together; whole leaves of its tree, which are 8 wide
 
 
 @dataclass(frozen=True)
 class Volume:
-    """The dense contents of a file over a box of cells.
+    """The dense contents of a file over a box of cells, in the units of `write_volume`.
 
     Attributes:
-        density: (nx, ny, nz) float32 [-].
-        temperature: (nx, ny, nz) float32, above ambient [K].
-        velocity: (nx, ny, nz, 3) float32 [m/s].
+        temperature: above ambient [K].
         centre: world position of the centre of cell (0, 0, 0) [m].
-        cell_size: edge of a cell [m].
-        metadata: metadata of each grid, by the grid's name.
+        metadata: of each grid, by its name.
     """
 
     density: Float32Array
@@ -63,26 +54,11 @@ class Volume:
 
 
 def import_openvdb() -> ModuleType:
-    """The OpenVDB binding: an installed one, else the one inside the bpy wheel.
-
-    Raises:
-        VolumeUnavailableError: there is none, or it cannot be loaded.
-    """
-    if "openvdb" in sys.modules:
-        return sys.modules["openvdb"]
-    spec = importlib.util.find_spec("openvdb") or _spec_inside_bpy()
-    if spec is None or spec.loader is None:
-        raise VolumeUnavailableError(
-            "OpenVDB is not installed: it comes inside the bpy wheel, which exists for Python 3.11 and 3.13 on "
-            f"Linux and macOS; this is Python {sys.version_info.major}.{sys.version_info.minor} on {sys.platform}"
-        )
+    """The OpenVDB binding. Raises VolumeUnavailableError: there is none, or it cannot be loaded."""
     try:
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    except ImportError as error:
-        raise VolumeUnavailableError(f"{spec.origin} cannot be loaded: {error}") from error
-    sys.modules["openvdb"] = module
-    return module
+        return openvdb_binding.import_openvdb()
+    except RuntimeError as error:
+        raise VolumeUnavailableError(str(error)) from error
 
 
 def write_volume(
@@ -112,12 +88,11 @@ def write_volume(
         velocity: (nx, ny, nz, 3) at cell centres, world axes [m/s].
         origin: lower corner of the smoke's box [m]; the centre of cell (i, j, k) is origin + (i + 1/2, ...) cell_size.
         cell_size: edge of a cell [m].
-        ambient_temperature: temperature of the air [K].
+        ambient_temperature: of the air [K].
         parameters: tolerance and precision.
         fps: frames a second of simulated time [1/s].
         shutter: how long the shutter is open [frames].
-        first_cell: which cell of the smoke's box the arrays begin at, where they hold only a part of it: all of its
-            smoke, and the velocity around that.
+        first_cell: of the smoke's box, where arrays begin that hold all of its smoke, and the velocity around it.
 
     Raises:
         ValueError: shapes do not fit together, or a value is not finite.
@@ -177,12 +152,7 @@ def validate_volume(path: Path) -> None:
 
 
 def read_volume(path: Path, shape: tuple[int, int, int], first_cell: tuple[int, int, int] = (0, 0, 0)) -> Volume:
-    """Read a box of cells of a volume into dense arrays.
-
-    Args:
-        path: a file by `write_volume`.
-        shape: number of cells along x, y, z.
-        first_cell: index of the box's lower cell.
+    """Read a box of cells of a file by `write_volume`, from `first_cell` on, into dense arrays.
 
     Raises:
         InvalidFileError: the file is not what `write_volume` writes.
@@ -196,16 +166,6 @@ def read_volume(path: Path, shape: tuple[int, int, int], first_cell: tuple[int, 
         cell_size=transform.voxelSize()[0],
         metadata={name: dict(grid.metadata) for name, grid in grids.items()},
     )
-
-
-def _spec_inside_bpy() -> ModuleSpec | None:
-    # find_spec of a top-level package locates it without running it.
-    bpy = importlib.util.find_spec("bpy")
-    for folder in (bpy.submodule_search_locations or ()) if bpy else ():
-        for suffix in EXTENSION_SUFFIXES:
-            for file in sorted(Path(folder).glob(f"*/python/lib/python3.*/site-packages/openvdb{suffix}")):
-                return importlib.util.spec_from_loader("openvdb", ExtensionFileLoader("openvdb", str(file)))
-    return None
 
 
 def _checked(name: str, values: ArrayLike, dimensions: int, first_cell: tuple[int, int, int]) -> Float32Array:
@@ -224,14 +184,7 @@ def _checked(name: str, values: ArrayLike, dimensions: int, first_cell: tuple[in
 def _around(
     drawn: NDArray[np.bool_], wind: Float32Array, *, shutter_s: float, cell_size: float
 ) -> tuple[NDArray[np.bool_], tuple[int, int, int]]:
-    """The cells that smoke may be drawn in: a mask, and the cell of the arrays, maybe outside, that it begins at.
-
-    Args:
-        drawn: where there is smoke or heat.
-        wind: velocity [m/s].
-        shutter_s: how long the shutter is open [s].
-        cell_size: edge of a cell [m].
-    """
+    """The cells that smoke may be drawn in: a mask, and the cell of the arrays, maybe outside, that it begins at."""
     box = bounding_box(drawn)
     if box is None:
         return np.zeros((0, 0, 0), np.bool_), (0, 0, 0)
@@ -250,16 +203,10 @@ def _grid(
     half: bool,
     first_cell: tuple[int, int, int],
 ) -> Any:
-    """Fill a grid with the values to keep; everything else is its background, zero.
+    """Fill an empty grid with the values to keep; everything else is its background, zero.
 
-    Args:
-        grid: an empty one.
-        name: its name.
-        values: by cell.
-        keep: which to keep.
-        keep_from: cell of the values that `keep` begins at; what it has beyond their sides is as at the sides.
-        half: store 16-bit floats, unless a value is beyond them.
-        first_cell: index that cell (0, 0, 0) of the values gets in the grid.
+    `keep` begins at the cell `keep_from` of the values; what it has beyond their sides is as at the sides. Cell (0, 0,
+    0) of the values gets the index `first_cell` in the grid.
     """
     grid.name = name
     largest = 0.0
@@ -277,9 +224,7 @@ def _grid(
 def _parts(keep: NDArray[np.bool_], index: Sequence[int]) -> Iterator[Box]:
     """Boxes that hold all cells to keep: columns along z without the empty space below and above them.
 
-    Args:
-        keep: which cells to keep.
-        index: of cell (0, 0, 0) in the grid. Columns begin where leaves of the tree do, so that none is made twice.
+    Cell (0, 0, 0) has this index in the grid: columns begin where leaves of the tree do, so that none is made twice.
     """
     starts = [range(-(first % _COLUMN), length, _COLUMN) for first, length in zip(index, keep.shape, strict=True)]
     for x, y in itertools.product(*starts[:2]):

@@ -6,29 +6,45 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sim.core.domain import DomainParameters
+from sim.cloth.solver import SOLVER_NAME as CLOTH_NAME
+from sim.cloth.solver import ClothSolver
 from sim.core.solver import Coupling, Solver
 from sim.core.world import World
+from sim.coupling.body_samples import samples_of_moving_bodies
+from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
+from sim.coupling.cloth_fluid import ClothFluidCoupling
 from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
+from sim.coupling.cloth_samples import ClothSamples
 from sim.coupling.fluid_rigid import FluidRigidCoupling
+from sim.coupling.smoke_cloth import SmokeClothCoupling
+from sim.coupling.smoke_fluid import SmokeFluidCoupling
+from sim.coupling.smoke_reach import too_thin_bodies
+from sim.coupling.smoke_rigid import SmokeRigidCoupling
+from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
+from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
+from sim.fluid.discretization import Discretization
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
-from sim.fluid.nozzles import nozzle_collision, pipes
-from sim.fluid.opening import Opening, obstruction
+from sim.fluid.nozzles import opening_problem, pipes
+from sim.fluid.opening import Opening
 from sim.fluid.parameters import shared_conflicts
+from sim.fluid.solvers import SOLVERS
+from sim.fluid.tank import FluidStart
+from sim.rigid.solver import SOLVER_NAME as RIGID_NAME
+from sim.rigid.solver import RigidSolver
+from sim.rigid.start import check_start
 from sim.rigid.static import StaticBody
-from sim.scene import SceneParameters
 from sim.shapes.placement import build_solid
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
+from sim.smoke.solver import SmokeSolver
 
 if TYPE_CHECKING:
-    from sim.cloth.solver import ClothSolver
-    from sim.coupling.cloth_samples import ClothSamples
+    from numpy.typing import NDArray
+
+    from sim.core.domain import DomainParameters
     from sim.fluid.fluid import SPHFluid
-    from sim.rigid.solver import RigidSolver
+    from sim.scene import SceneParameters
     from sim.shapes.solid import Solid
-    from sim.smoke.solver import SmokeSolver
 
 
 def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Sequence[Solver] = ()) -> World:
@@ -43,73 +59,63 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         ShapeError: a shape cannot be built.
         ValueError: a body cannot start as described.
     """
-    bodies = [StaticBody(parameters) for parameters in scene.rigid if parameters.kind == "static"]
+    _refuse_names(scene)
+    static = [StaticBody(parameters) for parameters in scene.rigid if parameters.kind == "static"]
     rigid = _build_rigid(scene)
     cloths = [_build_cloths(scene, frames_per_second)] if scene.cloth else []
-    samples = _sample_cloths(scene, cloths)
-    fluids = [_build_fluids(scene, bodies, rigid, samples)] if scene.fluid else []
-    smokes = [_build_smoke(smoke, scene, bodies) for smoke in scene.smoke]
+    samples = None
+    if cloths and scene.fluid:
+        samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
+    fluids = [_build_fluids(scene, static, rigid, samples)] if scene.fluid else []
+    smokes = [_build_smoke(smoke, scene, static) for smoke in scene.smoke]
     coupled: list[Solver] = [*fluids, *cloths, *([] if rigid is None else [rigid]), *smokes]
     couplings: list[Coupling] = [] if rigid is None else [FluidRigidCoupling(fluid, rigid) for fluid in fluids]
     for cloth in cloths:
         contacts = contacts_of_cloths(cloth, scene.rigid, domain=scene.domain, rigid=rigid)
         cloth.add_contacts(contacts)
         couplings += [] if rigid is None else [ClothRigidCoupling(cloth, rigid, contacts)]
-        if samples is not None:
-            from sim.coupling.cloth_fluid import ClothFluidCoupling
-
-            couplings += [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
+        couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
-    return World([*coupled, *solvers], frames_per_second=frames_per_second, couplings=couplings, static_bodies=bodies)
+    return World([*coupled, *solvers], frames_per_second=frames_per_second, couplings=couplings, static_bodies=static)
 
 
-def _sample_cloths(scene: SceneParameters, cloths: Sequence[ClothSolver]) -> ClothSamples | None:
-    """The samples of all cloths that a fluid feels; None where there is no fluid, or no cloth."""
-    from sim.coupling.cloth_samples import ClothSamples
-
-    if not (cloths and scene.fluid):
-        return None
-    fluid = scene.fluid[0]
-    return ClothSamples.of(cloths[0], fluid.spacing, fluid.support_in_spacings)
+def _refuse_names(scene: SceneParameters) -> None:
+    """Refuse fluids and smokes with the name of a solver for many bodies."""
+    names = {body.name for body in (*scene.fluid, *scene.smoke)}
+    if RIGID_NAME in names and any(body.kind != "static" for body in scene.rigid):
+        raise ValueError(
+            f'"{RIGID_NAME}" is what all moving bodies are called together; name the fluid or smoke otherwise'
+        )
+    if CLOTH_NAME in names and scene.cloth:
+        raise ValueError(f'"{CLOTH_NAME}" is what all cloths are called together; name the fluid or smoke otherwise')
 
 
 def _build_fluids(
-    scene: SceneParameters, bodies: Sequence[StaticBody], rigid: RigidSolver | None, cloth: ClothSamples | None
+    scene: SceneParameters, static: Sequence[StaticBody], rigid: RigidSolver | None, cloth: ClothSamples | None
 ) -> SPHFluid:
     """One solver for all fluids, as they share the tank; of what moves it has the samples."""
-    from sim.coupling.body_samples import samples_of_moving_bodies
-    from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
-    from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
-    from sim.fluid.discretization import Discretization
-    from sim.fluid.solvers import SOLVERS
-    from sim.fluid.tank import FluidStart
-
     if conflicts := shared_conflicts(scene.fluid):
         number, key, message = conflicts[0]
         raise ValueError(f'fluid "{scene.fluid[number].name}": {key} {message}')
     spacing, support = scene.fluid[0].spacing, scene.fluid[0].support_in_spacings
     discretization = Discretization(spacing, support)
     volume = discretization.particle_volume
-    solids = [body.solid for body in bodies]
     movers = [body for body in scene.rigid if body.kind != "static"]
-    moving = [build_solid(body) for body in movers]
-    openings = _build_openings(scene, [*solids, *moving], spacing, volume)
-    around = pipes(openings, spacing)
+    solids = [*(body.solid for body in static), *(build_solid(body) for body in movers)]
+    around = pipes(_build_openings(scene, solids, spacing, volume), spacing)
     sheets = [] if cloth is None else [cloth.start]
-    in_the_way = np.concatenate([NO_POINTS, *around, *sheets])
-    filling = fill_fluids(scene.fluid, scene.domain, [*solids, *moving], in_the_way)
+    filling = fill_fluids(scene.fluid, scene.domain, solids, np.concatenate([NO_POINTS, *around, *sheets]))
     speeds = [] if rigid is None else [expected_body_speed(movers, rigid.solids, scene.domain, scene.gravity)]
     speeds += [] if cloth is None else [expected_cloth_speed(scene.cloth, cloth.start, scene.domain, scene.gravity)]
     samples = [
         sink_samples(
-            _reachable(body.surface_samples(spacing), scene.domain, discretization.support_radius),
+            _reachable(body.solid.surface_samples(spacing), scene.domain, discretization.support_radius),
             body.solid.signed_distance,
             spacing,
             support,
         )
-        for body in bodies
+        for body in static
     ]
-    boundary = BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples, *around)
     start = FluidStart(
         scene.fluid,
         domain=scene.domain,
@@ -117,12 +123,12 @@ def _build_fluids(
         positions=filling.positions,
         velocities=filling.velocities,
         phase=filling.phase,
-        boundary=boundary,
+        boundary=BoundarySamples.of_bodies(domain_wall_samples(scene.domain, spacing, support), *samples, *around),
         moving=BoundarySamples.of_bodies() if rigid is None else samples_of_moving_bodies(rigid, spacing, support),
         sheets=None if cloth is None else cloth.sheets,
-        body_count=len(moving),
+        body_count=len(movers),
         body_speed=max(speeds, default=0.0),
-        capacity=particle_capacity(scene.fluid, scene.domain, filling.count_of(len(scene.fluid)), volume),
+        capacity=particle_capacity(scene.fluid, scene.domain, filling, volume),
     )
     return SOLVERS[scene.fluid[0].solver](start)
 
@@ -134,10 +140,7 @@ def _build_openings(scene: SceneParameters, solids: list[Solid], spacing: float,
         for number, emitter in enumerate(fluid.emitter):
             name = f'fluid "{fluid.name}" emitter[{number}]'
             opening = Opening.of(emitter, spacing, volume, fluid.support_in_spacings)
-            reason = obstruction(opening, spacing, scene.domain, solids)
-            for earlier_name, earlier in openings.items():
-                reason = reason or nozzle_collision(opening, earlier, earlier_name, spacing)
-            if reason:
+            if reason := opening_problem(opening, spacing, scene.domain, solids, openings):
                 raise ValueError(f"{name}: {reason}")
             openings[name] = opening
     return list(openings.values())
@@ -151,16 +154,9 @@ def _reachable(samples: NDArray[np.float32], domain: DomainParameters, margin: f
 
 def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
     """The solver of the bodies that move, if there are any."""
-    from sim.rigid.solver import SOLVER_NAME, RigidSolver
-    from sim.rigid.start import check_start
-
     moving = [body for body in scene.rigid if body.kind != "static"]
     if not moving:
         return None
-    if SOLVER_NAME in {body.name for body in (*scene.fluid, *scene.smoke)}:
-        raise ValueError(
-            f'"{SOLVER_NAME}" is what all moving bodies are called together; name the fluid or smoke otherwise'
-        )
     obstacles = [body for body in scene.rigid if body.kind == "static"]
     solver = RigidSolver(moving, obstacles=obstacles, domain=scene.domain, gravity=scene.gravity)
     check_start(solver)
@@ -169,25 +165,17 @@ def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
 
 def _build_cloths(scene: SceneParameters, frames_per_second: float) -> ClothSolver:
     """One solver for all cloths, as they collide with each other."""
-    from sim.cloth.solver import SOLVER_NAME, ClothSolver
-
-    if SOLVER_NAME in {body.name for body in (*scene.fluid, *scene.smoke)}:
-        raise ValueError(f'"{SOLVER_NAME}" is what all cloths are called together; name the fluid or smoke otherwise')
     return ClothSolver(scene.cloth, domain=scene.domain, gravity=scene.gravity, frames_per_second=frames_per_second)
 
 
-def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, bodies: Sequence[StaticBody]) -> SmokeSolver:
+def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, static: Sequence[StaticBody]) -> SmokeSolver:
     """The solver of one smoke, with static bodies in it, and room for what will move in it."""
-    from sim.coupling.smoke_sources import with_sources_on
-    from sim.smoke.solver import SmokeSolver
-
-    moving = _meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid)
     return SmokeSolver(
         with_sources_on(smoke, scene.rigid),
         domain=scene.domain,
         gravity=scene.gravity,
-        solids=[body.solid for body in bodies],
-        moving=moving,
+        solids=[body.solid for body in static],
+        moving=_meets_fluid(smoke, scene) or any(body.kind != "static" for body in scene.rigid),
     )
 
 
@@ -206,12 +194,6 @@ def _couple_smokes(
     rigid: RigidSolver | None,
 ) -> list[Coupling]:
     """Each smoke with what is in its way, which is put there, and with what hangs in it."""
-    from sim.coupling.smoke_cloth import SmokeClothCoupling
-    from sim.coupling.smoke_fluid import SmokeFluidCoupling
-    from sim.coupling.smoke_reach import too_thin_bodies
-    from sim.coupling.smoke_rigid import SmokeRigidCoupling
-    from sim.coupling.smoke_sources import SmokeSourcesOnBodies
-
     couplings: list[Coupling] = []
     moving = [body for body in scene.rigid if body.kind != "static"]
     for number, smoke in enumerate(smokes):

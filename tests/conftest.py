@@ -1,4 +1,4 @@
-"""What makes all tests quick: bytecode that outlives processes, kernels found again, families that stay together."""
+"""What makes all tests quick: bytecode that outlives processes, families of tests that stay together."""
 
 import os
 import sys
@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-FAMILIES = {"cloth": "cloth", "coupling": "fluid", "fluid": "fluid", "rigid": "rigid", "smoke": "smoke"}
-"""Folders of tests/sim whose tests share kernels, and a name for those that share them."""
 
 VALIDATION_CASES = "tests/validation/test_validation_cases.py"
 """Of all solvers, and long: a family of its own."""
@@ -20,14 +17,8 @@ FILMS = {f"tests/acceptance/test_{name}.py" for name in ("end_to_end", "faults",
 ON_THEIR_OWN = {"tests/acceptance/test_sample_jobs.py"}
 """Files of long tests that share nothing; they fill up whichever process is done first."""
 
-ORDER = ("smoke", "fluid", "validation", "cloth", "films", "rigid")
-"""Families that begin before all others, the longest first, so that none is left for the end of one process alone.
-
-The first three, with which CI's three processes begin, hold every test of smoke, whose kernels read fields. Taichi
-numbers the fields of a process, and looks for kept kernels by these numbers: tests that always come first, and in the
-same order, find theirs again. And a process has room for some hundred solvers with fields
-(`sim.core.runtime.require_room_for_fields`): they are several families for that.
-"""
+ORDER = ("smoke", "fluid", "validation", "cloth", "coupling", "films", "rigid")
+"""Families that begin before all others, the longest first, so that none is left for the end of one process alone."""
 
 
 def bytecode_folder() -> Path:
@@ -52,7 +43,7 @@ if sys.dont_write_bytecode:
 
 
 def family_of(nodeid: str) -> str:
-    """What `pytest -n 2 --dist loadfile` gives to one process: files, but families that share kernels or a film."""
+    """What `--dist loadfile` gives to one process: a folder of tests/sim, the tests of a film, or a file."""
     path = nodeid.partition("::")[0]
     if path in ON_THEIR_OWN:
         return nodeid
@@ -61,8 +52,7 @@ def family_of(nodeid: str) -> str:
     if path == VALIDATION_CASES:
         return "validation"
     folders = path.split("/")[:-1]
-    is_kin = len(folders) == 3 and folders[:2] == ["tests", "sim"] and folders[2] in FAMILIES
-    return FAMILIES[folders[2]] if is_kin else path
+    return folders[2] if len(folders) == 3 and folders[:2] == ["tests", "sim"] else path
 
 
 def in_order_of_families(nodeids: list[str]) -> list[str]:

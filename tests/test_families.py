@@ -21,12 +21,6 @@ def test_every_file_that_is_named_is_there(path):
     assert path in FILES
 
 
-def test_all_smoke_is_in_the_three_families_that_begin():
-    smoke = [path for path in FILES if path.startswith("tests/sim/") and "smoke" in path]
-    families = {family_of(f"{path}::test") for path in (*smoke, CONFTEST["VALIDATION_CASES"])}
-    assert families == set(CONFTEST["ORDER"][:3])
-
-
 def test_families_stay_together_and_begin_with_those_that_are_named_and_then_with_the_largest():
     nodeids = [
         "tests/acceptance/test_sample_jobs.py::test_b",

@@ -14,7 +14,8 @@ import click
 
 from sim.core.runtime import initialize
 from validation.cases import CASES, load_case
-from validation.page import FOLDER, TITLES, keep_figure, keep_result, load_results, update_page
+from validation.checks import TITLES
+from validation.page import FOLDER, keep_figure, keep_result, load_results, update_page
 
 
 @click.command(help=__doc__.replace("\n\n", "\n\n\b\n"))

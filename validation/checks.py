@@ -9,29 +9,31 @@ from typing import Any
 
 import numpy as np
 
-SIGNIFICANT_DIGITS = 6
-"""Of the numbers that are written: more than any tolerance here asks for, few enough to read."""
+TITLES = {
+    "wcsph": "WCSPH",
+    "dfsph": "DFSPH",
+    "pcisph": "PCISPH",
+    "rigid": "value",
+    "cloth": "value",
+    "smoke": "value",
+    "maccormack": "MacCormack",
+    "semi_lagrangian": "semi-Lagrangian",
+}
+"""Of solvers, in the order of the page; "value" where the solvers share the code."""
+
+SIGNIFICANT_DIGITS = 6  # of the numbers that are written: more than any tolerance here asks for, few enough to read
 
 
 @dataclass(frozen=True)
 class Check:
-    """One number against what it should be.
+    """One number against what it should be."""
 
-    Attributes:
-        name: what is compared, in words.
-        value: what came out.
-        expected: what theory or experiment says; 0 for an error that is bounded.
-        tolerance: largest |value - expected| that passes.
-        reason: why this much and no more.
-        unit: of all three numbers; "-" for ratios.
-    """
-
-    name: str
-    value: float
-    expected: float
-    tolerance: float
-    reason: str
-    unit: str = "-"
+    name: str  # what is compared, in words
+    value: float  # what came out
+    expected: float  # what theory or experiment says; 0 for an error that is bounded
+    tolerance: float  # largest |value - expected| that passes
+    reason: str  # why this much and no more
+    unit: str = "-"  # of all three numbers; "-" for ratios
 
     @property
     def holds(self) -> bool:
@@ -46,25 +48,15 @@ class Check:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What one solver made of one case.
+    """What one solver made of one case."""
 
-    Attributes:
-        case: name of the case.
-        solver: "wcsph", "dfsph" or "pcisph"; "rigid" where no fluid is in it, "all" where the solvers share the code.
-        settings: what was computed: sizes, resolutions, durations, in SI units.
-        checks: the numbers.
-        series: curves for the figure, by name.
-        seconds: time that it took [s], on a machine that other work shares.
-        device: what Taichi ran on.
-    """
-
-    case: str
-    solver: str
-    settings: Mapping[str, Any]
-    checks: Sequence[Check]
-    series: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    seconds: float = 0.0
-    device: str = "cpu"
+    case: str  # name of the case
+    solver: str  # "wcsph", "dfsph" or "pcisph"; "rigid" where no fluid is in it, "all" where the solvers share the code
+    settings: Mapping[str, Any]  # what was computed: sizes, resolutions, durations, in SI units
+    checks: Sequence[Check]  # the numbers
+    series: Mapping[str, Sequence[float]] = field(default_factory=dict)  # curves for the figure, by name
+    seconds: float = 0.0  # time that it took [s], on a machine that other work shares
+    device: str = "cpu"  # what Taichi ran on
 
     @property
     def failures(self) -> list[str]:
@@ -73,8 +65,7 @@ class CaseResult:
 
     def as_json(self) -> dict[str, Any]:
         """Plain data, numbers rounded."""
-        plain: dict[str, Any] = _rounded(asdict(self))
-        return plain
+        return _rounded(asdict(self))
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> CaseResult:

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-CERTAIN = 1.0e-12
-"""A determinant larger than this, over the product of the lengths that go into it, has the sign that float64 says."""
+CERTAIN = 1.0e-12  # above it, over the product of the lengths in it, a determinant has the sign of float64
 
 
 def edges_of_triangles(triangles: NDArray[np.integer]) -> NDArray[np.int64]:

@@ -9,28 +9,11 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from validation.checks import CaseResult
+from validation.checks import TITLES, CaseResult
 
-COLOURS = {
-    "wcsph": "#2a6fbb",
-    "dfsph": "#d1652b",
-    "pcisph": "#2f8f5b",
-    "rigid": "#2a6fbb",
-    "cloth": "#2a6fbb",
-    "maccormack": "#2a6fbb",
-    "semi_lagrangian": "#d1652b",
-}
-TITLES = {
-    "wcsph": "WCSPH",
-    "dfsph": "DFSPH",
-    "pcisph": "PCISPH",
-    "rigid": "rigid body",
-    "cloth": "cloth",
-    "maccormack": "MacCormack",
-    "semi_lagrangian": "semi-Lagrangian",
-}
 THEORY = "#222222"
 SHADES = ("#2a6fbb", "#d1652b", "#2f8f5b", "#8a5fb0")
+COLOURS = {**dict.fromkeys(TITLES, SHADES[0]), "dfsph": SHADES[1], "pcisph": SHADES[2], "semi_lagrangian": SHADES[1]}
 
 mpl.rcParams.update(
     {
@@ -99,17 +82,7 @@ def draw_refinement(
     title: str = "refinement",
     tick: Callable[[float], str] = lambda spacing: f"1/{round(1 / spacing)}",
 ) -> None:
-    """Errors over spacings beside a dashed line of an order.
-
-    Args:
-        axes: the panel.
-        curves: spacings, errors and style of each.
-        order: of the line, which begins at the largest error of the first curve.
-        x: name of the axis.
-        y: name of the axis.
-        title: of the panel.
-        tick: how a spacing is written.
-    """
+    """Curves of spacings, errors and a style beside a dashed line of an order; `tick` writes a spacing."""
     for spacings, errors, style in curves:
         axes.loglog(spacings, errors, **{"linestyle": "-", "marker": "o", "markersize": 4, **style})
     everywhere = sorted({spacing for spacings, _, _ in curves for spacing in spacings}, reverse=True)

@@ -8,21 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from validation.cases import CASES, load_case
-from validation.checks import CaseResult, Check
+from validation.checks import TITLES, CaseResult, Check
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "validation"
 PAGE = "README.md"
-
-TITLES = {
-    "wcsph": "WCSPH",
-    "dfsph": "DFSPH",
-    "pcisph": "PCISPH",
-    "rigid": "value",
-    "cloth": "value",
-    "smoke": "value",
-    "maccormack": "MacCormack",
-    "semi_lagrangian": "semi-Lagrangian",
-}
 
 DEVICES = {"cpu": "a CPU", "cuda": "a GPU"}
 
@@ -67,11 +56,7 @@ def update_page(folder: Path) -> None:
 
 
 def with_tables(text: str, folder: Path = FOLDER) -> str:
-    """The page with its tables made from the kept results.
-
-    Raises:
-        KeyError: the page names a case that does not exist.
-    """
+    """The page with its tables made from the kept results. Raises KeyError where it names a case that there is not."""
 
     def table(match: re.Match[str]) -> str:
         name = match["case"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -18,18 +19,14 @@ if TYPE_CHECKING:
 
 FLUID_SOLVERS = ("wcsph", "dfsph", "pcisph")
 
-GRAVITY, WATER = 9.81, 1000.0
-"""[m/s²], and the density of water [kg/m³]."""
+GRAVITY, WATER = 9.81, 1000.0  # [m/s²], and the density of water [kg/m³]
 
 EARTH, WEIGHTLESS = (0.0, 0.0, -GRAVITY), (0.0, 0.0, 0.0)
 EVERY_FACE = ("x-", "x+", "y-", "y+", "z-", "z+")
 HALL = DomainParameters(min=(-5.0, -5.0, 0.0), max=(5.0, 5.0, 10.0))
 
-SPACING = 0.02
-"""Of the particles around bodies that are validated in water [m]."""
-
-SIDE_IN_RADII = 6.0
-"""Of the tank with a sphere in it, and the depth of its water."""
+SPACING = 0.02  # of the particles around bodies that are validated in water [m]
+SIDE_IN_RADII = 6.0  # of the tank with a sphere in it, and the depth of its water
 
 Vectors = NDArray[np.float32]
 Curve = NDArray[np.float64]
@@ -78,6 +75,18 @@ def advance(solver: Steppable, duration: float, *, cuts: int = 1) -> Iterator[fl
         yield cut * part
 
 
+def recorded(
+    solver: Steppable, duration: float, *, cuts: int, start: bool = False, **quantities: Callable[[], float]
+) -> dict[str, list[float]]:
+    """Quantities after each of so many equal parts of a duration [s], and `times` [s]; with those at the start."""
+    found: dict[str, list[float]] = {name: [] for name in ("times", *quantities)}
+    for time in chain([0.0] if start else [], advance(solver, duration, cuts=cuts)):
+        found["times"].append(time)
+        for name, quantity in quantities.items():
+            found[name].append(float(quantity()))
+    return found
+
+
 def lattice(low: Sequence[float], high: Sequence[float], spacing: float) -> Vectors:
     """Cubic lattice that fills a box, half a spacing from its faces, (n, 3) [m]."""
     counts = [round((b - a) / spacing) for a, b in zip(low, high, strict=True)]
@@ -102,17 +111,9 @@ def make_fluid(
     coupled: Mapping[str, Any] | None = None,
     **parameters: Any,
 ) -> SPHFluid:
-    """A fluid of given particles between the walls of a domain.
+    """A fluid of given particles between the walls of a domain, at rest without velocities.
 
-    Args:
-        solver: its name in a job.
-        domain: whose closed faces are walls.
-        positions: of the particles [m], (n, 3).
-        spacing: of the particles [m].
-        velocities: of the particles [m/s], (n, 3); at rest without.
-        gravity: [m/s²].
-        coupled: what the solver is told of bodies that move.
-        parameters: of the material, where it is not the default water.
+    `coupled` are fields of `FluidStart` on bodies that move, `parameters` those of a material other than water.
     """
     from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
     from sim.fluid.parameters import FluidParameters
@@ -154,13 +155,14 @@ def momentum_drifts(
     cuts: int,
 ) -> dict[str, list[float]]:
     """Change of the linear and the angular momentum over their scales, while a solver advances by a duration [s]."""
-    start = totals()
-    drifts: dict[str, list[float]] = {"times": [], "linear": [], "angular": []}
-    for time in advance(solver, duration, cuts=cuts):
-        drifts["times"].append(time)
-        for name, now, before, scale in zip(("linear", "angular"), totals(), start, scales, strict=True):
-            drifts[name].append(float(np.abs(now - before).max()) / scale)
-    return drifts
+    linear, angular = totals()
+    return recorded(
+        solver,
+        duration,
+        cuts=cuts,
+        linear=lambda: float(np.abs(totals()[0] - linear).max()) / scales[0],
+        angular=lambda: float(np.abs(totals()[1] - angular).max()) / scales[1],
+    )
 
 
 def body(name: str, shape: dict[str, Any], **parameters: Any) -> RigidBodyParameters:
@@ -204,18 +206,7 @@ class Tank:
         velocity: Sequence[float] = (0.0, 0.0, 0.0),
         **material: float,
     ) -> None:
-        """Fill the tank around the bodies.
-
-        Args:
-            solver: of the fluid.
-            bodies: dynamic or kinematic.
-            domain: the tank.
-            depth: of the water before the bodies displace some [m].
-            gravity: [m/s²].
-            block: two corners of the water [m], where it does not fill the tank.
-            velocity: of the water [m/s].
-            material: of the fluid, where it is not the default.
-        """
+        """Fill the tank around the bodies, up to a depth [m] or between two corners of a block [m]."""
         from sim.coupling.body_samples import samples_of_moving_bodies
         from sim.coupling.body_speed import expected_body_speed
         from sim.coupling.fluid_rigid import FluidRigidCoupling
@@ -234,9 +225,15 @@ class Tank:
             "body_speed": expected_body_speed(bodies, self.rigid.solids, domain, gravity),
         }
         self.fluid = make_fluid(
-            solver, domain, points, spacing=SPACING, velocities=np.broadcast_to(np.float32(velocity), points.shape),
-            gravity=gravity, coupled=coupled, **material,
-        )  # fmt: skip
+            solver,
+            domain,
+            points,
+            spacing=SPACING,
+            velocities=np.broadcast_to(np.float32(velocity), points.shape),
+            gravity=gravity,
+            coupled=coupled,
+            **material,
+        )
         self.coupling = FluidRigidCoupling(self.fluid, self.rigid)
 
     def stable_dt(self) -> float:
@@ -260,20 +257,13 @@ class Tank:
         inside = 0
         for number, turned in enumerate(self.rigid.bodies.rotation()):
             in_body = (position - self.rigid.bodies.position[number]) @ turned
-            distance = self.rigid.signed_distance_in_body_frame(number)(in_body)
+            distance = self.rigid.solids[number].signed_distance(in_body)
             inside += int((distance < -0.1 * self.fluid.spacing).sum())
-        return inside + self.fluid.particles_removed
+        return inside + self.fluid.tank.removed
 
 
 def submerged_sphere(solver: str, density: float | None, radius: float, **material: float) -> Tank:
-    """A sphere in the middle of a cube of water.
-
-    Args:
-        solver: of the fluid.
-        density: of the sphere [kg/m³]; without one it is held for good.
-        radius: of the sphere [m].
-        material: of the water, where it is not the default.
-    """
+    """A sphere of a radius [m] and a density [kg/m³], without which it is held, in the middle of a cube of water."""
     side = SIDE_IN_RADII * radius
     kind = {"kind": "kinematic"} if density is None else {"density": density}
     sphere = body("sphere", {"type": "sphere", "radius": radius}, position=(0.0, 0.0, side / 2.0), **kind)

@@ -20,12 +20,10 @@ Array = NDArray[np.float64]
 Flow = Callable[[Array], Array]
 """Velocities [m/s], (n, 3), at positions [m], (n, 3)."""
 
-AMBIENT = 293.0
-"""Temperature of the air [K]."""
+AMBIENT = 293.0  # temperature of the air [K]
 
 FACES = ("u_face_x", "v_face_y", "w_face_z")
-NEVER_S = 1.0e6
-"""When a source starts that must not emit: a smoke has one at least [s]."""
+NEVER_S = 1.0e6  # when a source starts that must not emit: a smoke has one at least [s]
 
 
 def build_box(
@@ -43,10 +41,9 @@ def build_box(
     size = tuple(n * cell_size for n in cells)
     middle = tuple(0.5 * edge for edge in size)
     idle = {"shape": {"type": "box", "size": size}, "position": middle, "start_s": NEVER_S}
-    parameters = {
-        "name": "air", "min": (0.0, 0.0, 0.0), "max": size, "cell_size": cell_size, "source": [idle],
-        "open_faces": (), "vorticity_confinement": 0.0, "cooling": 0.0, "advection": advection, **keys,
-    }  # fmt: skip
+    box = {"name": "air", "min": (0.0, 0.0, 0.0), "max": size, "cell_size": cell_size, "source": [idle]}
+    still = {"open_faces": (), "vorticity_confinement": 0.0, "cooling": 0.0, "advection": advection}
+    parameters = {**box, **still, **keys}
     return SmokeSolver(
         SmokeParameters.model_validate(parameters), domain=DomainParameters(), gravity=gravity, solids=solids
     )
@@ -54,14 +51,14 @@ def build_box(
 
 def warm_box(n: int, advection: Advection, *, height: float = 1.0, **keys: Any) -> SmokeSolver:
     """Air whose warm parts rise, in a box of a metre, n cells across and closed unless `keys` say otherwise."""
-    return build_box((n, n, round(height * n)), 1.0 / n, advection=advection, gravity=EARTH,
-                     buoyancy_temperature=GRAVITY / AMBIENT, **keys)  # fmt: skip
+    cells, buoyancy = (n, n, round(height * n)), {"buoyancy_temperature": GRAVITY / AMBIENT}
+    return build_box(cells, 1.0 / n, advection=advection, gravity=EARTH, **buoyancy, **keys)
 
 
 def ball_source(height: float, radius: float, warmer: float, end: float) -> dict[str, Any]:
     """A ball that emits evenly until some time [s], so high over the middle of the floor and so much warmer [K]."""
-    return {"shape": {"type": "sphere", "radius": radius}, "position": (0.5, 0.5, height), "fluctuation": 0.0,
-            "temperature": AMBIENT + warmer, "end_s": end}  # fmt: skip
+    ball = {"shape": {"type": "sphere", "radius": radius}, "position": (0.5, 0.5, height)}
+    return {**ball, "fluctuation": 0.0, "temperature": AMBIENT + warmer, "end_s": end}
 
 
 def set_flow(solver: SmokeSolver, flow: Flow, **cell_fields: Array) -> None:

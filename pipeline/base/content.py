@@ -12,8 +12,7 @@ from blake3 import blake3
 
 from pipeline.base.errors import MissingInputError
 
-ABSENT = "absent"
-"""Version of a package that is not installed."""
+ABSENT = "absent"  # version of a package that is not installed
 
 
 @cache
@@ -28,12 +27,7 @@ def tool_version(package: str) -> str:
 def content_name(file: str, kind: str) -> str:
     """Hash and suffix of a file of the user's, for the suffix decides how the file is read.
 
-    Args:
-        file: its path.
-        kind: what it is, for messages: "mesh".
-
-    Raises:
-        MissingInputError: it cannot be read.
+    `kind` is what it is, for messages: "mesh". Raises MissingInputError if it cannot be read.
     """
     status = status_of(file, kind)
     return _hash(file, kind, status.st_size, status.st_mtime_ns) + Path(file).suffix.lower()

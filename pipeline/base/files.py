@@ -9,18 +9,14 @@ from pathlib import Path
 from uuid import uuid4
 
 
-def replace_durably(path: Path, content: str | bytes) -> None:
+def replace_durably(path: Path, content: str | bytes, *, mark: str = "part") -> None:
     """Write a file aside, force it to the disk and rename it: others see the old one or the new one, never a part.
 
-    Args:
-        path: the file; its folder is there.
-        content: what it is to hold; text is written as UTF-8.
-
-    Raises:
-        OSError: it cannot be written, as on a full disk; the old file stands then, and nothing is left beside it.
+    Text is written as UTF-8. Where it cannot be written, as on a full disk, the old file stands, and nothing is left
+    beside it. `mark` is in the name aside: runners remove what others have left behind as "part".
     """
     # Workers write the same text at once, and in containers they have the same process ids.
-    part = path.with_name(f".{path.name}.part.{uuid4().int}")
+    part = path.with_name(f".{path.name}.{mark}.{uuid4().int}")
     try:
         part.write_bytes(content.encode() if isinstance(content, str) else content)
         sync(part)
@@ -32,11 +28,7 @@ def replace_durably(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside this one, of the same suffix, to write to; takes its place at the end of a block without an error.
-
-    Raises:
-        OSError: the folder cannot be made, or the file cannot be moved.
-    """
+    """A path beside this one, of the same suffix, to write to; takes its place when the block ends without an error."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:

@@ -17,12 +17,7 @@ _quoted = encode_basestring_ascii
 def task_fingerprint(task: Task, hashes: Mapping[ArtifactPath, str]) -> str:
     """Digest of everything that decides what a task's outputs hold.
 
-    Args:
-        task: the task.
-        hashes: content hash of each of its inputs; more may be in it.
-
-    Raises:
-        KeyError: an input has no hash yet.
+    `hashes` are those of its inputs' contents, and maybe of more files. Raises KeyError if an input has none.
     """
     # As json.dumps(..., separators=(",", ":")) writes [digest, [[path, hash], ...]], in a third of its time.
     inputs = ",".join([f"[{_quoted(path)},{_quoted(hashes[path])}]" for path in task.inputs])

@@ -3,10 +3,39 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.base.task import ArtifactPath, TaskId
+
+
+class _Below:
+    """A path right below a job's folder, of the same name in every job."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, layout: JobLayout, _owner: type[JobLayout]) -> Path:
+        return layout.root / self._name
+
+
+def _of_frame(folder: str, suffix: str) -> Callable[[int], ArtifactPath]:
+    """Where the artifacts of frames lie that share a folder, by the frame."""
+
+    def path(frame: int) -> ArtifactPath:
+        return ArtifactPath(f"{folder}/{frame:06d}{suffix}")
+
+    return path
+
+
+def _of_body(folder: str, suffix: str) -> Callable[[str, int], ArtifactPath]:
+    """Where the artifacts of bodies at a frame lie, by body and frame."""
+
+    def path(body: str, frame: int) -> ArtifactPath:
+        return JobLayout.product(folder, body, frame, suffix)
+
+    return path
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,44 +45,26 @@ class JobLayout:
     root: Path
 
     # --- files of the job itself ---
-    @property
-    def job_file(self) -> Path:
-        """The job as submitted, overrides applied."""
-        return self.root / "job.toml"
+    job_file = _Below("job.toml")  # as submitted, overrides applied
+    goal = _Below("goal.json")  # the stages after which the job ends; not there if it ends with the film
+    recording_story = _Below("take.json")  # of a recording of `pipeline live`; its end adds the number of frames
+    manifest = _Below("manifest.db")  # the record of every task
+    lease = _Below("runner.lease")  # lock file with the process that runs this job
+    receipts = _Below(".receipts")
+    provenance = _Below(".provenance")  # texts that receipts name by their digests
+    report = _Below("report.html")
+    preview_movie = _Below("movie-so-far.mp4")  # of the pictures that are there, while there is no whole film
+    preview_scratch = _Below(".so-far")  # what the preview movie is made of, while a run makes it
+    stills = _Below("stills")  # single frames drawn with other settings than the film's; no artifacts
+    inputs = _Below("inputs")  # copies of the user's own files, such as meshes
+    checkpoints = _Below("cache/checkpoints")
 
-    @property
-    def goal(self) -> Path:
-        """The stages after which the job ends; not there if it ends with the film."""
-        return self.root / "goal.json"
-
-    @property
-    def take_story(self) -> Path:
-        """Description of a recording of `pipeline live`, beside its job file; its end adds the number of frames."""
-        return self.root / "take.json"
-
-    @property
-    def manifest(self) -> Path:
-        """The record of every task."""
-        return self.root / "manifest.db"
-
-    @property
-    def lease(self) -> Path:
-        """Lock file with the process that runs this job."""
-        return self.root / "runner.lease"
+    poses = "poses/{frame}.json"  # poses of the moving bodies at a frame, for Blender: path relative to the folder
+    views = "views/{frame}.json"  # pose of a moving camera at a frame, for Blender: path relative to the folder
 
     def is_of_lease(self, path: Path) -> bool:
         """Whether a path is the lease or its guard."""
         return path.parent == self.root and self.lease.name in path.name
-
-    @property
-    def receipts(self) -> Path:
-        """Folder of all receipts."""
-        return self.root / ".receipts"
-
-    @property
-    def provenance(self) -> Path:
-        """Folder of the texts that receipts name by their digests."""
-        return self.root / ".provenance"
 
     def job_text(self, digest: str) -> Path:
         """A job file that artifacts were made from."""
@@ -75,60 +86,22 @@ class JobLayout:
         """Path of an artifact."""
         return self.root / artifact
 
-    @property
-    def report(self) -> Path:
-        """Report of timings and solvers, for people."""
-        return self.root / "report.html"
-
-    @property
-    def preview_movie(self) -> Path:
-        """A small film of the pictures that are there, while there is no whole one; no artifact."""
-        return self.root / "movie-so-far.mp4"
-
-    @property
-    def preview_scratch(self) -> Path:
-        """Folder of what the preview movie is made of, while a run makes it."""
-        return self.root / ".so-far"
-
-    @property
-    def stills(self) -> Path:
-        """Folder of single frames drawn otherwise than the film's; no artifacts."""
-        return self.root / "stills"
-
-    @property
-    def inputs(self) -> Path:
-        """Copies of the user's own files, such as meshes."""
-        return self.root / "inputs"
-
-    @property
-    def poses(self) -> str:
-        """Poses of the moving bodies at a frame, for Blender: path relative to the folder, with {frame}."""
-        return "poses/{frame}.json"
-
-    @property
-    def views(self) -> str:
-        """Pose of a moving camera at a frame, for Blender: path relative to the folder, with {frame}."""
-        return "views/{frame}.json"
-
     def rejected_picture(self, frame: int) -> Path:
         """A picture that failed its checks twice, kept to be looked at."""
         return self.root / "rejected" / f"{frame:06d}.png"
 
-    @property
-    def checkpoints(self) -> Path:
-        """Folder of the simulation's checkpoints."""
-        return self.root / "cache" / "checkpoints"
-
     # --- artifacts ---
     @staticmethod
-    def frame_cache(frame: int) -> ArtifactPath:
-        """HDF5 snapshot of every body at one frame."""
-        return ArtifactPath(f"cache/{frame:06d}.h5")
+    def product(folder: str, body: str, frame: int, suffix: str) -> ArtifactPath:
+        """File of a body at one frame, for the renderer."""
+        return ArtifactPath(f"{folder}/{body}/{frame:06d}{suffix}")
 
-    @staticmethod
-    def frame_bounds(frame: int) -> ArtifactPath:
-        """Bounds of the bodies of one frame."""
-        return ArtifactPath(f"bounds/{frame:06d}.json")
+    frame_cache = staticmethod(_of_frame("cache", ".h5"))  # HDF5 snapshot of every body
+    frame_bounds = staticmethod(_of_frame("bounds", ".json"))
+    picture = staticmethod(_of_frame("frames", ".png"))
+    master = staticmethod(_of_frame("frames", ".exr"))  # rendered frame in linear light, with its passes
+    surface = staticmethod(_of_body("surfaces", ".ply"))
+    whitewater = staticmethod(_of_body("whitewater", ".ply"))  # points of a fluid's spray, foam and bubbles
 
     @staticmethod
     def film_bounds() -> ArtifactPath:
@@ -139,41 +112,6 @@ class JobLayout:
     def body_mesh(body: str, part: str = "body") -> ArtifactPath:
         """PLY mesh of a rigid body, or of a part of it, in its rest pose."""
         return ArtifactPath(f"meshes/{body}.ply" if part == "body" else f"meshes/{body}.{part}.ply")
-
-    @staticmethod
-    def product(folder: str, body: str, frame: int, suffix: str) -> ArtifactPath:
-        """File of a body at one frame, for the renderer."""
-        return ArtifactPath(f"{folder}/{body}/{frame:06d}{suffix}")
-
-    @staticmethod
-    def surface(body: str, frame: int) -> ArtifactPath:
-        """PLY surface of a fluid at one frame."""
-        return ArtifactPath(f"surfaces/{body}/{frame:06d}.ply")
-
-    @staticmethod
-    def volume(body: str, frame: int) -> ArtifactPath:
-        """OpenVDB volume of a smoke at one frame."""
-        return ArtifactPath(f"volumes/{body}/{frame:06d}.vdb")
-
-    @staticmethod
-    def whitewater(body: str, frame: int) -> ArtifactPath:
-        """PLY points of a fluid's spray, foam and bubbles at one frame."""
-        return ArtifactPath(f"whitewater/{body}/{frame:06d}.ply")
-
-    @staticmethod
-    def cloth(body: str, frame: int) -> ArtifactPath:
-        """PLY mesh of a cloth at one frame."""
-        return ArtifactPath(f"cloths/{body}/{frame:06d}.ply")
-
-    @staticmethod
-    def picture(frame: int) -> ArtifactPath:
-        """Rendered frame."""
-        return ArtifactPath(f"frames/{frame:06d}.png")
-
-    @staticmethod
-    def master(frame: int) -> ArtifactPath:
-        """Rendered frame in linear light, with its passes."""
-        return ArtifactPath(f"frames/{frame:06d}.exr")
 
     @staticmethod
     def segment(index: int, suffix: str = ".mp4") -> ArtifactPath:

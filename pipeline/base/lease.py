@@ -29,10 +29,10 @@ from typing import Self
 
 import psutil
 
+from pipeline.base import wording
 from pipeline.base.errors import NO_LOCKS, JobBusyError, LeaseLostError, PipelineError
 
-HEARTBEAT_INTERVAL_S = 5.0
-"""How often a holder says that it is alive."""
+HEARTBEAT_INTERVAL_S = 5.0  # how often a holder says that it is alive
 
 EXPIRY_S = 60.0
 """Age of the heartbeat at which a holder on another machine counts as dead: a dozen heartbeats missed in a row."""
@@ -40,25 +40,15 @@ EXPIRY_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class LeaseHolder:
-    """The process that holds a lease.
-
-    Attributes:
-        host: name of its machine.
-        boot_id: identifies that machine's last start.
-        pid_namespace: identifies the set of processes in which `pid` means something; containers have their own.
-        pid: its process number.
-        process_start: when it started, as the kernel counts; with `pid` it identifies the process.
-        token: unique to this lease.
-        acquired: wall time [s since the epoch].
-    """
+    """The process that holds a lease."""
 
     host: str
-    boot_id: str
-    pid_namespace: str
+    boot_id: str  # of the machine's last start
+    pid_namespace: str  # the set of processes in which `pid` means something; containers have their own
     pid: int
-    process_start: str
-    token: str
-    acquired: float
+    process_start: str  # as the kernel counts; with `pid` it identifies the process
+    token: str  # unique to this lease
+    acquired: float  # wall time [s since the epoch]
 
     @classmethod
     def this_process(cls) -> LeaseHolder:
@@ -94,19 +84,15 @@ class Lease:
         self.takeover = takeover
 
     @classmethod
-    def acquire(cls, path: Path, *, expiry_s: float = EXPIRY_S) -> Self:
-        """Take the lease.
-
-        Args:
-            path: the lease's file, such as `JobLayout.lease`; its folder is there.
-            expiry_s: age of the heartbeat at which a holder on another machine counts as dead [s].
+    def acquire(cls, path: Path) -> Self:
+        """Take the lease of this file, whose folder is there.
 
         Raises:
             JobBusyError: a live process holds it.
             PipelineError: the file system has no locks.
         """
         try:
-            return cls(path, *_take(path, expiry_s))
+            return cls(path, *_take(path))
         except OSError as error:
             if error.errno not in NO_LOCKS:
                 raise
@@ -115,8 +101,7 @@ class Lease:
     def heartbeat(self) -> None:
         """Say that the holder is alive; inside the context a thread does, every HEARTBEAT_INTERVAL_S.
 
-        Raises:
-            LeaseLostError: somebody has taken the job over. Stop at once, and write no record any more.
+        Raises LeaseLostError: somebody has taken the job over. Stop at once, and write no record any more.
         """
         with _guard(self._path):
             if not self._is_mine():
@@ -129,8 +114,7 @@ class Lease:
     def check(self) -> None:
         """Make sure that the lease was still ours at the last heartbeat; costs nothing.
 
-        Raises:
-            LeaseLostError: see `heartbeat`.
+        Raises LeaseLostError: see `heartbeat`.
         """
         if self._loss is not None:
             raise self._loss
@@ -174,13 +158,13 @@ class Lease:
             self.release()
 
 
-def _take(path: Path, expiry_s: float) -> tuple[LeaseHolder, str | None]:
+def _take(path: Path) -> tuple[LeaseHolder, str | None]:
     """Write this process's name into a lease's file, unless a live one's is there; see `Lease.acquire`."""
     with _guard(path) as now_s:
         takeover = None
         if path.exists():
             holder = read_holder(path)
-            evidence = _evidence_of_death(holder, age_s=now_s - path.stat().st_mtime, expiry_s=expiry_s)
+            evidence = _evidence_of_death(holder, age_s=now_s - path.stat().st_mtime)
             if evidence is None:
                 assert holder is not None
                 raise busy_error(path, holder)
@@ -200,7 +184,7 @@ def read_holder(path: Path) -> LeaseHolder | None:
         return None
 
 
-def live_holder(path: Path, *, expiry_s: float = EXPIRY_S) -> LeaseHolder | None:
+def live_holder(path: Path) -> LeaseHolder | None:
     """The live process that holds a lease, or None: for `status`, which changes nothing.
 
     The heartbeat's age is taken by this machine's clock here.
@@ -210,7 +194,7 @@ def live_holder(path: Path, *, expiry_s: float = EXPIRY_S) -> LeaseHolder | None
         age_s = time.time() - path.stat().st_mtime
     except FileNotFoundError:
         return None
-    return holder if _evidence_of_death(holder, age_s=age_s, expiry_s=expiry_s) is None else None
+    return holder if _evidence_of_death(holder, age_s=age_s) is None else None
 
 
 def refuse_if_held(path: Path) -> None:
@@ -222,9 +206,8 @@ def refuse_if_held(path: Path) -> None:
 
 def busy_error(path: Path, holder: LeaseHolder) -> JobBusyError:
     """The error that says who runs what this lease is about."""
-    return JobBusyError(
-        f"{path.parent} is being run already, by process {holder.pid} on {holder.host} since {_clock(holder.acquired)}"
-    )
+    since = wording.moment(holder.acquired)
+    return JobBusyError(f"{path.parent} is being run already, by {_describe(holder)} since {since}")
 
 
 def remove_guard(path: Path) -> None:
@@ -234,19 +217,20 @@ def remove_guard(path: Path) -> None:
             _guard_file(path).unlink()
 
 
-def _evidence_of_death(holder: LeaseHolder | None, *, age_s: float, expiry_s: float) -> str | None:
+def _evidence_of_death(holder: LeaseHolder | None, *, age_s: float) -> str | None:
     """Why the holder counts as dead, or None if it may be alive."""
     if holder is None:
         return "its name is not legible"
-    if holder.host == platform.node() and holder.boot_id != _boot_id() and age_s > _uptime_s():
+    uptime_s = time.time() - float(psutil.boot_time())
+    if holder.host == platform.node() and holder.boot_id != _boot_id() and age_s > uptime_s:
         # Its last heartbeat is older than this boot. (A live one of another machine that has the same name is not.)
-        return "the machine was started anew since"
+        return "the machine was restarted since"
     if (holder.boot_id, holder.pid_namespace) == (_boot_id(), _pid_namespace()):
         process_start = _process_start(holder.pid)
         if process_start is None:
             return "the process is gone"
         return None if process_start == holder.process_start else "its number belongs to another process now"
-    return f"it has not been heard of for {age_s:.0f} s" if age_s > expiry_s else None
+    return f"it has not been heard of for {age_s:.0f} s" if age_s > EXPIRY_S else None
 
 
 @contextmanager
@@ -280,7 +264,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 def _process_start(pid: int) -> str | None:
     """When a process started, in a form that stays the same for its life; None if there is no such process any more.
 
-    Linux counts ticks since the machine's start. Elsewhere it is wall time, rounded, for it may be derived anew.
+    Linux counts ticks since boot. Elsewhere it is wall time, rounded, as it is derived again each time.
     """
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -301,10 +285,6 @@ def _boot_id() -> str:
     return path.read_text().strip() if path.exists() else str(round(psutil.boot_time()))
 
 
-def _uptime_s() -> float:
-    return time.time() - float(psutil.boot_time())
-
-
 def _pid_namespace() -> str:
     path = Path("/proc/self/ns/pid")
     return str(path.readlink()) if path.is_symlink() else platform.node()
@@ -312,7 +292,3 @@ def _pid_namespace() -> str:
 
 def _describe(holder: LeaseHolder | None) -> str:
     return "an unknown process" if holder is None else f"process {holder.pid} on {holder.host}"
-
-
-def _clock(time_s: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(time_s))

@@ -24,13 +24,15 @@ def peak_memory_bytes() -> int:
     """Largest resident memory of this process since `reset_peak_memory`, or of its largest ended child."""
     unit = 1 if sys.platform == "darwin" else 1024
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * unit
-    own = _status_bytes("VmHWM") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    own = _peak_since_reset_bytes() or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
     return max(own, children)
 
 
-def resident_memory_bytes() -> int:
-    """Resident memory of this process now; 0 when the system does not tell."""
-    return _status_bytes("VmRSS") or 0
+def resident_memory_bytes(pid: int) -> int:
+    """Resident memory of a process now; 0 when it has ended."""
+    with suppress(psutil.Error):
+        return int(psutil.Process(pid).memory_info().rss)
+    return 0
 
 
 def process_tree(pid: int) -> list[int]:
@@ -39,7 +41,7 @@ def process_tree(pid: int) -> list[int]:
     Linux tells the children of each thread. Asking for the parent of every process of the machine, as is done
     elsewhere, takes some milliseconds, too much to be done twice a second.
     """
-    if not _tells_children():
+    if not Path(f"/proc/self/task/{os.getpid()}/children").exists():
         with suppress(psutil.Error):
             return [pid, *(child.pid for child in psutil.Process(pid).children(recursive=True))]
         return []
@@ -51,7 +53,7 @@ def process_tree(pid: int) -> list[int]:
 
 def tree_memory_bytes(pid: int) -> int:
     """Resident memory of a process and all that it started; memory that they share counts once for each."""
-    return sum(_resident_bytes(each) for each in process_tree(pid))
+    return sum(resident_memory_bytes(each) for each in process_tree(pid))
 
 
 def machine_memory_bytes() -> int:
@@ -98,10 +100,6 @@ def _control_groups() -> list[Path]:
     return []
 
 
-def _tells_children() -> bool:
-    return Path(f"/proc/self/task/{os.getpid()}/children").exists()
-
-
 def _children(pid: int) -> Iterator[int]:
     with suppress(OSError):
         for thread in os.listdir(f"/proc/{pid}/task"):  # noqa: PTH208 - names are all that is wanted
@@ -109,18 +107,9 @@ def _children(pid: int) -> Iterator[int]:
                 yield from map(int, Path(f"/proc/{pid}/task/{thread}/children").read_text().split())
 
 
-def _resident_bytes(pid: int) -> int:
-    with suppress(OSError):
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
-    with suppress(psutil.Error):
-        return int(psutil.Process(pid).memory_info().rss)
-    return 0
-
-
-def _status_bytes(field: str) -> int | None:
+def _peak_since_reset_bytes() -> int | None:
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
-            name, _, value = line.partition(":")
-            if name == field:
-                return int(value.split()[0]) * 1024
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
     return None

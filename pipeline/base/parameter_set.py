@@ -11,14 +11,12 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 from blake3 import blake3
 from pydantic import BaseModel
 
-_SHOWN_LENGTH = 80
-"""Longest value shown in full when a change is described [characters]."""
+_SHOWN_LENGTH = 80  # longest value shown in full when a change is described [characters]
 
 
 def digest_of(text: str) -> str:
@@ -40,7 +38,7 @@ class ParameterSet:
     @classmethod
     def of(
         cls,
-        values: Mapping[str, Any] = MappingProxyType({}),
+        values: Mapping[str, Any] | None = None,
         /,
         *,
         stage: str,
@@ -53,7 +51,7 @@ class ParameterSet:
         Args:
             values: parameters by name; here a name may be one of the words below.
             stage: name of the stage.
-            version: the stage's version.
+            version: of the stage.
             tools: version of each tool that does the work.
             **more: further parameters.
 
@@ -61,7 +59,7 @@ class ParameterSet:
             ValueError: two parameters share a name, or a value is not a finite number.
         """
         document = {"stage_name": stage, "stage_version": version, "tools": dict(tools)}
-        for name, value in (*values.items(), *more.items()):
+        for name, value in (*(values or {}).items(), *more.items()):
             if name in document:
                 raise ValueError(f"two parameters of stage {stage} are called {name}")
             document[name] = _plain(value)
@@ -69,11 +67,10 @@ class ParameterSet:
 
 
 def explain_difference(old: ParameterSet, new: ParameterSet) -> list[str]:
-    """Name what changed from one parameter set to another, by its path in the job file.
+    """Name what changed from one parameter set to another, by its path in the job file, a clause each.
 
-    Returns:
-        One clause a change, such as `camera.position changed from [3, 2, 1] to [4, 2, 1]`; lists of tables are shown
-        by the tables' names, as in `fluid[water].viscosity`. Empty if nothing changed.
+    As `camera.position changed from [3, 2, 1] to [4, 2, 1]`; tables of a list are called by their names, as in
+    `fluid[water].viscosity`.
     """
     return [*_differences("", json.loads(old.canonical), json.loads(new.canonical))]
 

@@ -1,4 +1,4 @@
-"""Making very many objects at once."""
+"""The garbage collector, paused while very many objects are made at once."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def many_objects() -> Iterator[None]:
-    """Pause the collector of cycles while a block makes objects by the hundred thousand, all of which stay.
-
-    It would walk through all of them again and again, and find nothing: a quarter of the time of planning 100,000
-    tasks. What is freed by its last reference is freed as ever.
-    """
+    """Pause the collector of cycles while a block makes a great many objects that all stay."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:

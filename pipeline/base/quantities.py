@@ -8,27 +8,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-SHARE = "%"
-"""Unit of numbers that are stored as fractions of 1 and shown in per cent."""
+SHARE = "%"  # unit of numbers that are stored as fractions of 1 and shown in per cent
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """Presentation of a number of the diagnostics.
+    """Presentation of a number of the diagnostics."""
 
-    Attributes:
-        name: as the solvers write it.
-        label: in words, without the unit.
-        unit: in which it is stored, `SHARE` for fractions; empty for counts.
-        panel: title of the plot that it belongs on, with others of its kind.
-        counted: it is a whole number.
-    """
-
-    name: str
-    label: str
-    unit: str
-    panel: str
-    counted: bool = False
+    name: str  # as the solvers write it
+    label: str  # in words, without the unit
+    unit: str  # in which it is stored, `SHARE` for fractions; empty for counts
+    panel: str  # title of the plot that it belongs on, with others of its kind
+    counted: bool = False  # it is a whole number
 
     def text(self, value: float) -> str:
         """The number with its unit, to four digits."""
@@ -40,11 +31,9 @@ class Quantity:
 
 
 def quantity(name: str, *, of_kind: str | None = None) -> Quantity:
-    """The quantity of a name.
+    """The quantity of a name in the diagnostics of a kind of body.
 
-    Args:
-        name: as in the diagnostics.
-        of_kind: what the body is; the mass of smoke is an integral of its density, which has no unit.
+    The mass of smoke is an integral of its density, which has no unit.
     """
     found = _KNOWN.get(name)
     if found is None and name.startswith(COUNT_OF_FLUID):
@@ -60,8 +49,7 @@ def quantity(name: str, *, of_kind: str | None = None) -> Quantity:
 COUNT_OF_FLUID = "particle_count_"
 """Begins the name of the number of particles of one fluid among several in a tank; its name follows."""
 
-MECHANICAL_ENERGY = "mechanical_energy"
-"""Sum of `PARTS_OF_ENERGY`; not written by any solver."""
+MECHANICAL_ENERGY = "mechanical_energy"  # sum of `PARTS_OF_ENERGY`; not written by any solver
 PARTS_OF_ENERGY = ("kinetic_energy", "potential_energy", "elastic_energy")
 
 _ENERGY, _MOMENTUM, _ANGULAR, _MASS, _SPEED = "Energy", "Momentum", "Angular momentum", "Mass", "Largest speed"
@@ -136,63 +124,42 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class CountedEvent:
-    """A number of the diagnostics that counts what should not happen.
+    """A number of the diagnostics that counts what should not happen."""
 
-    Attributes:
-        name: as the solvers write it.
-        one: what has happened once.
-        many: what has happened several times.
-        running_total: the number counts since the start; else it is counted anew in every frame.
-    """
-
-    name: str
-    one: str
-    many: str
-    running_total: bool = False
+    name: str  # as the solvers write it
+    one: str  # what has happened once
+    many: str  # what has happened several times
+    and_so: str = ""  # what follows either
+    running_total: bool = False  # counted since the start; else in every frame by itself
 
     def text(self, count: int) -> str:
         """Count in words: `3 solves hit their iteration limit`."""
-        return f"1 {self.one}" if count == 1 else f"{count:,} {self.many}"
+        return (f"1 {self.one}" if count == 1 else f"{count:,} {self.many}") + self.and_so
 
 
 WARNINGS = (
     CountedEvent("not_converged", "solve hit its iteration limit", "solves hit their iteration limit"),
-    CountedEvent(
-        "squeezed",
-        "frame has particles squeezed by more than 20 %",
-        "frames have particles squeezed by more than 20 %",
-    ),
+    CountedEvent("squeezed", "frame has", "frames have", " particles squeezed by more than 20 %"),
     CountedEvent(
         "emission_blocked",
         "particle was not emitted, as its place was taken",
         "particles were not emitted, as their places were taken",
     ),
-    CountedEvent(
-        "emission_capped",
-        "particle was not emitted, as there are max_particles",
-        "particles were not emitted, as there are max_particles",
-    ),
-    CountedEvent(
-        "whitewater_capped",
-        "particle was not made, as there are max_particles",
-        "particles were not made, as there are max_particles",
-    ),
-    CountedEvent(
-        "crossings_left",
-        "crossing of cloth could not be prevented",
-        "crossings of cloth could not be prevented",
-    ),
+    CountedEvent("emission_capped", "particle was", "particles were", " not emitted, as there are max_particles"),
+    CountedEvent("whitewater_capped", "particle was", "particles were", " not made, as there are max_particles"),
+    CountedEvent("crossings_left", "crossing", "crossings", " of cloth could not be prevented"),
     CountedEvent(
         "jammed",
-        "frame has cloth so jammed that much of it moves as one, which is slow: give weaker wind, slower pins and "
-        "bodies, or a larger thickness",
-        "frames have cloth so jammed that much of it moves as one, which is slow: give weaker wind, slower pins and "
-        "bodies, or a larger thickness",
+        "frame has",
+        "frames have",
+        " cloth so jammed that much of it moves as one, which is slow: give weaker wind, slower pins and bodies, or a "
+        "larger thickness",
     ),
     CountedEvent(
         "overlong_springs",
-        "spring of a cloth is half too long: give more substeps or iterations, or pin more nodes",
-        "springs of cloth are half too long: give more substeps or iterations, or pin more nodes",
+        "spring of a cloth is",
+        "springs of cloth are",
+        " half too long: give more substeps or iterations, or pin more nodes",
     ),
     CountedEvent(
         "nodes_lost",

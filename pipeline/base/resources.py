@@ -8,8 +8,7 @@ from dataclasses import replace
 from pipeline.base.memory import machine_memory_bytes
 from pipeline.base.task import Resources
 
-MEMORY_SHARE = 0.9
-"""Share of the physical memory that tasks may claim; the rest is the system's and the runner's own."""
+MEMORY_SHARE = 0.9  # share of the physical memory that tasks may claim; the rest is the system's and the runner's own
 
 
 def machine_capacity(*, gpus: int = 0) -> Resources:
@@ -38,8 +37,7 @@ def claim(request: Resources, capacity: Resources) -> Resources:
 
     `cores = 0` stands for all cores. Who asks for more cores or memory than there is gets all of it, and so runs alone.
 
-    Raises:
-        ValueError: it needs more GPUs than there are.
+    Raises ValueError: it needs more GPUs than there are.
     """
     if request.gpus > capacity.gpus:
         raise ValueError(f"needs {request.gpus} GPUs, but this machine offers {capacity.gpus}")

@@ -1,4 +1,4 @@
-"""Tasks: what the plan is made of.
+"""Tasks, what the plan is made of: their resources, states, failures and limits of retries.
 
 A *task* is one stage over one frame (or over the whole job, as for the simulation). It reads and writes *artifacts*,
 files of the job's folder that are named by their path relative to it. Tasks depend on artifacts, not on tasks, so a
@@ -14,8 +14,7 @@ from typing import NewType
 from pipeline.base.parameter_set import ParameterSet
 
 TaskId = NewType("TaskId", str)
-ArtifactPath = NewType("ArtifactPath", str)
-"""POSIX path relative to the job's folder."""
+ArtifactPath = NewType("ArtifactPath", str)  # POSIX path relative to the job's folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,31 +28,18 @@ class Resources:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One unit of work, decided by `Stage.plan` from the job alone.
+    """One unit of work, decided by `Stage.plan` from the job alone."""
 
-    Attributes:
-        id: unique in the job, e.g. `render/000012`; safe as a relative path.
-        stage: name of its stage.
-        inputs: artifacts it reads.
-        outputs: artifacts it commits, in order.
-        parameters: everything else that decides its outputs; shared by all tasks of the stage and subject.
-        subject: the body it is about, or "".
-        frame: the frame it is about, or None for the whole job.
-        resources: what it occupies.
-        checkpointed: it commits its outputs one by one and continues where it stopped.
-        on_first_gpu: if it needs a GPU, it computes on the machine's first one and cannot be given another.
-    """
-
-    id: TaskId
+    id: TaskId  # unique in the job, e.g. `render/000012`; safe as a relative path
     stage: str
     inputs: tuple[ArtifactPath, ...]
-    outputs: tuple[ArtifactPath, ...]
-    parameters: ParameterSet
-    subject: str = ""
-    frame: int | None = None
+    outputs: tuple[ArtifactPath, ...]  # in the order in which it commits them
+    parameters: ParameterSet  # what decides its outputs beside the inputs; shared by all tasks of stage and subject
+    subject: str = ""  # the body that it is about
+    frame: int | None = None  # None: the whole job
     resources: Resources = field(default=Resources())
-    checkpointed: bool = False
-    on_first_gpu: bool = False
+    checkpointed: bool = False  # it commits its outputs one by one and continues where it stopped
+    on_first_gpu: bool = False  # if it needs a GPU, it takes the machine's first one and cannot be given another
 
 
 class TaskState(StrEnum):
@@ -80,3 +66,14 @@ class FailureKind(StrEnum):
     DISK_FULL = "disk full"
     CANCELLED = "cancelled"
     DIVERGED = "diverged"
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """Limits of retries and of failures."""
+
+    attempts: int = 3  # how often a task is tried when the machine is at fault
+    out_of_memory_attempts: int = 2  # the same, when memory ran out; every retry has the machine for itself
+    backoff_s: float = 2.0  # pause before the second attempt [s]; doubles with each further one
+    failure_share: float = 0.25  # a stage in which this share of the ended tasks failed stops the job ...
+    failure_count: int = 10  # ... once this many of its tasks failed

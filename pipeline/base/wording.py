@@ -28,17 +28,18 @@ def size(byte_count: float) -> str:
     return f"{byte_count / 1024:.1f} GiB"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things: `1 file`, `12 files`."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
 def moment(time_s: float) -> str:
     """A wall time [s since the epoch] in this machine's time zone."""
     return datetime.fromtimestamp(time_s, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
 
 
 def mixed_devices(drawn_on: Mapping[str, int]) -> list[str]:
-    """A warning of a film that was drawn by several kinds of device; empty for one that was not.
-
-    Args:
-        drawn_on: number of frames by device.
-    """
+    """A warning of a film that was drawn by several kinds of device (frames by device); empty for one that was not."""
     if len(drawn_on) < 2:
         return []
     counts = ", ".join(f"{frames} on {device}" for device, frames in drawn_on.items())

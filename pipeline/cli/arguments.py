@@ -6,7 +6,8 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
+from difflib import get_close_matches
 from functools import reduce, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from pipeline.queue.submitting import QueueOptions
 from pipeline.run.executors.choice import executor_options
 
 if TYPE_CHECKING:
+    from pipeline.base.task import Resources
     from pipeline.job.loading import LoadedJob
     from pipeline.queue.job_queue import JobQueue
 
@@ -27,8 +29,27 @@ SUFFIX = ".toml"
 
 PRIORITY = click.IntRange(-1000, 1000)
 
-BLENDER_VARIABLE = "PIPELINE_BLENDER"
-"""Names the Blender that job files may name, too."""
+BLENDER_VARIABLE = "PIPELINE_BLENDER"  # names the Blender that job files may name, too
+
+
+cores_option = click.option(
+    "--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all if omitted."
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+output_option = click.option(
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=DEFAULT_OUTPUT,
+    show_default=True,
+    is_eager=True,  # names of jobs are looked up in it
+    help="Folder that holds the jobs' folders.",
+)
+until_option = click.option(
+    "--until",
+    multiple=True,
+    metavar="STAGE",
+    help="End after this stage: simulate, surface, cloth, volume, whitewater, render, ...; may be given twice.",
+)
 
 
 class JobFilePath(click.ParamType):  # type: ignore[type-arg]
@@ -44,27 +65,25 @@ class JobFilePath(click.ParamType):  # type: ignore[type-arg]
 
 def job_options(command: Any) -> Any:
     """The job file and the options that change the job."""
-    for decorate in (
-        click.option("--preview", is_flag=True, help="A fast, small version of the same job."),
-        click.option(
-            "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Override a key: render.quality=final"
-        ),
-        click.argument("job_file", metavar="JOB", type=JobFilePath()),
-    ):
-        command = decorate(command)
-    return command
+    command = click.option("--preview", is_flag=True, help="A fast, small version of the same job.")(command)
+    command = overrides_option("render.quality=final")(command)
+    return click.argument("job_file", metavar="JOB", type=JobFilePath())(command)
 
 
-def output_option(command: Any) -> Any:
-    """The folder that jobs' folders lie in."""
-    return click.option(
-        "--output",
-        type=click.Path(path_type=Path, file_okay=False),
-        default=DEFAULT_OUTPUT,
-        show_default=True,
-        is_eager=True,  # names of jobs are looked up in it
-        help="Folder that holds the jobs' folders.",
-    )(command)
+def overrides_option(example: str) -> Callable[[Any], Any]:
+    """Keys of the job with other values."""
+    return click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=f"Override a key: {example}")
+
+
+def claim_cores(cores: int | None) -> Resources:
+    """What one task in this process may use; tells the libraries that count cores for themselves."""
+    from pipeline.base.resources import machine_capacity
+    from pipeline.run.executors.worker_process import THREAD_VARIABLES
+
+    capacity = machine_capacity(gpus=1)
+    capacity = replace(capacity, cores=min(cores or capacity.cores, capacity.cores))
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(capacity.cores)))  # before anything reads them
+    return capacity
 
 
 def submitted_job_argument(command: Any) -> Any:
@@ -78,28 +97,10 @@ def target_option(meaning: str, *, required: bool = False) -> Callable[[Any], An
     return click.option("-o", "--to", "target", type=path, required=required, help=f"Where to write it{meaning}.")
 
 
-def json_option(command: Any) -> Any:
-    """For machines."""
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
-
-
-def until_option(command: Any) -> Any:
-    """The stages after which a job ends."""
-    return click.option(
-        "--until",
-        multiple=True,
-        metavar="STAGE",
-        help="End after this stage: simulate, surface, cloth, volume, whitewater, render, ...; may be given twice.",
-    )(command)
-
-
 def require_own_programs(loaded: LoadedJob, overrides: Sequence[str]) -> None:
-    """Refuse a job file that names a program to be run: whose file it is decides nothing about what runs here.
+    """Refuse (JobFileError) a job file that names a program to be run: whose file it is does not decide what runs here.
 
     The user names it with `--set`, or in the environment. A job's folder keeps what its user has named.
-
-    Raises:
-        JobFileError: it names one.
     """
     program = loaded.job.render.blender
     if program is None or any(override.replace(" ", "").startswith("render.blender=") for override in overrides):
@@ -116,11 +117,7 @@ def require_own_programs(loaded: LoadedJob, overrides: Sequence[str]) -> None:
 
 
 def require_plannable(loaded: LoadedJob) -> None:
-    """Refuse numbers that planning would overflow with, before the whole scene is looked at.
-
-    Raises:
-        JobFileError: carries every such number.
-    """
+    """Refuse (JobFileError) numbers that planning would overflow with, before the whole scene is looked at."""
     from pipeline.job.magnitudes import check_magnitudes
     from pipeline.model.problems import Findings
 
@@ -132,11 +129,7 @@ def require_plannable(loaded: LoadedJob) -> None:
 def submission_folder(job_file: Path, name: str, output: Path, *, is_changed: bool) -> JobLayout:
     """The folder that submitting a job file fills: its own, if it is the job file of a job's folder as it stands.
 
-    Args:
-        job_file: as it was named.
-        name: of the job.
-        output: the folder that jobs' folders lie in.
-        is_changed: whether options change the job.
+    `is_changed`: whether options change the job.
     """
     own_folder = JobLayout(job_file.parent)
     is_own = output == DEFAULT_OUTPUT and job_file.name == "job.toml" and not is_changed
@@ -144,14 +137,9 @@ def submission_folder(job_file: Path, name: str, output: Path, *, is_changed: bo
 
 
 def find_job_file(job: str, output: Path) -> Path:
-    """The job file that is meant; one that was named with its ending need not be there.
+    """The job file that is meant: by its path, with or without the ending, as a job's folder, or as a submitted job.
 
-    Args:
-        job: path of a job file, its name without the ending, a job's folder, or the name of a submitted job.
-        output: the folder that jobs' folders lie in.
-
-    Raises:
-        JobFileError: there is none, or there are two.
+    One that was named with its ending need not be there. Raises JobFileError if there is none, or there are two.
     """
     path = Path(job)
     if path.exists() and not path.is_dir():
@@ -168,7 +156,7 @@ def find_job_file(job: str, output: Path) -> Path:
         return submitted
     if path.suffix == SUFFIX or path.is_dir():
         return path  # reading it says what is wrong
-    near = _nearest(named.name, [each.name for each in Path(named.parent).glob(f"*{SUFFIX}")])
+    near = nearest(named.name, [each.name for each in Path(named.parent).glob(f"*{SUFFIX}")])
     remedy = near or f"; a new one: pipeline new {job}"
     raise JobFileError([f'there is neither a job file {named} nor a job "{job}" in {output}{remedy}'])
 
@@ -176,9 +164,7 @@ def find_job_file(job: str, output: Path) -> Path:
 def job_folder(job: str, output: Path) -> JobLayout:
     """The folder that a job has, or will have when its first run begins.
 
-    Args:
-        job: path of its folder, its name under `output`, or its job file, with or without the ending.
-        output: the folder that jobs' folders lie in.
+    `job` is the path of its folder, its name under `output`, or its job file, with or without the ending.
 
     Raises:
         PipelineError: there are two such jobs.
@@ -205,16 +191,11 @@ def job_folder(job: str, output: Path) -> JobLayout:
 
 
 def find_job(job: str, output: Path) -> JobLayout:
-    """The folder of a job that was submitted; see `job_folder`.
-
-    Raises:
-        PipelineError: there is none, or there are two.
-        JobFileError: the job file that was named is wrong.
-    """
+    """The folder of a job that was submitted, as by `job_folder`. Raises PipelineError if there is none, too."""
     layout = job_folder(job, output)
     if not layout.job_file.exists():
         file = next((each for each in (Path(job), _with_ending(Path(job))) if each.is_file()), None)
-        near = _nearest(layout.root.name, [each.parent.name for each in layout.root.parent.glob("*/job.toml")])
+        near = nearest(layout.root.name, [each.parent.name for each in layout.root.parent.glob("*/job.toml")])
         submit = f"pipeline submit {shlex.quote(str(file)) if file else f'JOB{SUFFIX}'}"
         raise PipelineError(f"no submitted job in {layout.root}{near}; submit one with: {submit}")
     return layout
@@ -239,9 +220,8 @@ def _folder_of_file(path: Path, output: Path) -> JobLayout:
     return JobLayout(output / load_job(path).name)
 
 
-def _nearest(name: str, names: list[str]) -> str:
-    from difflib import get_close_matches
-
+def nearest(name: str, names: Sequence[str]) -> str:
+    """The end of a message about an unknown name: the one that may be meant, if there is such."""
     near = get_close_matches(name, names, n=1)
     return f'; did you mean "{near[0]}"?' if near else ""
 
@@ -290,7 +270,7 @@ def parse_frames(text: str) -> frozenset[int]:
     return frozenset(frames)
 
 
-_QUEUE_OPTIONS = (
+_QUEUE_OPTIONS: tuple[Callable[[Any], Any], ...] = (
     click.option("--detach", is_flag=True, help="Return at once; the job runs in the background."),
     click.option(
         "--priority",
@@ -304,9 +284,7 @@ _QUEUE_OPTIONS = (
         callback=parse_size,
         help="Pause when less than this is free on the disk, such as 20GB; 2 GiB if omitted.",
     ),
-    click.option(
-        "--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all of them if omitted."
-    ),
+    cores_option,
     *executor_options,
 )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ from pipeline.base.errors import DiskFullError, PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.cli.arguments import (
     PRIORITY,
+    claim_cores,
     find_job,
     output_option,
     parse_frames,
@@ -23,8 +23,7 @@ from pipeline.cli.arguments import (
 )
 from pipeline.queue.submitting import QueueOptions, is_finished, look_at, run, stages_to_run
 
-STOPPED_EXIT_CODE = 143
-"""As shells report a program that SIGTERM ended."""
+STOPPED_EXIT_CODE = 143  # as shells report a program that SIGTERM ended
 FAILED_EXIT_CODE = 5
 
 
@@ -61,7 +60,7 @@ def resume(job: str, output: Path, options: QueueOptions) -> None:
     pipeline resume /mnt/films/dam-break --detach
     """
     from pipeline.job.loading import job_of_text, load_job
-    from pipeline.record.interrupted_recording import complete_crashed_take
+    from pipeline.record.interrupted_recording import complete_interrupted_recording
     from pipeline.run.goal import read_goal, what_is_made
 
     queue, name = place(job, output)
@@ -71,7 +70,7 @@ def resume(job: str, output: Path, options: QueueOptions) -> None:
         submitted = job_of_text(waiting.text, layout.job_file)
     else:
         layout = find_job(job, output)
-        if sentence := complete_crashed_take(layout):
+        if sentence := complete_interrupted_recording(layout):
             click.echo(sentence, err=True)
         submitted = load_job(layout.job_file)
     until = read_goal(layout) if waiting is None else waiting.until
@@ -170,27 +169,21 @@ def _run_queue(output: Path) -> None:
         if lease.takeover is not None:
             say(f"{lease.takeover}; its queue goes on")
         turns = Turns(queue, None)
-        FarmRunner(queue, lease, turns.run, say, pause_on_signal=False, after_turn=turns.ended).work()
+        FarmRunner(queue, lease, turns.run, say, turns.ended, pause_on_signal=False).work()
     left = len(queue.waiting())
     click.echo(f"{left} jobs are left in the queue" if left else "the queue is empty", err=True)
 
 
 def _run_stage(layout: JobLayout, stage: str, frames: str | None, *, cores: int | None, openjd: bool) -> None:
-    from dataclasses import replace
-
     from pipeline.base.lease import refuse_if_held
-    from pipeline.base.resources import machine_capacity
     from pipeline.base.task import FailureKind
     from pipeline.job.loading import load_job
-    from pipeline.run.executors.worker_process import THREAD_VARIABLES
     from pipeline.run.runner import STAGES_REFERENCE
     from pipeline.run.single_stage import run_stage
 
     layout = JobLayout(layout.root.absolute())
     refuse_if_held(layout.lease)
-    capacity = machine_capacity(gpus=1)
-    capacity = replace(capacity, cores=min(cores or capacity.cores, capacity.cores))
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(capacity.cores)))  # before anything reads them
+    capacity = claim_cores(cores)
     stopped = []
 
     def stop(_number: int, _frame: FrameType | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -12,7 +13,7 @@ import click
 from pipeline.base import wording
 from pipeline.base.errors import PipelineError
 from pipeline.base.task import ArtifactPath
-from pipeline.cli.arguments import DEFAULT_OUTPUT, find_job, json_option, parse_age, submitted_job_argument
+from pipeline.cli.arguments import find_job, json_option, output_option, parse_age, submitted_job_argument
 
 
 @click.command()
@@ -56,7 +57,7 @@ def verify(job: str, output: Path, deep: bool, rebuild: bool, as_json: bool) -> 
         for artifact in flaws:
             mark_as_touched(layout.path(ArtifactPath(artifact)))
         for text in texts:
-            how = "written anew" if restore_text(layout, text) else "removed; nothing else knows it"
+            how = "written anew" if restore_text(layout, layout.root / text) else "removed; nothing else knows it"
             click.secho(f"{text}: is not what its name says; {how}", fg="red", err=as_json)
     sys.exit(int(bool(flaws or texts)))
 
@@ -126,14 +127,8 @@ def clean(
 
 
 @click.command()
-@click.option(
-    "--output",
-    type=click.Path(path_type=Path),
-    default=DEFAULT_OUTPUT,
-    show_default=True,
-    help="Folder that results go to.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
+@output_option
+@json_option
 def doctor(output: Path, as_json: bool) -> None:
     """Examine this machine: devices, libraries, Blender, memory, disk.
 
@@ -147,7 +142,7 @@ def doctor(output: Path, as_json: bool) -> None:
 
     examinations = examine(output)
     if as_json:
-        click.echo(json.dumps([each.as_json() for each in examinations], indent=2, ensure_ascii=False))
+        click.echo(json.dumps([asdict(each) for each in examinations], indent=2, ensure_ascii=False))
     else:
         print_report(examinations)
     sys.exit(int(any(each.status == "failed" for each in examinations)))

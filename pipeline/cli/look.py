@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,8 +19,16 @@ from pipeline.base import wording
 from pipeline.base.console import print_warnings
 from pipeline.base.errors import JobFileError, PipelineError
 from pipeline.base.layout import JobLayout
-from pipeline.base.task import TaskId, TaskState
-from pipeline.cli.arguments import find_job, job_folder, json_option, output_option, place, submitted_job_argument
+from pipeline.base.task import TaskId
+from pipeline.cli.arguments import (
+    find_job,
+    job_folder,
+    json_option,
+    nearest,
+    output_option,
+    place,
+    submitted_job_argument,
+)
 from pipeline.cli.make import assessment_as_json
 
 if TYPE_CHECKING:
@@ -27,8 +37,7 @@ if TYPE_CHECKING:
     from pipeline.record.reader import AttemptRow, StageSummary
 
 FOLLOW_INTERVAL_S = 0.5
-_WIDTH = 11
-"""Of the first column; the longest word is `interrupted`."""
+_WIDTH = 11  # of the first column; the longest word is `interrupted`
 
 _VERDICT_WORDING = {
     "up to date": "up to date",
@@ -149,10 +158,9 @@ def _show_job(job: str, output: Path, *, as_json: bool) -> None:
     if until:
         click.echo(f"  ends after {', '.join(until)}, as submitted; the whole film: pipeline submit {job}")
     for stage in summary:
-        counts: dict[str, int] = {}
+        counts: Counter[str] = Counter()
         for task_state, count in stage.counts.items():
-            word = task_word(task_state, runs=holder is not None)
-            counts[word] = counts.get(word, 0) + count
+            counts[task_word(task_state, runs=holder is not None)] += count
         click.echo(f"  {stage.stage:>10}  {', '.join(f'{count} {word}' for word, count in counts.items())}")
     if preview is not None:
         click.echo(f"  preview movie: {preview}")
@@ -205,7 +213,9 @@ def explain(
 
 
 def _tell_story(layout: JobLayout, task: str, *, as_json: bool) -> None:
+    from pipeline.base.lease import live_holder
     from pipeline.job.loading import load_job
+    from pipeline.queue.states import task_word
     from pipeline.record.reader import ManifestReader
     from pipeline.run.assessment import assess_job
     from pipeline.store.origins import origins_of
@@ -214,30 +224,31 @@ def _tell_story(layout: JobLayout, task: str, *, as_json: bool) -> None:
     assessments, _, _ = assess_job(load_job(layout.job_file), layout)
     found = next((each for each in assessments if each.task.id == task or task in each.task.outputs), None)
     if found is None:
-        raise PipelineError(f'the job has no task "{task}"{_nearest(task, [each.task.id for each in assessments])}')
+        raise PipelineError(f'the job has no task "{task}"{nearest(task, [each.task.id for each in assessments])}')
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         state, history = manifest.states().get(found.task.id), manifest.history(found.task.id)
         events = manifest.events(task=found.task.id)
-    receipts = [(output_path, read_receipt(layout, output_path)) for output_path in found.task.outputs]
-    origins = [origin.as_json() for origin in origins_of(layout, [receipt for _, receipt in receipts if receipt])]
+    receipts = {path: read_receipt(layout, path) for path in found.task.outputs}
+    there = [receipt for receipt in receipts.values() if receipt is not None]
+    origins = origins_of(layout, there)
     if as_json:
         story = {
             **assessment_as_json(found),
             "state": state,
             "parameters": json.loads(found.task.parameters.canonical),
             "inputs": list(found.task.inputs),
-            "receipts": [json.loads(receipt.to_json()) for _, receipt in receipts if receipt is not None],
-            "provenance": origins,
+            "receipts": [json.loads(receipt.to_json()) for receipt in there],
+            "provenance": [origin.as_json() for origin in origins],
             "attempts": [attempt._asdict() for attempt in history],
         }
         click.echo(json.dumps(story, indent=1))
         return
-    states = dict.fromkeys([state or "not planned yet", _VERDICT_WORDING[found.verdict.value]])
-    click.echo(f"{found.task.id}: {', '.join(states)}")
+    word = None if state is None else task_word(state, runs=live_holder(layout.lease) is not None)
+    click.echo(f"{found.task.id}: {word or 'not planned yet'}, {_VERDICT_WORDING[found.verdict.value]}")
     for reason in found.reasons:
         click.echo(f"  {reason.text}")
     click.echo(f"reads   {_shortened(found.task.inputs) or 'the job file only'}")
-    for path, receipt in receipts[:3]:
+    for path, receipt in list(receipts.items())[:3]:
         if receipt is None:
             click.echo(f"makes   {path}: not there yet")
         else:
@@ -246,12 +257,10 @@ def _tell_story(layout: JobLayout, task: str, *, as_json: bool) -> None:
                 f"makes   {path}: {wording.size(receipt.size)}, attempt {receipt.attempt}, {flaw or 'as committed'}"
             )
     if len(receipts) > 3:
-        there = sum(receipt is not None for _, receipt in receipts)
-        click.echo(f"        ... {there} of {len(receipts)} files are there")
+        click.echo(f"        ... {len(there)} of {len(receipts)} files are there")
     click.echo(f"key     {found.task.parameters.digest[:16]} (its parameters: pipeline explain ... --json)")
-    for origin in origins_of(layout, [receipt for _, receipt in receipts if receipt is not None]):
-        for line in origin.lines():
-            click.echo(line)
+    for line in chain.from_iterable(origin.lines() for origin in origins):
+        click.echo(line)
     for attempt in history:
         click.echo(_attempt_line(attempt))
     for event in events:
@@ -287,15 +296,10 @@ def _activity(
     """What happens to a job, or would."""
     if pid is not None:
         return f"{state}, process {pid}"
-    done = sum(
-        count
-        for stage in summary
-        for task_state, count in stage.counts.items()
-        if task_state in (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
-    )
+    done = sum(stage.done for stage in summary)
     total = sum(stage.total for stage in summary)
     if state == "recorded":
-        return _activity_of_take(layout)
+        return _activity_of_recording(layout)
     words = [state if entry is None or not entry.note else f"{state} ({entry.note})"]
     if total and (done < total or state != "done"):
         words.append(f"{done} of {total} tasks done")
@@ -304,23 +308,23 @@ def _activity(
     return ", ".join(words)
 
 
-def _activity_of_take(layout: JobLayout) -> str:
-    """What submitting a take would do."""
-    from pipeline.record.interrupted_recording import frames_of_crashed_take, is_job_of_take
+def _activity_of_recording(layout: JobLayout) -> str:
+    """What submitting a recording of `pipeline live` would do."""
+    from pipeline.record.interrupted_recording import frames_of_interrupted_recording, is_job_of_recording
 
     film = f"submitting {layout.job_file} makes the film"
     try:
-        if not is_job_of_take(layout):
+        if not is_job_of_recording(layout):
             return f"a take, but {layout.job_file} is not its job: submitting that makes no film of its frames"
     except JobFileError:
         return f"a take, whose job file is damaged; see: pipeline check {layout.job_file}"
-    found = frames_of_crashed_take(layout)
+    found = frames_of_interrupted_recording(layout)
     if found is None:
         return f"a take; {film}"
     short = "a take that was cut short"
     if not found.whole:
         return f"{short}: {found.flaw}" if found.is_cut else f"{short} before its first frame"
-    short += f" with {found.whole} frame{'' if found.whole == 1 else 's'}"
+    short += f" with {wording.counted(found.whole, 'frame')}"
     return f"{short}, and {found.flaw}; {film} of those before it" if found.is_cut else f"{short}; {film} of all"
 
 
@@ -339,13 +343,6 @@ def _is_running(layout: JobLayout, task: TaskId, attempt: int) -> bool:
         return False
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         return any((row.task, row.number) == (task, attempt) for row in manifest.running_attempts())
-
-
-def _nearest(name: str, names: Sequence[str]) -> str:
-    from difflib import get_close_matches
-
-    close = get_close_matches(name, names, n=1)
-    return f'; did you mean "{close[0]}"?' if close else ""
 
 
 def _attempt_line(attempt: AttemptRow) -> str:

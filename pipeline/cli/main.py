@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,11 @@ import click
 from pipeline import __version__
 from pipeline.base.errors import PLACE_TROUBLES, DiskFullError, PipelineError
 from pipeline.cli.control import cancel, pause, priority, resume, work
-from pipeline.cli.dashboard import dashboard
 from pipeline.cli.keep import clean, doctor, schema, verify
 from pipeline.cli.look import explain, status
 from pipeline.cli.make import check, export, new, plan, rerun, submit
+from pipeline.cli.pages import dashboard, live, view
 from pipeline.cli.pictures import animatic, compare, loop, report, still
-from pipeline.cli.steering import live
-from pipeline.cli.viewing import view
 from pipeline.run.executors.failures import is_disk_full
 
 SECTIONS = {
@@ -25,10 +24,6 @@ SECTIONS = {
     "Control jobs that run or wait": (pause, resume, cancel, priority, work),
     "Keep things in order": (verify, clean, doctor, schema),
 }
-
-view.short_help = "Look at simulated frames in a browser: scrub, play, turn, colour."
-live.short_help = "Play with a scene in a browser while it is computed."
-dashboard.short_help = "Show all jobs in a browser, and control them there."
 
 FORMER = {
     "queue": "pipeline status",
@@ -68,11 +63,7 @@ class PipelineGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that is called.
-
-        Raises:
-            UnknownCommandError: there is none.
-        """
+        """The command that is called. Raises UnknownCommandError if there is none."""
         name = args[0]
         if name not in self.commands and not name.startswith("-"):
             raise UnknownCommandError(_meant(name, args[1:], [*self.commands]))
@@ -89,20 +80,16 @@ class PipelineGroup(click.Group):
 
 def _meant(name: str, rest: list[str], commands: list[str]) -> str:
     """A sentence about a word in place of a command."""
-    from difflib import get_close_matches
-
     if name in FORMER:
         words = [each for each in rest if not each.startswith("-")]
         film = words[0] if words else "my-film"
         return f"{name} is now: {FORMER[name].replace('my-film', film)}"
-    if Path(name).suffix == ".toml" or Path(name).is_file():
-        return f"{name} is a job file; did you mean: pipeline submit {name}"
-    if Path(f"{name}.toml").is_file():
-        return f"{name}.toml is a job file; did you mean: pipeline submit {name}"
-    near = get_close_matches(name, [*commands, *FORMER], n=1)
-    if near and near[0] in FORMER:
-        return f'no command "{name}"; did you mean: {FORMER[near[0]]}'
-    return f'no command "{name}"' + (f"; did you mean: pipeline {near[0]}" if near else "; see: pipeline --help")
+    for file in (name, f"{name}.toml"):
+        if Path(file).is_file() or Path(name).suffix == ".toml":
+            return f"{file} is a job file; did you mean: pipeline submit {name}"
+    typed = {command: f"pipeline {command}" for command in commands} | FORMER
+    near = get_close_matches(name, typed, n=1)
+    return f'no command "{name}"; ' + (f"did you mean: {typed[near[0]]}" if near else "see: pipeline --help")
 
 
 @click.group(

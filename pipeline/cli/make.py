@@ -75,7 +75,7 @@ def check(job_file: Path, overrides: tuple[str, ...], preview: bool, until: tupl
         return
     job = loaded.job
     click.echo(f"{job_file}: ok")
-    click.echo(f"  {job.name}: {job.frame_count} frames, {job.frame_count / job.fps:.3g} s at {job.fps} fps")
+    click.echo(f"  {job.name}: {job.frame_count} frames, {job.film_s:.3g} s at {job.fps} fps")
     for kind in KINDS.values():
         if kind.size and kind.bodies(job):
             click.echo(f"  {kind.size.format(findings.elements[kind.name])}")
@@ -156,10 +156,10 @@ def submit(
     pipeline submit dam.toml --output /shared/renders --scheduler tcp://farm:8786
     """
     from pipeline.job.loading import read_job
-    from pipeline.record.interrupted_recording import complete_crashed_take
+    from pipeline.record.interrupted_recording import complete_interrupted_recording
     from pipeline.run.goal import what_is_made
 
-    if job_file.name == "job.toml" and (sentence := complete_crashed_take(JobLayout(job_file.parent))):
+    if job_file.name == "job.toml" and (sentence := complete_interrupted_recording(JobLayout(job_file.parent))):
         click.echo(sentence, err=True)
     loaded = read_job(job_file, overrides, preview=preview)
     require_own_programs(loaded, overrides)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Sequence
-from contextlib import redirect_stdout
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,11 +15,19 @@ import click
 
 from pipeline.base.errors import PipelineError, StageUnavailableError
 from pipeline.base.layout import JobLayout
-from pipeline.cli.arguments import find_job, output_option, require_own_programs, submitted_job_argument, target_option
+from pipeline.cli.arguments import (
+    claim_cores,
+    cores_option,
+    find_job,
+    output_option,
+    overrides_option,
+    require_own_programs,
+    submitted_job_argument,
+    target_option,
+)
 from pipeline.run.executors.choice import require_possible
 
 if TYPE_CHECKING:
-    from pipeline.base.task import Resources
     from pipeline.job.loading import LoadedJob
     from pipeline.model.job import Job
     from pipeline.show.picture_set import PictureSet
@@ -27,8 +35,7 @@ if TYPE_CHECKING:
 
 _QUALITIES = ("draft", "preview", "final")
 _POSITION, _KEYFRAMES = "camera.position", "camera.keyframe"
-_TOLD_FRAMES = 10
-"""Every so many frames of an animatic its progress is printed."""
+_TOLD_FRAMES = 10  # frames of an animatic between two lines of progress
 
 
 @click.command()
@@ -36,11 +43,9 @@ _TOLD_FRAMES = 10
 @click.option("--frame", type=click.IntRange(min=0), help="Which frame.")
 @click.option("--quality", type=click.Choice(_QUALITIES), default="final", show_default=True, help="How well drawn.")
 @click.option("--resolution", type=(int, int), metavar="WIDTH HEIGHT", help="Size [pixels]; the job's if omitted.")
-@click.option(
-    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Override a key: render.exposure=0.5, set.name=..."
-)
+@overrides_option("render.exposure=0.5, set.name=...")
 @target_option("; in JOB/stills/ if omitted, a sheet in JOB/sheet.png")
-@click.option("--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all if omitted.")
+@cores_option
 @click.option("--sheet", is_flag=True, help="Put rendered frames side by side on one picture instead.")
 @click.option("--pictures", type=click.IntRange(min=1), default=12, show_default=True, help="Most pictures on a sheet.")
 @click.option(
@@ -78,7 +83,6 @@ def still(
         _write_sheet(find_job(job, output), target, pictures=pictures, columns=columns)
         return
     from pipeline.job.loading import read_job
-    from pipeline.run.runner import STAGES_REFERENCE
     from pipeline.show.stills import make_still, survey
 
     layout = JobLayout(find_job(job, output).root.absolute())
@@ -87,15 +91,14 @@ def still(
     changes += [] if resolution is None else [f"render.resolution=[{resolution[0]}, {resolution[1]}]"]
     loaded = read_job(layout.job_file, [*changes, *overrides])
     require_own_programs(loaded, overrides)
-    found = survey(loaded, layout, [frame], stages=STAGES_REFERENCE)
+    found = survey(loaded, layout, [frame])
     if found.lacking:
         raise PipelineError(_why_lacking(found.lacking[-1], layout, frame))
     path = layout.stills / f"{frame:06d}-{_words(loaded, overrides)}.png" if target is None else target
-    if path.suffix.lower() != ".png":
-        raise PipelineError(f'{path}: a still is a PNG, so its name must end in ".png"')
+    _require_ending(path, ".png", "a still is a PNG")
     require_possible(loaded.job, {task.stage for task in found.todo})
     _make_folder(path)
-    capacity = _capacity(cores)
+    capacity = claim_cores(cores)
     width, height = loaded.job.render.resolution
     made = _made_first(found)
     click.echo(
@@ -104,15 +107,7 @@ def still(
         err=True,
     )
     with redirect_stdout(sys.stderr):  # what the stages print is no output of this command
-        make_still(
-            loaded,
-            found,
-            layout,
-            path,
-            capacity=capacity,
-            stages=STAGES_REFERENCE,
-            say=lambda sentence: click.echo(f"  {sentence}", err=True),
-        )
+        make_still(loaded, found, layout, path, capacity=capacity, say=lambda told: click.echo(f"  {told}", err=True))
     click.echo(path)
 
 
@@ -121,7 +116,6 @@ def _write_sheet(layout: JobLayout, target: Path | None, *, pictures: int, colum
 
     from pipeline.job.loading import load_job
     from pipeline.show.picture_set import evenly_spread, picture_set
-    from render.errors import InvalidFileError
     from render.sheet import contact_sheet
 
     submitted = load_job(layout.job_file)
@@ -131,10 +125,8 @@ def _write_sheet(layout: JobLayout, target: Path | None, *, pictures: int, colum
     path = layout.root / "sheet.png" if target is None else target
     if path.suffix.lower() not in Image.registered_extensions():
         raise PipelineError(f'{path}: "{path.suffix}" is no kind of picture; use .png, .jpg or .webp')
-    try:
+    with _making(path):
         contact_sheet(evenly_spread(frames.all, pictures), path, columns=columns)
-    except (InvalidFileError, ValueError, OSError) as error:
-        raise PipelineError(f"cannot make {path}: {error}") from error
     _say_remark(submitted, frames)
     click.echo(path)
 
@@ -169,9 +161,7 @@ def _make_folder(target: Path) -> None:
 
 def _made_first(found: Survey) -> str:
     """What is made before the frame is drawn, as `surface, 3 of whitewater`; empty if all is there."""
-    counts: dict[str, int] = {}
-    for task in found.todo[:-1]:
-        counts[task.stage] = counts.get(task.stage, 0) + 1
+    counts = Counter(task.stage for task in found.todo[:-1])
     return ", ".join(stage if count == 1 else f"{count} of {stage}" for stage, count in counts.items())
 
 
@@ -179,10 +169,9 @@ def _why_lacking(artifact: str, layout: JobLayout, frame: int) -> str:
     """Whether the simulation has not come so far, or the options ask for another one."""
     from pipeline.base.lease import live_holder
     from pipeline.job.loading import read_job
-    from pipeline.run.runner import STAGES_REFERENCE
     from pipeline.show.stills import survey
 
-    if not survey(read_job(layout.job_file), layout, [frame], stages=STAGES_REFERENCE).lacking:
+    if not survey(read_job(layout.job_file), layout, [frame]).lacking:
         return (
             "--set changes what is simulated, and a still shows what this job has simulated; "
             f"submit a job of its own: pipeline submit {shlex.quote(str(layout.job_file))} --set name=... --set ..."
@@ -198,7 +187,7 @@ def _why_lacking(artifact: str, layout: JobLayout, frame: int) -> str:
 @submitted_job_argument
 @click.option("--width", type=click.IntRange(64, 3840), default=640, show_default=True, help="Of the film [pixels].")
 @target_option("; JOB/NAME-animatic.mp4 if omitted")
-@click.option("--cores", type=click.IntRange(min=1), help="Use at most this many processor cores; all if omitted.")
+@cores_option
 def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: int | None) -> None:
     """Show how a job moves, in plain pictures, before it is rendered.
 
@@ -225,10 +214,9 @@ def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: 
     size = _fitted(submitted.job.render.resolution, width)
     loaded = read_job(layout.job_file, [f"render.resolution=[{size[0]}, {size[1]}]"])
     path = layout.root / f"{submitted.job.name}-animatic.mp4" if target is None else target
-    if path.suffix.lower() != ".mp4":
-        raise PipelineError(f'{path}: an animatic is an MP4, so its name must end in ".mp4"')
+    _require_ending(path, ".mp4", "an animatic is an MP4")
     planned = submitted.job.frame_count
-    found = survey(loaded, layout, range(planned), stages=STAGES_REFERENCE)
+    found = survey(loaded, layout, range(planned))
     frames = drawable_frames(found)
     if frames == 0:
         raise PipelineError(_why_lacking(found.lacking[0], layout, 0))
@@ -241,7 +229,7 @@ def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: 
     if todo:
         refuse_if_held(layout.lease)  # whoever runs the job makes them
         require_possible(loaded.job, {task.stage for task in todo})
-    capacity = _capacity(cores)
+    capacity = claim_cores(cores)
     shown = f"{frames} frames" if frames == planned else f"the {frames} of {planned} frames that are simulated"
     click.echo(f"{shown}, {size[0]} x {size[1]} pixels{f'; {len(todo)} files to make first' if todo else ''}", err=True)
     with redirect_stdout(sys.stderr):  # what the stages print is no output of this command
@@ -262,7 +250,6 @@ def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: 
         frames,
         path,
         threads=capacity.cores,
-        stages=STAGES_REFERENCE,
         drawn=lambda frame: click.echo(f"  frame {frame}", err=True) if frame % _TOLD_FRAMES == 0 else None,
     )
     click.echo(path)
@@ -272,17 +259,6 @@ def _fitted(resolution: tuple[int, int], width: int) -> tuple[int, int]:
     """A size of the same proportions, so wide; even, as video needs it."""
     height = width * resolution[1] / resolution[0]
     return max(16, 2 * round(width / 2)), max(16, 2 * round(height / 2))
-
-
-def _capacity(cores: int | None) -> Resources:
-    """What one task in this process may use; tells the libraries that count cores for themselves."""
-    from pipeline.base.resources import machine_capacity
-    from pipeline.run.executors.worker_process import THREAD_VARIABLES
-
-    capacity = machine_capacity(gpus=1)
-    capacity = replace(capacity, cores=min(cores or capacity.cores, capacity.cores))
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(capacity.cores)))  # before anything reads them
-    return capacity
 
 
 @click.command()
@@ -299,7 +275,7 @@ def report(jobs: tuple[str, ...], output: Path, target: Path | None) -> None:
     pipeline report my-film
     pipeline report bunny-wcsph bunny-dfsph --to energy.html
     """
-    from pipeline.show.report.writing import write_report
+    from pipeline.show.report.page import write_report
 
     layouts = [find_job(job, output) for job in jobs]
     if target is None and len(layouts) > 1:
@@ -330,13 +306,11 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
     from pipeline.base.resources import machine_capacity
     from pipeline.job.loading import load_job
     from pipeline.show.picture_set import picture_set
-    from render.errors import InvalidFileError
     from render.side_by_side import Film, compare_films
 
     if len(jobs) < 2:
         raise click.UsageError("name two jobs at least")
-    if target.suffix.lower() != ".mp4":
-        raise PipelineError(f'{target}: a comparison is an MP4, so its name must end in ".mp4"')
+    _require_ending(target, ".mp4", "a comparison is an MP4")
     films = []
     for layout in (find_job(job, output) for job in jobs):
         submitted = load_job(layout.job_file)
@@ -349,11 +323,8 @@ def compare(jobs: tuple[str, ...], output: Path, width: int, target: Path) -> No
             there = f"{len(pictures)} of {submitted.frame_count} frames are there"
             click.echo(f"{submitted.name}: {there}{frames.others}", err=True)
         _say_remark(submitted, frames)
-    try:
-        with replacing(target) as part:
-            count = compare_films(films, part, width=width, threads=machine_capacity().cores)
-    except (InvalidFileError, ValueError, OSError) as error:
-        raise PipelineError(f"cannot make {target}: {error}") from error
+    with _making(target), replacing(target) as part:
+        count = compare_films(films, part, width=width, threads=machine_capacity().cores)
     click.echo(f"{target}: {count} frames")
 
 
@@ -374,7 +345,6 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
     from pipeline.base.files import replacing
     from pipeline.job.loading import load_job
     from pipeline.show.picture_set import picture_set
-    from render.errors import InvalidFileError
     from render.loop import FORMATS, write_loop
 
     if target.suffix.lower() not in FORMATS:
@@ -392,18 +362,26 @@ def loop(job: str, *, output: Path, width: int, fps: float, first: int, last: in
             f"of the frames {first}-{last} of {submitted.name} {there} are rendered{frames.others}; choose with --until"
         )
     _say_remark(submitted, frames)
+    rate = submitted.movie.playback_fps or submitted.fps
+    with _making(target), replacing(target) as part:
+        count = write_loop(pictures[first : last + 1], part, fps=rate, width=width, loop_fps=fps)
+    click.echo(f"{target}: {count} frames, {target.stat().st_size / 1e6:.2g} MB")
+
+
+def _require_ending(path: Path, suffix: str, what: str) -> None:
+    if path.suffix.lower() != suffix:
+        raise PipelineError(f'{path}: {what}, so its name must end in "{suffix}"')
+
+
+@contextmanager
+def _making(target: Path) -> Iterator[None]:
+    """What goes wrong with pictures and places in the block, as a line about the file that was to be made."""
+    from render.errors import InvalidFileError
+
     try:
-        with replacing(target) as part:
-            count = write_loop(
-                pictures[first : last + 1],
-                part,
-                fps=submitted.movie.playback_fps or submitted.fps,
-                width=width,
-                loop_fps=fps,
-            )
+        yield
     except (InvalidFileError, ValueError, OSError) as error:
         raise PipelineError(f"cannot make {target}: {error}") from error
-    click.echo(f"{target}: {count} frames, {target.stat().st_size / 1e6:.2g} MB")
 
 
 def _say_remark(job: Job, frames: PictureSet) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 from blake3 import blake3
 
-from pipeline.base.files import sync
+from pipeline.base.files import replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.job.input_files import input_files
 from pipeline.job.loading import LoadedJob, changed_text, job_of_text
@@ -24,8 +22,7 @@ def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
 
     Returns:
         The job that reads the copies, as the workers will load it, and its text, which names them by paths relative to
-        the folder. What is planned from this job is of the bytes that the workers get, even if an original changes
-        meanwhile.
+        the folder.
 
     Raises:
         OSError: a file cannot be read, or the folder not be written.
@@ -37,25 +34,10 @@ def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
         digest = blake3(content).hexdigest()[:12]
         copy = layout.inputs / f"{source.stem.removesuffix(f'-{digest}')}-{digest}{source.suffix}"
         if not copy.is_file() or copy.read_bytes() != content:
-            _write(copy, content)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            # No lease is held yet, and the runner of this folder would remove a part.
+            replace_durably(copy, content, mark="copying")
         kept = file.written(copy.relative_to(layout.root).as_posix())
         changes.append(Override(file.place, kept, loaded.path.name))
     text = changed_text(loaded.text, changes) if changes else loaded.text
     return job_of_text(text, layout.job_file), text
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write aside and rename. No lease is held yet: the name is not one that the runner of this folder sweeps away."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".copying", dir=path.parent)
-    part = Path(name)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.chmod(0o644)  # mkstemp's files are for their owner alone
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-    sync(path.parent)

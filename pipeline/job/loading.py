@@ -6,11 +6,10 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from pipeline.base.errors import JobFileError
 from pipeline.job.input_files import InputFile, input_files
@@ -19,7 +18,7 @@ from pipeline.job.overrides import Override, OverrideError, apply_overrides, par
 from pipeline.job.presets import preview_overrides
 from pipeline.kinds.table import job_type
 from pipeline.model.job import Job
-from pipeline.model.positions import KeyPath
+from pipeline.model.meshes import with_value
 from pipeline.model.problems import JobSource
 
 MAX_BYTES = 16 * 2**20
@@ -27,7 +26,6 @@ MAX_BYTES = 16 * 2**20
 MAX_DEPTH = 32
 """Four times what any job needs; keeps recursive code far from Python's limit."""
 MOST_JOBS = 16
-"""Validated jobs that a process keeps."""
 
 _SYNTAX_POSITION = re.compile(
     r"(?P<what>.*) \(at (?:line (?P<line>\d+), column (?P<column>\d+)|end of document)\)", re.DOTALL
@@ -54,7 +52,7 @@ class LoadedJob:
 
 
 def load_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False) -> Job:
-    """The job in a file. See `read_job`."""
+    """The job in a file, as of `read_job`."""
     return read_job(path, overrides, preview=preview).job
 
 
@@ -85,11 +83,7 @@ def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool =
 
 
 def job_of_text(text: str, path: Path) -> Job:
-    """The job that `load_job` will find in a file once this text is written to it.
-
-    Raises:
-        JobFileError: carries every problem found.
-    """
+    """The job that `load_job` will find in a file once this text is written to it; raises JobFileError."""
     return _with_absolute_files(_job_of(path, text, JobSource(path.name, text)), text, path)[0]
 
 
@@ -172,38 +166,28 @@ def _parse_overrides(arguments: Sequence[str], document: Mapping[str, Any]) -> l
 
 
 def changed_text(text: str, changes: Sequence[Override]) -> str:
-    """A job file's text with these keys changed, comments and order kept.
-
-    Raises:
-        JobFileError: a change does not fit the text.
-    """
+    """A job file's text with these keys changed, comments and order kept; raises JobFileError."""
     try:
         return apply_overrides(text, changes)
     except OverrideError as error:
         raise JobFileError([str(error)]) from None
 
 
-_JOBS: dict[bytes, Job] = {}
-"""The jobs that this process has validated, by the hash of their text; the latest `MOST_JOBS`."""
+_JOBS: dict[str, Job] = {}
+"""The jobs that this process has validated, by their text; the latest `MOST_JOBS`."""
 
 
 def _job_of(path: Path, text: str, source: JobSource) -> Job:
     """The job that a text describes, its files as the text names them; each text is validated once a process."""
-    job = _JOBS.get(_hash(text))
-    if job is None:
-        job = _validate(_parse(path, text), source)
-        _remember(text, job)
-    return job
+    if text not in _JOBS:
+        _remember(text, _validate(_parse(path, text), source))
+    return _JOBS[text]
 
 
 def _remember(text: str, job: Job) -> None:
-    _JOBS[_hash(text)] = job
+    _JOBS[text] = job
     while len(_JOBS) > MOST_JOBS:
         del _JOBS[next(iter(_JOBS))]
-
-
-def _hash(text: str) -> bytes:
-    return sha256(text.encode()).digest()
 
 
 def _validate(document: Mapping[str, Any], source: JobSource) -> Job:
@@ -222,7 +206,7 @@ def _with_tuples(value: Any) -> Any:
 
 
 def _with_absolute_files(job: Job, text: str, path: Path) -> tuple[Job, str]:
-    """A job and its text with the files that they name relative to their own folder named by absolute paths."""
+    """A job and its text with relative files, which are of the text's own folder, named by absolute paths."""
     files = list(input_files(job))
     if job.render.blender is not None:
         files.append(InputFile(("render", "blender"), job.render.blender, "program"))
@@ -236,18 +220,6 @@ def _with_absolute_files(job: Job, text: str, path: Path) -> tuple[Job, str]:
         return job, text
     text = changed_text(text, changes)
     for change in changes:
-        job = _with_value(job, change.path, change.value)
+        job = with_value(job, change.path, change.value)
     _remember(text, job)
     return job, text
-
-
-def _with_value(value: Any, path: KeyPath, new: object) -> Any:
-    """A model, tuple or table with another value at a path; nothing is validated."""
-    if not path:
-        return new
-    key, rest = path[0], path[1:]
-    if isinstance(value, BaseModel):
-        return value.model_copy(update={str(key): _with_value(getattr(value, str(key)), rest, new)})
-    if isinstance(value, tuple):
-        return tuple(_with_value(each, rest, new) if index == key else each for index, each in enumerate(value))
-    return {**value, key: _with_value(value[key], rest, new)}

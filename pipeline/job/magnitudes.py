@@ -11,11 +11,10 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 
-SMALLEST_LENGTH = 1.0e-6
-LARGEST_LENGTH = 1.0e6
-"""A micrometre to a thousand kilometres [m]; single precision ends well within."""
+# A micrometre to a thousand kilometres [m].
+SMALLEST_LENGTH, LARGEST_LENGTH = 1.0e-6, 1.0e6
+# Of any other kind, in SI units.
 LARGEST_NUMBER = 1.0e9
-"""Of any other kind, in SI units."""
 
 
 def check_magnitudes(job: Job, findings: Findings) -> bool:
@@ -24,14 +23,12 @@ def check_magnitudes(job: Job, findings: Findings) -> bool:
     scene = job.model_dump(include={"domain", "gravity", *KINDS, "whitewater"})
     for path, value in _numbers(scene):
         node = schema.node_at(path)
-        unit = node.unit if node is not None else ""
-        is_size = unit == "m" and node is not None and node.is_positive
-        largest = LARGEST_LENGTH if unit == "m" else LARGEST_NUMBER
-        shown = f" {unit}" if unit else ""
+        largest = LARGEST_LENGTH if node.unit == "m" else LARGEST_NUMBER
         if abs(value) > largest:
-            findings.error(path, f"must be within ±{largest:g}{shown}, got {value:g}; units are SI")
+            bound = f"{largest:g} {node.unit}".rstrip()
+            findings.error(path, f"must be within ±{bound}, got {value:g}; units are SI")
             ok = False
-        elif is_size and value < SMALLEST_LENGTH:
+        elif node.unit == "m" and node.is_positive and value < SMALLEST_LENGTH:
             findings.error(path, f"must be at least {SMALLEST_LENGTH:g} m, got {value:g}; units are SI")
             ok = False
     return ok

@@ -35,7 +35,6 @@ _BOUNDS = {
 _BODY_NAME_RULE = 'must begin with a letter and go on with letters, digits, "_" or "-", 64 at most'
 _JOB_NAME_RULE = 'must begin with a letter or digit and go on with letters, digits, ".", "_" or "-", 100 at most'
 
-
 _RENAMED: dict[KeyPath, str] = {("stage",): "[stage] is now [set]"}
 """Keys of earlier versions that have another name now."""
 
@@ -54,7 +53,7 @@ def explain(error: ValidationError, document: Mapping[str, Any]) -> list[Problem
     return problems
 
 
-def spelled(value: object) -> str:
+def _spelled(value: object) -> str:
     """A value as it looks in a message."""
     if isinstance(value, str):
         return f"the text {json.dumps(value, ensure_ascii=False)}"
@@ -67,8 +66,7 @@ def spelled(value: object) -> str:
     return str(value)
 
 
-def value_at(document: Any, path: KeyPath) -> Any:
-    """The value at a path of a parsed document."""
+def _value_at(document: Any, path: KeyPath) -> Any:
     for part in path:
         document = document[part]
     return document
@@ -95,11 +93,11 @@ def _is_consequence(details: ErrorDetails, document: object) -> bool:
     """Whether the error merely follows from others: a list "too short" because its elements were refused."""
     if details["type"] != "too_short":
         return False
-    return bool(value_at(document, _written_path(details, document)))
+    return bool(_value_at(document, _written_path(details, document)))
 
 
 def _problem(path: KeyPath, errors: list[ErrorDetails], document: Mapping[str, Any]) -> Problem:
-    value = value_at(document, path)
+    value = _value_at(document, path)
     missing = [key for each in errors if each["type"] == "missing" and isinstance(key := each["loc"][-1], str)]
     if missing:
         return Problem(path, _missing_keys(path, missing, value))
@@ -110,72 +108,55 @@ def _problem(path: KeyPath, errors: list[ErrorDetails], document: Mapping[str, A
 
 
 def _missing_keys(path: KeyPath, missing: list[str], value: object) -> str:
-    node = schema.node_at(path)
-    sentences = []
-    for key in missing:
-        child = node.narrowed(value).child(key) if node is not None else None
-        meaning = f" ({child.description.rstrip('.')})" if child is not None and child.description else ""
-        sentences.append(f'missing key "{key}"{meaning}')
-    return "; ".join(sentences)
+    table = schema.node_at(path).narrowed(value)
+    about = {key: table.child(key).description.rstrip(".") for key in missing}
+    return "; ".join(f'missing key "{key}"' + (f" ({meaning})" if meaning else "") for key, meaning in about.items())
 
 
 def _unexpected_value(path: KeyPath, errors: list[ErrorDetails], value: object) -> str:
-    expected = list(dict.fromkeys(_expectation(each) for each in errors))
-    sentence = f"expected {' or '.join(expected)}, got {spelled(value)}"
-    node = schema.node_at(path)
-    if node is not None and node.is_array_of_tables and isinstance(value, Mapping):
+    expected = dict.fromkeys(_EXPECTED.get(each["type"]) or quoted_list(_words(each, "expected")) for each in errors)
+    sentence = f"expected {' or '.join(expected)}, got {_spelled(value)}"
+    if schema.node_at(path).is_array_of_tables and isinstance(value, Mapping):
         return f"{sentence}; write [[{'.'.join(str(part) for part in path if isinstance(part, str))}]], in two brackets"
-    choices = [choice for each in errors if each["type"] == "literal_error" for choice in _choices(each)]
+    choices = [word for each in errors if each["type"] == "literal_error" for word in _words(each, "expected")]
     return sentence + (suggestion(value, choices) if isinstance(value, str) else "")
 
 
-def _expectation(details: ErrorDetails) -> str:
-    if details["type"] == "literal_error":
-        return quoted_list(_choices(details))
-    return _EXPECTED[details["type"]]
-
-
-def _choices(details: ErrorDetails) -> list[str]:
-    return [word.strip("'") for word in details["ctx"]["expected"].replace(" or ", ", ").split(", ")]
+def _words(details: ErrorDetails, key: str) -> list[str]:
+    """Choices that an error lists as `'a', 'b' or 'c'`."""
+    return [word.strip("'") for word in details["ctx"][key].replace(" or ", ", ").split(", ")]
 
 
 def _broken_rule(path: KeyPath, details: ErrorDetails, document: Mapping[str, Any]) -> str:
-    value = value_at(document, path)
+    value = _value_at(document, path)
     if details["type"] == "extra_forbidden":
-        return _unknown_key(path, value_at(document, path[:-1]))
+        return _unknown_key(path, _value_at(document, path[:-1]))
     rule = _RULES.get(details["type"])
     if rule is None:
-        return f"{details['msg'][:1].lower()}{details['msg'][1:]}, got {spelled(value)}"
+        return f"{details['msg'][:1].lower()}{details['msg'][1:]}, got {_spelled(value)}"
     return rule(path, details, value)
 
 
 def _out_of_bounds(path: KeyPath, details: ErrorDetails, value: object) -> str:
     sign, key = _BOUNDS[details["type"]]
-    node = schema.node_at(path)
-    unit = f" {node.unit}" if node is not None and node.unit else ""
-    return f"must be {sign} {details['ctx'][key]:.10g}{unit}, got {spelled(value)}"
+    bound = f"{details['ctx'][key]:.10g} {schema.node_at(path).unit}".rstrip()
+    return f"must be {sign} {bound}, got {_spelled(value)}"
 
 
 def _wrong_length(path: KeyPath, details: ErrorDetails, value: object) -> str:
     got = len(value) if isinstance(value, list) else 0
     if details["type"] == "missing":  # a vector that lacks its last elements
-        return f"expected {_vector_length(path)} values, got {got}"
+        length = max(len(alternative.get("prefixItems", [])) for alternative in schema.node_at(path).alternatives)
+        return f"expected {length} values, got {got}"
     if details["type"] == "too_short":
         return f"must hold at least {details['ctx']['min_length']}, got {got}"
     return f"expected {details['ctx']['max_length']} values, got {got}"
 
 
-def _vector_length(path: KeyPath) -> int:
-    node = schema.node_at(path)
-    assert node is not None, path
-    return max(len(alternative.get("prefixItems", [])) for alternative in node.alternatives)
-
-
 def _unknown_key(path: KeyPath, table: object) -> str:
     if path in _RENAMED:
         return _RENAMED[path]
-    key, parent = str(path[-1]), schema.node_at(path[:-1])
-    known = parent.narrowed(table).keys if parent is not None else []
+    key, known = str(path[-1]), schema.node_at(path[:-1]).narrowed(table).keys
     sentence = f'unknown key "{key}"'
     if near := suggestion(key, known):
         return sentence + near
@@ -188,26 +169,21 @@ def _unknown_key(path: KeyPath, table: object) -> str:
 
 
 def _unknown_type(_path: KeyPath, details: ErrorDetails, _value: object) -> str:
-    known = [word.strip("'") for word in details["ctx"]["expected_tags"].split(", ")]
+    known = _words(details, "expected_tags")
     tag = details["ctx"]["tag"]
     return f'unknown type "{tag}", types are {", ".join(known)}{suggestion(tag, known)}'
 
 
 def _no_type(path: KeyPath, _details: ErrorDetails, _value: object) -> str:
-    node = schema.node_at(path)
-    assert node is not None, path
     # What may be left out may be null as well, which has no type.
-    known = [each["properties"]["type"]["const"] for each in node.alternatives if "properties" in each]
+    alternatives = schema.node_at(path).alternatives
+    known = [each["properties"]["type"]["const"] for each in alternatives if "properties" in each]
     return f'missing key "type"; types are {", ".join(known)}'
 
 
 def _wrong_pattern(_path: KeyPath, details: ErrorDetails, value: object) -> str:
     rule = _JOB_NAME_RULE if details["ctx"]["pattern"] == NAME_PATTERN else _BODY_NAME_RULE
-    return f"{rule}, got {spelled(value)}"
-
-
-def _own_words(_path: KeyPath, details: ErrorDetails, _value: object) -> str:
-    return str(details["ctx"]["error"])
+    return f"{rule}, got {_spelled(value)}"
 
 
 _RULES: dict[str, Callable[[KeyPath, ErrorDetails, object], str]] = {
@@ -219,6 +195,6 @@ _RULES: dict[str, Callable[[KeyPath, ErrorDetails, object], str]] = {
     "union_tag_not_found": _no_type,
     "string_pattern_mismatch": _wrong_pattern,
     "string_too_short": lambda _path, _details, _value: "must not be empty",
-    "finite_number": lambda _path, _details, value: f"must be finite, got {spelled(value)}",
-    "value_error": _own_words,
+    "finite_number": lambda _path, _details, value: f"must be finite, got {_spelled(value)}",
+    "value_error": lambda _path, details, _value: str(details["ctx"]["error"]),
 }

@@ -113,7 +113,7 @@ def _resolve(written_path: str, document: object) -> tuple[KeyPath, schema.Schem
     for word in written_path.split("."):
         part = _element(word, document, path, written_path) if node.is_array else word
         child = node.narrowed(document).child(part)
-        if child is None:
+        if not child.alternatives:
             raise OverrideError(_unknown_key(written_path, word, path, node.narrowed(document)))
         path, node = (*path, part), child
         document = _below(document, part)

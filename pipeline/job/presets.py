@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.overrides import Override
-from pipeline.kinds.table import KINDS
+from pipeline.kinds.checks.shapes import build_solids
+from pipeline.kinds.table import KINDS, placements
 from pipeline.model.job import Job
 from pipeline.model.problems import Findings
 
@@ -29,8 +32,10 @@ def preview_overrides(job: Job) -> list[Override]:
     ]
     if job.render.samples is not None:
         changes.append((("render", "samples"), max(1, job.render.samples // 4)))
-    can_be_built = check_magnitudes(job, Findings())  # what is wrong with them is told of the changed job
-    changes += [change for kind in KINDS.values() for change in kind.coarser(job, COARSENING, can_be_built)]
+    # What is wrong with numbers and shapes is told of the changed job.
+    can_be_built = check_magnitudes(job, Findings())
+    solids = partial(build_solids, placements(job), Findings()) if can_be_built else None
+    changes += [change for kind in KINDS.values() for change in kind.coarser(job, COARSENING, solids)]
     return [Override(path, value, PREVIEW) for path, value in changes]
 
 

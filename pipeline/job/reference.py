@@ -19,17 +19,16 @@ from sim.cloth.materials import MATERIAL_UNITS, MATERIALS, SOURCES
 BEGIN = "<!-- reference: begin; written by `python -m pipeline.job.reference docs/guide/job-file.md` -->"
 END = "<!-- reference: end -->"
 
+# The key that tables of several types stand under, by the end of their models' names.
 _KEYS_OF_TYPED = {
     "Shape": "shape",
     "Opening": "[[fluid.emitter]] shape",
     "Sheet": "[[cloth]] shape",
     "Region": "[[cloth.pin]] region",
 }
-"""The key that tables of several types stand under, by the end of their models' names."""
-FEW_TYPES = 3
-CLOTH = "ClothParameters"
-"""Title of the table whose keys come from its material."""
-
+_FEW_TYPES = 3
+# Title of the table whose keys come from its material.
+_CLOTH = "ClothParameters"
 _SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 
 
@@ -72,33 +71,27 @@ def _nested_tables(path: str, property_: schema.Node) -> Iterator[tuple[str, str
 
 def _table_of(path: str, property_: schema.Node) -> tuple[schema.Node | None, str]:
     """The table that a property holds, one or many, and how its header is written."""
-    if "$ref" in property_:
-        return _definition(property_), f"[{path}]"
-    items = property_.get("items")
-    if isinstance(items, dict) and "$ref" in items:
-        return _definition(items), f"[[{path}]]"
-    extra = property_.get("additionalProperties")
-    if isinstance(extra, dict) and "$ref" in extra:
-        return _definition(extra), f"[{path}.NAME]"
+    definitions = schema.job_schema()["$defs"]
+    for node, heading in (
+        (property_, f"[{path}]"),
+        (property_.get("items"), f"[[{path}]]"),
+        (property_.get("additionalProperties"), f"[{path}.NAME]"),
+    ):
+        if isinstance(node, dict) and "$ref" in node:
+            return definitions[node["$ref"].rpartition("/")[2]], heading
     return None, ""
 
 
-def _definition(node: schema.Node) -> schema.Node:
-    definition: schema.Node = schema.job_schema()["$defs"][node["$ref"].rpartition("/")[2]]
-    return definition
-
-
 def _section(heading: str, about: str, node: schema.Node) -> Iterator[str]:
-    rows = list(_rows(node))
     yield f"### `{heading}`" if heading.startswith("[") or "=" in heading else f"### {heading}"
     yield ""
     if about:
         yield from (" ".join(about.split()), "")
     yield "| key | value | default | meaning |"
     yield "|---|---|---|---|"
-    yield from rows
+    yield from _rows(node)
     yield ""
-    if node.get("title") == CLOTH:
+    if node.get("title") == _CLOTH:
         yield from _materials_of_cloth()
 
 
@@ -118,14 +111,10 @@ def _rows(node: schema.Node) -> Iterator[str]:
     required = node.get("required", [])
     for key, property_ in node["properties"].items():
         table, _ = _table_of(key, property_)
-        if (
-            table is not None
-            or (key == "type" and "const" in property_)
-            or "Reserved" in property_.get("description", "")
-        ):
+        if table is not None or (key == "type" and "const" in property_):
             continue
         default = "required" if key in required else _written(property_.get("default"))
-        if node.get("title") == CLOTH and key in MATERIAL_UNITS:
+        if node.get("title") == _CLOTH and key in MATERIAL_UNITS:
             default = "the material's"
         cells = (f"`{key}`", _kind(property_), default, property_.get("description", ""))
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
@@ -138,7 +127,7 @@ def _kind(node: schema.Node) -> str:
         return " or ".join(_kind(option) for option in options)
     if "oneOf" in node:
         types = sorted(node["discriminator"]["mapping"])
-        return f"{quoted_list(types)}, see below" if len(types) <= FEW_TYPES else "a shape, see below"
+        return f"{quoted_list(types)}, see below" if len(types) <= _FEW_TYPES else "a shape, see below"
     if "enum" in node:
         return quoted_list(node["enum"])
     if "const" in node:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 from pydantic.json_schema import GenerateJsonSchema
@@ -37,7 +37,7 @@ def _schema_of(model: type[Job]) -> Node:
 
 @dataclass(frozen=True)
 class SchemaNode:
-    """A place in the schema: the alternatives that a value there may take."""
+    """A place in the schema: the alternatives that a value there may take; none where there is no such place."""
 
     alternatives: tuple[Node, ...]
     description: str = ""
@@ -53,8 +53,7 @@ class SchemaNode:
     def keys(self) -> list[str]:
         """Keys that a table here, or a table of the array here, may have."""
         if self.is_array_of_tables:
-            element = self.child(0)
-            return element.keys if element is not None else []
+            return self.child(0).keys
         return list(dict.fromkeys(key for node in self.alternatives for key in node.get("properties", {})))
 
     @property
@@ -75,8 +74,7 @@ class SchemaNode:
     @property
     def is_array(self) -> bool:
         """Whether this is a list, and nothing else but absent."""
-        kinds = {node.get("type") for node in self.alternatives} - {"null"}
-        return kinds == {"array"}
+        return {node.get("type") for node in self.alternatives} - {"null"} == {"array"}
 
     @property
     def is_array_of_tables(self) -> bool:
@@ -90,11 +88,9 @@ class SchemaNode:
         fitting = tuple(node for node in self.alternatives if _constants(node).items() <= value.items())
         return SchemaNode(fitting or self.alternatives, self.description)
 
-    def child(self, part: str | int) -> SchemaNode | None:
-        """Schema under a key or an index; None where there is no such place."""
+    def child(self, part: str | int) -> SchemaNode:
+        """Schema under a key or an index."""
         found = [place for node in self.alternatives if (place := _child(node, part)) is not None]
-        if not found:
-            return None
         alternatives = tuple(node for place in found for node in place.alternatives)
         inherited = self.description if isinstance(part, int) else ""  # an element has its vector's unit
         return SchemaNode(alternatives, next((place.description for place in found if place.description), inherited))
@@ -105,12 +101,9 @@ def root() -> SchemaNode:
     return _resolve(job_schema())
 
 
-def node_at(path: KeyPath) -> SchemaNode | None:
-    """The place at a path, or None where the schema knows none."""
-    node: SchemaNode | None = root()
-    for part in path:
-        node = node.child(part) if node is not None else None
-    return node
+def node_at(path: KeyPath) -> SchemaNode:
+    """The place at a path."""
+    return reduce(SchemaNode.child, path, root())
 
 
 def sections() -> Iterator[tuple[str, SchemaNode]]:
@@ -118,7 +111,7 @@ def sections() -> Iterator[tuple[str, SchemaNode]]:
     top = root()
     for key in top.keys:
         child = top.child(key)
-        if child is not None and child.is_table and not child.is_open:
+        if child.is_table and not child.is_open:
             yield key, child
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.live_parameters import LiveParameters
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
@@ -24,41 +25,31 @@ if TYPE_CHECKING:
     from render.bounds import Reach
     from render.spec import SceneObject
     from sim.core.snapshots import Snapshot
-    from sim.shapes import PlacedSolid
+    from sim.shapes.placement import PlacedSolid
 
 Solids = Mapping[KeyPath, "PlacedSolid"]
 """Shapes of a job that can be built, by the path of their table."""
 
+SolidBuilder = Callable[[], Solids]
+
 Change = tuple[KeyPath, object]
 """A key of the job file, and another value for it."""
 
-
 Materials = Callable[[str], MaterialParameters]
-"""What a part of a body looks like, by the name of the part."""
+"""Material of a part of a body, by the name of the part."""
 
 
 class Codec(Protocol):
     """Codec of bodies that the cache does not keep array by array as they are."""
 
     def write(self, group: h5py.Group, name: str, snapshot: Snapshot, *, longest_shutter_s: float) -> None:
-        """Write the arrays of a body into its group.
-
-        Args:
-            group: the body's.
-            name: of the body, for errors.
-            snapshot: the body.
-            longest_shutter_s: the longest time that any shutter is open [s]; what no picture shows may be left out.
-        """
+        """Write the arrays of a body into its group; what no shutter of this length [s] shows may be left out."""
 
     def read(self, group: h5py.Group) -> Any:
         """A body as the kind's product is made of it."""
 
     def sparse(self, group: h5py.Group) -> Mapping[str, Iterable[Any]]:
-        """Datasets whose files may be far smaller than they are, with selections that hold all that is there of them.
-
-        Raises:
-            InvalidArtifactError: they are none that `write` writes.
-        """
+        """Datasets that are larger than what is stored of them, each with selections that hold all that is stored."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,9 +63,9 @@ class Product:
         suffix: of the files.
         tools: version of each package that does the work.
         parameters: what decides the file besides the cache.
-        memory_bytes: what a task takes.
+        memory_bytes: memory of a task.
         preflight: why this machine cannot make it, a sentence each.
-        write: makes the file of a body; `threads` are what it may use.
+        write: makes the file of a body, with so many threads.
         validate: decodes the file; raises InvalidArtifactError.
         file_bytes: about the size of a file by the number of the body's elements.
     """
@@ -91,9 +82,26 @@ class Product:
     file_bytes: Callable[[float], float]
     preflight: Callable[[], list[str]] = list
 
+    def file_of(self, body: str) -> str:
+        """Files of a body for the renderer: path below the job's folder, with {frame}."""
+        return f"{self.folder}/{body}/{{frame}}{self.suffix}"
 
-def _none_of_each(_job: Job, _index: int) -> Iterator[tuple[KeyPath, Placement]]:
-    return iter(())
+
+@dataclass(frozen=True)
+class Display:
+    """How `pipeline view` and `pipeline live` show a body of this kind.
+
+    Attributes:
+        layer: title of the box that shows and hides the bodies of the kind.
+        form: points at `position` [m], coloured by the speed of `velocity` or any array of a number each; a mesh of
+            `position` [m] and `triangles`; parts of the body's shape, placed by `position` [m] and `orientation`;
+            density of the cells of a grid.
+        radius: of points: the attribute that holds it [m].
+    """
+
+    layer: str
+    form: Literal["points", "mesh", "parts", "density"]
+    radius: str = "radius"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,21 +114,25 @@ class Kind:
         about: what the reference says of the table.
         size: how many elements the bodies of a job have, for people: "about {:,} particles".
         elements: about how many of these a body has at most.
-        snapshot_bytes: what a snapshot or a checkpoint takes, by the number of elements: in memory, in a frame of the
-            cache, and in a checkpoint.
+        snapshot_bytes: size of an element in memory, in a frame of the cache, and in a checkpoint.
         wears: the kind whose looks its bodies can have (`blender_scripts.look_table`).
-        material: materials of the parts of a body, itself first, where the job does not say.
+        material: usual materials of the parts of a body, itself first.
         placements: the solids that its tables place, each with the path of its table below the body's.
         check: looks at all bodies of the kind; returns the number of their elements.
-        coarser: changes that make the bodies coarser by a factor, for a preview; the last argument says whether the
-            shapes of the job can be built at all.
+        coarser: changes that make the bodies coarser by a factor, for a preview; the last argument builds the solids
+            of the job, or is None where its numbers cannot be computed with.
         solvers: its solvers in a scene, at so many frames a second; None for the kinds that `sim.build` couples.
-        codec: how the cache keeps it.
+        shares_solver: whether a body is one of those that have one solver, which is called by the name of the kind;
+            None for kinds whose solvers have the names of their bodies.
+        is_closed: its drawn meshes have an inside.
+        codec: how the cache keeps it, if not array by array.
         product: the file that is made of each frame; None if the renderer needs none but the cached frame.
         objects: what the renderer draws of a body.
         reach: how far a body reaches in a frame, from its group of the cache; None where there is nothing of it.
         reach_bytes: what finding that takes, by the number of elements.
-        facts: a body in a few words, for the report; the number of its elements in the last frame, if that is known.
+        display: how the viewer shows it.
+        live: what can be changed of it while it runs; None: it does not run live.
+        facts: a body in a few words, for the report, with the number of its elements in the last frame if known.
     """
 
     name: str
@@ -131,18 +143,26 @@ class Kind:
     snapshot_bytes: tuple[float, float, float] = (0.0, 0.0, 0.0)
     wears: str = "rigid"
     material: Callable[[Any], Mapping[str, MaterialParameters]]
-    placements: Callable[[Job, int], Iterator[tuple[KeyPath, Placement]]] = _none_of_each
+    placements: Callable[[Job, int], Iterator[tuple[KeyPath, Placement]]] = lambda _job, _index: iter(())
     check: Callable[[Job, Solids, MemoryBudget, Findings], int]
-    coarser: Callable[[Job, float, bool], Sequence[Change]] = lambda _job, _factor, _can_be_built: ()
+    coarser: Callable[[Job, float, SolidBuilder | None], Sequence[Change]] = lambda _job, _factor, _solids: ()
     solvers: Callable[[SceneParameters, float], Sequence[Solver]] | None = None
-    codec: Codec | None = None
+    shares_solver: Callable[[Any], bool] | None = None
+    is_closed: bool = True
+    codec: Callable[[], Codec] | None = None
     product: Product | None = None
     objects: Callable[[Job, JobLayout, Any, Materials], Iterator[SceneObject]]
     reach: Callable[[Job, JobLayout, Any, h5py.Group], Reach | None]
     reach_bytes: float = 0.0
+    display: Display
+    live: LiveParameters | None = None
     facts: Callable[[Any, float | None], str] = lambda _body, _count: ""
 
     def bodies(self, job: SceneParameters) -> Sequence[Any]:
         """The job's bodies of this kind, in the order of the file."""
         bodies: Sequence[Any] = getattr(job, self.name)
         return bodies
+
+    def has_shared_solver(self, job: SceneParameters) -> bool:
+        """Whether some bodies of the job share a solver that is called by the name of the kind."""
+        return self.shares_solver is not None and any(map(self.shares_solver, self.bodies(job)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
 from math import prod
 from pathlib import Path
@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING
 
 from pipeline.base.content import status_of, tool_version
 from pipeline.base.errors import MissingInputError
-from pipeline.kinds.base import Change, Kind, Materials, Product, Solids
+from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.fluid import validate_mesh
+from pipeline.kinds.live_parameters import CLOTH_LIVE
 from pipeline.model.job import Job
-from pipeline.model.looks import BODY, CLOTHS
+from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.parameters import MaterialParameters
+from sim.cloth.materials import Material
 from sim.cloth.parameters import ClothParameters, RectangleSheet
 from sim.scene import SceneParameters
 from sim.shapes.parameters import MeshShape
@@ -35,13 +37,17 @@ BASE_BYTES = 250_000_000
 BYTES_PER_NODE = 600
 """The frame's arrays, the normals of its triangles and the mesh as it is written."""
 
+LOOKS: dict[Material, MaterialParameters] = {
+    "cotton": MaterialParameters(look="cotton"),
+    "silk": MaterialParameters(look="silk"),
+    "denim": MaterialParameters(look="denim"),
+    "rubber": MaterialParameters(look="rubber", color=(0.03, 0.03, 0.035)),
+}
+"""By what a cloth is made of."""
+
 
 def count_cloth_nodes(scene: SceneParameters) -> int:
-    """Number of nodes of all cloths.
-
-    Raises:
-        MissingInputError: a mesh file cannot be read, or holds no sheet.
-    """
+    """Number of nodes of all cloths; raises as `count_nodes`."""
     return sum(count_nodes(cloth) for cloth in scene.cloth)
 
 
@@ -61,16 +67,12 @@ def count_nodes(cloth: ClothParameters) -> int:
 @cache
 def _nodes_of_mesh(shape: MeshShape, _size: int, _mtime_ns: int) -> int:
     from sim.cloth.sheet import build_sheet
-    from sim.shapes import ShapeError
+    from sim.shapes.solid import ShapeError
 
     try:
         return len(build_sheet(shape).vertices)
     except ShapeError as error:
         raise MissingInputError(f"{error}; the job needs it") from error
-
-
-def _materials(cloth: ClothParameters) -> Mapping[str, MaterialParameters]:
-    return {BODY: CLOTHS[cloth.material]}
 
 
 def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
@@ -79,7 +81,7 @@ def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -
     return check_cloths(job, solids, budget, findings)
 
 
-def _coarser(job: Job, factor: float, _can_be_built: bool) -> list[Change]:
+def _coarser(job: Job, factor: float, _solids: SolidBuilder | None) -> list[Change]:
     changes: list[Change] = []
     for index, cloth in enumerate(job.cloth):
         # Pins would hold others in a coarser sheet where they name nodes by number, and others or none in a region.
@@ -90,7 +92,6 @@ def _coarser(job: Job, factor: float, _can_be_built: bool) -> list[Change]:
 
 
 def _coarser_sheet(path: KeyPath, sheet: RectangleSheet, factor: float) -> Change:
-    """The key that divides a sheet, and its value for so many fewer cells along each side."""
     if sheet.counts is None:
         assert sheet.resolution is not None
         return (*path, "resolution"), sheet.resolution * factor
@@ -100,8 +101,7 @@ def _coarser_sheet(path: KeyPath, sheet: RectangleSheet, factor: float) -> Chang
 def _objects(_job: Job, _layout: JobLayout, cloth: ClothParameters, material_of: Materials) -> Iterator[SceneObject]:
     from render.spec import MeshSequenceObject
 
-    file = f"cloths/{cloth.name}/{{frame}}.ply"
-    yield MeshSequenceObject(name=cloth.name, file=file, material=material_of(BODY))
+    yield MeshSequenceObject(name=cloth.name, file=MESH.file_of(cloth.name), material=material_of(BODY))
 
 
 def _reach(_job: Job, _layout: JobLayout, _cloth: ClothParameters, group: h5py.Group) -> Reach | None:
@@ -125,6 +125,19 @@ def _write_mesh(path: Path, cloth: Snapshot, _job: Job, _threads: int) -> None:
     )
 
 
+MESH = Product(
+    stage="cloth",
+    version=1,
+    folder="cloths",
+    suffix=".ply",
+    tools=lambda _job: {"numpy": tool_version("numpy")},
+    parameters=lambda _job: {},
+    memory_bytes=lambda _job, cloth: BASE_BYTES + BYTES_PER_NODE * count_nodes(cloth),
+    write=_write_mesh,
+    validate=validate_mesh,
+    file_bytes=lambda nodes: 70.0 * nodes,
+)
+
 CLOTH = Kind(
     name="cloth",
     parameters=ClothParameters,
@@ -133,23 +146,16 @@ CLOTH = Kind(
     elements=lambda _job, cloth: count_nodes(cloth),
     snapshot_bytes=(60.0, 32.0, 54.0),
     wears="cloth",
-    material=_materials,
+    material=lambda cloth: {BODY: LOOKS[cloth.material]},
     check=_check,
     coarser=_coarser,
-    product=Product(
-        stage="cloth",
-        version=1,
-        folder="cloths",
-        suffix=".ply",
-        tools=lambda _job: {"numpy": tool_version("numpy")},
-        parameters=lambda _job: {},
-        memory_bytes=lambda _job, cloth: BASE_BYTES + BYTES_PER_NODE * count_nodes(cloth),
-        write=_write_mesh,
-        validate=validate_mesh,
-        file_bytes=lambda nodes: 70.0 * nodes,
-    ),
+    shares_solver=lambda _cloth: True,
+    is_closed=False,
+    product=MESH,
     objects=_objects,
     reach=_reach,
     reach_bytes=100.0,
+    display=Display("Cloth", "mesh"),
+    live=CLOTH_LIVE,
     facts=lambda cloth, _count: f"cloth of {cloth.material}, {cloth.mass_per_area:g} kg/m²",
 )

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from math import ceil, inf, prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from blender_scripts.look_table import LOOK_TABLE
 from pipeline.base.content import tool_version
-from pipeline.kinds.base import Change, Kind, Materials, Product, Solids
+from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.live_parameters import FLUID_LIVE
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, WHITEWATER
-from pipeline.model.looks import FLUID as LOOK
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.parameters import MaterialParameters
@@ -30,11 +30,10 @@ if TYPE_CHECKING:
     from sim.core.snapshots import Snapshot
 
 MOST_IN_A_VOLUME = 1.5
-"""Of a thin block or a narrow opening, whose last particles reach beyond it, as against what the volume tells."""
+"""Particles of a thin block or a narrow opening, over what its volume holds: the last ones reach beyond it."""
 
 WETS_WITHIN_RADII = 1.5
-"""How near a fluid's surface is to what it touches, in radii of its particles. It ends 0.05 radii above a floor and a
-radius inside of a body where particles rest, and 0.8 above where they move; a layer of one particle is two thick."""
+"""How near a fluid's surface is to what it touches, in radii of its particles: up to 0.8 above moving ones."""
 
 WORKER_BYTES = 100_000_000
 BYTES_PER_SURFACE_PARTICLE = 140_000
@@ -49,13 +48,7 @@ def most_particles(scene: SceneParameters) -> float:
 
 
 def most_particles_of(fluid: FluidParameters, scene: SceneParameters, *, until_s: float = inf) -> float:
-    """About the most particles of a fluid: what its blocks and emitters give, at most a domain full.
-
-    Args:
-        fluid: one of the scene's.
-        scene: which has the domain.
-        until_s: what flows in later does not count [s].
-    """
+    """About the most particles of a fluid: what blocks, and emitters until a time [s], give, at most a domain full."""
     filled = sum(
         prod(block.shape.size) * block.scale**3 if isinstance(block.shape, BoxShape) else inf for block in fluid.block
     )
@@ -63,10 +56,6 @@ def most_particles_of(fluid: FluidParameters, scene: SceneParameters, *, until_s
     room = prod(high - low for low, high in zip(scene.domain.min, scene.domain.max, strict=True))
     volume = min(MOST_IN_A_VOLUME * (filled + emitted), room)
     return min(volume, fluid.most_volume) / fluid.lattice_volume
-
-
-def _materials(_fluid: FluidParameters) -> Mapping[str, MaterialParameters]:
-    return {BODY: LOOK, **WHITEWATER}
 
 
 def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:
@@ -84,7 +73,7 @@ def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -
     return sum(check_fluid_size(job, index, solids, budget, findings) for index in range(len(job.fluid)))
 
 
-def _coarser(job: Job, factor: float, _can_be_built: bool) -> list[Change]:
+def _coarser(job: Job, factor: float, _solids: SolidBuilder | None) -> list[Change]:
     changes: list[Change] = []
     for index, fluid in enumerate(job.fluid):
         changes.append((("fluid", index, "particle_radius"), fluid.particle_radius * factor))
@@ -101,7 +90,7 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
     sees = material.look is None or LOOK_TABLE[material.look].refracts
     yield MeshSequenceObject(
         name=fluid.name,
-        file=f"surfaces/{fluid.name}/{{frame}}.ply",
+        file=SURFACE.file_of(fluid.name),
         material=material,
         wets_within=WETS_WITHIN_RADII * fluid.particle_radius if sees else None,
     )
@@ -138,7 +127,7 @@ def _surface_parameters(job: Job) -> dict[str, Any]:
 
 def _surface_memory(job: Job, fluid: FluidParameters) -> int:
     """An upper bound: how many particles there are is not known before the simulation has filled its blocks."""
-    on_surface = most_particles_of(fluid, job, until_s=job.frame_count / job.fps) ** (2.0 / 3.0)
+    on_surface = most_particles_of(fluid, job, until_s=job.film_s) ** (2.0 / 3.0)
     finer = CUBE_SIZE / job.surface.cube_size_in_radii
     meshing: int = ceil(BYTES_PER_SURFACE_PARTICLE * on_surface * finer**2)
     return WORKER_BYTES + meshing
@@ -159,7 +148,7 @@ def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
 
 
 def validate_mesh(path: Path) -> None:
-    """Decode a PLY; raises InvalidArtifactError if it is damaged."""
+    """Decode a PLY; raises InvalidArtifactError."""
     from render.meshes import validate_ply
 
     validate_ply(path)
@@ -170,6 +159,19 @@ def _facts(fluid: FluidParameters, count: float | None) -> str:
     return f"{fluid.solver.upper()}, {particles} of radius {fluid.particle_radius:g} m"
 
 
+SURFACE = Product(
+    stage="surface",
+    version=2,
+    folder="surfaces",
+    suffix=".ply",
+    tools=_surface_tools,
+    parameters=_surface_parameters,
+    memory_bytes=_surface_memory,
+    write=_write_surface,
+    validate=validate_mesh,
+    file_bytes=lambda particles: 2_500.0 * particles ** (2 / 3),
+)
+
 FLUID = Kind(
     name="fluid",
     parameters=FluidParameters,
@@ -178,24 +180,15 @@ FLUID = Kind(
     elements=lambda job, fluid: most_particles_of(fluid, job),
     snapshot_bytes=(84.0, 26.0, 90.0),
     wears="fluid",
-    material=_materials,
+    material=lambda _fluid: {BODY: MaterialParameters(look="water"), **WHITEWATER},
     placements=_placements,
     check=_check,
     coarser=_coarser,
-    product=Product(
-        stage="surface",
-        version=2,
-        folder="surfaces",
-        suffix=".ply",
-        tools=_surface_tools,
-        parameters=_surface_parameters,
-        memory_bytes=_surface_memory,
-        write=_write_surface,
-        validate=validate_mesh,
-        file_bytes=lambda particles: 2_500.0 * particles ** (2 / 3),
-    ),
+    product=SURFACE,
     objects=_objects,
     reach=_reach,
     reach_bytes=160.0,
+    display=Display("Particles", "points", radius="particle_radius"),
+    live=FLUID_LIVE,
     facts=_facts,
 )

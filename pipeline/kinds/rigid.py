@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from math import cos, radians, sin
 from typing import TYPE_CHECKING
 
-from pipeline.kinds.base import Kind, Materials, Solids
+from pipeline.kinds.base import Display, Kind, Materials, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
+from pipeline.kinds.live_parameters import RIGID_LIVE
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, NATURAL_MATERIALS, SOLID, parts_of
-from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
-from render.parameters import MaterialParameters
 from sim.rigid.parameters import RigidBodyParameters
-from sim.shapes.parameters import Placement
 
 if TYPE_CHECKING:
     import h5py
@@ -24,14 +22,6 @@ if TYPE_CHECKING:
     from pipeline.base.layout import JobLayout
     from render.bounds import Reach
     from render.spec import SceneObject
-
-
-def _materials(body: RigidBodyParameters) -> Mapping[str, MaterialParameters]:
-    return NATURAL_MATERIALS.get(body.shape.type, {BODY: SOLID})
-
-
-def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:
-    yield (), job.rigid[index]
 
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
@@ -95,9 +85,12 @@ RIGID = Kind(
     name="rigid",
     parameters=RigidBodyParameters,
     about="Rigid bodies.",
-    material=_materials,
-    placements=_placements,
+    material=lambda body: NATURAL_MATERIALS.get(body.shape.type, {BODY: SOLID}),
+    placements=lambda job, index: iter([((), job.rigid[index])]),
     check=_check,
+    shares_solver=lambda body: body.kind != "static",
     objects=_objects,
     reach=_reach,
+    display=Display("Rigid bodies", "parts"),
+    live=RIGID_LIVE,
 )

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.base.content import ABSENT, tool_version
 from pipeline.base.errors import InvalidArtifactError
-from pipeline.kinds.base import Change, Kind, Materials, Product, Solids
+from pipeline.kinds.base import Change, Codec, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
-from pipeline.model.looks import SMOKE as LOOK
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.parameters import MaterialParameters
 from sim.shapes.parameters import Placement
-from sim.smoke.parameters import CELLS_PER_EDDY, SmokeParameters, SmokeSourceParameters
+from sim.smoke.parameters import CELLS_PER_EDDY, SmokeParameters
 
 if TYPE_CHECKING:
     import h5py
@@ -27,52 +26,24 @@ if TYPE_CHECKING:
     from pipeline.kinds.smoke_codec import SmokeInBox
     from render.bounds import Reach
     from render.spec import SceneObject
-    from sim.core.snapshots import Snapshot
 
 WORKER_BYTES = 130_000_000
 BYTES_PER_CELL = 80
 """Of writing a volume all full of smoke, what is read from the cache included."""
 
 
-class SmokeCodec:
-    """Smoke in the cache, as exactly as pictures can show it: `smoke_codec`."""
+def _codec() -> Codec:
+    from pipeline.kinds import smoke_codec
 
-    def write(self, group: h5py.Group, name: str, snapshot: Snapshot, *, longest_shutter_s: float) -> None:
-        """Write the grids of a smoke where there is some."""
-        from pipeline.kinds.smoke_codec import write_smoke
-
-        write_smoke(group, name, snapshot, longest_shutter_s=longest_shutter_s)
-
-    def read(self, group: h5py.Group) -> SmokeInBox:
-        """The part of a smoke that is not empty."""
-        from pipeline.kinds.smoke_codec import read_smoke
-
-        return read_smoke(group)
-
-    def sparse(self, group: h5py.Group) -> dict[str, Iterator[Any]]:
-        """The grids, in slabs of the box that is not empty."""
-        from pipeline.kinds.smoke_codec import grids_of, slabs, stored_box
-
-        return {key: slabs(stored_box(grid)) for key, grid in grids_of(group).items()}
-
-
-def _materials(_smoke: SmokeParameters) -> Mapping[str, MaterialParameters]:
-    return {BODY: LOOK}
+    return smoke_codec
 
 
 def _placements(job: Job, index: int) -> Iterator[tuple[KeyPath, Placement]]:
-    for number, source in enumerate(job.smoke[index].source):
-        yield ("source", number), _at_the_start(job, source)
-
-
-def _at_the_start(job: Job, source: SmokeSourceParameters) -> SmokeSourceParameters:
-    """A source on a body stands where that does."""
-    body = next((body for body in job.rigid if body.name == source.follow), None)
-    if body is None:
-        return source
     from sim.coupling.smoke_sources import placed_on
 
-    return placed_on(source, body)
+    for number, source in enumerate(job.smoke[index].source):
+        body = next((body for body in job.rigid if body.name == source.follow), None)
+        yield ("source", number), source if body is None else placed_on(source, body)
 
 
 def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
@@ -81,11 +52,13 @@ def _check(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -
     return check_smokes(job, solids, budget, findings)
 
 
-def _coarser(job: Job, factor: float, can_be_built: bool) -> list[Change]:
-    from pipeline.kinds.checks.coarser_smoke import coarser_cell_sizes
+def _coarser(job: Job, factor: float, solids: SolidBuilder | None) -> list[Change]:
+    from pipeline.kinds.checks.smoke import coarser_cell_sizes
 
     changes: list[Change] = []
-    cell_sizes = coarser_cell_sizes(job, factor) if can_be_built else [smoke.cell_size for smoke in job.smoke]
+    cell_sizes = [smoke.cell_size for smoke in job.smoke]
+    if job.smoke and solids is not None:
+        cell_sizes = coarser_cell_sizes(job, factor, solids())
     for index, (smoke, cell_size) in enumerate(zip(job.smoke, cell_sizes, strict=True)):
         changes.append((("smoke", index, "cell_size"), cell_size))
         gusts = smoke.turbulence
@@ -100,7 +73,7 @@ def _objects(job: Job, _layout: JobLayout, smoke: SmokeParameters, material_of: 
     box_min, box_max = smoke.corners(job.domain)
     yield VolumeSequenceObject(
         name=smoke.name,
-        file=f"volumes/{smoke.name}/{{frame}}.vdb",
+        file=VOLUME.file_of(smoke.name),
         box_min=box_min,
         box_max=box_max,
         open_faces=smoke.open_faces,
@@ -152,6 +125,20 @@ def _validate_volume(path: Path) -> None:
     validate_volume(path)
 
 
+VOLUME = Product(
+    stage="volume",
+    version=2,
+    folder="volumes",
+    suffix=".vdb",
+    tools=_openvdb,
+    parameters=lambda job: {"volume": job.volume, "fps": job.fps, "shutter": job.render.shutter},
+    memory_bytes=lambda job, smoke: WORKER_BYTES + BYTES_PER_CELL * prod(smoke.cell_counts(job.domain)),
+    write=_write_volume,
+    validate=_validate_volume,
+    file_bytes=lambda cells: 20_000 + 3.0 * cells,
+    preflight=_missing_openvdb,
+)
+
 SMOKE = Kind(
     name="smoke",
     parameters=SmokeParameters,
@@ -160,26 +147,15 @@ SMOKE = Kind(
     elements=lambda job, smoke: prod(smoke.cell_counts(job.domain)),
     snapshot_bytes=(24.0, 2.0, 26.0),
     wears="smoke",
-    material=_materials,
+    material=lambda _smoke: {BODY: MaterialParameters(look="smoke")},
     placements=_placements,
     check=_check,
     coarser=_coarser,
-    codec=SmokeCodec(),
-    product=Product(
-        stage="volume",
-        version=2,
-        folder="volumes",
-        suffix=".vdb",
-        tools=_openvdb,
-        parameters=lambda job: {"volume": job.volume, "fps": job.fps, "shutter": job.render.shutter},
-        memory_bytes=lambda job, smoke: WORKER_BYTES + BYTES_PER_CELL * prod(smoke.cell_counts(job.domain)),
-        write=_write_volume,
-        validate=_validate_volume,
-        file_bytes=lambda cells: 20_000 + 3.0 * cells,
-        preflight=_missing_openvdb,
-    ),
+    codec=_codec,
+    product=VOLUME,
     objects=_objects,
     reach=_reach,
     reach_bytes=8.0,
+    display=Display("Smoke", "density"),
     facts=lambda smoke, _count: f"smoke, cells of {smoke.cell_size:g} m",
 )

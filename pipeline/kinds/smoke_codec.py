@@ -1,8 +1,8 @@
-"""Smoke in the cache: only where it is, and as exactly as pictures can show (docs/decisions/0025-smoke-on-disk.md).
+"""Codec of smoke in the cache: only where it is, and as exactly as pictures can show it.
 
 Datasets have the shape of the whole box of cells, but chunks of empty space are not in the file: any HDF5 library
-reads them as what is empty there, no smoke, air of the ambient temperature, at rest. What is cut off or rounded is so
-for pictures alone; the simulation continues from checkpoints, which are exact.
+reads them as no smoke, air of the ambient temperature, at rest. Checkpoints are exact. See
+docs/decisions/0025-smoke-on-disk.md.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from sim.smoke.parameters import MOST_CELLS
 
 Float32Array = NDArray[np.float32]
 
+GRIDS = ("density", "temperature", "velocity")
 CHUNK_CELLS = 32
-"""Edge of a chunk: finer ones hug the smoke more closely, and cost more in calls and in the index than they save."""
-
+"""Edge of a chunk: finer ones cost more in calls and in the index than they save."""
 DENSITY_BITS = 11
 """Significant bits of a density, as many as 16-bit floats have: wrong by 5e-4 of it at most, and without bias."""
 DENSITY_FLOOR = 2.0**-20
@@ -61,25 +61,19 @@ class SmokeInBox:
     ambient_temperature: float
 
 
-def write_smoke(group: h5py.Group, name: str, smoke: Snapshot, *, longest_shutter_s: float) -> None:
-    """Write the arrays of a smoke into the group of its body.
+def write(group: h5py.Group, name: str, snapshot: Snapshot, *, longest_shutter_s: float) -> None:
+    """Write the grids of a smoke into the group of its body.
 
-    The velocity is kept as far around smoke and heat as they are drawn in motion blur with the longest shutter.
-
-    Args:
-        group: where the datasets go.
-        name: of the smoke, for errors.
-        smoke: its snapshot.
-        longest_shutter_s: longest time that any shutter is open [s]; with one frame, pictures may change theirs.
+    The velocity is kept as far around smoke and heat as they are drawn in motion blur with the longest shutter [s].
 
     Raises:
         InvalidArtifactError: a value is not finite.
     """
-    fields = {key: np.asarray(smoke.arrays[key], np.float32) for key in ("density", "temperature", "velocity")}
+    fields = {key: np.asarray(snapshot.arrays[key], np.float32) for key in GRIDS}
     for key, values in fields.items():
         _require_finite(name, key, values)
     density, temperature, velocity = fields.values()
-    ambient, cell_size = np.float32(smoke.number("ambient_temperature")), smoke.number("cell_size")
+    ambient, cell_size = np.float32(snapshot.number("ambient_temperature")), snapshot.number("cell_size")
     step = _power_of_two_below(cell_size / longest_shutter_s / VELOCITY_STEPS)
     present = _present(density, temperature, ambient)
     around, box = _around(present, velocity, shutter_s=longest_shutter_s, cell_size=cell_size)
@@ -112,14 +106,14 @@ def write_smoke(group: h5py.Group, name: str, smoke: Snapshot, *, longest_shutte
                 _put(datasets["velocity"], (*block, axis), np.where(near, component, np.float32(0.0)))
 
 
-def read_smoke(group: h5py.Group) -> SmokeInBox:
-    """Read what is there of a smoke, from the group of its body.
+def read(group: h5py.Group) -> SmokeInBox:
+    """Read the part of a smoke that is not empty, from the group of its body.
 
     Raises:
-        InvalidArtifactError: its grids are none that `write_smoke` writes.
+        InvalidArtifactError: its grids are none that `write` writes.
     """
-    grids = grids_of(group)
-    part = stored_box(grids["velocity"])
+    grids = _grids_of(group)
+    part = _stored_box(grids["velocity"])
     velocity = np.empty((*(side.stop - side.start for side in part), 3), np.float32)
     for axis in range(3):  # a third faster than all at once, as chunks hold one component each
         velocity[..., axis] = grids["velocity"][(*part, axis)]
@@ -135,31 +129,34 @@ def read_smoke(group: h5py.Group) -> SmokeInBox:
     )
 
 
+def sparse(group: h5py.Group) -> dict[str, Iterator[Box]]:
+    """The grids, each in slabs of the box that is not empty.
+
+    Raises:
+        InvalidArtifactError: they are none that `write` writes.
+    """
+    return {key: _slabs(_stored_box(grid)) for key, grid in _grids_of(group).items()}
+
+
 def read_density(group: h5py.Group) -> tuple[Float32Array, tuple[float, float, float], float]:
-    """Read where a smoke is, from the group of its body.
+    """Read the density of a smoke, from the group of its body.
 
     Returns:
         Density of the cells that are not empty (nx, ny, nz) [-], lower corner of the first of them [m], and the edge of
         a cell [m].
 
     Raises:
-        InvalidArtifactError: its grids are none that `write_smoke` writes.
+        InvalidArtifactError: its grids are none that `write` writes.
     """
-    density = grids_of(group)["density"]
-    part, cell_size = stored_box(density), float(group.attrs["cell_size"])
+    density = _grids_of(group)["density"]
+    part, cell_size = _stored_box(density), float(group.attrs["cell_size"])
     x, y, z = (float(low) + side.start * cell_size for low, side in zip(group.attrs["origin"], part, strict=True))
     return density[part], (x, y, z), cell_size
 
 
-def grids_of(group: h5py.Group) -> dict[str, h5py.Dataset]:
-    """The grids of a smoke by name, of which nothing has been read yet.
-
-    Empty space is not stored, so a small file may claim any size: what no smoke has is refused here.
-
-    Raises:
-        InvalidArtifactError: one is missing, they differ in shape, or they have more cells than any smoke.
-    """
-    grids = {key: group.get(key) for key in ("density", "temperature", "velocity")}
+def _grids_of(group: h5py.Group) -> dict[str, h5py.Dataset]:
+    """The grids of a smoke by name, not read yet; as empty space is not stored, a small file may claim any size."""
+    grids = {key: group.get(key) for key in GRIDS}
     for key, dataset in grids.items():
         if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
             raise InvalidArtifactError(f"{group.name}: has no grid of {key}")
@@ -171,12 +168,8 @@ def grids_of(group: h5py.Group) -> dict[str, h5py.Dataset]:
     return grids
 
 
-def stored_box(grid: h5py.Dataset) -> Box:
-    """The cells outside of which a grid of a smoke holds nothing; all of them where it was stored as it is.
-
-    Raises:
-        InvalidArtifactError: the box is none, or not in the grid; or there is none, and hardly anything is stored.
-    """
+def _stored_box(grid: h5py.Dataset) -> Box:
+    """The cells outside of which a grid of a smoke holds nothing; all of them where it was stored as it is."""
     shape = grid.shape[:3]
     if "box" not in grid.attrs:
         require_stored(grid)
@@ -190,7 +183,7 @@ def stored_box(grid: h5py.Dataset) -> Box:
     return x, y, z
 
 
-def slabs(box: Box) -> Iterator[Box]:
+def _slabs(box: Box) -> Iterator[Box]:
     """Parts of a box that are few cells long along x, so that reading them takes little memory."""
     for start in range(box[0].start, box[0].stop, CHUNK_CELLS):
         yield slice(start, min(start + CHUNK_CELLS, box[0].stop)), box[1], box[2]
@@ -198,7 +191,7 @@ def slabs(box: Box) -> Iterator[Box]:
 
 def _require_finite(name: str, key: str, values: Float32Array) -> None:
     whole = slice(0, values.shape[0]), slice(None), slice(None)
-    for slab in slabs(whole):
+    for slab in _slabs(whole):
         finite = np.isfinite(values[slab])
         if not finite.all():
             x, y, z = (int(index) for index in np.argwhere(~finite)[0][:3])
@@ -208,7 +201,7 @@ def _require_finite(name: str, key: str, values: Float32Array) -> None:
 def _present(density: Float32Array, temperature: Float32Array, ambient: np.float32) -> NDArray[np.bool_]:
     """Where there is smoke or heat that is not rounded away, (nx, ny, nz)."""
     present = np.empty(density.shape, np.bool_)
-    for slab in slabs((slice(0, density.shape[0]), slice(None), slice(None))):
+    for slab in _slabs((slice(0, density.shape[0]), slice(None), slice(None))):
         warm = np.abs(temperature[slab] - ambient) > 0.5 * TEMPERATURE_STEP_K
         np.logical_or(density[slab] >= DENSITY_FLOOR, warm, out=present[slab])
     return present
@@ -223,14 +216,12 @@ def _around(
     if box is None:
         return around, (slice(0, 0), slice(0, 0), slice(0, 0))
     reach = blur_reach(velocity[box], present[box], shutter_s=shutter_s, cell_size=cell_size)
-    wide = grown(present[box], reach)
-    low = [max(0, side.start - reach) for side in box]
-    high = [min(n, side.stop + reach) for side, n in zip(box, present.shape, strict=True)]
-    x, y, z = (slice(a, b) for a, b in zip(low, high, strict=True))
-    inside = tuple(
-        slice(a - side.start + reach, b - side.start + reach) for a, b, side in zip(low, high, box, strict=True)
+    x, y, z = (
+        slice(max(0, side.start - reach), min(n, side.stop + reach)) for side, n in zip(box, present.shape, strict=True)
     )
-    around[x, y, z] = wide[inside]
+    starts = [side.start - reach for side in box]  # of the grown box, beyond the grid or not
+    inside = tuple(slice(each.start - a, each.stop - a) for each, a in zip((x, y, z), starts, strict=True))
+    around[x, y, z] = grown(present[box], reach)[inside]
     return around, (x, y, z)
 
 

@@ -101,14 +101,16 @@ _RANKS: dict[type, int] = {
 }
 
 
+def drawn_bodies(job: Job, layout: JobLayout) -> Iterator[tuple[Kind, Any, SceneObject]]:
+    """Every object that the renderer draws, with its body and that one's kind."""
+    for _, kind, body in bodies(job):
+        for drawn in kind.objects(job, layout, body, partial(material_of, job, body.name)):
+            yield kind, body, drawn
+
+
 def scene_objects(job: Job, layout: JobLayout) -> list[SceneObject]:
     """Objects that the renderer draws of all bodies: solids first, volumes last."""
-    objects = [
-        drawn
-        for _, kind, body in bodies(job)
-        for drawn in kind.objects(job, layout, body, partial(material_of, job, body.name))
-    ]
-    return sorted(objects, key=lambda drawn: _RANKS[type(drawn)])
+    return sorted((drawn for _, _, drawn in drawn_bodies(job, layout)), key=lambda drawn: _RANKS[type(drawn)])
 
 
 # --- materials ---

@@ -11,6 +11,9 @@ from sim.smoke.parameters import SmokeParameters
 Box = NDArray[np.float64]
 """Lower and upper corner [m], (2, 3)."""
 
+ALL = 1.0 - 1e-6
+"""Share of a box that counts as all of it: sizes and positions written in decimal do not add up exactly."""
+
 
 def domain_box(domain: DomainParameters) -> Box:
     """The box of a domain."""

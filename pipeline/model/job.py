@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from pipeline.model.limits import LimitParameters
-from pipeline.model.problems import suggestion
+from pipeline.model.problems import unknown_name
 from render.parameters import (
     CameraParameters,
     LightParameters,
@@ -72,6 +72,11 @@ class Job(SceneParameters):
         return DEFAULT_FRAMES
 
     @property
+    def film_s(self) -> float:
+        """Length of the film [s]."""
+        return self.frame_count / self.fps
+
+    @property
     def _named(self) -> frozenset[str]:
         """Names of all bodies, of whatever kind."""
         tables = (getattr(self, key) for key in type(self).model_fields)
@@ -116,10 +121,10 @@ class Job(SceneParameters):
             raise ValueError(f'camera.follow: "{name}" is static; set camera.look_at to look at it')
         known = self.moving_bodies if key == "follow" else rigid
         if name not in known:
-            kind = "dynamic or kinematic rigid body" if key == "follow" else "rigid body"
-            kinds = "moving bodies" if key == "follow" else "rigid bodies"
-            hint = suggestion(name, known) or (f"; {kinds} are {', '.join(known)}" if known else "")
-            raise ValueError(f'camera.{key}: no {kind} is named "{name}"{hint}')
+            kind, plural = "rigid body", "rigid bodies"
+            if key == "follow":
+                kind, plural = "dynamic or kinematic rigid body", "moving bodies"
+            raise ValueError(f"camera.{key}: {unknown_name(name, known, kind, plural=plural)}")
 
     @model_validator(mode="after")
     def _frames_or_duration(self) -> Self:

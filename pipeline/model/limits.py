@@ -7,12 +7,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from pipeline.base.policy import Policy
+from pipeline.base.task import Policy
 from render.parameters import Fraction, Parameters, Positive
 
 DEFAULT_STALL_S = 3600.0
-"""A single frame shows no sign of life while Cycles draws it, and a final one in film resolution takes half an hour on
-a few cores."""
+"""Cycles shows no sign of life within a frame, and a final one takes half an hour on a few cores."""
 
 
 class LimitParameters(Parameters):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from render.parameters import MaterialParameters
-from sim.cloth.materials import Material
 
 BODY = "body"
 """The part of a shape that carries the body's own name."""
@@ -28,19 +27,6 @@ NATURAL_MATERIALS: dict[str, dict[str, MaterialParameters]] = {
 WHITEWATER = {part: MaterialParameters(look=part) for part in ("spray", "foam", "bubbles")}
 """Materials of the parts of a fluid that has whitewater; each is a look of its own."""
 
-CLOTHS: dict[Material, MaterialParameters] = {
-    "cotton": MaterialParameters(look="cotton"),
-    "silk": MaterialParameters(look="silk"),
-    "denim": MaterialParameters(look="denim"),
-    "rubber": MaterialParameters(look="rubber", color=(0.03, 0.03, 0.035)),
-}
-"""Materials of cloths, by what they are made of."""
-
-GLOWING_K = 900.0
-"""From here on the glow of smoke shows beside other light; by day it takes 1200 K and more [K]."""
-
-FLUID = MaterialParameters(look="water")
-SMOKE = MaterialParameters(look="smoke")
 SOLID = MaterialParameters(look="plastic")
 
 

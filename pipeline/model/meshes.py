@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from collections.abc import Iterator
+from typing import Any
 
 from pydantic import BaseModel
 
 from pipeline.model.positions import KeyPath
 from sim.shapes.parameters import MeshShape
-
-M = TypeVar("M", bound=BaseModel)
 
 
 def mesh_shapes(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, MeshShape]]:
@@ -25,23 +23,13 @@ def mesh_shapes(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, MeshS
             yield from mesh_shapes(child, (*path, index))
 
 
-def with_meshes(model: M, replaced: Callable[[MeshShape], MeshShape]) -> M:
-    """A copy of a table with each mesh below it replaced; the table itself if there is none."""
-    changes: dict[str, Any] = {}
-    for key in type(model).model_fields:
-        before = getattr(model, key)
-        after = _replaced(before, replaced)
-        if after is not before:
-            changes[key] = after
-    return model.model_copy(update=changes) if changes else model
-
-
-def _replaced(value: Any, replaced: Callable[[MeshShape], MeshShape]) -> Any:
-    if isinstance(value, MeshShape):
-        return replaced(value)
+def with_value(value: Any, path: KeyPath, new: object) -> Any:
+    """A model, tuple or table with another value at a path; nothing is validated."""
+    if not path:
+        return new
+    key, rest = path[0], path[1:]
     if isinstance(value, BaseModel):
-        return with_meshes(value, replaced)
+        return value.model_copy(update={str(key): with_value(getattr(value, str(key)), rest, new)})
     if isinstance(value, tuple):
-        children = tuple(_replaced(child, replaced) for child in value)
-        return children if any(a is not b for a, b in zip(children, value, strict=True)) else value
-    return value
+        return tuple(with_value(each, rest, new) if index == key else each for index, each in enumerate(value))
+    return {**value, key: with_value(value[key], rest, new)}

@@ -1,14 +1,13 @@
-"""The line of every key of a TOML text.
+"""The line of every key of a TOML text, which neither `tomllib` nor `tomlkit` tells.
 
-`tomllib` gives values without positions and `tomlkit` keeps formatting but no line numbers, while an error is only
-half as useful without its line. This scanner reads TOML that `tomllib` has accepted already, so it need not diagnose
-anything: it walks the text once and writes down where each key and each array element starts.
+The scanner reads TOML that `tomllib` has accepted already, so it need not diagnose anything.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import count
 
 KeyPath = tuple[str | int, ...]
 """Keys and array indices from the top of the document, e.g. `("fluid", 0, "rest_density")`."""
@@ -30,23 +29,21 @@ _ESCAPED = {"b": "\b", "t": "\t", "n": "\n", "f": "\f", "r": "\r", "e": "\x1b"}
 
 def locate_keys(text: str) -> Mapping[KeyPath, int]:
     """Line, counted from 1, of every table, key and array element of a valid TOML document."""
-    scanner = _Scanner(text)
-    scanner.scan_document()
-    return scanner.lines
+    return _Scanner(text).scan_document()
 
 
 class _Scanner:
     def __init__(self, text: str) -> None:
-        self.text = text
-        self.at = 0
-        self.lines: dict[KeyPath, int] = {}
+        self._text = text
+        self._at = 0
+        self._lines: dict[KeyPath, int] = {}
         self._last_offset, self._last_line = 0, 1
         self._tables_in_array: dict[KeyPath, int] = {}
 
-    def scan_document(self) -> None:
+    def scan_document(self) -> Mapping[KeyPath, int]:
         table: KeyPath = ()
         self._skip(_BLANK_LINES_AND_COMMENTS)
-        while self.at < len(self.text):
+        while self._at < len(self._text):
             if self._take("[["):
                 table = self._enter_table(self._key_parts(), in_array=True)
                 self._take("]]")
@@ -56,26 +53,24 @@ class _Scanner:
             else:
                 self._scan_pair(table)
             self._skip(_BLANK_LINES_AND_COMMENTS)
+        return self._lines
 
     def _enter_table(self, parts: list[str], *, in_array: bool) -> KeyPath:
         path: KeyPath = ()
         for part in parts[:-1]:
             path = self._last_table((*path, part))
         path = (*path, parts[-1])
-        if not in_array:
-            path = self._last_table(path)
-        else:
-            self._record(path)
+        if in_array:
             self._tables_in_array[path] = self._tables_in_array.get(path, 0) + 1
-            path = self._last_table(path)
+        path = self._last_table(path)
         self._record(path)
         return path
 
     def _last_table(self, path: KeyPath) -> KeyPath:
         """`path` itself, or the newest table of the array of tables at `path`."""
         self._record(path)
-        count = self._tables_in_array.get(path, 0)
-        return (*path, count - 1) if count else path
+        tables = self._tables_in_array.get(path, 0)
+        return (*path, tables - 1) if tables else path
 
     def _scan_pair(self, table: KeyPath) -> None:
         path = table
@@ -88,27 +83,22 @@ class _Scanner:
 
     def _scan_value(self, path: KeyPath) -> None:
         if self._take("["):
-            self._scan_array(path)
+            for index in self._items_until("]"):
+                self._record((*path, index))
+                self._scan_value((*path, index))
         elif self._take("{"):
-            self._scan_inline_table(path)
+            for _ in self._items_until("}"):
+                self._scan_pair(path)
         elif not self._skip(_STRING):
             self._skip(_BARE_VALUE)
 
-    def _scan_array(self, path: KeyPath) -> None:
-        index = 0
+    def _items_until(self, end: str) -> Iterator[int]:
+        """Numbers of the items of an array or an inline table, each of which the caller scans."""
         self._skip(_BLANK_LINES_AND_COMMENTS)
-        while not self._take("]"):
-            self._record((*path, index))
-            self._scan_value((*path, index))
-            index += 1
-            self._skip(_BLANK_LINES_AND_COMMENTS)
-            self._take(",")
-            self._skip(_BLANK_LINES_AND_COMMENTS)
-
-    def _scan_inline_table(self, path: KeyPath) -> None:
-        self._skip(_BLANK_LINES_AND_COMMENTS)
-        while not self._take("}"):
-            self._scan_pair(path)
+        for index in count():
+            if self._take(end):
+                return
+            yield index
             self._skip(_BLANK_LINES_AND_COMMENTS)
             self._take(",")
             self._skip(_BLANK_LINES_AND_COMMENTS)
@@ -117,32 +107,32 @@ class _Scanner:
         parts: list[str] = []
         while not parts or self._take("."):
             self._skip(_BLANK)
-            quoted = _STRING.match(self.text, self.at)
-            match = quoted or _BARE_KEY.match(self.text, self.at)
+            quoted = _STRING.match(self._text, self._at)
+            match = quoted or _BARE_KEY.match(self._text, self._at)
             if match is None:
-                raise ValueError(f"not TOML at offset {self.at}")
-            self.at = match.end()
+                raise ValueError(f"not TOML at offset {self._at}")
+            self._at = match.end()
             parts.append(_unquote(match.group()) if quoted else match.group())
             self._skip(_BLANK)
         return parts
 
     def _take(self, token: str) -> bool:
-        if self.text.startswith(token, self.at):
-            self.at += len(token)
+        if self._text.startswith(token, self._at):
+            self._at += len(token)
             return True
         return False
 
     def _skip(self, pattern: re.Pattern[str]) -> bool:
-        match = pattern.match(self.text, self.at)
+        match = pattern.match(self._text, self._at)
         if match is None:
             return False
-        self.at = match.end()
+        self._at = match.end()
         return True
 
     def _record(self, path: KeyPath) -> None:
-        self._last_line += self.text.count("\n", self._last_offset, self.at)
-        self._last_offset = self.at
-        self.lines.setdefault(path, self._last_line)
+        self._last_line += self._text.count("\n", self._last_offset, self._at)
+        self._last_offset = self._at
+        self._lines.setdefault(path, self._last_line)
 
 
 def _unquote(key: str) -> str:

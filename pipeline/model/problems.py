@@ -24,24 +24,18 @@ class Problem:
 
 @dataclass(slots=True)
 class Findings:
-    """Findings of the checks.
-
-    Attributes:
-        errors: what forbids the job, in any order.
-        warnings: what is worth a look, in any order.
-        elements: about how many particles, cells or nodes the bodies of each kind have, by its name.
-    """
+    """Findings of the checks: problems in any order, and about how many elements the bodies have, by kind."""
 
     errors: list[Problem] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)
     elements: dict[str, int] = field(default_factory=dict)
 
     def error(self, path: KeyPath, message: str) -> None:
-        """Note what forbids the job."""
+        """Note a problem that forbids the job."""
         self.errors.append(Problem(path, message))
 
     def warn(self, path: KeyPath, message: str) -> None:
-        """Note what is worth a look."""
+        """Note a problem that is worth a look."""
         self.warnings.append(Problem(path, message))
 
 
@@ -104,6 +98,13 @@ def suggestion(word: object, known: Iterable[str]) -> str:
     candidates = {candidate.lower(): candidate for candidate in known}
     close = difflib.get_close_matches(str(word).lower(), list(candidates), n=1, cutoff=_CLOSE_ENOUGH)
     return f'; did you mean "{candidates[close[0]]}"?' if close else ""
+
+
+def unknown_name(name: str, known: Iterable[str], kind: str, *, plural: str = "", none: str = "") -> str:
+    """Sentence that no body of a kind has a name, with the names that may be meant, or what to do if there are none."""
+    names = list(known)
+    listed = f"; {plural or f'{kind}s'} are {', '.join(names)}" if names else none
+    return f'no {kind} is named "{name}"{suggestion(name, names) or listed}'
 
 
 def quoted_list(words: Iterable[str]) -> str:

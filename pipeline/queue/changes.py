@@ -1,37 +1,19 @@
-"""What people ask of jobs in a farm's queue: pause, resume, cancel, retry, another priority.
+"""Changes that people ask for of jobs in a farm's queue: pause, resume, cancel, retry, another priority.
 
 Commands and the dashboard call these. Each only changes the job's entry in the queue, which whoever runs it looks at.
 """
 
 from __future__ import annotations
 
-import time
-from dataclasses import replace
-from typing import NamedTuple
-
 from pipeline.base.errors import JobBusyError, PipelineError
 from pipeline.base.lease import live_holder
-from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob, new_entry, new_submission
-from pipeline.queue.states import JobState, state_of
-from pipeline.record.interrupted_recording import complete_crashed_take
+from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob, new_entry
+from pipeline.record.interrupted_recording import complete_interrupted_recording
 from pipeline.run.goal import read_goal
 
 
-class Continuation(NamedTuple):
-    """How a job goes on.
-
-    Attributes:
-        entry: to be queued.
-        note: what was done to its folder for that, a sentence; "" for nothing.
-    """
-
-    entry: QueuedJob
-    note: str = ""
-
-
-def queue_state(queue: JobQueue, job: QueuedJob) -> JobState:
-    """Where a job of the queue stands."""
-    return state_of(job, runs=live_holder(queue.layout(job.name).lease) is not None)
+def _runs(queue: JobQueue, name: str) -> bool:
+    return live_holder(queue.layout(name).lease) is not None
 
 
 def entry_of(queue: JobQueue, name: str) -> QueuedJob:
@@ -57,7 +39,7 @@ def pause_job(queue: JobQueue, name: str) -> bool:
         if entry.desired is Desired.NONE:
             raise PipelineError(f"{name} has failed, and does not run; see: pipeline status")
         queue.change(name, desired=Desired.PAUSE, note="asked to pause")
-    return queue_state(queue, entry) is JobState.RUNNING
+    return entry.desired is Desired.RUN and _runs(queue, name)
 
 
 def cancel_job(queue: JobQueue, name: str) -> None:
@@ -79,17 +61,15 @@ def another_try(queue: JobQueue, name: str, *, background: bool) -> QueuedJob:
         PipelineError: the job is not in the queue, or waits for its turn already.
     """
     entry = entry_of(queue, name)
-    if entry.desired is Desired.RUN and queue_state(queue, entry) is not JobState.RUNNING:
+    if entry.desired is Desired.RUN and not _runs(queue, name):
         raise PipelineError(f"{name} waits for its turn already; see: pipeline status")
-    return replace(
-        entry, submission=new_submission(), desired=Desired.RUN, note="", submitted=time.time(), background=background
-    )
+    return entry.again(background=background)
 
 
-def continuation(queue: JobQueue, name: str) -> Continuation:
+def continuation(queue: JobQueue, name: str) -> tuple[QueuedJob, str]:
     """The entry by which a job goes on in the background as it was meant, to be queued.
 
-    Of a take whose recorder crashed, all frames that are there are taken over.
+    Of a take whose recorder crashed, all frames that are there are taken over; that is told in a sentence, else "".
 
     Raises:
         PipelineError: it was never submitted, or its job file is damaged.
@@ -100,17 +80,13 @@ def continuation(queue: JobQueue, name: str) -> Continuation:
         layout = queue.layout(name)
         if not layout.job_file.exists():
             raise PipelineError(f"no submitted job in {layout.root}; submit one with: pipeline submit JOB.toml")
-        if live_holder(layout.lease) is not None:
+        if _runs(queue, name):
             raise JobBusyError(f"{name} runs already")
-        note = complete_crashed_take(layout)
-        return Continuation(new_entry(name, until=read_goal(layout), background=True), note)
+        note = complete_interrupted_recording(layout)
+        return new_entry(name, until=read_goal(layout), background=True), note
     if paused.desired is Desired.RUN:
-        runs = queue_state(queue, paused) is JobState.RUNNING
-        raise JobBusyError(f"{name} runs already" if runs else f"{name} waits for its turn already")
-    entry = replace(
-        paused, submission=new_submission(), desired=Desired.RUN, note="", submitted=time.time(), background=True
-    )
-    return Continuation(entry)
+        raise JobBusyError(f"{name} {'runs' if _runs(queue, name) else 'waits for its turn'} already")
+    return paused.again(background=True), ""
 
 
 def _not_queued(queue: JobQueue, name: str) -> PipelineError:

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from pipeline.run.plan import Assessment
 
 RESERVE_BYTES = 2 * 2**30
-"""Free space at which a job pauses: a checkpoint of a large simulation and the frames that are being written fit."""
+"""Free space at which a job pauses: a checkpoint of a large simulation and a few frames fit."""
 RESERVE_SHARE = 0.05
-"""On small disks the reserve is this share of the disk."""
+"""The reserve of a small disk is this share of it."""
 
 
 def free_bytes(folder: Path) -> int:
@@ -32,12 +32,7 @@ def usual_reserve_bytes(folder: Path) -> int:
 
 
 def shortage(folder: Path, reserve_bytes: int | None) -> str | None:
-    """A sentence if less than the reserve is free, else None.
-
-    Args:
-        folder: on the disk in question.
-        reserve_bytes: the reserve [bytes]; None: the usual one.
-    """
+    """A sentence if less than the reserve is free on the disk of a folder, else None; the usual reserve for None."""
     free = free_bytes(folder)
     reserve = usual_reserve_bytes(folder) if reserve_bytes is None else reserve_bytes
     if free >= reserve:
@@ -46,19 +41,12 @@ def shortage(folder: Path, reserve_bytes: int | None) -> str | None:
 
 
 class Size(NamedTuple):
-    """What decides how much a frame of a job takes.
+    """What decides how much a frame of a job takes."""
 
-    Attributes:
-        elements: particles, cells or nodes of all bodies of a kind, by its name.
-        pixels: of a picture.
-        picture_bytes_per_pixel: what a picture takes, on the mean of its files [bytes].
-        film_factor: how much more a film takes than one of H.264 [-].
-    """
-
-    elements: Mapping[str, float]
-    pixels: int
-    picture_bytes_per_pixel: float = 1.2
-    film_factor: float = 1.0
+    elements: Mapping[str, float]  # particles, cells or nodes of all bodies of a kind, by its name
+    pixels: int  # of a picture
+    picture_bytes_per_pixel: float = 1.2  # what a picture takes, on the mean of its files [bytes]
+    film_factor: float = 1.0  # how much more a film takes than one of H.264 [-]
 
 
 def size_of(job: Job, findings: Findings) -> Size:
@@ -92,8 +80,7 @@ _BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
     # Segments of 120 frames and the film; a frame takes a tenth of a byte a pixel in each.
     "movie": lambda size: 12.0 * size.film_factor * size.pixels,
 }
-"""What one file of a stage takes, about, where nothing has been made yet to go by [bytes]. The factors are those of a
-few small jobs, and rough."""
+"""What one file of a stage takes, roughly, where nothing has been made yet to go by [bytes]."""
 
 
 def checkpoint_bytes(size: Size) -> float:
@@ -119,13 +106,7 @@ def _bytes_per_artifact(stage: str, size: Size) -> float:
 
 
 def estimate_bytes(assessments: Iterable[Assessment], costs: Mapping[str, StageCost], size: Size) -> float:
-    """What is to be made will take, about [bytes]; by what the same stage has taken in this job, where it has.
-
-    Args:
-        assessments: the plan, held against the record.
-        costs: what the stages have taken so far: `ManifestReader.stage_costs`.
-        size: of the job.
-    """
+    """What is to be made will take, about [bytes]; by what the same stage has taken in this job, where it has."""
     total = 0.0
     simulated = False
     for each in assessments:

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
@@ -35,7 +35,7 @@ MAX_LOG_BYTES = 4 * 2**20
 
 
 COMMAND: tuple[str, ...] = (sys.executable, "-P", "-m", "pipeline")
-"""This program's command line, as a runner in the background is started; no module is taken from the working folder."""
+"""This program's command line for a runner in the background; no module is taken from the working folder."""
 
 
 class StopReason(StrEnum):
@@ -48,15 +48,13 @@ class StopReason(StrEnum):
 
 
 class FarmControl(RunControl):
-    """Stops a run when its entry in the queue, a more urgent job or the disk says so; and on signals, as ever.
+    """Stops a run when its entry in the queue, a more urgent job or the disk says so; and on signals.
 
     Attributes:
         reason: why the farm stopped it; None while it did not.
-        signals: how often a person or the system asked.
     """
 
     def __init__(self, queue: JobQueue, job: QueuedJob, lease: Lease, say: Callable[[str], None]) -> None:
-        """Args are those of the runner."""
         super().__init__()
         self._queue = queue
         self._job = job
@@ -67,17 +65,8 @@ class FarmControl(RunControl):
         self.reason: StopReason | None = None
 
     @property
-    def signals(self) -> int:
-        """How often it was interrupted by a signal."""
-        return super().interruptions
-
-    @property
     def interruptions(self) -> int:
-        """How often the run was asked to stop, by whomever; asked for by the runner several times a second.
-
-        Raises:
-            LeaseLostError: another process runs the queue now.
-        """
+        """How often the run was asked to stop. Raises LeaseLostError if another process runs the queue now."""
         self._lease.check()
         now = time.monotonic()
         if now - self._looked >= LOOK_INTERVAL_S and self.reason is not StopReason.CANCELLED:
@@ -119,7 +108,7 @@ class FarmControl(RunControl):
 
 
 class TakeOver:
-    """An observer: once a run has taken a job's text into its folder, its entry need not hold it any more.
+    """Observer that drops a job's text from its entry once a run has taken it over into the folder.
 
     A folder that is moved away between two runs is then missed, instead of being filled anew.
     """
@@ -146,13 +135,7 @@ class TakeOver:
 
 
 class Ended(NamedTuple):
-    """How a job's turn ended.
-
-    Attributes:
-        outcome: of its run; None if it did not come to one.
-        reason: why the farm stopped it, if it did.
-        error: what kept it from running.
-    """
+    """End of a job's turn: the outcome of its run, if any, why the farm stopped it, and what kept it from running."""
 
     outcome: Outcome | None
     reason: StopReason | None = None
@@ -167,30 +150,22 @@ class Ended(NamedTuple):
 
 @dataclass
 class FarmRunner:
-    """Runs the queue; its lease is held by the caller.
-
-    Attributes:
-        queue: the farm's queue.
-        lease: the queue's lease.
-        run_job: runs one job, under this control, with this further observer.
-        say: takes sentences for the user.
-        submission: the submission that it runs for; it stops once that is settled. None: it runs until nothing waits.
-        pause_on_signal: whether the own job pauses if a signal stopped it, as a person meant it who pressed Ctrl-C;
-            else, and if it is another one, it stays in the queue for the next runner.
-        after_turn: called with the name and folder of a job whose turn ended, and how it ended.
-    """
+    """Runs the queue; its lease is held by the caller."""
 
     queue: JobQueue
     lease: Lease
+    # runs one job, under this control, with this further observer
     run_job: Callable[[QueuedJob, FarmControl, TakeOver], Outcome]
-    say: Callable[[str], None]
+    say: Callable[[str], None]  # takes sentences for the user
+    # called with the name and folder of a job whose turn ended, and how it ended
+    after_turn: Callable[[str, Path, Ended], None]
+    # the submission that it runs for; it stops once that is settled. None: it runs until nothing waits
     submission: str | None = None
+    # whether the own job pauses if a signal stopped it, as a person meant it who pressed Ctrl-C; else, and if it is
+    # another one, it stays in the queue for the next runner
     pause_on_signal: bool = True
-    after_turn: Callable[[str, Path, Ended], None] | None = None
-
-    def __post_init__(self) -> None:
-        self._busy: dict[str, float] = {}
-        self._told_busy: set[str] = set()
+    _busy: dict[str, float] = field(default_factory=dict)
+    _told_busy: set[str] = field(default_factory=set)
 
     def work(self) -> Ended | None:
         """Run jobs; returns how the last turn of the own job ended, or None if it was settled without one.
@@ -269,8 +244,7 @@ class FarmRunner:
         return Ended(outcome, control.reason), control.signals > 0
 
     def _tell(self, job: QueuedJob, ended: Ended) -> None:
-        if self.after_turn is not None:
-            self.after_turn(job.name, self.queue.layout(job.name).root, ended)
+        self.after_turn(job.name, self.queue.layout(job.name).root, ended)
 
     def _settle_ended(self, job: QueuedJob, control: FarmControl, outcome: Outcome) -> None:
         match outcome.kind:
@@ -291,10 +265,7 @@ class FarmRunner:
     def _settle(self, job: QueuedJob, desired: Desired | None, note: str = "") -> None:
         """Write down how a turn ended, unless the job has been submitted anew or cancelled meanwhile.
 
-        Args:
-            job: the entry that the turn began with.
-            desired: what is wanted of it from now on; None: nothing more, the entry goes.
-            note: why.
+        `desired` is what is wanted of it from now on; None: nothing more, the entry goes.
         """
         with self.queue.locked():
             try:
@@ -325,10 +296,7 @@ def _disk_of(queue: JobQueue, job: QueuedJob) -> Path:
 
 
 def start_in_background(queue: JobQueue) -> int | None:
-    """Start a runner that no terminal holds, unless the queue has one; returns its process id, or None.
-
-    What it prints goes to the queue's log.
-    """
+    """Start a runner that no terminal holds, unless the queue has one; returns its process id, or None."""
     with queue.locked():
         if live_holder(queue.lease) is not None:
             return None

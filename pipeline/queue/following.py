@@ -31,8 +31,7 @@ DONE = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
 def watch(layout: JobLayout) -> int:
     """Show a running job's progress until its runner ends.
 
-    Returns:
-        0 if that run itself says that it has done everything, else 5, as `submit` would have; CTRL_C after Ctrl-C.
+    Returns 0 if that run itself says that it has done everything, else 5, as `submit` would have; CTRL_C after Ctrl-C.
     """
     watched: str | None = None
     preview_said = False
@@ -60,11 +59,7 @@ def watch(layout: JobLayout) -> int:
 
 
 class Follower:
-    """Sees one submission through that waits in the queue or runs in another process.
-
-    Attributes:
-        submission: names the submission that is followed.
-    """
+    """Sees one submission through that waits in the queue or runs in another process."""
 
     def __init__(self, queue: JobQueue, layout: JobLayout, *, submission: str = "") -> None:
         self._queue = queue
@@ -82,17 +77,19 @@ class Follower:
         self.submission = queued.submission
         holder = live_holder(self._layout.lease)
         if holder is not None:
-            self._say(f"{busy_error(self._layout.lease, holder)}; watching it instead (Ctrl-C ends the watching only)")
+            click.echo(
+                f"{busy_error(self._layout.lease, holder)}; watching it instead (Ctrl-C ends the watching only)",
+                err=True,
+            )
             if queued.submission == entry.submission:
-                self._say("it runs an earlier version of the job; this one follows")
+                click.echo("it runs an earlier version of the job; this one follows", err=True)
         return queued
 
     def follow(self) -> int | None:
         """Show progress until the submission is settled, or nobody runs the queue any more.
 
-        Returns:
-            0 if its run says that it has done everything, else what `submit` would have returned; None if somebody has
-            to run the queue, and nobody does. CTRL_C after Ctrl-C: the job stays in the queue.
+        Returns 0 if its run says that it has done everything, else what `submit` would have returned; None if somebody
+        has to run the queue, and nobody does. CTRL_C after Ctrl-C: the job stays in the queue.
         """
         display = open_display()
         stages: dict[str, StageProgress] = {}
@@ -153,10 +150,6 @@ class Follower:
         why = f" ({entry.note})" if entry.note else ""
         display.say(f"it pauses{why}; continue with: pipeline resume {self._layout.root}")
         return STOPPED_FROM_ELSEWHERE
-
-    @staticmethod
-    def _say(sentence: str) -> None:
-        click.echo(sentence, err=True)
 
 
 def _say_how_it_ended(display: Display, layout: JobLayout, summary: list[StageSummary], ended_as: str | None) -> int:

@@ -4,12 +4,9 @@ The folder that holds jobs' folders is a *farm*. Its queue is `.farm/` in it: on
 runs, pauses or has failed, and the lease of the process that runs the queue. A finished job leaves no file.
 
 An entry says what is *wanted*, not what is done. A command changes the entry, and whoever runs the job looks at it a
-few times a second: a job that is to pause pauses, one whose entry is gone is cancelled. So no order can be lost between
-two processes, and none is left over for a later run. Every change is one atomic rename under a lock that the kernel
-drops with its holder: a crash in the middle of one leaves the old entry or the new one.
-
-Files and no database: a look needs neither a lock nor leave to write, also after a writer was killed, while SQLite has
-to roll back a journal first; and a damaged file costs one entry, not the only copies of all jobs that wait.
+few times a second: a job that is to pause pauses, one whose entry is gone is cancelled. Every change is one atomic
+rename under a lock that the kernel drops with its holder: a crash in the middle of one leaves the old entry or the new
+one.
 """
 
 from __future__ import annotations
@@ -37,7 +34,7 @@ from pipeline.base.files import replace_durably, sync
 from pipeline.base.layout import JobLayout
 
 MAX_ENTRY_BYTES = 40 * 2**20
-"""Over twice the largest job file, as JSON may write it. A larger entry is not ours."""
+"""Over twice the largest job file, as JSON may write it."""
 MAX_NAME_BYTES = 200
 """A folder's name becomes a file's, with an ending."""
 LATEST_S = 1e11
@@ -61,46 +58,33 @@ class QueueError(PipelineError):
 
 @dataclass(frozen=True, slots=True)
 class QueuedJob:
-    """One job in the queue.
+    """One job in the queue."""
 
-    Attributes:
-        name: name of its folder in the farm.
-        submission: names this submission; a new one is drawn when the job is to run (again).
-        desired: what is wanted of it.
-        priority: higher ones go first, and interrupt lower ones.
-        submitted: wall time of the submission [s since the epoch]; the older of equals goes first.
-        note: why it pauses or failed, or empty.
-        text: its job file, until a run has taken it over into the folder; None: what is in the folder.
-        rerun_stages: with `rerun_frames`, tasks to run again although they are up to date; None: none.
-        rerun_frames: see `rerun_stages`.
-        until: the stages after which it ends; empty: the film.
-        cores: processor cores to use at most; None: all.
-        reserve_bytes: free disk space at which it pauses [bytes]; None: the usual, see `pipeline.queue.disk`.
-        background: whether it needs a process of its own in the background, as no terminal waits for it.
-        settings: further options of the command that submitted it, by name; those who run the job know them.
-    """
-
-    name: str
-    submission: str
+    name: str  # name of its folder in the farm
+    submission: str  # names this submission; a new one is drawn when the job is to run (again)
     desired: Desired = Desired.RUN
-    priority: int = 0
+    priority: int = 0  # higher ones go first, and interrupt lower ones
+    # wall time of the submission [s since the epoch]; the older of equals goes first
     submitted: Annotated[float, Field(ge=0.0, lt=LATEST_S, allow_inf_nan=False)] = 0.0
-    note: str = ""
-    text: str | None = None
+    note: str = ""  # why it pauses or failed, or empty
+    text: str | None = None  # its job file, until a run has taken it over into the folder; None: what is in the folder
+    # with `rerun_frames`, tasks to run again although they are up to date; None: none
     rerun_stages: tuple[str, ...] | None = None
-    rerun_frames: tuple[int, ...] | None = None
-    until: tuple[str, ...] = ()
-    cores: int | None = None
+    rerun_frames: tuple[int, ...] | None = None  # see `rerun_stages`
+    until: tuple[str, ...] = ()  # the stages after which it ends; empty: the film
+    cores: int | None = None  # processor cores to use at most; None: all
+    # free disk space at which it pauses [bytes]; None: the usual, see `pipeline.queue.disk`
     reserve_bytes: int | None = None
-    background: bool = False
+    background: bool = False  # whether it needs a process of its own in the background, as no terminal waits for it
+    # further options of the command that submitted it, by name; those who run the job know them
     settings: tuple[tuple[str, str], ...] = ()
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(strict=True, extra="forbid")
 
-    @property
-    def order(self) -> tuple[int, float, str]:
-        """Sorts entries into the order in which they run."""
-        return (-self.priority, self.submitted, self.name)
+    def again(self, **changes: Any) -> QueuedJob:
+        """A new submission of it, to run, with these fields changed."""
+        now = time.time()
+        return replace(self, submission=new_submission(), desired=Desired.RUN, note="", submitted=now, **changes)
 
     def to_json(self) -> str:
         """The entry file's text."""
@@ -108,11 +92,7 @@ class QueuedJob:
 
     @staticmethod
     def from_json(text: str) -> QueuedJob:
-        """Read an entry file's text.
-
-        Raises:
-            QueueError: it is none; the text says why.
-        """
+        """Read an entry file's text. Raises QueueError with the reason if it is none."""
         try:
             return _reader().validate_json(text)
         except ValueError as error:
@@ -127,12 +107,7 @@ def _reader() -> TypeAdapter[QueuedJob]:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """What lies in a queue.
-
-    Attributes:
-        jobs: its entries, in the order in which they run.
-        flaws: a sentence about each file that is no entry.
-    """
+    """The entries of a queue, in the order in which they run, and a sentence about each file that is no entry."""
 
     jobs: tuple[QueuedJob, ...]
     flaws: tuple[str, ...]
@@ -184,7 +159,6 @@ class JobQueue:
 
         Raises:
             QueueError: the farm cannot be written to, or its file system has no locks.
-            OSError: another trouble of the disk.
         """
         with self._mutex:  # the kernel's lock keeps processes out, not the threads of this one
             if self._is_locked:
@@ -225,19 +199,14 @@ class JobQueue:
         jobs, flaws = [], []
         for path in sorted(self._entries.glob("[!.]*.json")) if self._entries.is_dir() else ():
             try:
-                job = self.find(path.name.removesuffix(".json"))
+                jobs.append(self.find(path.name.removesuffix(".json")))
             except QueueError as error:
                 flaws.append(str(error))
-            else:
-                jobs.extend([job] if job is not None else [])
-        return Listing(tuple(sorted(jobs, key=lambda job: job.order)), tuple(flaws))
+        in_turn = sorted(filter(None, jobs), key=lambda job: (-job.priority, job.submitted, job.name))
+        return Listing(tuple(in_turn), tuple(flaws))
 
     def find(self, name: str) -> QueuedJob | None:
-        """The entry of a job, or None if it has none.
-
-        Raises:
-            QueueError: there is a file in its place that is no entry.
-        """
+        """The entry of a job, or None if it has none. Raises QueueError for a file in its place that is no entry."""
         path = self._path(name)
         try:
             known = self._read.get(name)
@@ -290,8 +259,7 @@ class JobQueue:
     def enqueue(self, new: QueuedJob) -> QueuedJob:
         """Queue a job to run: what an older entry of it says is replaced, but for its place among equals.
 
-        Returns:
-            The entry as it is now; with the older one's submission if that asks for the very same run already.
+        Returns the entry as it is now; with the older one's submission if that asks for the very same run already.
         """
         with self.locked():
             try:
@@ -311,11 +279,7 @@ class JobQueue:
         return new
 
     def change(self, name: str, **changes: Any) -> QueuedJob:
-        """Change fields of a job's entry.
-
-        Raises:
-            QueueError: the job has none.
-        """
+        """Change fields of a job's entry. Raises QueueError if the job has none."""
         with self.locked():
             job = self.find(name)
             if job is None:
@@ -350,11 +314,7 @@ def _version(status: os.stat_result) -> tuple[int, int, int]:
 
 
 def checked_name(name: str) -> str:
-    """The name, if it can be that of a job's folder, right in the farm and visible, and printed as it is.
-
-    Raises:
-        QueueError: it cannot.
-    """
+    """The name, if it can be that of a job's folder, right in the farm and visible; else raises QueueError."""
     # Control characters, and surrogates: bytes of a file's name that are no UTF-8.
     unfit = any(unicodedata.category(character) in {"Cc", "Cs"} for character in name)
     if unfit or not name or name.startswith(".") or "/" in name or len(name.encode()) > MAX_NAME_BYTES:

@@ -9,38 +9,28 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.lease import live_holder
 from pipeline.queue.following import done_and_total
 from pipeline.queue.job_queue import JobQueue, QueuedJob
-from pipeline.queue.states import JobState, state_of, state_without_entry
+from pipeline.queue.states import JobState, state_after, state_of
 from pipeline.record.reader import LastRun, ManifestReader
+from pipeline.store.artifacts import holds_frames
 
 
 @dataclass(frozen=True, slots=True)
 class ListedJob:
-    """A job in a line.
+    """A job in a line."""
 
-    Attributes:
-        name: of its folder.
-        state: where it stands.
-        priority: in the queue; None: it is not in it.
-        changed: when it was submitted, or, out of the queue, when something last happened [s since the epoch].
-        done: how many of its tasks are done.
-        tasks: how many there are; 0 before its first run.
-        note: why it pauses or failed, or empty.
-    """
-
-    name: str
+    name: str  # of its folder
     state: JobState
-    priority: int | None
-    changed: float
-    done: int = 0
-    tasks: int = 0
-    note: str = ""
+    priority: int | None  # in the queue; None: it is not in it
+    changed: float  # when it was submitted, or, out of the queue, when something last happened [s since the epoch]
+    done: int = 0  # how many of its tasks are done
+    tasks: int = 0  # how many there are; 0 before its first run
+    note: str = ""  # why it pauses or failed, or empty
 
 
 def list_jobs(queue: JobQueue) -> tuple[list[ListedJob], list[str]]:
     """The jobs of a farm: those of the queue in the order in which they run, then the others, newest first.
 
-    Returns:
-        The jobs, and a sentence about each record or entry that cannot be read.
+    Returns the jobs, and a sentence about each record or entry that cannot be read.
     """
     listing = queue.listing()
     flaws = [*listing.flaws]
@@ -56,18 +46,22 @@ def list_jobs(queue: JobQueue) -> tuple[list[ListedJob], list[str]]:
 
 
 def state_of_job(layout: JobLayout, entry: QueuedJob | None) -> JobState:
-    """Where a job stands.
-
-    Raises:
-        ManifestError: its record cannot be read.
-    """
+    """Where a job stands. Raises ManifestError if its record cannot be read."""
     runs = live_holder(layout.lease) is not None
     if entry is not None:
         return state_of(entry, runs=runs)
-    if not layout.manifest.exists():
-        return state_without_entry(layout, LastRun(None, None), runs=runs, is_empty=True)
-    with ManifestReader.open_readonly(layout.manifest) as manifest:
-        return state_without_entry(layout, manifest.last_run(), runs=runs, is_empty=manifest.is_empty())
+    last_run, is_empty = LastRun(None, None), True
+    if layout.manifest.exists():
+        with ManifestReader.open_readonly(layout.manifest) as manifest:
+            last_run, is_empty = manifest.last_run(), manifest.is_empty()
+    if runs:
+        return JobState.RUNNING
+    if last_run.run is not None:
+        return state_after(last_run.outcome)
+    if layout.recording_story.exists():
+        return JobState.RECORDED
+    # A record that was lost and rebuilt knows no run, although there were some.
+    return JobState.NOT_STARTED if is_empty and not holds_frames(layout) else JobState.INTERRUPTED
 
 
 def _listed(layout: JobLayout, entry: QueuedJob | None, flaws: list[str]) -> ListedJob:

@@ -33,7 +33,12 @@ from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from pipeline.base.errors import PipelineError
+from pipeline.base.errors import DiskFullError, PipelineError
+from pipeline.base.layout import JobLayout
+from pipeline.queue.farm import Ended, StopReason
+from pipeline.queue.states import ending_of
+from pipeline.run.events import JobOutcome
+from pipeline.run.goal import what_is_made
 
 SETTINGS_VARIABLE = "PIPELINE_NOTIFY"
 _SHOWN_BYTES = 2000
@@ -50,25 +55,15 @@ class NotifySettingsError(PipelineError):
 
 @dataclass(frozen=True, slots=True)
 class Notification:
-    """One message about a job.
+    """One message about a job."""
 
-    Attributes:
-        event: done, failed or paused.
-        job: name of the job.
-        folder: its folder.
-        message: one sentence: the film, the first failure, or why it pauses.
-        seconds: how long its last run took [s]; 0 if it did not come to one.
-        failures: the tasks that failed, with their messages.
-        host: the machine that the runner is on.
-    """
-
-    event: Event
+    event: Event  # done, failed or paused
     job: str
     folder: str
-    message: str
-    seconds: float = 0.0
-    failures: tuple[str, ...] = ()
-    host: str = platform.node()
+    message: str  # one sentence: the film, the first failure, or why it pauses
+    seconds: float = 0.0  # how long its last run took [s]; 0 if it did not come to one
+    failures: tuple[str, ...] = ()  # the tasks that failed, with their messages
+    host: str = platform.node()  # the machine that the runner is on
 
     def fill(self, text: str) -> str:
         """Put the values into a text with `{event}`, `{job}`, `{folder}` and `{message}`."""
@@ -77,6 +72,31 @@ class Notification:
     def as_json(self) -> str:
         """All of it, and as `text` the sentence that chat programs look for."""
         return json.dumps({**asdict(self), "text": f"{self.job}: {self.event}: {self.message}"}, ensure_ascii=False)
+
+
+_PAUSES = {StopReason.PAUSED, StopReason.DISK_SHORT}
+_FAILURES = {JobOutcome.FAILED, JobOutcome.TOO_MANY_FAILURES}
+
+
+def notification_of(name: str, folder: Path, ended: Ended) -> Notification | None:
+    """The notification of how a turn ended; None for a job that only lets another go first, or was cancelled."""
+    outcome = ended.outcome
+    if ended.error is not None:
+        kind: Event = "paused" if isinstance(ended.error, DiskFullError) else "failed"
+        return Notification(kind, name, str(folder), str(ended.error))
+    if outcome is not None and outcome.kind is JobOutcome.SUCCEEDED:
+        made = what_is_made(JobLayout(folder))
+        return Notification("done", name, str(folder), f"{made} is done", seconds=outcome.seconds)
+    if outcome is not None and outcome.kind in _FAILURES:
+        failures = tuple(f"{failed.task_id}: {failed.message}" for failed in outcome.failures)
+        first = failures[0] if failures else outcome.kind.value
+        return Notification("failed", name, str(folder), first, seconds=outcome.seconds, failures=failures)
+    if ended.reason is None or ended.reason in _PAUSES:
+        why = ended.reason or (ending_of(outcome.kind) if outcome is not None else "paused")
+        seconds = 0.0 if outcome is None else outcome.seconds
+        sentence = f"{why}; continue with: pipeline resume {folder}"
+        return Notification("paused", name, str(folder), sentence, seconds=seconds)
+    return None
 
 
 class Target(BaseModel):
@@ -113,10 +133,7 @@ class Settings(BaseModel):
 
 
 def settings_path(environment: Mapping[str, str]) -> Path | None:
-    """Where the settings are; None if there are to be none.
-
-    A relative XDG_CONFIG_HOME counts as none, as its specification has it.
-    """
+    """Where the settings are; None if there are to be none. A relative XDG_CONFIG_HOME counts as none."""
     named = environment.get(SETTINGS_VARIABLE)
     if named is not None:
         return Path(named) if named else None
@@ -127,11 +144,7 @@ def settings_path(environment: Mapping[str, str]) -> Path | None:
 
 
 def load_targets(path: Path | None) -> tuple[Target, ...]:
-    """Read the settings.
-
-    Raises:
-        NotifySettingsError: they cannot be read, or something in them is wrong; all of it is said.
-    """
+    """Read the settings. Raises NotifySettingsError with all that is wrong in them."""
     if path is None:
         return ()
     try:

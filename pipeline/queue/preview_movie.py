@@ -1,10 +1,8 @@
 """The preview movie: while a job draws its frames, a small film of those that are there, made anew now and then.
 
-    runner's events -> which frames are drawn -> [ pause -> child process encodes aside -> renamed ]
-
-It costs a farm next to nothing and cannot harm it: one child process at a time, of low priority, encodes for at most
-`SHARE` of the time on one core, and whatever becomes of it, the run goes on. A film is renamed when it has been
-decoded, so nobody sees a part of one. What is left of a killed run is removed by the next.
+It cannot harm the run: one child process at a time, of low priority, encodes for at most `SHARE` of the time on one
+core, and whatever becomes of it, the run goes on. A film is renamed when it has been decoded, so nobody sees a part of
+one. What is left of a killed run is removed by the next.
 """
 
 from __future__ import annotations
@@ -16,15 +14,11 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
-from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, TaskId, TaskState
 from pipeline.model.job import Job
-from pipeline.queue.preview_movie_child import Request
 from pipeline.run.events import Committed, JobOutcome, RunEnded, RunEvent, RunStarted, StateChanged
 from pipeline.run.executors.worker_process import THREAD_VARIABLES, python_argv
 from pipeline.run.plan import NEVER_MADE, Assessment, Verdict
@@ -34,19 +28,19 @@ SHARE = 0.05
 SHORTEST_PAUSE_S = 10.0
 """Before the first film, and between two [s]; a job that takes less needs none."""
 _LAST_WAIT_S = 10.0
-"""How long the end of a run waits for the child that it has killed [s]: on a disk that is gone it may not end."""
+"""How long the end of a run waits for the child that it has killed [s]; on a disk that is gone it may not end."""
 
 
 class PreviewMovie:
-    """An observer of a run, and a context manager around it, that keeps `JobLayout.preview_movie` up to date.
+    """Observer of a run, and context manager around it, that keeps `JobLayout.preview_movie` up to date.
 
     The film is there from some seconds after the first frame until the whole film is committed. A run that is stopped
-    or fails leaves it. One of an earlier version of the job goes when a run begins. A job that does without the film
-    has one removed that was made before.
+    or fails leaves it. One of an earlier version of the job goes when a run begins, and any with a job that does
+    without.
     """
 
     def __init__(self, job: Job, layout: JobLayout, say: Callable[[str], None], warn: Callable[[str], None]) -> None:
-        """Args are the job, its folder, and who takes sentences and warnings for the user, from another thread."""
+        """`say` and `warn` take sentences and warnings for the user, from another thread."""
         self._making = job.movie.so_far
         self._job = job
         self._layout = layout
@@ -66,9 +60,7 @@ class PreviewMovie:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._end()
 
     def notify(self, event: RunEvent) -> None:
@@ -163,24 +155,19 @@ class PreviewMovie:
         shutil.rmtree(self._layout.preview_scratch, ignore_errors=True)
 
     def _make(self, drawn: Sequence[int]) -> float:
-        """Have a film made of these frames; returns the processor time that it took [s].
-
-        Raises:
-            _ChildError: the child process failed, or was killed.
-            OSError: it could not be started, or the film not be put into its place.
-        """
+        """Have a film made of these frames; returns the processor time that took [s]. Raises _ChildError, OSError."""
         layout = self._layout
         scratch = layout.preview_scratch.absolute()
         scratch.mkdir(exist_ok=True)
-        request = Request(
-            pictures={frame: str(layout.path(layout.picture(frame)).absolute()) for frame in drawn},
-            frames=self._job.frame_count,
-            fps=self._job.movie.playback_fps or self._job.fps,
-            output=str(scratch / "film.mp4"),
-            copies=str(scratch),
-        )
+        film = scratch / "film.mp4"
+        request = {
+            "pictures": {frame: str(layout.path(layout.picture(frame)).absolute()) for frame in drawn},
+            "frames": self._job.frame_count,
+            "fps": self._job.movie.playback_fps or self._job.fps,
+            "output": str(film),
+        }
         request_file = scratch / "request.json"
-        request_file.write_text(json.dumps(asdict(request)), encoding="utf-8")
+        request_file.write_text(json.dumps(request), encoding="utf-8")
         with self._changed:
             if self._ended:
                 raise _ChildError("the run is over")
@@ -201,7 +188,7 @@ class PreviewMovie:
             self._child = None
         if child.returncode != 0:
             raise _ChildError(lines[-1] or f"its process ended with code {child.returncode}")
-        Path(request.output).replace(layout.preview_movie)
+        film.replace(layout.preview_movie)
         return float(lines[-1])
 
 

@@ -7,39 +7,12 @@ import os
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.base.files import sync
 
 _NICENESS = 10
 """What the tasks leave over, and a tenth of a core where they leave nothing."""
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What the child is to make.
-
-    Attributes:
-        pictures: path of each frame that is drawn.
-        frames: how many the whole film has.
-        fps: of the film [1/s].
-        output: the MP4 to write.
-        copies: folder of small copies, kept for the next child.
-    """
-
-    pictures: dict[int, str]
-    frames: int
-    fps: float
-    output: str
-    copies: str
-
-    @classmethod
-    def read(cls, path: Path) -> Request:
-        """From a file of JSON, whose keys are texts."""
-        fields = json.loads(path.read_text(encoding="utf-8"))
-        fields["pictures"] = {int(frame): picture for frame, picture in fields["pictures"].items()}
-        return cls(**fields)
 
 
 def main() -> None:
@@ -49,11 +22,11 @@ def main() -> None:
     from render.errors import InvalidFileError
     from render.preview_movie import write_preview_movie
 
-    request = Request.read(Path(sys.argv[1]))
-    pictures = {frame: Path(picture) for frame, picture in request.pictures.items()}
-    output = Path(request.output)
+    request = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    pictures = {int(frame): Path(picture) for frame, picture in request["pictures"].items()}
+    output = Path(request["output"])
     try:
-        write_preview_movie(pictures, request.frames, output, fps=request.fps, copies=Path(request.copies))
+        write_preview_movie(pictures, request["frames"], output, fps=request["fps"], copies=output.parent)
         sync(output)
     except (InvalidFileError, OSError) as error:
         sys.exit(str(error))

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import StrEnum
 
-from pipeline.base.layout import JobLayout
 from pipeline.base.task import TaskState
 from pipeline.queue.job_queue import Desired, QueuedJob
-from pipeline.record.reader import LastRun
 from pipeline.run.events import JobOutcome
-from pipeline.store.artifacts import holds_frames
 
 
 class JobState(StrEnum):
@@ -48,39 +45,12 @@ TASK_WORDS: Mapping[TaskState, str] = {
 
 
 def state_of(job: QueuedJob, *, runs: bool) -> JobState:
-    """Where a job of the queue stands.
-
-    Args:
-        job: its entry.
-        runs: whether somebody works in its folder.
-    """
+    """Where a job of the queue stands; it `runs` while somebody works in its folder."""
     if job.desired is Desired.RUN:
         return JobState.RUNNING if runs else JobState.QUEUED
     if job.desired is Desired.PAUSE:
         return JobState.PAUSING if runs else JobState.PAUSED
     return JobState.FAILED
-
-
-def state_without_entry(layout: JobLayout, last_run: LastRun, *, runs: bool, is_empty: bool) -> JobState:
-    """Where a job stands that is not in the queue.
-
-    Args:
-        layout: its folder.
-        last_run: how its last run ended.
-        runs: whether somebody works in its folder.
-        is_empty: whether its record holds nothing that was made.
-
-    Raises:
-        OSError: its folder cannot be read.
-    """
-    if runs:
-        return JobState.RUNNING
-    if last_run.run is not None:
-        return state_after(last_run.outcome)
-    if layout.take_story.exists():
-        return JobState.RECORDED
-    # A record that was lost and rebuilt knows no run, although there were some.
-    return JobState.NOT_STARTED if is_empty and not holds_frames(layout) else JobState.INTERRUPTED
 
 
 def state_after(outcome: str | None) -> JobState:

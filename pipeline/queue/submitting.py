@@ -26,22 +26,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class QueueOptions:
-    """How a job waits its turn.
+    """How a job waits its turn."""
 
-    Attributes:
-        cores: processor cores to use at most; None: all.
-        detach: return at once, and let it run in the background.
-        priority: higher ones go first; None: as before, 0 for a new one.
-        reserve_bytes: free disk space at which it pauses [bytes]; None: the usual.
-        executor: what runs its tasks; see `pipeline.run.executors.choice`.
-        scheduler: address of a Dask scheduler.
-        workers: how many Dask workers to start on this machine.
-    """
-
-    cores: int | None = None
-    detach: bool = False
-    priority: int | None = None
-    reserve_bytes: int | None = None
+    cores: int | None = None  # processor cores to use at most; None: all
+    detach: bool = False  # return at once, and let it run in the background
+    priority: int | None = None  # higher ones go first; None: as before, 0 for a new one
+    reserve_bytes: int | None = None  # free disk space at which it pauses [bytes]; None: the usual
+    # what runs its tasks; with `scheduler` and `workers`, see `pipeline.run.executors.choice`
     executor: str | None = None
     scheduler: str | None = None
     workers: int | None = None
@@ -87,10 +78,8 @@ def run(
 
     Raises:
         PipelineError: the folder cannot be written to, the record is damaged, or there is nothing such to run again.
-        DiskFullError: not even the record could be opened; nothing is lost.
         StageUnavailableError: a stage that has to run cannot run on this machine.
-        JobBusyError: the job is being run by another process, and something is to run again. (Otherwise that run is
-            watched.)
+        JobBusyError: the job is being run by another process, and something is to run again.
     """
     from pipeline.base.lease import live_holder, refuse_if_held
     from pipeline.queue.job_queue import JobQueue, checked_name, new_entry
@@ -110,26 +99,22 @@ def run(
     name = checked_name(layout.root.absolute().name)
     if job.recorded is not None and queue.find(name) is None:
         refuse_if_held(layout.lease)  # by who records it: only the end of a take writes how many frames it has
-    job_text = None
-    if submitted is not None:
-        job, job_text = _keep(submitted, layout)
-    entry = new_entry(
-        name,
-        text=job_text,
-        rerun_stages=None if rerun is None else tuple(sorted(rerun.stages)),
-        rerun_frames=None if rerun is None or rerun.frames is None else tuple(sorted(rerun.frames)),
-        until=tuple(until),
-        cores=options.cores,
-        reserve_bytes=options.reserve_bytes,
-        priority=queue.priority_of(name) if options.priority is None else options.priority,
-        background=options.detach,
-        settings=choice.settings,
-    )
+    job, job_text = (job, None) if submitted is None else _keep(submitted, layout)
     if paused is not None:
-        as_it_was = replace(
-            paused, submission=entry.submission, desired=entry.desired, note="", submitted=entry.submitted
+        entry = options.applied_to(paused.again(background=options.detach, settings=choice.settings))
+    else:
+        entry = new_entry(
+            name,
+            text=job_text,
+            rerun_stages=None if rerun is None else tuple(sorted(rerun.stages)),
+            rerun_frames=None if rerun is None or rerun.frames is None else tuple(sorted(rerun.frames)),
+            until=tuple(until),
+            cores=options.cores,
+            reserve_bytes=options.reserve_bytes,
+            priority=queue.priority_of(name) if options.priority is None else options.priority,
+            background=options.detach,
+            settings=choice.settings,
         )
-        entry = options.applied_to(replace(as_it_was, background=options.detach, settings=choice.settings))
     if rerun is not None:
         refuse_if_held(layout.lease)
     try:
@@ -169,11 +154,7 @@ def stages_to_run(state: JobAssessment | None) -> frozenset[str]:
 def is_finished(state: JobAssessment | None, layout: JobLayout, text: str | None, until: Sequence[str]) -> bool:
     """Whether there is nothing at all to do: all that is wanted is there, made from this very job file.
 
-    Args:
-        state: how the job stands.
-        layout: its folder.
-        text: the job file; None: that of the folder.
-        until: the stages after which it ends.
+    `text` is the job file; None: that of the folder.
     """
     from pipeline.queue.job_queue import JobQueue
     from pipeline.run.goal import read_goal

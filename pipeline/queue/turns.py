@@ -19,24 +19,21 @@ from pipeline.model.job import Job
 from pipeline.queue.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background
 from pipeline.queue.following import CTRL_C, STOPPED_FROM_ELSEWHERE, Follower
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob, QueueError
-from pipeline.queue.news import notification_of
-from pipeline.queue.notifications import send
+from pipeline.queue.notifications import notification_of, send
 from pipeline.queue.preview_movie import PreviewMovie
 from pipeline.queue.states import ending_of
 from pipeline.run.checked_job import needs_pictures
 from pipeline.run.control import RunControl, Selection
-from pipeline.run.events import JobOutcome, Outcome
+from pipeline.run.events import JobOutcome, Observer, Outcome
 from pipeline.run.executors.choice import ExecutorChoice, open_machines
 from pipeline.run.goal import read_goal, what_is_made
-from pipeline.run.observers import Observer, Observers
 from pipeline.run.progress import ProgressObserver, open_display
 from pipeline.run.runner import STAGES_REFERENCE, run_job
 from pipeline.run.solver_numbers import SolverWatch, simulation_numbers
 from pipeline.stages.gpus import render_trouble, usable_gpus
 
 GPU_TASKS = 1
-"""At least one task at a time on a GPU. Whether there is one is not asked here: if not, a stage that has to run names
-it as an obstacle, and what is up to date needs none."""
+"""At least one task at a time on a GPU. Whether there is one, a stage says that has to run."""
 
 
 def stand_in_queue(queue: JobQueue, layout: JobLayout, entry: QueuedJob, *, detach: bool) -> int:
@@ -71,7 +68,7 @@ def stand_in_queue(queue: JobQueue, layout: JobLayout, entry: QueuedJob, *, deta
 def _run_queue(queue: JobQueue, layout: JobLayout, lease: Lease, submission: str) -> int | None:
     """Run the queue until our job is settled; returns the exit code, or None if somebody else has to settle it."""
     turns = Turns(queue, submission)
-    runner = FarmRunner(queue, lease, turns.run, say, submission=submission, after_turn=turns.ended)
+    runner = FarmRunner(queue, lease, turns.run, say, turns.ended, submission=submission)
     if lease.takeover is not None:
         say(f"{lease.takeover}; its queue goes on")
     try:
@@ -87,13 +84,6 @@ def _run_queue(queue: JobQueue, layout: JobLayout, lease: Lease, submission: str
     if ended.error is not None:
         raise ended.error
     return exit_code_of(ended)
-
-
-def notify(name: str, folder: Path, ended: Ended) -> None:
-    """Tell those who want to know how a turn of a job ended."""
-    notification = notification_of(name, folder, ended)
-    if notification is not None:
-        print_warnings(send(notification))
 
 
 def exit_code_of(ended: Ended) -> int:
@@ -117,20 +107,14 @@ class Turns:
         self._aside = False
 
     def run(self, entry: QueuedJob, control: FarmControl, observer: TakeOver) -> Outcome:
-        """One job's turn: run it with progress on standard error.
-
-        Args:
-            entry: the job.
-            control: stops it.
-            observer: gets every event of the run.
-        """
+        """One job's turn: run it with progress on standard error."""
         layout = as_given(self._queue.layout(entry.name))
         self._job = None
         self._aside = entry.submission != self._submission
         if self._aside:
             say(f"{entry.name}: its turn")
         job = load_job(layout.job_file) if entry.text is None else job_of_text(entry.text, layout.job_file)
-        outcome = _run_once(job, layout, entry, control=control, observer=observer)
+        outcome = _run_once(job, layout, entry, control=control, observer=observer.notify)
         self._job = job
         return outcome
 
@@ -141,7 +125,9 @@ class Turns:
                 _report(self._job, as_given(JobLayout(folder)), ended.outcome, aside=self._aside)
             except (OSError, PipelineError) as error:  # of its folder: the other jobs go on
                 print_warnings([f"{name}: {error}"])
-        notify(name, folder, ended)
+        notification = notification_of(name, folder, ended)
+        if notification is not None:
+            print_warnings(send(notification))
 
 
 def as_given(layout: JobLayout) -> JobLayout:
@@ -154,8 +140,7 @@ def as_given(layout: JobLayout) -> JobLayout:
 def run_now(queue: JobQueue, layout: JobLayout, job: Job, entry: QueuedJob) -> int | None:
     """Run a job in which nothing is to be done, beside the queue.
 
-    Returns:
-        The exit code; None if somebody else works in its folder now.
+    Returns the exit code; None if somebody else works in its folder now.
     """
     try:
         outcome = _run_once(job, layout, replace(entry, settings=()))  # no cluster is needed for nothing
@@ -198,17 +183,17 @@ def _run_once(
 
         if draws_here and (trouble := render_trouble(job)):
             warn(f"{trouble}; frames are drawn on the processor")
-        observers: list[Observer] = [progress, SolverWatch(layout, warn)]
+        observers: list[Observer] = [progress.notify, SolverWatch(layout, warn).notify]
         if observer is not None:
             observers.append(observer)
-        observers.append(stack.enter_context(PreviewMovie(job, layout, progress.display.say, warn)))
+        observers.append(stack.enter_context(PreviewMovie(job, layout, progress.display.say, warn)).notify)
         return run_job(
             job,
             layout,
             executor=machines.executor,
             job_text=entry.text,
             stages=STAGES_REFERENCE,
-            observer=Observers(*observers),
+            observers=observers,
             control=control,
             rerun=rerun,
             until=entry.until,
@@ -244,7 +229,7 @@ def _report(job: Job, layout: JobLayout, outcome: Outcome, *, aside: bool = Fals
 
 def _write_report(layout: JobLayout) -> None:
     """Leave the report in the job's folder. That it cannot be written is said, and changes nothing about the run."""
-    from pipeline.show.report.writing import write_report
+    from pipeline.show.report.page import write_report
 
     try:
         write_report([layout], layout.report)

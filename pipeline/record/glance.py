@@ -13,8 +13,7 @@ from typing import NamedTuple, TypeVar
 from pipeline.base.errors import ManifestError
 from pipeline.record.reader import ManifestReader
 
-TIMEOUT_S = 0.5
-"""How long a glance waits for a lock, which only a manifest on a network file system has."""
+TIMEOUT_S = 0.5  # how long a glance waits for a lock, which only a manifest on a network file system has
 TRIES = 5
 
 T = TypeVar("T")
@@ -38,11 +37,7 @@ def version_of(path: Path) -> Version:
 
 
 def glance(path: Path, query: Callable[[ManifestReader], T]) -> T:
-    """Result of a query on a manifest, of one moment or of moments right after each other.
-
-    Args:
-        path: the manifest.
-        query: reads; it may be called again.
+    """Result of a query on a manifest, of one moment or of moments right after each other; it may be called again.
 
     Raises:
         ManifestError: see `ManifestReader.open_readonly`.

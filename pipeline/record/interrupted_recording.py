@@ -1,6 +1,6 @@
-"""Takes whose recorder ended without writing how many frames there are: their frames make the film all the same.
+"""Recordings of `pipeline live` whose recorder was killed: their frames make the film all the same.
 
-Only the end of a take writes `frames` into its job; until then the job has one, and the take's story has none.
+Only the end of a recording writes `frames` into its job; until then the job has one, and the recording's story none.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeGuard
 from pipeline.base.files import replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
+from pipeline.base.wording import counted
 from pipeline.job.loading import changed_text, read_job
 from pipeline.job.overrides import Override
 from pipeline.record.manifest import Manifest
@@ -19,17 +20,11 @@ from pipeline.store.receipts import read_receipt, verify_artifact
 
 
 class FoundFrames(NamedTuple):
-    """Frames of a recording whose job does not know of them.
+    """Frames of a recording whose job does not know of them."""
 
-    Attributes:
-        whole: how many frames are there, from the first on.
-        behind: how many lie behind the first one that is missing or damaged, that one not counted.
-        is_cut: whether one is missing or damaged, and not just the end.
-    """
-
-    whole: int
-    behind: int
-    is_cut: bool
+    whole: int  # how many are there, from the first on
+    behind: int  # how many lie behind the first one that is missing or damaged, that one not counted
+    is_cut: bool  # whether one is missing or damaged, and not just the end
 
     @property
     def flaw(self) -> str:
@@ -40,13 +35,10 @@ class FoundFrames(NamedTuple):
         return f"frame {self.whole} is missing or damaged{more}"
 
 
-def frames_of_crashed_take(layout: JobLayout) -> FoundFrames | None:
+def frames_of_interrupted_recording(layout: JobLayout) -> FoundFrames | None:
     """Frames of a recording whose job does not know of them; None if there is no such recording.
 
     One that is being recorded looks the same: its folder is held.
-
-    Args:
-        layout: of any folder.
     """
     if (story := _story(layout)) is None or story["frames"] is not None:
         return None
@@ -62,41 +54,34 @@ def frames_of_crashed_take(layout: JobLayout) -> FoundFrames | None:
     )
 
 
-def is_job_of_take(layout: JobLayout) -> bool:
-    """Whether the job in a take's folder is the take's; any other simulates, over its frames.
+def is_job_of_recording(layout: JobLayout) -> bool:
+    """Whether the job in a recording's folder is the recording's; any other simulates, over its frames.
 
-    Args:
-        layout: of a folder with a take's story; one that is illegible names no take.
-
-    Raises:
-        JobFileError: the job file is damaged.
+    An illegible story names no recording. Raises JobFileError if the job file is damaged.
     """
     story = _story(layout)
     recorded = read_job(layout.job_file).job.recorded
     return recorded is not None and (story is None or recorded == story["take"])
 
 
-def complete_crashed_take(layout: JobLayout) -> str:
-    """Write into a take's job and story how many frames it has, if its recorder could not.
+def complete_interrupted_recording(layout: JobLayout) -> str:
+    """Write into a recording's job and story how many frames it has, if its recorder could not.
 
     A job that somebody has given another length meanwhile keeps it. Where a frame is missing or damaged and others lie
     behind it, the story stays open: should that frame come back, the next call takes over the rest.
-
-    Args:
-        layout: of any folder.
 
     Returns:
         What was done, a sentence; "" if there was nothing to do.
 
     Raises:
-        JobBusyError: the take is being recorded.
+        JobBusyError: it is being recorded.
         JobFileError: its job file is damaged.
         OSError: the folder cannot be read or written.
     """
-    if not _has_any(frames_of_crashed_take(layout)):
+    if not _has_any(frames_of_interrupted_recording(layout)):
         return ""
     with Lease.acquire(layout.lease):
-        found, story = frames_of_crashed_take(layout), _story(layout)
+        found, story = frames_of_interrupted_recording(layout), _story(layout)
         if not _has_any(found) or story is None:  # another process was faster
             return ""
         loaded = read_job(layout.job_file)
@@ -110,10 +95,10 @@ def complete_crashed_take(layout: JobLayout) -> str:
             length = ("duration", found.whole / job.fps) if job.duration is not None else ("frames", found.whole)
             replace_durably(layout.job_file, changed_text(loaded.text, [Override((length[0],), length[1], "take")]))
         story["frames" if not found.is_cut else "taken_over"] = found.whole
-        replace_durably(layout.take_story, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
+        replace_durably(layout.recording_story, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
         with Manifest(layout.manifest) as manifest:
             reconcile(manifest, layout, clean=False)
-    frames = "1 frame" if found.whole == 1 else f"{found.whole} frames"
+    frames = counted(found.whole, "frame")
     return f"{told}it has {frames}, and so has its job file now{f'; {found.flaw}' if found.is_cut else ''}"
 
 
@@ -123,9 +108,9 @@ def _has_any(found: FoundFrames | None) -> TypeGuard[FoundFrames]:
 
 
 def _story(layout: JobLayout) -> dict[str, Any] | None:
-    """What is told of a take; None if the folder is that of no take, or nothing legible is told."""
+    """The recording's story; None if the folder holds no recording, or the story is illegible."""
     try:
-        story = json.loads(layout.take_story.read_text(encoding="utf-8"))
+        story = json.loads(layout.recording_story.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     return story if isinstance(story, dict) and "take" in story and "frames" in story else None

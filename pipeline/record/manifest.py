@@ -4,7 +4,7 @@ One process writes, the holder of the job's lease, over one connection and from 
 (`Manifest.open_readonly`). Workers never open it: what they commit stands in receipts, and the runner records it.
 
 What must outlive a power cut (attempts, artifacts, the plan) is synced at its commit. Task states and events are not:
-the next run works states out anew. Either way a killed process loses nothing that was written.
+the next run works states out again. Either way a killed process loses nothing that was written.
 """
 
 from __future__ import annotations
@@ -30,31 +30,13 @@ from pipeline.record.reader import (
     BUSY_TIMEOUT_S,
     SUCCEEDED,
     ArtifactRow,
-    AttemptRow,
-    EventRow,
-    LastRun,
     ManifestReader,
-    StageCost,
-    StageSummary,
     clear_errors,
     damaged,
     is_damage,
     result_code,
 )
 from pipeline.store.receipts import Receipt
-
-__all__ = [
-    "SUCCEEDED",
-    "ArtifactRow",
-    "AttemptRow",
-    "EventRow",
-    "LastRun",
-    "Manifest",
-    "ManifestReader",
-    "StageCost",
-    "StageSummary",
-    "is_on_network",
-]
 
 _NETWORK_FILE_SYSTEMS = {
     *("nfs", "nfs3", "nfs4", "cifs", "smb2", "smb3", "smbfs", "afs", "afpfs", "webdav"),
@@ -97,11 +79,7 @@ class Manifest(ManifestReader):
 
     # --- a run's frame ---
     def begin_run(self, job_name: str, *, run: str = "") -> bool:
-        """Mark the job as being run.
-
-        Args:
-            job_name: name of the job.
-            run: the run's token, that of its lease.
+        """Mark the job as being run, by the token of the run's lease.
 
         Returns:
             Whether the last run had ended cleanly. False for a new manifest, too: there may be receipts that an older
@@ -118,12 +96,7 @@ class Manifest(ManifestReader):
         return row is not None and bool(row[0])
 
     def end_run(self, outcome: str = SUCCEEDED, *, clean: bool = True) -> None:
-        """Mark the end of a run.
-
-        Args:
-            outcome: how it ended, a JobOutcome's value.
-            clean: whether everything that was committed has been recorded for certain.
-        """
+        """Mark the end of a run: a JobOutcome's value, and whether all that was committed is recorded for certain."""
         with self.transaction():
             self._connection.execute("UPDATE job SET clean_shutdown = ?, outcome = ?", (clean, outcome))
 
@@ -159,11 +132,9 @@ class Manifest(ManifestReader):
 
     # --- the plan ---
     def record_plan(self, tasks: Sequence[Task], states: Mapping[TaskId, TaskState] | None = None) -> None:
-        """Make these the job's tasks, in this order.
+        """Make these the job's tasks, in this order; those without a state are PENDING.
 
-        Args:
-            tasks: the whole plan. A task that is no longer in it keeps its history, but counts no more.
-            states: where each stands; those not named are PENDING.
+        A task that is no longer in the plan keeps its history, but counts no more.
         """
         states = states or {}
         known = {
@@ -202,11 +173,7 @@ class Manifest(ManifestReader):
 
     # --- attempts ---
     def start_attempt(self, task: TaskId, *, host: str | None = None) -> int:
-        """Open an attempt of a planned task and set the task RUNNING.
-
-        Args:
-            task: the task.
-            host: the machine it runs on; this one by default.
+        """Open an attempt of a planned task on a machine, by default this one, and set the task RUNNING.
 
         Returns:
             The attempt's number, one higher than any of this task before it, for ever.
@@ -241,8 +208,8 @@ class Manifest(ManifestReader):
             attempt: number from `start_attempt`.
             failure: why it ended; None if it succeeded.
             message: what the user should read about it.
-            seconds: how long it worked [s].
-            peak_memory_bytes: most memory that its process held [bytes].
+            seconds: how long it worked.
+            peak_memory_bytes: most memory that its process held.
             state: the task's state from now on, set in the same commit; None leaves it.
         """
         outcome = SUCCEEDED if failure is None else str(failure)
@@ -314,26 +281,15 @@ class Manifest(ManifestReader):
 
 def artifact_row(receipt: Receipt) -> ArtifactRow:
     """Row of an artifact, from its receipt."""
-    return ArtifactRow(
-        artifact=receipt.artifact,
-        task=receipt.task,
-        attempt=receipt.attempt,
-        fingerprint=receipt.fingerprint,
-        parameters=receipt.parameters,
-        size=receipt.size,
-        mtime_ns=receipt.mtime_ns,
-        hash=receipt.hash,
-        inputs=json.dumps(receipt.inputs, sort_keys=True, separators=(",", ":")),
-        device=receipt.device,
-    )
+    inputs = json.dumps(receipt.inputs, sort_keys=True, separators=(",", ":"))
+    same = {name: getattr(receipt, name) for name in ArtifactRow._fields if name != "inputs"}
+    return ArtifactRow(**same, inputs=inputs)
 
 
 def is_on_network(path: Path, mounts: Iterable[tuple[str, str]] | None = None) -> bool:
-    """Whether a path lies on a file system that several machines may write.
+    """Whether a path, which need not exist, lies on a file system that several machines may write.
 
-    Args:
-        path: the path; it need not exist.
-        mounts: (mount point, file system type) of all mounts; the machine's by default.
+    `mounts` are (mount point, file system type) of all mounts, the machine's by default.
     """
     if mounts is None:
         mounts = [(partition.mountpoint, partition.fstype) for partition in psutil.disk_partitions(all=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import sqlite3
@@ -15,13 +16,11 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.paused_gc import many_objects
 from pipeline.base.task import ArtifactPath, TaskId, TaskState
 from pipeline.record.migrations import migrations, refuse_newer, schema_version
-from pipeline.record.pages import PageQueries
 
 BUSY_TIMEOUT_S = 10.0
 """How long to wait for another process's lock; with a write-ahead log only a checkpoint ever makes one wait."""
 
-SUCCEEDED = "succeeded"
-"""Outcome of an attempt that ended well; any other is a FailureKind."""
+SUCCEEDED = "succeeded"  # outcome of an attempt that ended well; any other is a FailureKind
 
 
 class ArtifactRow(NamedTuple):
@@ -74,6 +73,11 @@ class StageSummary(NamedTuple):
         """Number of planned tasks of the stage."""
         return sum(self.counts.values())
 
+    @property
+    def done(self) -> int:
+        """Number of those that are done."""
+        return sum(self.counts.get(state, 0) for state in (TaskState.SUCCEEDED, TaskState.UP_TO_DATE))
+
 
 class StageCost(NamedTuple):
     """Cost of a stage so far, for estimates."""
@@ -103,7 +107,34 @@ class LastRun(NamedTuple):
     outcome: str | None  # a JobOutcome's value; None while it goes on, and if it was killed
 
 
-class ManifestReader(PageQueries):
+class StagePace(NamedTuple):
+    """Pace of a stage's planned tasks."""
+
+    stage: str
+    mean_seconds: float | None  # of an attempt that ended well; None before there is one
+    busy_s: float = 0.0  # how long attempts worked in a span of time [s]; one beside another counts twice
+    busy_since: float | None = None  # when the first of these was at work in it [s since the epoch]
+
+
+class TaskRow(NamedTuple):
+    """A planned task with its last attempt, whose fields are None before there is one."""
+
+    task: TaskId
+    state: TaskState
+    attempt: int | None
+    finished: float | None
+    message: str | None
+    seconds: float | None
+
+
+class TaskPage(NamedTuple):
+    """Some of the planned tasks that were asked for, in the plan's order, and how many there are."""
+
+    rows: list[TaskRow]
+    total: int
+
+
+class ManifestReader:
     """Queries on the record. The connection belongs to the thread that opened it.
 
     Every query raises ManifestError when the file is damaged, its text naming the remedy, or cannot be read.
@@ -123,7 +154,7 @@ class ManifestReader(PageQueries):
             path: the manifest.
             leave_no_trace: make no file beside one that nobody has open, as SQLite else does for its index. A runner
                 that starts meanwhile is not noticed then: see `pipeline.record.glance`.
-            timeout_s: how long to wait for another process's lock [s].
+            timeout_s: how long to wait for another process's lock.
 
         Raises:
             ManifestError: there is none, it is damaged, or a newer program's.
@@ -167,7 +198,7 @@ class ManifestReader(PageQueries):
             return {row.artifact: row for row in map(ArtifactRow._make, self._rows("SELECT * FROM artifact"))}
 
     def is_at_rest(self, tasks: int) -> bool:
-        """Whether the last run ended well and cleanly, with so many tasks, and nothing has been started since."""
+        """Whether the last run ended well and cleanly, with this number of tasks, and nothing was started since."""
         return bool(
             self._rows(
                 "SELECT 1 FROM job WHERE clean_shutdown AND outcome = ?"
@@ -230,10 +261,7 @@ class ManifestReader(PageQueries):
         return [EventRow._make(row) for row in reversed(rows)]
 
     def devices(self, stage: str) -> dict[str, int]:
-        """Devices that computed the artifacts of a stage, with the number of tasks; those that do not say are left out.
-
-        Neither do those count that are to be made anew.
-        """
+        """Devices that computed the artifacts of a stage, with the number of tasks; those to be made anew left out."""
         rows = self._rows(
             "SELECT device, count(DISTINCT artifact.task) FROM artifact JOIN task ON task.id = artifact.task"
             " WHERE device != '' AND position IS NOT NULL AND stage = ? AND state IN (?, ?)"
@@ -280,6 +308,84 @@ class ManifestReader(PageQueries):
         )
         return [StageTiming._make(row) for row in rows]
 
+    # --- for a page of a job that runs ---
+    def stage_paces(self, since: float, until: float) -> dict[str, StagePace]:
+        """Pace of each stage's planned tasks, busy between two wall times; stages without an attempt left out."""
+        rows = self._rows(
+            "WITH tried AS (SELECT stage, outcome = ?3 AS well, seconds,"
+            "   max(started, ?1) AS began, min(coalesce(finished, ?2), ?2) AS ended"
+            "   FROM attempt JOIN task ON task.id = attempt.task WHERE position IS NOT NULL)"
+            " SELECT stage, avg(seconds) FILTER (WHERE well),"
+            "   coalesce(sum(ended - began) FILTER (WHERE ended > began), 0.0), min(began) FILTER (WHERE ended > began)"
+            " FROM tried GROUP BY stage",
+            (since, until, SUCCEEDED),
+        )
+        return {row.stage: row for row in map(StagePace._make, rows)}
+
+    def artifacts_of(self, task: TaskId, *, since: float = 0.0) -> tuple[int, int]:
+        """Number of artifacts of a task, and of those written after a wall time."""
+        rows = self._rows(
+            "SELECT count(*), coalesce(sum(mtime_ns >= ?2), 0) FROM artifact WHERE task = ?1", (task, int(since * 1e9))
+        )
+        return int(rows[0][0]), int(rows[0][1])
+
+    def is_empty(self) -> bool:
+        """Whether there is no artifact on record."""
+        return not self._rows("SELECT 1 FROM artifact LIMIT 1")
+
+    def frame_count(self) -> int:
+        """Number of frames of the planned tasks."""
+        return int(self._rows("SELECT coalesce(max(frame) + 1, 0) FROM task WHERE position IS NOT NULL")[0][0])
+
+    def newest_in(self, folder: str, suffix: str, *, limit: int, offset: int = 0) -> list[tuple[ArtifactPath, int]]:
+        """Artifacts right in a folder of the job, the newest first, each with its modification time [ns]."""
+        rows = self._rows(
+            "SELECT path, mtime_ns FROM artifact WHERE path > ?1 || '/' AND path < ?1 || '0'"  # 0 follows / in ASCII
+            " AND substr(path, -length(?2)) = ?2 ORDER BY mtime_ns DESC, path DESC LIMIT ?3 OFFSET ?4",
+            (folder, suffix, limit, offset),
+        )
+        return [(ArtifactPath(path), int(mtime_ns)) for path, mtime_ns in rows]
+
+    def newest_and_count_in(self, folder: str, suffix: str) -> tuple[tuple[ArtifactPath, int] | None, int]:
+        """The first one that `newest_in` tells, or None, and of how many."""
+        rows = self._rows(
+            "SELECT path, max(mtime_ns), count(*) FROM artifact WHERE path > ?1 || '/' AND path < ?1 || '0'"
+            " AND substr(path, -length(?2)) = ?2",  # beside max() SQLite takes the path from its row
+            (folder, suffix),
+        )
+        path, mtime_ns, count = rows[0]
+        return None if path is None else (ArtifactPath(path), int(mtime_ns)), int(count)
+
+    def task_page(
+        self,
+        *,
+        stage: str | None = None,
+        states: Sequence[TaskState] = (),
+        text: str = "",
+        limit: int = 50,
+        offset: int = 0,
+    ) -> TaskPage:
+        """Planned tasks with their last attempts, in the plan's order: those whose id contains a text."""
+        values = (stage, text, json.dumps([str(state) for state in states]))
+        rows = self._rows(
+            "WITH chosen AS MATERIALIZED ("
+            "   SELECT id, position, state FROM task"
+            "   WHERE position IS NOT NULL AND (?1 IS NULL OR stage = ?1) AND instr(id, ?2)"
+            "     AND (?3 = '[]' OR state IN (SELECT value FROM json_each(?3)))"
+            "   ORDER BY position LIMIT ?4 OFFSET ?5)"
+            " SELECT id, state, number, finished, message, seconds"
+            " FROM chosen LEFT JOIN attempt ON attempt.task = id"
+            "   AND number = (SELECT max(number) FROM attempt AS later WHERE later.task = id)"
+            " ORDER BY position",
+            (*values, limit, offset),
+        )
+        counted = self._rows(
+            "SELECT count(*) FROM task WHERE position IS NOT NULL AND (?1 IS NULL OR stage = ?1) AND instr(id, ?2)"
+            " AND (?3 = '[]' OR state IN (SELECT value FROM json_each(?3)))",
+            values,
+        )
+        return TaskPage([TaskRow._make(row)._replace(state=TaskState(row[1])) for row in rows], int(counted[0][0]))
+
     def _rows(self, query: str, parameters: Sequence[object] = ()) -> list[tuple[Any, ...]]:
         """All rows of a query. Damage shows only at the page that it hit, so they are fetched here, under one roof."""
         with clear_errors(self._path, "read"):
@@ -302,14 +408,9 @@ def damaged(path: Path, finding: str) -> ManifestError:
 
 @contextmanager
 def clear_errors(path: Path, what: str) -> Iterator[None]:
-    """Turn SQLite's errors in the block into ones for the user; a mistake in a statement itself stays what it is.
+    """Turn SQLite's errors in the block into ManifestErrors; a mistake in a statement itself stays what it is.
 
-    Args:
-        path: the manifest.
-        what: what the block does to it: "read" or "written".
-
-    Raises:
-        ManifestError: the file is damaged, or it cannot be used now.
+    `what` is what the block does to the manifest: "read" or "written".
     """
     try:
         yield

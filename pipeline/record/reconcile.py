@@ -6,11 +6,14 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from operator import attrgetter
 from pathlib import Path
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, FailureKind, TaskState
-from pipeline.record.manifest import ArtifactRow, Manifest, artifact_row
+from pipeline.base.wording import counted
+from pipeline.record.manifest import Manifest, artifact_row
+from pipeline.record.reader import ArtifactRow
 from pipeline.store.artifacts import edited_name, sweep_parts
 from pipeline.store.receipts import Receipt, hash_file, read_receipt, verify_artifact
 
@@ -20,51 +23,33 @@ class FileCondition(StrEnum):
 
     MISSING = "missing"
     EDITED = "edited"
-    INTERRUPTED = "interrupted"
-    """Its commit was cut short: the file may be the old or the new one, and has no receipt."""
+    INTERRUPTED = "interrupted"  # its commit was cut short: the file may be the old or the new one, and has no receipt
 
 
 @dataclass(frozen=True, slots=True)
 class FileProblem:
-    """Fault of a recorded artifact's file.
-
-    Attributes:
-        condition: what kind of problem it is.
-        reason: a sentence about this file.
-    """
+    """Fault of a recorded artifact's file."""
 
     condition: FileCondition
-    reason: str
+    reason: str  # a sentence about this file
 
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """State of the recorded artifacts' files.
+    """State of the recorded artifacts' files."""
 
-    Attributes:
-        problems: artifacts whose file does not count.
-        new_mtimes_ns: modification times [ns] of files that were touched or copied, but hold the recorded bytes.
-        newer_receipts: receipts of files that were committed anew without the record learning of it.
-    """
-
-    problems: Mapping[ArtifactPath, FileProblem]
-    new_mtimes_ns: Mapping[ArtifactPath, int]
-    newer_receipts: tuple[Receipt, ...]
+    problems: dict[ArtifactPath, FileProblem]  # of artifacts whose file does not count
+    new_mtimes_ns: dict[ArtifactPath, int]  # of files that were touched or copied, but hold the recorded bytes
+    newer_receipts: tuple[Receipt, ...]  # of files committed again that the record does not know
 
 
 @dataclass(frozen=True, slots=True)
 class Reconciliation:
-    """The record as it stands now, and what was put right.
+    """The record as it stands now, and what was put right."""
 
-    Attributes:
-        rows: every artifact on record, those with a problem included; input of `plan.assess`.
-        problems: the artifacts whose file does not count; input of `plan.assess`.
-        sentences: what the user should know, one line each; none after a clean run that nobody has touched.
-    """
-
-    rows: dict[ArtifactPath, ArtifactRow]
-    problems: dict[ArtifactPath, FileProblem]
-    sentences: tuple[str, ...]
+    rows: dict[ArtifactPath, ArtifactRow]  # every artifact on record, those with a problem included
+    problems: dict[ArtifactPath, FileProblem]  # of artifacts whose file does not count
+    sentences: tuple[str, ...]  # for the user, one line each; none after a clean run that nobody has touched
 
     @property
     def valid_rows(self) -> dict[ArtifactPath, ArtifactRow]:
@@ -80,19 +65,16 @@ def reconcile(manifest: Manifest, layout: JobLayout, *, clean: bool) -> Reconcil
     swept away, and receipts that the record lacks are adopted. Artifacts whose file vanished are dropped from the
     record.
 
-    Args:
-        manifest: the record; the caller holds the job's lease.
-        layout: the job's folder.
-        clean: what `Manifest.begin_run` returned.
+    The caller holds the job's lease; `clean` is what `Manifest.begin_run` returned.
     """
     sentences = [*_close_open_attempts(manifest)]
     if not clean:
         swept = sweep_parts(layout)
         if swept:
-            sentences.append(f"swept away {_count(len(swept), 'unfinished file')}")
+            sentences.append(f"swept away {counted(len(swept), 'unfinished file')}")
         adopted = _adopt_receipts(manifest, layout)
         if adopted:
-            sentences.append(f"found {_count(adopted, 'finished file')} that the record did not know yet")
+            sentences.append(f"found {counted(adopted, 'finished file')} that the record did not know yet")
     rows = manifest.artifacts()
     inspection = inspect_files(layout, rows)
     rows.update({receipt.artifact: artifact_row(receipt) for receipt in inspection.newer_receipts})
@@ -107,7 +89,7 @@ def reconcile(manifest: Manifest, layout: JobLayout, *, clean: bool) -> Reconcil
             if problem.condition is FileCondition.EDITED:
                 sentences.append(f"{path}: {problem.reason}")
                 manifest.log_event("edited", sentences[-1], task=rows[path].task)
-    return Reconciliation(rows, dict(inspection.problems), tuple(sentences))
+    return Reconciliation(rows, inspection.problems, tuple(sentences))
 
 
 def inspect_files(layout: JobLayout, rows: Mapping[ArtifactPath, ArtifactRow]) -> Inspection:
@@ -183,7 +165,7 @@ def _close_open_attempts(manifest: Manifest) -> Iterator[str]:
                 message="the runner ended before the attempt did",
                 state=TaskState.PENDING,
             )
-    yield f"{_count(len(lost), 'attempt')} ended with the last runner, first {lost[0].task}; each starts again"
+    yield f"{counted(len(lost), 'attempt')} ended with the last runner, first {lost[0].task}; each starts again"
 
 
 def _adopt_receipts(manifest: Manifest, layout: JobLayout) -> int:
@@ -199,12 +181,8 @@ def _adopt_receipts(manifest: Manifest, layout: JobLayout) -> int:
 
 def _is_known(receipt: Receipt, rows: Mapping[ArtifactPath, ArtifactRow]) -> bool:
     row = rows.get(receipt.artifact)
-    return row is not None and (row.task, row.attempt, row.fingerprint, row.hash) == (
-        receipt.task,
-        receipt.attempt,
-        receipt.fingerprint,
-        receipt.hash,
-    )
+    identity = attrgetter("task", "attempt", "fingerprint", "hash")
+    return row is not None and identity(row) == identity(receipt)
 
 
 def _describe_edit(layout: JobLayout, artifact: ArtifactPath, finding: str) -> str:
@@ -225,7 +203,3 @@ def _move_aside(manifest: Path) -> Path | None:
         if part.exists():
             part.rename(f"{kept}{suffix}")
     return kept
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.base.errors import PipelineError
+from pipeline.base.files import replace_durably
 from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import digest_of
 from pipeline.record.manifest import artifact_row
 from pipeline.record.reader import ManifestReader
 from pipeline.record.reconcile import receipts
-from pipeline.store.provenance import restore
 from pipeline.store.receipts import verify_artifact
 
 
@@ -34,15 +35,20 @@ def flaws_of(layout: JobLayout, *, deep: bool) -> tuple[int, dict[str, str]]:
     return len(seen), flaws
 
 
-def restore_text(layout: JobLayout, text: str) -> bool:
-    """Write a damaged text of the provenance anew, if the record or the folder knows it; else remove it."""
-
-    path = layout.root / text
-    parameters = None
-    if path.parent == layout.provenance / "parameters" and layout.manifest.exists():
+def restore_text(layout: JobLayout, path: Path) -> bool:
+    """Rewrite a damaged text of the provenance from record or folder, else remove it; returns whether it was known."""
+    text = None
+    if path.parent == layout.parameters_text("").parent and layout.manifest.exists():
         with ManifestReader.open_readonly(layout.manifest) as manifest:
             parameters = manifest.parameters(path.stem)
-    return restore(layout, path, parameters)
+        text = None if parameters is None else parameters.canonical
+    elif layout.job_file.exists():
+        text = layout.job_file.read_text(encoding="utf-8")
+    path.unlink()
+    if text is None or digest_of(text) != path.stem:
+        return False
+    replace_durably(path, text)
+    return True
 
 
 def mark_as_touched(path: Path) -> None:

@@ -14,17 +14,11 @@ from pipeline.run.plan import Assessment, Verdict, assess, plan_job
 
 
 class JobAssessment(NamedTuple):
-    """How a job stands.
+    """How a job stands."""
 
-    Attributes:
-        assessments: what would run, and why.
-        costs: what the stages have taken so far.
-        at_rest: whether a run would find nothing at all to do or to put right: neither in the record nor in the files.
-    """
-
-    assessments: list[Assessment]
-    costs: Mapping[str, StageCost]
-    at_rest: bool
+    assessments: list[Assessment]  # what would run, and why
+    costs: Mapping[str, StageCost]  # what the stages have taken so far
+    at_rest: bool  # whether a run would find nothing to do or to put right, neither in the record nor in the files
 
     @property
     def current(self) -> frozenset[ArtifactPath]:
@@ -35,13 +29,7 @@ class JobAssessment(NamedTuple):
 
 
 def assess_job(job: Job, layout: JobLayout, until: Sequence[str] = ()) -> JobAssessment:
-    """Hold a job against its record and its files; changes nothing.
-
-    Args:
-        job: the job.
-        layout: its folder.
-        until: the stages after which it ends; empty: the film.
-    """
+    """Hold a job that ends after the stages `until`, or with the film, against its record and its files."""
     from pipeline.stages import STAGES
 
     tasks = plan_job(job, layout, STAGES, until)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 
 from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
@@ -10,9 +11,8 @@ from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, TaskI
 from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest, artifact_row
 from pipeline.record.reader import ArtifactRow
-from pipeline.run.events import Committed, Failed, Finished, Notice, TaskEvent, Warned
+from pipeline.run.events import Committed, Failed, Finished, Notice, Observer, TaskEvent, Warned
 from pipeline.run.executors.base import Assignment
-from pipeline.run.observers import Observer
 from pipeline.run.plan import input_hashes
 from pipeline.run.scheduler import OWN_FAILURES
 from pipeline.store.receipts import read_receipt, verify_artifact
@@ -24,44 +24,20 @@ Settled = Committed | Finished | Failed
 """What becomes of a task, as the scheduler takes it."""
 
 
+@dataclass
 class RunRecord:
-    """The record of a run: keeps the manifest true to the executor's events, and passes on what the scheduler needs.
+    """The record of a run: keeps the manifest true to the executor's events, and passes on what the scheduler needs."""
 
-    Args:
-        manifest: the record, open for writing.
-        job: the job.
-        layout: its folder.
-        stages: where the stages are, as `module:ATTRIBUTE`.
-        rows: the artifacts that are valid; kept up to date.
-        observer: gets commits that were adopted, and a notice of a full disk.
-
-    Attributes:
-        rows: the artifacts that are valid, by path.
-        failures: the last failure of each task, in order.
-        parts_left: whether an attempt may have left a part file behind.
-        ended_by_force: whether an attempt ended in a way that may have swallowed the word of a commit.
-    """
-
-    def __init__(
-        self,
-        manifest: Manifest,
-        job: Job,
-        layout: JobLayout,
-        *,
-        stages: str,
-        rows: dict[ArtifactPath, ArtifactRow],
-        observer: Observer,
-    ) -> None:
-        self._manifest = manifest
-        self._job = job
-        self._layout = layout
-        self._stages = stages
-        self._observer = observer
-        self._assignments: dict[TaskId, Assignment] = {}
-        self.rows = rows
-        self.failures: dict[TaskId, Failed] = {}
-        self.parts_left = False
-        self.ended_by_force = False
+    manifest: Manifest  # open for writing
+    job: Job
+    layout: JobLayout
+    stages: str  # where the stages are, as `module:ATTRIBUTE`
+    rows: dict[ArtifactPath, ArtifactRow]  # the artifacts that are valid; kept up to date
+    notify: Observer  # gets commits that were adopted, and a notice of a full disk
+    failures: dict[TaskId, Failed] = field(default_factory=dict)  # the last one of each task, in order
+    parts_left: bool = False  # whether an attempt may have left a part file behind
+    ended_by_force: bool = False  # whether an attempt ended in a way that may have swallowed the word of a commit
+    _assignments: dict[TaskId, Assignment] = field(default_factory=dict)
 
     def invalidate(self, tasks: Iterable[Task]) -> None:
         """Drop the receipts of tasks that are to run again, so that their stage finds nothing to reuse.
@@ -70,25 +46,25 @@ class RunRecord:
         """
         artifacts = [output for task in tasks for output in task.outputs if output in self.rows]
         for artifact in artifacts:
-            self._layout.receipt(artifact).unlink(missing_ok=True)
+            self.layout.receipt(artifact).unlink(missing_ok=True)
             del self.rows[artifact]
         if artifacts:
-            self._manifest.forget_artifacts(artifacts)
+            self.manifest.forget_artifacts(artifacts)
 
     def open_attempt(self, task: Task, *, threads: int, need: Resources) -> Assignment:
         """Number the next attempt of a task; it may begin when that is committed to the manifest."""
-        attempt = self._manifest.start_attempt(task.id)
+        attempt = self.manifest.start_attempt(task.id)
         inputs = input_hashes(task, self.rows)
-        limits = self._job.limits_of(task.stage)
+        limits = self.job.limits_of(task.stage)
         self._assignments[task.id] = assignment = Assignment(
             task=task,
             attempt=attempt,
             fingerprint=task_fingerprint(task, inputs),
             inputs=inputs,
             threads=threads,
-            job_file=self._layout.job_file.absolute(),  # wherever the worker's own folder is
-            root=self._layout.root.absolute(),
-            stages=self._stages,
+            job_file=self.layout.job_file.absolute(),  # wherever the worker's own folder is
+            root=self.layout.root.absolute(),
+            stages=self.stages,
             timeout_s=limits.timeout_s,
             stall_s=limits.stall_s,
             memory_bytes=limits.memory_bytes,
@@ -99,19 +75,15 @@ class RunRecord:
     def take(self, event: TaskEvent, *, lacking: Callable[[TaskId], Sequence[ArtifactPath]]) -> list[Settled]:
         """Put an event of an attempt on record.
 
-        Args:
-            event: of the attempt.
-            lacking: the outputs of a task whose commits the scheduler has not seen.
-
-        Returns:
-            The events for the scheduler, in order: the same one, or what the files on disk show to have happened.
+        Returns the events for the scheduler, in order: the same one, or what the files on disk show to have happened.
+        `lacking` finds the outputs of a task whose commits the scheduler has not seen.
         """
         match event:
             case Committed():
                 self._take_commit(event)
                 return [event]
             case Warned(task_id, _, _, message):
-                self._manifest.log_event("warning", message, task=task_id)
+                self.manifest.log_event("warning", message, task=task_id)
                 return []
             case Finished():
                 return self._take_end(event, lacking(event.task_id))
@@ -121,8 +93,8 @@ class RunRecord:
                 return []
 
     def _take_commit(self, commit: Committed) -> None:
-        self._manifest.record_artifact(commit.receipt)
-        self.rows[commit.artifact] = artifact_row(commit.receipt)
+        self.manifest.record_artifact(commit.receipt)
+        self.rows[commit.receipt.artifact] = artifact_row(commit.receipt)
 
     def _take_end(self, end: Finished, untold: Sequence[ArtifactPath]) -> list[Settled]:
         adopted, gone = self._adopt(end.task_id, untold)
@@ -131,7 +103,7 @@ class RunRecord:
             kind = FailureKind.FAILED
             failed = Failed(end.task_id, end.attempt, kind, sentence, "", end.seconds, end.peak_memory_bytes)
             return adopted + self._take_failure(failed, gone)
-        self._manifest.finish_attempt(
+        self.manifest.finish_attempt(
             end.task_id, end.attempt, seconds=end.seconds, peak_memory_bytes=end.peak_memory_bytes
         )
         return [*adopted, end]
@@ -142,7 +114,7 @@ class RunRecord:
         self.ended_by_force |= failed.kind in _FORCED_ENDS
         adopted, gone = self._adopt(failed.task_id, untold)
         succeeded = failed.kind in _FORCED_ENDS and not gone
-        self._manifest.finish_attempt(
+        self.manifest.finish_attempt(
             failed.task_id,
             failed.attempt,
             failure=None if succeeded else failed.kind,
@@ -154,31 +126,28 @@ class RunRecord:
             return [*adopted, Finished(failed.task_id, failed.attempt, failed.seconds, failed.peak_memory_bytes)]
         self.failures[failed.task_id] = failed
         if failed.kind is FailureKind.DISK_FULL:
-            place = failed.full_place or self._layout.root
+            place = failed.full_place or self.layout.root
             sentence = f"the disk is full ({place}): the job pauses; free some space and submit it again"
-            self._observer.notify(Notice(sentence))
+            self.notify(Notice(sentence))
         return [*adopted, failed]
 
     def _adopt(self, task_id: TaskId, untold: Sequence[ArtifactPath]) -> tuple[list[Settled], list[ArtifactPath]]:
-        """Take in outputs that are committed without the record knowing it.
+        """Take in outputs that are committed without the record knowing it: commits, and outputs that are not there.
 
         The stage found them there already, or its process was killed between a commit and the word of it.
-
-        Returns:
-            Their commits, and the outputs that are not committed.
         """
         assignment = self._assignments[task_id]
         commits: list[Settled] = []
         gone: list[ArtifactPath] = []
         for artifact in untold:
-            receipt = read_receipt(self._layout, artifact)
+            receipt = read_receipt(self.layout, artifact)
             if (
                 receipt is not None
                 and receipt.fingerprint == assignment.fingerprint
-                and verify_artifact(self._layout, receipt) is None
+                and verify_artifact(self.layout, receipt) is None
             ):
                 commit = Committed(task_id, assignment.attempt, receipt)
-                self._observer.notify(commit)
+                self.notify(commit)
                 self._take_commit(commit)
                 commits.append(commit)
             else:

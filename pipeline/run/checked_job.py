@@ -15,7 +15,7 @@ from pipeline.stages import STAGES
 from pipeline.stages.movie import MovieStage
 from pipeline.stages.render import RenderStage
 
-PICTURE_KEYS = frozenset({"camera", "light", "stage", "material", "render", "movie"})
+PICTURE_KEYS = frozenset({"camera", "light", "set", "material", "render", "movie"})
 """Tables of the job file that decide nothing but pictures."""
 
 
@@ -36,14 +36,11 @@ def without_pictures(findings: Findings) -> Findings:
 
 
 def check_job(job: Job, *, memory_bytes: int | None = None, until: Sequence[str] = ()) -> Findings:
-    """Look at the whole job: everything that can be known before any work starts.
+    """Look at the whole job, with absolute mesh paths: everything that can be known before any work starts.
 
-    Reads the mesh files and fills the fluid's blocks, so it takes a second or two for a large scene.
-
-    Args:
-        job: a job as `read_job` returns it, with absolute mesh paths.
-        memory_bytes: what the simulation may use; this machine's if omitted.
-        until: the stages after which the job ends; what is about pictures alone does not count if it draws none.
+    Reads the mesh files and fills the fluid's blocks, so it takes a second or two for a large scene. The simulation may
+    use `memory_bytes`, this machine's if omitted. What is about pictures alone does not count if the job, which ends
+    after the stages `until`, draws none.
     """
     findings = check_description(job, memory_bytes)
     for obstacle in MovieStage().preflight(job):
@@ -68,11 +65,7 @@ def _check_limits(job: Job, findings: Findings) -> None:
 def load_checked_job(
     path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False, until: Sequence[str] = ()
 ) -> tuple[LoadedJob, Findings]:
-    """Read a job file as `read_job` does, and look at the whole job; its warnings are in place.
-
-    Raises:
-        JobFileError: carries every problem found.
-    """
+    """Read a job file and look at the whole job; its warnings are in place. Raises JobFileError with every problem."""
     loaded = read_job(path, overrides, preview=preview)
     findings = check_job(loaded.job, until=until)
     if findings.errors:

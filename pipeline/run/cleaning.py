@@ -16,12 +16,7 @@ from pipeline.run.plan import plan_job
 
 
 def remove_contents(layout: JobLayout, is_meant: Callable[[list[Path]], bool]) -> None:
-    """Remove everything but the lease's own files, which are needed to give it back.
-
-    Args:
-        layout: the job's folder, whose lease the caller holds.
-        is_meant: gets the files and returns whether they are to go.
-    """
+    """Remove everything but the files of the lease, which the caller holds, if `is_meant` says so of the files."""
     files = [path for path in layout.root.rglob("*") if path.is_file() and not layout.is_of_lease(path)]
     if not is_meant(files):
         return
@@ -105,7 +100,7 @@ def superseded_logs(layout: JobLayout) -> list[Path]:
 
 
 def _is_older(path: Path, before: float) -> bool:
-    """Whether a file was last changed before a wall time [s since the epoch]; one that is gone was."""
+    """Whether a file was last changed before a wall time [s]; one that is gone was."""
     try:
         return path.stat().st_mtime < before
     except FileNotFoundError:

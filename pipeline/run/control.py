@@ -7,36 +7,28 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from difflib import get_close_matches
 from types import FrameType
 
 from pipeline.base.errors import PlanError
 from pipeline.base.task import Task, TaskId
+from pipeline.model.problems import suggestion
 from pipeline.run.plan import frame_ranges
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Tasks to run again although they are up to date.
+    """Tasks to run again although they are up to date."""
 
-    Attributes:
-        stages: names of the stages; empty: of all.
-        frames: their frames; None: all. Tasks about the whole job have no frame, and are not selected by one.
-    """
-
-    stages: frozenset[str] = frozenset()
+    stages: frozenset[str] = frozenset()  # names of the stages; empty: of all
+    # their frames; None: all. Tasks about the whole job have no frame, and are not selected by one
     frames: frozenset[int] | None = None
 
     def of(self, tasks: Sequence[Task]) -> frozenset[TaskId]:
-        """The selected ones of these tasks.
-
-        Raises:
-            PlanError: a stage or a frame is not in the plan, or a stage has no frames; says so of each.
-        """
+        """The selected ones of these tasks. Raises PlanError for each stage or frame that the plan lacks."""
         known = [*dict.fromkeys(task.stage for task in tasks)]
         unknown = sorted(self.stages - set(known))
         if unknown:
-            names = "; ".join(f'no stage "{name}" in this job{_nearest(name, known)}' for name in unknown)
+            names = "; ".join(f'no stage "{name}" in this job{suggestion(name, known)}' for name in unknown)
             raise PlanError(f"{names}; the stages are {', '.join(known)}")
         chosen = [task for task in tasks if not self.stages or task.stage in self.stages]
         if self.frames is not None:
@@ -58,25 +50,20 @@ class Selection:
             )
 
 
-def _nearest(name: str, names: Sequence[str]) -> str:
-    close = get_close_matches(name, names, n=1)
-    return f'; did you mean "{close[0]}"?' if close else ""
-
-
 class RunControl:
     """How a person stops a run; safe to call from signal handlers and other threads."""
 
     def __init__(self) -> None:
-        self._interruptions = 0
+        self.signals = 0
 
     def interrupt(self) -> None:
         """Once: finish what runs, and stop. Twice: stop at once. Either way the next run continues."""
-        self._interruptions += 1
+        self.signals += 1
 
     @property
     def interruptions(self) -> int:
-        """How often it was interrupted."""
-        return self._interruptions
+        """How often the run was asked to stop, by whomever."""
+        return self.signals
 
     @contextmanager
     def on_signals(self) -> Iterator[None]:

@@ -6,12 +6,12 @@ the same object.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, TaskId, TaskState
+from pipeline.base.task import FailureKind, Resources, Task, TaskId, TaskState
 from pipeline.store.receipts import Receipt
 
 if TYPE_CHECKING:
@@ -21,24 +21,26 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Started:
-    """The attempt runs, in process `pid` of `host`."""
-
+class _OfAttempt:
     task_id: TaskId
     attempt: int
+
+
+@dataclass(frozen=True, slots=True)
+class Started(_OfAttempt):
+    """The attempt runs, in process `pid` of `host`."""
+
     host: str
     pid: int
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class Progress(_OfAttempt):
     """How far the attempt is: `done` of `total`, in units of the stage's choice.
 
     While `preparing`, it does what is done once on a machine, such as compiling: no limit of time counts that.
     """
 
-    task_id: TaskId
-    attempt: int
     done: float
     total: float
     message: str = ""
@@ -46,70 +48,41 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
-class Committed:
+class Committed(_OfAttempt):
     """An output is in place, with its receipt beside it."""
 
-    task_id: TaskId
-    attempt: int
     receipt: Receipt
-
-    @property
-    def artifact(self) -> ArtifactPath:
-        """The output."""
-        return self.receipt.artifact
 
 
 @dataclass(frozen=True, slots=True)
-class Warned:
+class Warned(_OfAttempt):
     """The attempt goes on, but something is worth a look.
 
-    Attributes:
-        task_id: its task.
-        attempt: its number.
-        kind: what it is about, in a word: the same for all tasks that warn of the same.
-        message: a sentence for the user.
+    All tasks that warn of the same have the same `kind`, a word or two; `message` is a sentence for the user.
     """
 
-    task_id: TaskId
-    attempt: int
     kind: str
     message: str
 
 
 @dataclass(frozen=True, slots=True)
-class Finished:
+class Finished(_OfAttempt):
     """The attempt succeeded: all outputs are committed."""
 
-    task_id: TaskId
-    attempt: int
     seconds: float
     peak_memory_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
-class Failed:
-    """The attempt ended without success.
+class Failed(_OfAttempt):
+    """The attempt ended without success."""
 
-    Attributes:
-        task_id: its task.
-        attempt: its number.
-        kind: whose fault it is.
-        message: one line for the user.
-        details: traceback, or the last lines of the log where the process could say nothing any more.
-        seconds: how long it ran [s].
-        peak_memory_bytes: largest resident memory seen; 0 when unknown.
-        full_place: what could not be written as its disk is full, "" where that is not known; it may lie outside the
-            job's folder.
-    """
-
-    task_id: TaskId
-    attempt: int
-    kind: FailureKind
-    message: str
-    details: str = ""
-    seconds: float = 0.0
-    peak_memory_bytes: int = 0
-    full_place: str = ""
+    kind: FailureKind  # whose fault it is
+    message: str  # one line for the user
+    details: str = ""  # traceback, or the last lines of the log where the process could say nothing any more
+    seconds: float = 0.0  # how long it ran [s]
+    peak_memory_bytes: int = 0  # largest resident memory seen; 0 when unknown
+    full_place: str = ""  # what could not be written as its disk is full, maybe outside the job's folder; "" if unknown
 
 
 TaskEvent = Started | Progress | Committed | Warned | Finished | Failed
@@ -227,23 +200,14 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a run ended.
+    """How a run ended."""
 
-    Attributes:
-        kind: in one word.
-        ran: how many tasks succeeded in this run.
-        failures: the last failure of each task that failed for good, in order.
-        counts: number of tasks by stage and state.
-        seconds: how long the run took [s].
-        full_place: what a task could not write as its disk is full; "" where none says so.
-    """
-
-    kind: JobOutcome
-    ran: int = 0
-    failures: tuple[Failed, ...] = ()
-    counts: dict[tuple[str, TaskState], int] = field(default_factory=dict)
-    seconds: float = 0.0
-    full_place: str = ""
+    kind: JobOutcome  # in one word
+    ran: int = 0  # how many tasks succeeded in this run
+    failures: tuple[Failed, ...] = ()  # the last failure of each task that failed for good, in order
+    counts: dict[tuple[str, TaskState], int] = field(default_factory=dict)  # number of tasks by stage and state
+    seconds: float = 0.0  # how long the run took [s]
+    full_place: str = ""  # what a task could not write as its disk is full; "" where none says so
 
     @property
     def exit_code(self) -> int:
@@ -269,3 +233,6 @@ class RunEnded:
 
 
 RunEvent = RunStarted | StateChanged | TaskEvent | Notice | RunEnded
+
+Observer = Callable[[RunEvent], None]
+"""Gets every event of a run, in order. Called from the run's own loop, so it should be quick, and must not raise."""

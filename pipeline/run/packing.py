@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import heapq
 from collections import defaultdict
-from typing import NamedTuple
 
 from pipeline.base.resources import fits, minus, plus
 from pipeline.base.task import Resources, TaskId
@@ -16,23 +15,11 @@ Priority = tuple[int, int, int]
 """The lower, the more urgent; no two tasks have the same."""
 
 
-class _Claim(NamedTuple):
-    """A task and what it needs."""
-
-    task_id: TaskId
-    need: Resources
-
-
 class Packing:
     """The tasks that are ready, in their order, and what those that have been taken leave free.
 
-    Args:
-        machine: the most that one task may need.
-        capacity: what may be used at a time, where that is more than one machine.
-
-    Attributes:
-        machine: the same.
-        free: what no task occupies. Less than nothing where a machine went whose tasks still count.
+    One task may need no more than `machine` has; `capacity` is what may be used at a time, where that is more. What is
+    `free` is less than nothing where a machine went whose tasks still count.
     """
 
     def __init__(self, *, machine: Resources, capacity: Resources) -> None:
@@ -40,7 +27,7 @@ class Packing:
         self._capacity = self._at_least_a_machine(capacity)
         self.free = self._capacity
         self._ready: defaultdict[Resources, list[tuple[Priority, TaskId]]] = defaultdict(list)
-        self._blocked: _Claim | None = None
+        self._blocked: tuple[TaskId, Resources] | None = None
         self._overtakers: dict[TaskId, Resources] = {}
 
     @property
@@ -64,14 +51,14 @@ class Packing:
         self.free = plus(self.free, need)
 
     def take(self) -> TaskId | None:
-        """Take the most urgent task that fits, without starving a bigger one that is more urgent; it occupies its need.
+        """Take the most urgent task that fits; it occupies its need.
 
         When the most urgent task does not fit, others may overtake it only as long as it would fit beside all who did:
         once those end that ran before it was blocked, it starts.
         """
         heaps = sorted(((need, heap) for need, heap in self._ready.items() if heap), key=lambda each: each[1][0])
         for position, (need, heap) in enumerate(heaps):
-            candidate = _Claim(heap[0][1], need)
+            candidate = (heap[0][1], need)
             if position == 0 and self._blocked != candidate:
                 self._blocked = None
             if not fits(need, self.free):
@@ -81,18 +68,17 @@ class Packing:
                 continue
             if self._blocked not in (None, candidate) and self._would_delay_blocked(need):
                 continue
-            heapq.heappop(heap)
             if candidate == self._blocked:
                 self._blocked = None
             elif self._blocked is not None:
-                self._overtakers[candidate.task_id] = need
+                self._overtakers[heap[0][1]] = need
             self.free = minus(self.free, need)
-            return candidate.task_id
+            return heapq.heappop(heap)[1]
         return None
 
     def _would_delay_blocked(self, need: Resources) -> bool:
         assert self._blocked is not None
-        left = minus(self._capacity, self._blocked.need)
+        left = minus(self._capacity, self._blocked[1])
         for taken in self._overtakers.values():
             left = minus(left, taken)
         return not fits(need, left)

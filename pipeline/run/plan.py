@@ -8,6 +8,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from itertools import chain
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
 
 
 NEVER_MADE = "never made"
-"""The reason of outputs that are not on record, as a group of reasons says it."""
+"""The group of reasons of outputs that are not on record."""
 
 
 _CONDITION_WORDING = {
@@ -47,12 +49,7 @@ class Verdict(StrEnum):
 
 
 class Reason(NamedTuple):
-    """Why a task is not up to date.
-
-    Attributes:
-        text: about this one task.
-        group: the same for many tasks alike, without what is particular to one.
-    """
+    """Why a task is not up to date: a `text` about this one task, and a `group` that many tasks alike share."""
 
     text: str
     group: str
@@ -60,18 +57,12 @@ class Reason(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """One task's verdict.
-
-    Attributes:
-        task: the task.
-        verdict: what would become of it.
-        reasons: why; empty if it is up to date.
-        rebuilds: the outputs that would be made, or made anew. Of a checkpointed task only those that need it.
-    """
+    """One task's verdict."""
 
     task: Task
-    verdict: Verdict
-    reasons: tuple[Reason, ...] = ()
+    verdict: Verdict  # what would become of it
+    reasons: tuple[Reason, ...] = ()  # why; empty if it is up to date
+    # the outputs that would be made, or made anew. Of a checkpointed task only those that need it
     rebuilds: tuple[ArtifactPath, ...] = ()
 
 
@@ -87,12 +78,8 @@ class Estimate(NamedTuple):
 def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage], until: Sequence[str] = ()) -> list[Task]:
     """The tasks of a job, makers before users.
 
-    Args:
-        job: the job.
-        layout: its folder.
-        stages: every stage, makers before users.
-        until: the stages after which it ends: only their tasks and what these need; empty: all. What comes after them
-            is not even asked for a plan, as that may need a Blender.
+    With stages `until` after which the job ends, only their tasks and what these need. What comes after them is not
+    even asked for a plan, as that may need a Blender.
 
     Raises:
         PlanError: two tasks share a name or an output, an input has no maker, tasks wait for each other in a circle, or
@@ -128,11 +115,7 @@ def made_from(targets: Collection[TaskId], tasks: Sequence[Task]) -> list[Task]:
 
 
 def in_order(tasks: Sequence[Task]) -> list[Task]:
-    """The tasks with makers before users.
-
-    Raises:
-        PlanError: see `plan_job`.
-    """
+    """The tasks with makers before users. Raises PlanError, see `plan_job`."""
     makers: dict[ArtifactPath, TaskId] = {}
     names: set[TaskId] = set()
     for task in tasks:
@@ -145,26 +128,12 @@ def in_order(tasks: Sequence[Task]) -> list[Task]:
             makers[output] = task.id
     if _makers_first(tasks, makers):
         return [*tasks]
-    waiting: dict[TaskId, int] = {}
-    users: dict[TaskId, list[Task]] = {}
-    for task in tasks:
-        made_by = {makers[path] for path in task.inputs}
-        waiting[task.id] = len(made_by)
-        for maker in made_by:
-            users.setdefault(maker, []).append(task)
-    ready = deque(task for task in tasks if not waiting[task.id])
-    ordered: list[Task] = []
-    while ready:
-        task = ready.popleft()
-        ordered.append(task)
-        for user in users.get(task.id, ()):
-            waiting[user.id] -= 1
-            if not waiting[user.id]:
-                ready.append(user)
-    if len(ordered) < len(tasks):
-        stuck = [task.id for task in tasks if waiting[task.id]]
-        raise PlanError(f"{len(stuck)} tasks wait for each other in a circle, {stuck[0]} among them")
-    return ordered
+    by_id = {task.id: task for task in tasks}
+    sorter = TopologicalSorter({task.id: {makers[path]: None for path in task.inputs} for task in tasks})
+    try:
+        return [by_id[task_id] for task_id in sorter.static_order()]
+    except CycleError as error:
+        raise PlanError(f"tasks wait for each other in a circle: {', '.join(error.args[1])}") from None
 
 
 def _makers_first(tasks: Sequence[Task], makers: Mapping[ArtifactPath, TaskId]) -> bool:
@@ -181,15 +150,38 @@ def _makers_first(tasks: Sequence[Task], makers: Mapping[ArtifactPath, TaskId]) 
     return in_order
 
 
+def frame_turns(job: Job) -> list[int] | None:
+    """The turn of each frame, 0 for the first; None: as in the film."""
+    return spread_turns(job.frame_count) if job.render.order == "spread" else None
+
+
+def spread_turns(frames: int) -> list[int]:
+    """Turns of frames that are taken from all over the film: the first, the last, the middle, then between these.
+
+    After any number of turns no gap is more than twice as long as another, give or take a frame.
+    """
+    turns = [0] * frames
+    taken = 0
+    for frame in dict.fromkeys((0, frames - 1)):
+        turns[frame] = taken
+        taken += 1
+    gaps = deque([(0, frames - 1)])
+    while gaps:
+        before, after = gaps.popleft()
+        if after - before < 2:
+            continue
+        middle = (before + after) // 2
+        turns[middle] = taken
+        taken += 1
+        gaps += [(before, middle), (middle, after)]
+    return turns
+
+
 def up_to_date(task: Task, rows: Mapping[ArtifactPath, ArtifactRow]) -> bool:
-    """Whether every output is there with the fingerprint that the task has now.
+    """Whether every output is there with the fingerprint that the task has now; all its inputs are in `rows`.
 
     This is the early cutoff at dispatch: asked once a task's inputs are committed, it saves the run if what was made
     anew upstream turned out the same.
-
-    Args:
-        task: a task whose inputs are all in `rows`.
-        rows: the artifacts that are valid now.
     """
     fingerprint = task_fingerprint(task, input_hashes(task, rows))
     return all(output in rows and rows[output].fingerprint == fingerprint for output in task.outputs)
@@ -218,37 +210,33 @@ def assess(
         forced: tasks that are to run again whatever the record says.
     """
     with many_objects():
-        return [*_Assessor(rows, problems, parameters, forced).assess(tasks)]
+        assessor = _Assessor(rows, problems, parameters, forced)
+        return [assessor.assess(task) for task in tasks]
 
 
+@dataclass
 class _Assessor:
     """Walks the plan from makers to users, and remembers which artifacts will be made anew."""
 
-    def __init__(
-        self,
-        rows: Mapping[ArtifactPath, ArtifactRow],
-        problems: Mapping[ArtifactPath, FileProblem],
-        parameters: Callable[[str], ParameterSet | None],
-        forced: frozenset[TaskId],
-    ) -> None:
-        self._rows = rows
-        self._problems = problems
-        self._parameters = parameters
-        self._forced = forced
+    rows: Mapping[ArtifactPath, ArtifactRow]
+    problems: Mapping[ArtifactPath, FileProblem]
+    parameters: Callable[[str], ParameterSet | None]
+    forced: frozenset[TaskId]
+
+    def __post_init__(self) -> None:
         self._rebuilt: set[ArtifactPath] = set()
         self._parameter_reasons = cache(self._compare_parameters)
 
-    def assess(self, tasks: Iterable[Task]) -> Iterator[Assessment]:
-        for task in tasks:
-            assessment = self._assess(task)
-            self._rebuilt.update(assessment.rebuilds)
-            yield assessment
+    def assess(self, task: Task) -> Assessment:
+        assessment = self._assess(task)
+        self._rebuilt.update(assessment.rebuilds)
+        return assessment
 
     def _assess(self, task: Task) -> Assessment:
-        if task.id in self._forced:
+        if task.id in self.forced:
             return Assessment(task, Verdict.STALE, (_same("to be run again, as asked"),), task.outputs)
         rebuilt = [path for path in task.inputs if path in self._rebuilt]
-        fingerprint = None if rebuilt else task_fingerprint(task, input_hashes(task, self._rows))
+        fingerprint = None if rebuilt else task_fingerprint(task, input_hashes(task, self.rows))
         if len(task.outputs) == 1:  # as for nearly every task of a large job
             reasons = self._reasons(task, task.outputs[0], fingerprint)
             if reasons:
@@ -258,9 +246,8 @@ class _Assessor:
         found = {output: self._reasons(task, output, fingerprint) for output in task.outputs}
         bad = {output: reasons for output, reasons in found.items() if reasons}
         if bad:
-            return Assessment(
-                task, Verdict.STALE, _collect(bad, len(found)), tuple(bad) if task.checkpointed else task.outputs
-            )
+            reasons = _collect(chain.from_iterable(bad.values()), len(found))
+            return Assessment(task, Verdict.STALE, reasons, tuple(bad) if task.checkpointed else task.outputs)
         if rebuilt:
             reasons = _abridge(
                 Reason(f"{path} will be made anew", f"{_kind(path)} will be made anew") for path in rebuilt
@@ -270,11 +257,11 @@ class _Assessor:
 
     def _reasons(self, task: Task, output: ArtifactPath, fingerprint: str | None) -> tuple[Reason, ...]:
         """Why one output does not count; `fingerprint` is None if an input will be made anew."""
-        row = self._rows.get(output)
+        row = self.rows.get(output)
         if row is None:
             return (Reason(f"{output} was never made", NEVER_MADE),)
-        if output in self._problems:
-            problem = self._problems[output]
+        if output in self.problems:
+            problem = self.problems[output]
             return (Reason(f"{output}: {problem.reason}", _CONDITION_WORDING[problem.condition]),)
         if row.parameters != task.parameters.digest:
             return self._parameter_reasons(row.parameters, task.parameters)
@@ -283,7 +270,7 @@ class _Assessor:
         return _abridge(self._compare_inputs(task, row, certain=fingerprint is not None))
 
     def _compare_parameters(self, old_digest: str, new: ParameterSet) -> tuple[Reason, ...]:
-        old = self._parameters(old_digest)
+        old = self.parameters(old_digest)
         if old is None:
             return (_same("its parameters changed; what they were is not on record"),)
         return tuple(_same(clause) for clause in explain_difference(old, new))
@@ -298,7 +285,7 @@ class _Assessor:
         for path in task.inputs:
             if path not in used:
                 yield Reason(f"{path} is a new input", f"inputs from {_kind(path)} were added")
-            elif path not in self._rebuilt and used[path] != self._rows[path].hash:
+            elif path not in self._rebuilt and used[path] != self.rows[path].hash:
                 yield Reason(f"{path} changed", f"{_kind(path)} changed")
         for gone in sorted(used.keys() - set(task.inputs)):
             yield Reason(f"{gone} is no input any more", f"inputs from {_kind(gone)} were dropped")
@@ -364,27 +351,27 @@ def estimate(assessments: Iterable[Assessment], costs: Mapping[str, StageCost]) 
 
 def _abridge(reasons: Iterable[Reason]) -> tuple[Reason, ...]:
     """One reason for each kind; where there are several, the first and how many more."""
+    return tuple(
+        Reason(texts[0] if len(texts) == 1 else f"{texts[0]}, and {len(texts) - 1} more like it", group)
+        for group, texts in _by_group(reasons).items()
+    )
+
+
+def _collect(reasons: Iterable[Reason], outputs: int) -> tuple[Reason, ...]:
+    """The reasons of a task's outputs as the task's; where several outputs share a kind, how many of them do."""
+    return tuple(
+        Reason(texts[0], group)
+        if len(texts) == 1
+        else _same(group if len(texts) == outputs else f"{len(texts)} of {outputs} files: {group}")
+        for group, texts in _by_group(reasons).items()
+    )
+
+
+def _by_group(reasons: Iterable[Reason]) -> dict[str, list[str]]:
     texts: dict[str, list[str]] = {}
     for reason in reasons:
         texts.setdefault(reason.group, []).append(reason.text)
-    return tuple(
-        Reason(members[0] if len(members) == 1 else f"{members[0]}, and {len(members) - 1} more like it", group)
-        for group, members in texts.items()
-    )
-
-
-def _collect(found: Mapping[ArtifactPath, tuple[Reason, ...]], outputs: int) -> tuple[Reason, ...]:
-    """The reasons of a task's outputs as the task's; where several outputs share a kind, how many of them do."""
-    texts: dict[str, list[str]] = {}
-    for reasons in found.values():
-        for reason in reasons:
-            texts.setdefault(reason.group, []).append(reason.text)
-    return tuple(
-        Reason(members[0], group)
-        if len(members) == 1
-        else _same(group if len(members) == outputs else f"{len(members)} of {outputs} files: {group}")
-        for group, members in texts.items()
-    )
+    return texts
 
 
 def _label(task: Task) -> str:

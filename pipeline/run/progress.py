@@ -7,8 +7,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Protocol, Self, TextIO
+from typing import Self, TextIO
 
 from rich import progress as bars
 from rich.console import Console
@@ -69,19 +68,6 @@ class StageProgress:
         return ", ".join(parts)
 
 
-class Display(Protocol):
-    """Shows stages and sentences."""
-
-    def show(self, stages: Iterable[StageProgress]) -> None:
-        """The stages stand so now."""
-
-    def say(self, sentence: str, *, style: str = "") -> None:
-        """A sentence that stays on the screen."""
-
-    def close(self) -> None:
-        """Nothing follows."""
-
-
 @dataclass
 class ProgressObserver:
     """Turns a run's events into progress by stage. A context manager that closes its display."""
@@ -90,8 +76,7 @@ class ProgressObserver:
     stages: dict[str, StageProgress] = field(default_factory=dict)
     _awaited: dict[TaskId, set[ArtifactPath]] = field(default_factory=dict)
     _stage_of: dict[TaskId, str] = field(default_factory=dict)
-    _warned: set[tuple[str, str]] = field(default_factory=set)
-    _announced: set[str] = field(default_factory=set)
+    _said: set[tuple[str, str]] = field(default_factory=set)
 
     def notify(self, event: RunEvent) -> None:
         """Take note of an event, and show it."""
@@ -102,9 +87,10 @@ class ProgressObserver:
             case Committed(task_id, _, receipt):
                 self._count(task_id, {receipt.artifact}, now)
             case Progress(task_id, _, _, _, message, preparing):
-                self.stages[self._stage_of[task_id]].message = message
-                if preparing and message:
-                    self._announce(f"{self._stage_of[task_id]}: {message}")
+                stage = self._stage_of[task_id]
+                self.stages[stage].message = message
+                if preparing and message:  # it takes minutes, and nobody is to take it for a hang
+                    self._say_once(stage, message, f"{stage}: {message}")
             case StateChanged(task_id, _, TaskState.UP_TO_DATE | TaskState.SUCCEEDED):
                 self._count(task_id, self._awaited[task_id], now)
             case StateChanged(task_id, stage, TaskState.FAILED):
@@ -112,7 +98,8 @@ class ProgressObserver:
             case Failed(task_id, attempt, kind, message):
                 self.display.say(f"{task_id} (attempt {attempt}) {kind.value}: {message}", style="red")
             case Warned(task_id, _, kind, message):
-                self._warn(self._stage_of[task_id], kind, message)
+                sentence = f"warning: {message}; more are in the logs: pipeline explain --log"
+                self._say_once(self._stage_of[task_id], kind, sentence, style="yellow")
             case Notice(message):
                 self.display.say(message, style="yellow")
             case _:
@@ -134,17 +121,11 @@ class ProgressObserver:
             self._stage_of[task.id] = task.stage
             self._awaited[task.id] = set(assessment.rebuilds)
 
-    def _announce(self, sentence: str) -> None:
-        """What takes minutes, so that nobody takes it for a hang; once, however many wait for it."""
-        if sentence not in self._announced:
-            self._announced.add(sentence)
-            self.display.say(sentence)
-
-    def _warn(self, stage: str, kind: str, message: str) -> None:
-        """The first of each kind; a camera that is lost may be so for thousands of frames."""
-        if (stage, kind) not in self._warned:
-            self._warned.add((stage, kind))
-            self.display.say(f"warning: {message}; more are in the logs: pipeline explain --log", style="yellow")
+    def _say_once(self, stage: str, kind: str, sentence: str, *, style: str = "") -> None:
+        """The first of each kind: thousands of frames may lose their camera, or wait for the same kernels."""
+        if (stage, kind) not in self._said:
+            self._said.add((stage, kind))
+            self.display.say(sentence, style=style)
 
     def _count(self, task_id: TaskId, artifacts: set[ArtifactPath], now: float) -> None:
         """These are there now; each counts once, also if a second attempt commits it again."""
@@ -156,9 +137,7 @@ class ProgressObserver:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.display.close()
 
 
@@ -228,6 +207,9 @@ class PlainDisplay:
 
     def close(self) -> None:
         """Nothing to tidy up."""
+
+
+Display = LiveDisplay | PlainDisplay
 
 
 def open_display() -> Display:

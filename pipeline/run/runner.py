@@ -11,17 +11,17 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from pipeline.base.errors import DiskFullError, PlanError
 from pipeline.base.files import replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
-from pipeline.base.policy import Policy
 from pipeline.base.resources import machine_capacity
-from pipeline.base.task import Resources, TaskId, TaskState
+from pipeline.base.task import ArtifactPath, Policy, Resources, TaskId, TaskState
 from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest
-from pipeline.record.reconcile import Reconciliation, reconcile
+from pipeline.record.reconcile import reconcile
 from pipeline.run.bookkeeping import RunRecord
 from pipeline.run.control import RunControl, Selection
 from pipeline.run.events import (
@@ -34,8 +34,10 @@ from pipeline.run.events import (
     JobOutcome,
     Kill,
     Notice,
+    Observer,
     Outcome,
     RunEnded,
+    RunEvent,
     RunStarted,
     Skipped,
     Start,
@@ -45,10 +47,8 @@ from pipeline.run.events import (
 from pipeline.run.executors.attempt import load_stages
 from pipeline.run.executors.base import Assignment, Executor
 from pipeline.run.executors.failures import is_disk_full
-from pipeline.run.frame_order import frame_turns
 from pipeline.run.goal import write_goal
-from pipeline.run.observers import Observer, SilentObserver
-from pipeline.run.plan import Assessment, Verdict, assess, plan_job, up_to_date
+from pipeline.run.plan import Assessment, Verdict, assess, frame_turns, plan_job, up_to_date
 from pipeline.run.scheduler import Scheduler
 from pipeline.store.artifacts import sweep_parts
 
@@ -67,7 +67,7 @@ def run_job(
     executor: Executor,
     job_text: str | None = None,
     stages: str = STAGES_REFERENCE,
-    observer: Observer | None = None,
+    observers: Sequence[Observer] = (),
     control: RunControl | None = None,
     rerun: Selection | None = None,
     until: Sequence[str] = (),
@@ -83,7 +83,7 @@ def run_job(
         executor: runs the tasks; shut down by the caller.
         job_text: the job file, kept in the folder for the workers; None: it is there already.
         stages: where the stages are, as `module:ATTRIBUTE`.
-        observer: gets every event of the run.
+        observers: get every event of the run.
         control: how the caller stops the run; SIGINT and SIGTERM do in any case.
         rerun: tasks to run again although they are up to date.
         until: the stages after which it ends, kept in the folder; empty: the film.
@@ -97,8 +97,13 @@ def run_job(
         ManifestError: the record is damaged; the text says what to do.
         PlanError: the stages' tasks do not fit together, or `rerun` names what is not there.
     """
-    observer = observer or SilentObserver()
+
+    def notify(event: RunEvent) -> None:
+        for observer in observers:
+            observer(event)
+
     control = control or RunControl()
+    policy = policy or Policy()
     began = time.monotonic()
     layout.root.mkdir(parents=True, exist_ok=True)
     with Lease.acquire(layout.lease) as lease, Manifest(layout.manifest) as manifest, control.on_signals():
@@ -111,150 +116,117 @@ def run_job(
         clean = manifest.begin_run(job.name, run=lease.holder.token)
         if lease.takeover is not None:
             manifest.log_event("takeover", lease.takeover)
-            observer.notify(Notice(lease.takeover))
+            notify(Notice(lease.takeover))
         reconciliation = reconcile(manifest, layout, clean=clean)
         for sentence in reconciliation.sentences:
-            observer.notify(Notice(sentence))
+            notify(Notice(sentence))
         assessments = assess(
             tasks, reconciliation.rows, reconciliation.problems, parameters=manifest.parameters, forced=forced
         )
-        observer.notify(RunStarted(assessments))
+        notify(RunStarted(assessments))
         lease.check()
-        run = _Run(
-            job,
-            layout,
-            assessments,
-            reconciliation,
-            forced,
-            lease=lease,
-            manifest=manifest,
-            executor=executor,
-            observer=observer,
-            control=control,
-            stages=stages,
-            capacity=capacity or machine_capacity(gpus=max((task.resources.gpus for task in tasks), default=0)),
-            machine=machine,
-            policy=policy,
-        )
-        outcome = run.outcome(run.loop(), time.monotonic() - began)
-    observer.notify(RunEnded(outcome))
-    return outcome
-
-
-class _Run:
-    """One run of a job, holding its lease and its manifest."""
-
-    def __init__(
-        self,
-        job: Job,
-        layout: JobLayout,
-        assessments: Sequence[Assessment],
-        reconciliation: Reconciliation,
-        forced: frozenset[TaskId],
-        *,
-        lease: Lease,
-        manifest: Manifest,
-        executor: Executor,
-        observer: Observer,
-        control: RunControl,
-        stages: str,
-        capacity: Resources,
-        machine: Resources | None,
-        policy: Policy | None,
-    ) -> None:
-        self._layout = layout
-        self._lease = lease
-        self._manifest = manifest
-        self._executor = executor
-        self._observer = observer
-        self._control = control
-        self._forced = forced
-        self._record = RunRecord(
-            manifest, job, layout, stages=stages, rows=reconciliation.valid_rows, observer=observer
-        )
-        self._obeyed = 0
-        self._outcome: JobOutcome | None = None
-        self._tasks = {assessment.task.id: assessment.task for assessment in assessments}
-        self._record.invalidate(self._tasks[task_id] for task_id in forced)
-        done = {each.task.id for each in assessments if each.verdict is Verdict.UP_TO_DATE}
-        # What a long task has committed of its present fingerprint stays; its readers need not wait for it.
-        kept = {
-            artifact
-            for each in assessments
-            if each.task.checkpointed and each.verdict is Verdict.STALE
-            for artifact in set(each.task.outputs) - set(each.rebuilds)
-        }
+        record = RunRecord(manifest, job, layout, stages, reconciliation.valid_rows, notify)
+        record.invalidate(task for task in tasks if task.id in forced)
         try:
-            self._scheduler = Scheduler(
-                [assessment.task for assessment in assessments],
-                up_to_date=done,
-                committed=kept,
-                capacity=capacity,
+            scheduler = Scheduler(
+                tasks,
+                up_to_date={each.task.id for each in assessments if each.verdict is Verdict.UP_TO_DATE},
+                committed=_kept(assessments),
+                capacity=capacity or machine_capacity(gpus=max((task.resources.gpus for task in tasks), default=0)),
                 machine=machine,
                 policy=policy,
-                policies={stage: limits.policy(policy or Policy()) for stage, limits in job.limits.items()},
+                policies={stage: limits.policy(policy) for stage, limits in job.limits.items()},
                 turns=frame_turns(job),
             )
         except ValueError as error:  # a GPU that is nowhere, for instance
             raise PlanError(str(error)) from error
-        self._scheduler.drain_changes()  # the initial states are recorded as a whole
-        self._manifest.record_plan(
-            [*self._tasks.values()], {task_id: self._scheduler.state(task_id) for task_id in self._tasks}
-        )
+        scheduler.drain_changes()  # the initial states are recorded as a whole
+        manifest.record_plan(tasks, {task.id: scheduler.state(task.id) for task in tasks})
+        run = _Run(layout, lease, manifest, executor, notify, control, forced, record, scheduler)
+        outcome = run.outcome(run.loop(), time.monotonic() - began)
+    notify(RunEnded(outcome))
+    return outcome
+
+
+def _kept(assessments: Sequence[Assessment]) -> set[ArtifactPath]:
+    """What long tasks have committed of their present fingerprint: it stays, and its readers need not wait for it."""
+    return {
+        artifact
+        for each in assessments
+        if each.task.checkpointed and each.verdict is Verdict.STALE
+        for artifact in set(each.task.outputs) - set(each.rebuilds)
+    }
+
+
+@dataclass
+class _Run:
+    """One run of a job, holding its lease and its manifest."""
+
+    layout: JobLayout
+    lease: Lease
+    manifest: Manifest
+    executor: Executor
+    notify: Observer
+    control: RunControl
+    forced: frozenset[TaskId]
+    record: RunRecord
+    scheduler: Scheduler
+    obeyed: int = 0
+    ending: JobOutcome | None = None
 
     def loop(self) -> JobOutcome:
         """Run until the scheduler says that it is over."""
         try:
-            self._turn([], self._scheduler.start())
-            while self._outcome is None:
-                events = self._executor.wait(self._sleep_s())
-                self._lease.check()
-                self._turn(events, self._obey_control() + self._scheduler.handle(Tick(time.monotonic())))
-            if self._record.parts_left:
-                sweep_parts(self._layout)
-            self._manifest.end_run(self._outcome, clean=not self._record.ended_by_force)
+            self._turn([], self.scheduler.start())
+            while self.ending is None:
+                events = self.executor.wait(self._sleep_s())
+                self.lease.check()
+                self._turn(events, self._obey_control() + self.scheduler.handle(Tick(time.monotonic())))
+            if self.record.parts_left:
+                sweep_parts(self.layout)
+            self.manifest.end_run(self.ending, clean=not self.record.ended_by_force)
         except OSError as error:
             if not is_disk_full(error):
                 raise
             # Our own record could not be written. The receipts can tell all of it, so nothing is lost; the run does
             # not count as ended cleanly, and the next one reads them.
-            self._executor.shutdown()
-            self._notice(str(DiskFullError.of(self._layout.root)))
+            self.executor.shutdown()
+            self.notify(Notice(str(DiskFullError.of(self.layout.root))))
             return JobOutcome.DISK_FULL
-        return self._outcome
+        return self.ending
 
     def outcome(self, kind: JobOutcome, seconds: float) -> Outcome:
         """The run in figures."""
-        counts = self._scheduler.counts()
+        counts = self.scheduler.counts()
         return Outcome(
             kind=kind,
             ran=sum(count for (_, state), count in counts.items() if state is TaskState.SUCCEEDED),
             failures=tuple(
                 failed
-                for task_id, failed in self._record.failures.items()
-                if self._scheduler.state(task_id) is TaskState.FAILED
+                for task_id, failed in self.record.failures.items()
+                if self.scheduler.state(task_id) is TaskState.FAILED
             ),
             counts=counts,
             seconds=seconds,
-            full_place=next((failed.full_place for failed in self._record.failures.values() if failed.full_place), ""),
+            full_place=next((failed.full_place for failed in self.record.failures.values() if failed.full_place), ""),
         )
 
     # --- one turn ---
 
     def _sleep_s(self) -> float:
-        wakeup = self._scheduler.next_wakeup
+        wakeup = self.scheduler.next_wakeup
         return _TURN_S if wakeup is None else min(_TURN_S, max(0.0, wakeup - time.monotonic()))
 
     def _obey_control(self) -> list[Instruction]:
         instructions: list[Instruction] = []
-        while self._obeyed < min(2, self._control.interruptions):
-            self._obeyed += 1
-            if self._obeyed == 1:
-                self._notice("stopping: what runs is finished or checkpointed; once more stops at once")
-                instructions += self._scheduler.handle(DrainRequested())
+        while self.obeyed < min(2, self.control.interruptions):
+            self.obeyed += 1
+            if self.obeyed == 1:
+                self.notify(Notice("stopping: what runs is finished or checkpointed; once more stops at once"))
+                instructions += self.scheduler.handle(DrainRequested())
             else:
-                self._notice("stopping at once")
-                instructions += self._scheduler.handle(CancelRequested())
+                self.notify(Notice("stopping at once"))
+                instructions += self.scheduler.handle(CancelRequested())
         return instructions
 
     def _turn(self, events: Sequence[ExecutorEvent], instructions: Sequence[Instruction]) -> None:
@@ -269,45 +241,42 @@ class _Run:
         todo = deque(instructions)
         assignments: list[Assignment] = []
         cancellations: list[tuple[TaskId, float]] = []
-        with self._manifest.transaction(durable=False):
+        with self.manifest.transaction(durable=False):
             for event in events:
                 todo += self._take(event)
             while todo:
                 match todo.popleft():
                     case Start(task, threads, need):
                         # Early cutoff: what was made anew upstream may have turned out the same.
-                        if task.id not in self._forced and up_to_date(task, self._record.rows):
-                            todo += self._scheduler.handle(Skipped(task.id))
+                        if task.id not in self.forced and up_to_date(task, self.record.rows):
+                            todo += self.scheduler.handle(Skipped(task.id))
                         else:
-                            assignments.append(self._record.open_attempt(task, threads=threads, need=need))
+                            assignments.append(self.record.open_attempt(task, threads=threads, need=need))
                     case Stop(task_id):
                         cancellations.append((task_id, _STOP_GRACE_S))
                     case Kill(task_id):
                         cancellations.append((task_id, 0.0))
                     case Finish(outcome):
-                        self._outcome = outcome
+                        self.ending = outcome
             self._note_states()
         for assignment in assignments:
-            self._executor.submit(assignment)
+            self.executor.submit(assignment)
         for task_id, grace_s in cancellations:
-            self._executor.cancel(task_id, grace_s=grace_s)
+            self.executor.cancel(task_id, grace_s=grace_s)
 
     def _take(self, event: ExecutorEvent) -> list[Instruction]:
         if isinstance(event, CapacityChanged):
-            return self._scheduler.handle(event)
-        self._observer.notify(event)
-        settled = self._record.take(event, lacking=self._scheduler.lacking)
-        return [instruction for each in settled for instruction in self._scheduler.handle(each)]
+            return self.scheduler.handle(event)
+        self.notify(event)
+        settled = self.record.take(event, lacking=self.scheduler.lacking)
+        return [instruction for each in settled for instruction in self.scheduler.handle(each)]
 
     def _note_states(self) -> None:
-        latest = {change.task_id: change for change in self._scheduler.drain_changes()}
+        latest = {change.task_id: change for change in self.scheduler.drain_changes()}
         if latest:
-            self._manifest.set_states({task_id: change.state for task_id, change in latest.items()})
+            self.manifest.set_states({task_id: change.state for task_id, change in latest.items()})
             for change in latest.values():
-                self._observer.notify(change)
-
-    def _notice(self, sentence: str) -> None:
-        self._observer.notify(Notice(sentence))
+                self.notify(change)
 
 
 def _write_job_file(layout: JobLayout, text: str) -> None:

@@ -19,9 +19,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from pipeline.base.errors import PipelineError
-from pipeline.base.policy import Policy
 from pipeline.base.resources import claim, whole_machine
-from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, TaskId, TaskState
+from pipeline.base.task import ArtifactPath, FailureKind, Policy, Resources, Task, TaskId, TaskState
 from pipeline.run.events import (
     CancelRequested,
     CapacityChanged,
@@ -42,33 +41,16 @@ from pipeline.run.events import (
 )
 from pipeline.run.packing import Packing, Priority
 
-TERMINAL_STATES = frozenset(
-    {
-        TaskState.SUCCEEDED,
-        TaskState.UP_TO_DATE,
-        TaskState.FAILED,
-        TaskState.UPSTREAM_FAILED,
-        TaskState.CANCELLED,
-    }
-)
-_TRANSITIONS: Mapping[TaskState, frozenset[TaskState]] = {
-    TaskState.PENDING: frozenset({TaskState.READY, TaskState.UPSTREAM_FAILED, TaskState.CANCELLED}),
-    TaskState.READY: frozenset({TaskState.RUNNING, TaskState.CANCELLED}),
-    TaskState.RUNNING: frozenset(
-        {TaskState.SUCCEEDED, TaskState.UP_TO_DATE, TaskState.FAILED, TaskState.READY, TaskState.CANCELLED}
-    ),
+TERMINAL_STATES = frozenset(TaskState) - {TaskState.PENDING, TaskState.READY, TaskState.RUNNING}
+_TRANSITIONS: Mapping[TaskState, Collection[TaskState]] = {
+    TaskState.PENDING: {TaskState.READY, TaskState.UP_TO_DATE, TaskState.UPSTREAM_FAILED, TaskState.CANCELLED},
+    TaskState.READY: {TaskState.RUNNING, TaskState.CANCELLED},
+    TaskState.RUNNING: {TaskState.READY} | TERMINAL_STATES - {TaskState.UPSTREAM_FAILED},
 }
 
 
 class InvalidTransitionError(PipelineError):
-    """An event that cannot happen in the task's state; carries the states it went through."""
-
-    def __init__(self, task_id: TaskId, event: str, history: Sequence[TaskState]) -> None:
-        super().__init__(task_id, event, list(history))
-        self.task_id, self.event, self.history = task_id, event, list(history)
-
-    def __str__(self) -> str:
-        return f"{self.task_id}: {self.event} cannot happen after {' -> '.join(self.history)}"
+    """An event that cannot happen in the task's state; its text has the states that the task went through."""
 
 
 OWN_FAILURES = frozenset({FailureKind.FAILED, FailureKind.DIVERGED})
@@ -86,14 +68,16 @@ class _Entry:
     out_of_memory: int = 0
     history: list[TaskState] = field(default_factory=lambda: [TaskState.PENDING])
 
+    def refuse(self, event: str) -> InvalidTransitionError:
+        return InvalidTransitionError(f"{self.task.id}: {event} cannot happen after {' -> '.join(self.history)}")
+
 
 class Scheduler:
     """Decides what runs next.
 
     Lower frames go first, or those whose turn is earlier, and of one frame the later stage, so that the film shows
     early and few intermediate files wait for their reader. Tasks about the whole job go before any frame, and of these
-    the earlier stage: the small ones that prepare something are not kept waiting by a simulation that takes the whole
-    machine.
+    the earlier stage.
 
     Args:
         tasks: all tasks of the job; stages in the order of their first task.
@@ -106,7 +90,7 @@ class Scheduler:
         turns: place of each frame in the order; None: as they are numbered.
 
     Raises:
-        ValueError: a task needs what nobody makes, or more GPUs than there are.
+        ValueError: a task needs more GPUs than there are.
     """
 
     def __init__(
@@ -151,11 +135,9 @@ class Scheduler:
             self._counts[task.stage, TaskState.PENDING] += 1
             if task.id in up_to_date:
                 self._committed.update(task.outputs)
-        self._check_inputs_have_producers(tasks)
         for entry in self._entries.values():
             if entry.task.id in up_to_date:
-                # Not a transition of this run: it ended in an earlier one.
-                self._set_state(entry, TaskState.UP_TO_DATE, check=False)
+                self._set_state(entry, TaskState.UP_TO_DATE)
                 continue
             for artifact in entry.task.inputs:
                 if artifact not in self._committed:
@@ -185,10 +167,6 @@ class Scheduler:
         """Where a task stands."""
         return self._entries[task_id].state
 
-    def history(self, task_id: TaskId) -> list[TaskState]:
-        """The states that a task went through in this run."""
-        return list(self._entries[task_id].history)
-
     def lacking(self, task_id: TaskId) -> list[ArtifactPath]:
         """Outputs of a task that are not committed."""
         return [artifact for artifact in self._entries[task_id].task.outputs if artifact not in self._committed]
@@ -216,16 +194,15 @@ class Scheduler:
         """
         instructions: list[Instruction] = []
         match event:
-            case Committed(task_id):
-                artifact = event.artifact
-                entry = self._running_entry(task_id, f"commit of {artifact}")
-                if artifact not in entry.task.outputs:
-                    raise InvalidTransitionError(task_id, f"commit of {artifact}, not its output,", entry.history)
-                self._commit(artifact)
+            case Committed(task_id, _, receipt):
+                entry = self._running_entry(task_id, f"commit of {receipt.artifact}")
+                if receipt.artifact not in entry.task.outputs:
+                    raise entry.refuse(f"commit of {receipt.artifact}, not its output,")
+                self._commit(receipt.artifact)
             case Finished(task_id):
                 entry = self._running_entry(task_id, "success")
                 if lacking := self.lacking(task_id):
-                    raise InvalidTransitionError(task_id, f"success without {lacking[0]}", entry.history)
+                    raise entry.refuse(f"success without {lacking[0]}")
                 self._end(entry, TaskState.SUCCEEDED)
             case Skipped(task_id):
                 entry = self._running_entry(task_id, "skip")
@@ -253,12 +230,12 @@ class Scheduler:
     def _running_entry(self, task_id: TaskId, event: str) -> _Entry:
         entry = self._entries[task_id]
         if entry.state is not TaskState.RUNNING:
-            raise InvalidTransitionError(task_id, event, entry.history)
+            raise entry.refuse(event)
         return entry
 
-    def _set_state(self, entry: _Entry, state: TaskState, *, check: bool = True) -> None:
-        if check and state not in _TRANSITIONS.get(entry.state, frozenset()):
-            raise InvalidTransitionError(entry.task.id, f"becoming {state}", entry.history)
+    def _set_state(self, entry: _Entry, state: TaskState) -> None:
+        if state not in _TRANSITIONS.get(entry.state, ()):
+            raise entry.refuse(f"becoming {state}")
         self._counts[entry.task.stage, entry.state] -= 1
         self._counts[entry.task.stage, state] += 1
         entry.state = state
@@ -368,7 +345,7 @@ class Scheduler:
         unsettled = [entry for entry in self._entries.values() if entry.state not in TERMINAL_STATES]
         if unsettled and self._ending is None:
             names = ", ".join(entry.task.id for entry in unsettled[:3])
-            raise ValueError(f"tasks wait for each other in a circle: {names}")
+            raise ValueError(f"tasks wait for what none of the others makes: {names}")
         for entry in unsettled:
             self._set_state(entry, TaskState.CANCELLED)
         states = {state for _, state in self.counts()}
@@ -376,10 +353,3 @@ class Scheduler:
             return self._ending
         # Also when the end was asked for while the last task ran: nothing was left out.
         return JobOutcome.FAILED if TaskState.FAILED in states else JobOutcome.SUCCEEDED
-
-    def _check_inputs_have_producers(self, tasks: Sequence[Task]) -> None:
-        produced = {artifact for task in tasks for artifact in task.outputs} | self._committed
-        for task in tasks:
-            for artifact in task.inputs:
-                if artifact not in produced:
-                    raise ValueError(f"{task.id} reads {artifact}, which no task makes")

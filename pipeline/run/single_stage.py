@@ -49,32 +49,11 @@ def run_stage(
     stop_requested: Callable[[], bool],
     tell: Callable[[float, str], None],
 ) -> StageOutcome:
-    """Run the tasks of a stage that are not done, one after another, in this process.
-
-    Args:
-        job: the job.
-        layout: its folder, with its job file.
-        stage: name of the stage.
-        frames: its frames; None: all tasks.
-        capacity: what a task may use.
-        stages: where the stages are, as `module:ATTRIBUTE`.
-        stop_requested: whether to write a checkpoint and return.
-        tell: takes the share that is done, 0 to 1, and a sentence.
-
-    Raises:
-        PipelineError: an input is not there yet.
-        PlanError: there is no such stage, or no such frame.
-    """
+    """Run the tasks of a stage, or of some of its frames; see `run_tasks`. Raises PlanError if there are none such."""
     tasks = plan_job(job, layout, load_stages(stages))
     chosen = Selection(frozenset({stage}), frames).of(tasks)
-    return run_tasks(
-        [task for task in tasks if task.id in chosen],
-        layout,
-        capacity=capacity,
-        stages=stages,
-        stop_requested=stop_requested,
-        tell=tell,
-    )
+    todo = [task for task in tasks if task.id in chosen]
+    return run_tasks(todo, layout, capacity=capacity, stages=stages, stop_requested=stop_requested, tell=tell)
 
 
 def run_tasks(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from pipeline.base.errors import InvalidArtifactError
@@ -13,40 +14,27 @@ from pipeline.base.task import ArtifactPath
 from pipeline.record.reader import ManifestReader
 from pipeline.run.events import Committed, RunEvent
 from pipeline.run.plan import frame_ranges
-from pipeline.run.whitewater_numbers import (
-    WHITEWATER,
-    parts_of,
-    read_whitewater_numbers,
-    unreadable_whitewater,
-    whitewater_numbers,
-)
 from pipeline.store.cache import FrameNumbers, read_numbers
 from pipeline.store.receipts import Receipt, read_receipt
 from sim.core.solver import Diagnostics
 
-SIMULATE = "simulate"
-"""The stage whose artifacts are frames of the cache."""
+SIMULATE = "simulate"  # the stage whose artifacts are frames of the cache
+WHITEWATER = "whitewater"
 LINE_WIDTH = 100
 _TIED = "\N{NO-BREAK SPACE}"
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationNumbers:
-    """What the solvers told of a simulation, and what its whitewater came to.
+    """What the solvers told of a simulation, and what its whitewater came to."""
 
-    Attributes:
-        frames: of each committed frame that can be read, in order; maybe only what warnings need.
-        last: all numbers of the last of them.
-        unreadable: frames that were committed and cannot be read any more.
-        unreadable_whitewater: files of whitewater, likewise.
-    """
-
+    # of each committed frame that can be read, in order; maybe only what warnings need
     frames: tuple[FrameNumbers, ...] = ()
-    last: FrameNumbers | None = None
-    unreadable: tuple[int, ...] = ()
-    unreadable_whitewater: tuple[ArtifactPath, ...] = ()
+    last: FrameNumbers | None = None  # all numbers of the last of them
+    unreadable: tuple[int, ...] = ()  # frames that were committed and cannot be read any more
+    unreadable_whitewater: tuple[ArtifactPath, ...] = ()  # files of whitewater, likewise
 
-    def warnings(self) -> list[Warned]:
+    def warnings(self) -> list[CountedWarning]:
         """What happened in these frames that should not, by solver."""
         return count_warnings(self.frames)
 
@@ -54,8 +42,7 @@ class SimulationNumbers:
         """The last frame's numbers for people, by solver, and which frames could not be read."""
         lines = [] if self.last is None else describe(self.last)
         if self.unreadable:
-            frames = frame_ranges(self.unreadable, range(min(self.unreadable), max(self.unreadable) + 1))
-            lines.append(f"frames of the cache that cannot be read: {frames}; see: pipeline verify")
+            lines.append(f"frames of the cache that cannot be read: {_ranges(self.unreadable)}; see: pipeline verify")
         lines += [f"{told}; see: pipeline verify" for told in unreadable_whitewater(self.unreadable_whitewater)]
         return lines
 
@@ -73,15 +60,8 @@ class SimulationNumbers:
 
 
 @dataclass(frozen=True, slots=True)
-class Warned:
-    """Something that should not happen, and how often it did.
-
-    Attributes:
-        solver: which solver tells it.
-        event: what.
-        count: how often, over all frames.
-        frames: in which frames.
-    """
+class CountedWarning:
+    """An event of a solver that should not happen, how often it did over all frames, and in which."""
 
     solver: str
     event: CountedEvent
@@ -91,8 +71,7 @@ class Warned:
     def __str__(self) -> str:
         """`water: 3 solves hit their iteration limit, frames 12, 15-16`."""
         plural = "s" if len(self.frames) > 1 else ""
-        where = frame_ranges(self.frames, range(min(self.frames), max(self.frames) + 1))
-        return f"{self.solver}: {self.event.text(self.count)}, frame{plural} {where}"
+        return f"{self.solver}: {self.event.text(self.count)}, frame{plural} {_ranges(self.frames)}"
 
     def as_json(self) -> dict[str, object]:
         """For machines."""
@@ -108,9 +87,7 @@ class Warned:
 def simulation_numbers(layout: JobLayout, *, history: bool = False) -> SimulationNumbers:
     """The numbers of all frames that the simulation has committed; not those of an earlier version of it.
 
-    Args:
-        layout: the job's folder.
-        history: read all numbers of all frames; else all of the last frame, and of the others what warnings need.
+    With `history` all numbers of all frames; else all of the last frame, and of the others what warnings need.
 
     Raises:
         ManifestError: the record, which tells the fluids with whitewater, cannot be read.
@@ -118,11 +95,11 @@ def simulation_numbers(layout: JobLayout, *, history: bool = False) -> Simulatio
     only = None if history else [event.name for event in WARNINGS]
     receipts = _frame_receipts(layout)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
-        clouds = whitewater_numbers(layout, receipts, manifest.subjects(WHITEWATER))
+        whitewater, unreadable_files = _whitewater_numbers(layout, receipts, manifest.subjects(WHITEWATER))
 
     def numbers(receipt: Receipt, only: list[str] | None) -> FrameNumbers:
         of_cache = read_numbers(layout.path(receipt.artifact), only)
-        return replace(of_cache, solvers={**of_cache.solvers, **clouds.frames.get(of_cache.frame, {})})
+        return replace(of_cache, solvers={**of_cache.solvers, **whitewater.get(of_cache.frame, {})})
 
     frames: list[FrameNumbers] = []
     unreadable: list[int] = []
@@ -132,7 +109,7 @@ def simulation_numbers(layout: JobLayout, *, history: bool = False) -> Simulatio
         except InvalidArtifactError:
             unreadable.append(frame)
     last = numbers(receipts[frames[-1].frame], None) if frames else None
-    return SimulationNumbers(tuple(frames), last, tuple(unreadable), tuple(clouds.unreadable))
+    return SimulationNumbers(tuple(frames), last, tuple(unreadable), tuple(unreadable_files))
 
 
 def describe(numbers: FrameNumbers) -> list[str]:
@@ -151,7 +128,7 @@ def describe(numbers: FrameNumbers) -> list[str]:
     return lines
 
 
-def count_warnings(frames: Iterable[FrameNumbers]) -> list[Warned]:
+def count_warnings(frames: Iterable[FrameNumbers]) -> list[CountedWarning]:
     """What happened in these frames that should not, by solver."""
     counts: dict[tuple[str, CountedEvent], dict[int, int]] = {}
     totals: dict[tuple[str, CountedEvent], int] = {}
@@ -161,11 +138,22 @@ def count_warnings(frames: Iterable[FrameNumbers]) -> list[Warned]:
             totals[solver, event] = count
             if news > 0:
                 counts.setdefault((solver, event), {})[each.frame] = news
-    return [Warned(solver, event, sum(of.values()), tuple(of)) for (solver, event), of in counts.items()]
+    return [CountedWarning(solver, event, sum(of.values()), tuple(of)) for (solver, event), of in counts.items()]
+
+
+def unreadable_whitewater(files: Iterable[ArtifactPath]) -> list[str]:
+    """`whitewater of water that cannot be read: frames 3, 7-9`, a sentence for each fluid."""
+    frames: defaultdict[str, list[int]] = defaultdict(list)
+    for artifact in files:
+        frames[_whitewater_solver(artifact)].append(_frame_of(artifact))
+    return [
+        f"{solver} that cannot be read: frame{'s' if len(of) > 1 else ''} {_ranges(of)}"
+        for solver, of in frames.items()
+    ]
 
 
 class SolverWatch:
-    """Watches a run for what the solvers warn of, and tells each kind once, when it first happens."""
+    """Observer of a run for what the solvers warn of; it tells each kind once, when it first happens."""
 
     def __init__(self, layout: JobLayout, say: Callable[[str], None]) -> None:
         self._layout = layout
@@ -176,23 +164,20 @@ class SolverWatch:
         """Look at every frame, and every file of whitewater, that is committed."""
         if not isinstance(event, Committed) or event.receipt.stage not in (SIMULATE, WHITEWATER):
             return
+        artifact = event.receipt.artifact
         try:
-            frame, solvers = self._numbers_of(event.receipt)
+            if event.receipt.stage == SIMULATE:
+                solvers = read_numbers(self._layout.path(artifact)).solvers
+            else:
+                solvers = {_whitewater_solver(artifact): _read_whitewater(self._layout, artifact)}
         except InvalidArtifactError as error:
             self._say(str(error))
             return
         for solver, kind, count in _events_of(solvers):
             if (solver, kind.name) not in self._told:
                 self._told.add((solver, kind.name))
-                self._say(f"{Warned(solver, kind, count, (frame,))}; later ones are counted: pipeline status")
-
-    def _numbers_of(self, receipt: Receipt) -> tuple[int, Mapping[str, Diagnostics]]:
-        """The frame that was committed, and its numbers by what tells them."""
-        if receipt.stage == SIMULATE:
-            numbers = read_numbers(self._layout.path(receipt.artifact))
-            return numbers.frame, numbers.solvers
-        whitewater = parts_of(receipt.artifact)
-        return whitewater.frame, {whitewater.teller: read_whitewater_numbers(self._layout, receipt.artifact)}
+                warning = CountedWarning(solver, kind, count, (_frame_of(artifact),))
+                self._say(f"{warning}; later ones are counted: pipeline status")
 
 
 def _events_of(solvers: Mapping[str, Diagnostics]) -> list[tuple[str, CountedEvent, int]]:
@@ -204,23 +189,83 @@ def _events_of(solvers: Mapping[str, Diagnostics]) -> list[tuple[str, CountedEve
     ]
 
 
-def _frame_receipts(layout: JobLayout) -> Mapping[int, Receipt]:
-    """Receipts of the frames with the fingerprint of the one that was committed last, by frame."""
-    folder = layout.receipt(layout.frame_cache(0)).parent
-    artifacts = [
+def _ranges(frames: Collection[int]) -> str:
+    return frame_ranges(frames, range(min(frames), max(frames) + 1))
+
+
+# --- files ---
+
+
+def _receipts(layout: JobLayout, first: ArtifactPath) -> list[Receipt]:
+    """Receipts of all frames' files beside the one of the first frame."""
+    artifacts = (
         ArtifactPath(path.relative_to(layout.receipts).as_posix().removesuffix(".json"))
-        for path in sorted(folder.glob("[0-9]*.h5.json"))
-    ]
-    receipts = [receipt for receipt in (read_receipt(layout, artifact) for artifact in artifacts) if receipt]
-    return {_frame_of(receipt): receipt for receipt in _of_last_version(receipts)}
+        for path in sorted(layout.receipt(first).parent.glob("[0-9]*.json"))
+    )
+    return [receipt for receipt in (read_receipt(layout, artifact) for artifact in artifacts) if receipt]
 
 
-def _of_last_version(receipts: Sequence[Receipt]) -> list[Receipt]:
-    if not receipts:
-        return []
-    fingerprint = max(receipts, key=lambda receipt: receipt.finished).fingerprint
-    return [receipt for receipt in receipts if receipt.fingerprint == fingerprint]
+def _frame_receipts(layout: JobLayout) -> dict[int, Receipt]:
+    """Receipts of the frames with the fingerprint of the one that was committed last, by frame."""
+    receipts = _receipts(layout, layout.frame_cache(0))
+    newest = max(receipts, key=lambda receipt: receipt.finished, default=None)
+    return {
+        _frame_of(receipt.artifact): receipt
+        for receipt in receipts
+        if newest is not None and receipt.fingerprint == newest.fingerprint
+    }
 
 
-def _frame_of(receipt: Receipt) -> int:
-    return int(receipt.artifact.rpartition("/")[2].removesuffix(".h5"))
+def _whitewater_numbers(
+    layout: JobLayout, cached: Mapping[int, Receipt], fluids: Collection[str]
+) -> tuple[dict[int, dict[str, Diagnostics]], list[ArtifactPath]]:
+    """The numbers of all whitewater that was made from these frames, with the parameters of the newest.
+
+    Other rates or speeds make other numbers, of frames that are to be redone; fingerprints do not tell that, as each
+    frame has its own. Files of other frames and fluids are left over from an earlier version of the job.
+
+    Returns:
+        Numbers by frame and by what tells them, and the files that cannot be read.
+    """
+    numbers: defaultdict[int, dict[str, Diagnostics]] = defaultdict(dict)
+    unreadable = []
+    for fluid in sorted(fluids):
+        receipts = _receipts(layout, layout.whitewater(fluid, 0))
+        newest = max(receipts, key=lambda receipt: receipt.finished, default=None)
+        for receipt in receipts:
+            frame = cached.get(_frame_of(receipt.artifact))
+            is_current = newest is not None and receipt.parameters == newest.parameters
+            if frame is None or not is_current or receipt.inputs.get(frame.artifact) != frame.hash:
+                continue
+            solver = _whitewater_solver(receipt.artifact)
+            try:
+                numbers[_frame_of(receipt.artifact)][solver] = _read_whitewater(layout, receipt.artifact)
+            except InvalidArtifactError:
+                unreadable.append(receipt.artifact)
+    return numbers, unreadable
+
+
+def _read_whitewater(layout: JobLayout, artifact: ArtifactPath) -> Diagnostics:
+    """How many particles a file of whitewater has, and how many had no room, as its header tells.
+
+    Raises:
+        InvalidArtifactError: it cannot be read.
+    """
+    from render.errors import InvalidFileError
+    from render.point_clouds import read_point_counts
+
+    try:
+        counts = read_point_counts(layout.path(artifact))
+    except (OSError, InvalidFileError) as error:
+        raise InvalidArtifactError(f"{artifact}: its header cannot be read: {error}") from error
+    capped = {} if counts.not_made is None else {"whitewater_capped": float(counts.not_made)}
+    return {"whitewater_particles": float(counts.points), **capped}
+
+
+def _whitewater_solver(artifact: ArtifactPath) -> str:
+    """What a file's numbers are listed under, beside those of the solvers."""
+    return f"whitewater of {artifact.split('/')[1]}"
+
+
+def _frame_of(artifact: ArtifactPath) -> int:
+    return int(artifact.rpartition("/")[2].partition(".")[0])

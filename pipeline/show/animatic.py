@@ -38,29 +38,19 @@ def make_animatic(
     target: Path,
     *,
     threads: int,
-    stages: str,
     drawn: Callable[[int], None],
 ) -> None:
-    """Draw the first frames of a job with Workbench and put them together.
+    """Draw the first frames of a job with Workbench and put them together to an MP4.
 
-    Args:
-        loaded: the job, with the resolution that the film is to have.
-        layout: its folder, which holds all that these frames are drawn of.
-        frames: how many.
-        target: the MP4 to write; replaced if it is there.
-        threads: CPU threads to use.
-        stages: where the stages are, as `module:ATTRIBUTE`.
-        drawn: called with each frame that is there.
-
-    Raises:
-        PipelineError: a frame could not be drawn.
+    The job has the resolution that the film is to have; its folder holds all that these frames are drawn of. `drawn` is
+    called with each frame that is there. Raises PipelineError: a frame could not be drawn.
     """
     from render.blender import FrameRenderError
     from render.movie import encode_segment, validate_movie
     from render.workbench import draw_frames
 
     job = loaded.job
-    found = survey(loaded, layout, range(frames), stages=stages)
+    found = survey(loaded, layout, range(frames))
     with scratch_folder(loaded, found, layout) as scratch, TemporaryDirectory(prefix="animatic-") as folder:
         spec = scratch.root / "scene.json"
         render_spec(job, scratch, framed_points(job, scratch)).model_copy(update={"engine": "workbench"}).write(spec)

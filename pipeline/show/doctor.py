@@ -16,18 +16,18 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from pipeline.base.resources import machine_capacity
 from render.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
 
 Status = Literal["ok", "warning", "failed"]
 
 PROBE_TIMEOUT_S = 180.0
 LITTLE_MEMORY_BYTES = 4e9
-LITTLE_DISK_BYTES = 5e9
-"""The quickstart takes a few hundred MB, a film of a million particles tens of GB."""
+LITTLE_DISK_BYTES = 5e9  # the quickstart takes a few hundred MB, a film of a million particles tens of GB
 
 _EXCEPTION_NAME = re.compile(r"^[\w.]+(Error|Exception): ")
 
@@ -51,23 +51,12 @@ print('pysplashsurf', version('pysplashsurf'))
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """One thing that was looked at.
-
-    Attributes:
-        name: what.
-        status: ok; warning: some jobs cannot run, or run slowly; failed: no job can run to its end.
-        detail: what was found.
-        remedy: what to do, or "".
-    """
+    """One thing that was looked at."""
 
     name: str
-    status: Status
-    detail: str
+    status: Status  # warning: some jobs cannot run, or run slowly; failed: no job can run to its end
+    detail: str  # what was found
     remedy: str = ""
-
-    def as_json(self) -> dict[str, str]:
-        """For `--json`."""
-        return asdict(self)
 
 
 def examine(output: Path) -> list[Examination]:
@@ -78,9 +67,9 @@ def examine(output: Path) -> list[Examination]:
         ("devices", _examine_devices),
         ("Blender", _examine_blender),
         ("Cycles GPU", _examine_render_gpus),
-        ("OpenVDB", lambda: [_examine_import("OpenVDB", _OPENVDB_PROBE, "warning", "smoke needs the bpy package")]),
-        ("surfaces", lambda: [_examine_import("surfaces", _SURFACE_PROBE, "failed", _SYNC)]),
-        ("video", lambda: [_examine_import("video", _CODEC_PROBE, "failed", _SYNC)]),
+        ("OpenVDB", lambda: _examine_import("OpenVDB", _OPENVDB_PROBE, "warning", "smoke needs the bpy package")),
+        ("surfaces", lambda: _examine_import("surfaces", _SURFACE_PROBE, "failed", _SYNC)),
+        ("video", lambda: _examine_import("video", _CODEC_PROBE, "failed", _SYNC)),
         ("processor", _examine_processor),
         ("memory", _examine_memory),
         ("output folder", lambda: _examine_output(output)),
@@ -131,12 +120,8 @@ def _examine_python() -> Iterable[Examination]:
 def _examine_shared_libraries() -> Iterable[Examination]:
     missing = missing_libraries()
     if missing:
-        yield Examination(
-            "shared libraries",
-            "failed",
-            f"missing: {', '.join(missing)}",
-            install_line(DEBIAN_PACKAGES[library] for library in missing),
-        )
+        remedy = install_line(DEBIAN_PACKAGES[library] for library in missing)
+        yield Examination("shared libraries", "failed", f"missing: {', '.join(missing)}", remedy)
     else:
         yield Examination("shared libraries", "ok", "all that Blender and Taichi link to")
 
@@ -159,13 +144,11 @@ def _examine_blender() -> Iterable[Examination]:
     if succeeded:
         yield Examination("Blender", "ok", answer)
     elif executable:
-        yield Examination(
-            "Blender", "warning", f"no bpy module; {executable} is there", f'[render] blender = "{executable}"'
-        )
+        found = f"no bpy module; {executable} is there"
+        yield Examination("Blender", "warning", found, f'[render] blender = "{executable}"')
     else:
-        yield Examination(
-            "Blender", "failed", answer, 'install Blender 4.5 or newer and set [render] blender = "/path"'
-        )
+        remedy = 'install Blender 4.5 or newer and set [render] blender = "/path"'
+        yield Examination("Blender", "failed", answer, remedy)
 
 
 def _examine_render_gpus() -> Iterable[Examination]:
@@ -190,14 +173,13 @@ def _examine_render_gpus() -> Iterable[Examination]:
         yield Examination("Cycles GPU", "ok", "none found: frames are drawn on the processor")
 
 
-def _examine_import(name: str, code: str, otherwise: Status, remedy: str) -> Examination:
+def _examine_import(name: str, code: str, otherwise: Status, remedy: str) -> Iterable[Examination]:
     succeeded, answer = _run_child(code)
-    return Examination(name, "ok", answer) if succeeded else Examination(name, otherwise, answer, remedy)
+    yield Examination(name, "ok", answer) if succeeded else Examination(name, otherwise, answer, remedy)
 
 
 def _examine_processor() -> Iterable[Examination]:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    yield Examination("processor", "ok", f"{usable} of {os.cpu_count()} cores, {platform.machine()}")
+    yield Examination("processor", "ok", f"{machine_capacity().cores} of {os.cpu_count()} cores, {platform.machine()}")
 
 
 def _examine_memory() -> Iterable[Examination]:
@@ -218,9 +200,8 @@ def _examine_output(output: Path) -> Iterable[Examination]:
             file.write(b"written")
             file.flush()
     except OSError as error:
-        yield Examination(
-            "output folder", "failed", f"{folder} cannot be written: {error.strerror}", "choose another with --output"
-        )
+        found = f"{folder} cannot be written: {error.strerror}"
+        yield Examination("output folder", "failed", found, "choose another with --output")
         return
     free = shutil.disk_usage(folder).free
     found = f"{folder}: writable, {free / 1e9:.1f} GB free"
@@ -241,7 +222,7 @@ def _run_child(code: str) -> tuple[bool, str]:
             errors="replace",
             stdin=subprocess.DEVNULL,
             timeout=PROBE_TIMEOUT_S,
-            env={**os.environ, "PYTHONPATH": _search_path()},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(entry or "." for entry in sys.path)},
         )
     except subprocess.TimeoutExpired:
         return False, f"no answer within {PROBE_TIMEOUT_S:.0f} s"
@@ -251,8 +232,3 @@ def _run_child(code: str) -> tuple[bool, str]:
         return True, child.stdout.strip().rpartition("\n")[2]
     last_line = child.stderr.strip().rpartition("\n")[2]
     return False, _EXCEPTION_NAME.sub("", last_line) or f"exit code {child.returncode}"
-
-
-def _search_path() -> str:
-    root = str(Path(__file__).resolve().parents[2])
-    return os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -14,22 +14,13 @@ from pipeline.base.task import Resources, Task
 from pipeline.run.plan import frame_ranges
 
 SPECIFICATION = "jobtemplate-2023-09"
-CHUNK_FRAMES = 10
-"""Frames a chunk, unless the farm says otherwise: Blender and the scene are loaded once a chunk."""
-_STOP_PERIOD_S = 120
-"""Time a simulation gets to write its checkpoint when the farm cancels it [s]."""
-_NAME_CHARACTERS = 128
-"""Longest name of a job that the specification allows."""
+CHUNK_FRAMES = 10  # frames a chunk, unless the farm says otherwise: Blender and the scene are loaded once a chunk
+_STOP_PERIOD_S = 120  # time a simulation gets to write its checkpoint when the farm cancels it [s]
+_NAME_CHARACTERS = 128  # longest name of a job that the specification allows
 
 
 def job_template(name: str, tasks: Sequence[Task], *, python: str) -> dict[str, Any]:
-    """The template of a job, ready to be written as JSON into the job's folder, beside the job file.
-
-    Args:
-        name: the job's.
-        tasks: its plan, makers before users.
-        python: the interpreter that has this program, on the machines of the farm.
-    """
+    """The template of a job and its plan, ready to be written as JSON into the job's folder, beside the job file."""
     return {
         "specificationVersion": SPECIFICATION,
         "extensions": ["TASK_CHUNKING"],

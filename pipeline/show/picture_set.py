@@ -22,18 +22,11 @@ from pipeline.store.receipts import Receipt, read_receipt, verify_artifact
 
 @dataclass(frozen=True)
 class PictureSet:
-    """Frames that were made alike.
+    """Frames that were made alike."""
 
-    Attributes:
-        by_frame: by their numbers, rising.
-        earlier: how many others are there, drawn before by other settings.
-        remark: what to say of a set that is not of the job as it would be made now; empty if nothing is known to
-            differ.
-    """
-
-    by_frame: Mapping[int, Path]
-    earlier: int = 0
-    remark: str = ""
+    by_frame: Mapping[int, Path]  # by their numbers, rising
+    earlier: int = 0  # how many others are there, drawn before by other settings
+    remark: str = ""  # on a set that is not of the job as it would be made now; empty if nothing is known to differ
 
     @property
     def all(self) -> list[Path]:
@@ -71,7 +64,7 @@ def picture_set(job: Job, layout: JobLayout) -> PictureSet:
 
 
 def evenly_spread(frames: Sequence[Path], count: int) -> list[Path]:
-    """At most so many of the frames, the first and the last among them."""
+    """At most `count` of the frames, the first and the last among them."""
     if len(frames) <= count:
         return [*frames]
     if count == 1:
@@ -80,15 +73,10 @@ def evenly_spread(frames: Sequence[Path], count: int) -> list[Path]:
 
 
 class _Lineage(NamedTuple):
-    """How something was made, as far as receipts tell: digests of parameters by what stages are about.
+    """How something was made, as far as receipts tell: digests of parameters by what stages are about."""
 
-    Attributes:
-        made: of itself and of what it was made from.
-        changed: of what has taken the place of inputs since.
-    """
-
-    made: Mapping[str, frozenset[str]]
-    changed: Mapping[str, frozenset[str]]
+    made: Mapping[str, frozenset[str]]  # of itself and of what it was made from
+    changed: Mapping[str, frozenset[str]]  # of what has taken the place of inputs since
 
 
 class _Lineages:
@@ -148,8 +136,5 @@ def _remark(job: Job, layout: JobLayout, lineages: Iterable[_Lineage]) -> str:
     for lineage in lineages:
         changed.update(subject for subject, digests in lineage.made.items() if planned.get(subject) != digests)
         changed.update(lineage.changed)
-    return (
-        f"its frames are not as the job would be made now; what differs: {', '.join(sorted(changed))}"
-        if changed
-        else ""
-    )
+    differs = ", ".join(sorted(changed))
+    return f"its frames are not as the job would be made now; what differs: {differs}" if differs else ""

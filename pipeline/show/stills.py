@@ -22,6 +22,7 @@ from pipeline.base.task import ArtifactPath, Resources, Task
 from pipeline.job.loading import LoadedJob
 from pipeline.run.executors.attempt import load_stages
 from pipeline.run.plan import made_from, plan_job
+from pipeline.run.runner import STAGES_REFERENCE
 from pipeline.run.single_stage import run_tasks
 from pipeline.store.receipts import Receipt, read_receipt, verify_artifact
 
@@ -30,36 +31,23 @@ SIMULATION = "simulate"
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What frames can be drawn of.
+    """What frames can be drawn of."""
 
-    Attributes:
-        committed: what the job has of it, by its receipts.
-        todo: what can be made now, makers first; those that draw the frames are among them.
-        lacking: frames of the simulation that are not there as this job has it.
-    """
-
-    committed: tuple[Receipt, ...]
-    todo: tuple[Task, ...]
-    lacking: tuple[ArtifactPath, ...]
+    committed: tuple[Receipt, ...]  # of what the job has of it
+    todo: tuple[Task, ...]  # what can be made now, makers first; those that draw the frames are among them
+    lacking: tuple[ArtifactPath, ...]  # frames of the simulation that are not there as this job has it
 
 
-def survey(loaded: LoadedJob, layout: JobLayout, frames: Collection[int], *, stages: str) -> Survey:
-    """What has to be made to draw frames of a job anew.
+def survey(loaded: LoadedJob, layout: JobLayout, frames: Collection[int]) -> Survey:
+    """What has to be made to draw frames of a submitted job, changed as the pictures are to be.
 
-    Args:
-        loaded: the job, changed as the pictures are to be.
-        layout: the folder of the job that was submitted.
-        frames: which frames.
-        stages: where the stages are, as `module:ATTRIBUTE`.
-
-    Raises:
-        PipelineError: the job has no such frame.
+    Raises PipelineError: the job has no such frame.
     """
     job = loaded.job
     for frame in frames:
         if frame >= job.frame_count:
             raise PipelineError(f"{job.name} has no frame {frame}; its frames are 0-{job.frame_count - 1}")
-    tasks = plan_job(job, layout, load_stages(stages))
+    tasks = plan_job(job, layout, load_stages(STAGES_REFERENCE))
     pictures = {layout.picture(frame) for frame in frames}
     targets = {each.id for each in tasks if not pictures.isdisjoint(each.outputs)}
     needed = made_from(targets, tasks)
@@ -89,22 +77,12 @@ def make_still(
     target: Path,
     *,
     capacity: Resources,
-    stages: str,
     say: Callable[[str], None],
 ) -> None:
-    """Make what is missing of a still, draw it, and put it where it belongs.
+    """Make what is missing of a still, draw it, and put it into the target.
 
-    Args:
-        loaded: as for `survey`.
-        found: what `survey` found for one frame; nothing of the simulation is lacking.
-        layout: the folder of the job that was submitted.
-        target: the picture to write; replaced if it is there.
-        capacity: what a task may use.
-        stages: where the stages are, as `module:ATTRIBUTE`.
-        say: called with the name of what begins.
-
-    Raises:
-        PipelineError: it could not be made; says why.
+    `found` is what `survey` found for one frame; nothing of the simulation is lacking. `say` is called with the name of
+    what begins. Raises PipelineError: it could not be made; says why.
     """
     with scratch_folder(loaded, found, layout) as scratch:
         for task in found.todo:
@@ -118,7 +96,7 @@ def make_still(
                 [task],
                 scratch,
                 capacity=capacity,
-                stages=stages,
+                stages=STAGES_REFERENCE,
                 stop_requested=lambda: False,
                 tell=tell,
             )

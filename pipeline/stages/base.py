@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -22,10 +23,8 @@ class TaskContext(Protocol):
     task: Task
     attempt: int
     threads: int
-    gpu: int | None
-    """Which of the machine's GPUs the task has for itself, counted from 0; None: none."""
-    fingerprint: str
-    """Fingerprint of the task: what its artifacts are receipted with, and what a checkpoint must match."""
+    gpu: int | None  # which of the machine's GPUs the task has for itself, counted from 0; None: none
+    fingerprint: str  # fingerprint of the task: what its artifacts are receipted with, and what a checkpoint must match
 
     def committing(
         self, artifact: ArtifactPath, validate: Callable[[Path], None], *, device: str = ""
@@ -56,14 +55,16 @@ class Stage(Protocol):
     """A stage of the pipeline: one file here, one line in STAGES."""
 
     name: str
-    version: int
-    """Raised when the same parameters and inputs give other outputs; part of the fingerprint."""
+    version: int  # raised when the same parameters and inputs give other outputs; part of the fingerprint
 
+    @abstractmethod
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """The tasks of this stage. Pure."""
 
-    def preflight(self, job: Job) -> list[str]:
+    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
         """Why this machine cannot run this stage of this job, a sentence each with a remedy; empty if it can."""
+        return []
 
+    @abstractmethod
     def run(self, context: TaskContext) -> None:
         """Commit the task's outputs. Idempotent; shares no state with other tasks but warm caches."""

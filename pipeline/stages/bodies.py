@@ -9,14 +9,14 @@ from pipeline.base.task import Task, TaskId
 from pipeline.kinds.table import material_of
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
-from pipeline.stages.base import TaskContext
+from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.inputs import by_content
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.parameters import MeshShape
 
 
-class BodiesStage:
-    """One PLY a rigid body and part of its shape, in its rest pose: where it stands is no matter of its mesh."""
+class BodiesStage(Stage):
+    """One PLY per rigid body and part of its shape, in its rest pose, wherever it stands in the scene."""
 
     name = "bodies"
     version = 2
@@ -42,19 +42,15 @@ class BodiesStage:
             for body in job.rigid
         ]
 
-    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
-        """None: its packages are always there."""
-        return []
-
     def run(self, context: TaskContext) -> None:
         """Mesh one body."""
         from render.meshes import validate_ply, write_ply
-        from sim.rigid.static import StaticBody
+        from sim.shapes.mesh_file import texture_coordinates
+        from sim.shapes.placement import build_solid
         from sim.shapes.solid import TriangleMesh
-        from sim.shapes.texture_coordinates import texture_coordinates
 
         parameters = next(body for body in context.job.rigid if body.name == context.task.subject)
-        mesh = StaticBody(parameters).rest_mesh()
+        mesh = build_solid(parameters).rest_mesh()
         shape, uv = parameters.shape, None
         if isinstance(shape, MeshShape) and _is_textured(context.job, parameters):
             at_own_size = TriangleMesh(mesh.vertices / parameters.scale, mesh.faces)

@@ -16,21 +16,19 @@ from pipeline.kinds.rigid import rest_vertices
 from pipeline.kinds.table import bodies
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
-from pipeline.stages.base import TaskContext
+from pipeline.stages.base import Stage, TaskContext
 from pipeline.store.cache import open_bodies
 
 if TYPE_CHECKING:
     from render.bounds import Reach
 
-ACTION = "action"
-"""The film's one reach, by this name."""
+ACTION = "action"  # the film's one reach, by this name
 FILM = TaskId("bounds/film")
 
-BASE_BYTES = 150_000_000
-"""Interpreter, numpy, h5py and the meshes of bodies."""
+BASE_BYTES = 150_000_000  # interpreter, numpy, h5py and the meshes of bodies
 
 
-class BoundsStage:
+class BoundsStage(Stage):
     """How far the bodies of each frame reach, and those of the film; only for `camera.framing = "action"`.
 
     A file a frame, made while the simulation goes on, so that the last frame is soon followed by the one that all
@@ -52,7 +50,9 @@ class BoundsStage:
             if body.kind != "static"
             for part in parts_of(body.shape.type)
         )
-        resources = Resources(memory_bytes=_memory_bytes(job))
+        # Bodies are read one after the other; the cells of a smoke are few bytes each, and only one smoke's at a time.
+        in_memory = BASE_BYTES + sum(kind.reach_bytes * kind.elements(job, body) for _, kind, body in bodies(job))
+        resources = Resources(memory_bytes=int(in_memory))
         frames = [
             Task(
                 id=TaskId(f"bounds/{frame:06d}"),
@@ -86,10 +86,6 @@ class BoundsStage:
         )
         return [*frames, film]
 
-    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
-        """None: its packages are always there."""
-        return []
-
     def run(self, context: TaskContext) -> None:
         """Find how far a frame's bodies reach, or the film's."""
         from render.bounds import validate_bounds, write_bounds
@@ -106,11 +102,6 @@ def read_framed(path: Path) -> NDArray[np.float64]:
     from render.bounds import corners_of, read_bounds
 
     return corners_of(read_bounds(path)[ACTION])
-
-
-def _memory_bytes(job: Job) -> int:
-    """Bodies are read one after the other; the cells of a smoke are few bytes each, and only one smoke's at a time."""
-    return int(BASE_BYTES + sum(kind.reach_bytes * kind.elements(job, body) for _, kind, body in bodies(job)))
 
 
 def _of_frame(job: Job, layout: JobLayout, frame: int) -> dict[str, Reach]:

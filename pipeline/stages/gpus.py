@@ -45,18 +45,14 @@ TROUBLE_KEPT_S = 3600.0
 
 
 def render_gpus(job: Job) -> tuple[Gpu, ...]:
-    """The GPUs of this machine that a job's pictures may be drawn on; a renderer is told which by its place in these.
-
-    Asks Blender only if the job leaves it a choice.
-    """
+    """The GPUs of this machine that a job's pictures may be drawn on; a renderer is given one by its place in these."""
     return () if job.render.device == "cpu" else known_gpus(job.render.blender).of_kind(job.render.device)
 
 
 def own_gpus() -> tuple[int, ...] | None:
     """The places in that list which this process may use, each once, in their order; None: all.
 
-    Raises:
-        PipelineError: the variable cannot be read.
+    Raises PipelineError: the variable cannot be read.
     """
     text = os.environ.get(OWN_GPUS)
     if text is None:
@@ -72,11 +68,7 @@ def own_gpus() -> tuple[int, ...] | None:
 
 
 def first_gpu(task: Task) -> int:
-    """The place of the GPU that a task gets where tasks run one after another.
-
-    Raises:
-        PipelineError: none is left to this process.
-    """
+    """The place of the GPU that a task gets where tasks run one after another; see `require_some`."""
     own = own_gpus()
     return 0 if own is None or task.on_first_gpu else require_some(own)[0]
 
@@ -100,13 +92,10 @@ def render_trouble(job: Job) -> str:
 
 
 def known_gpus(blender: str | None) -> Probe:
-    """All GPUs of this machine, as a Blender finds them.
+    """All GPUs of this machine, as a Blender executable finds them, or the bpy module (None).
 
     Asked in a child process. The answer is kept in the user's cache folder until Blender, the driver or the visible
     devices change; one that was cut short is kept for `TROUBLE_KEPT_S`, and by this process.
-
-    Args:
-        blender: path of a Blender executable, or None for the bpy module.
     """
     from render.gpus import Probe
 

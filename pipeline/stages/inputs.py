@@ -9,10 +9,7 @@ from pydantic import BaseModel
 
 from pipeline.base.content import content_name, tool_version
 from pipeline.base.errors import StageUnavailableError
-from pipeline.kinds.table import KINDS
-from pipeline.model.meshes import with_meshes
-from sim.scene import SceneParameters
-from sim.shapes.parameters import MeshShape
+from pipeline.model.meshes import mesh_shapes, with_value
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -21,8 +18,7 @@ M = TypeVar("M", bound=BaseModel)
 def blender_version(executable: str | None) -> str:
     """Version of the Blender that draws; wherever it lies, the same version gives the same frames.
 
-    Raises:
-        StageUnavailableError: the executable is not there, or not a Blender that can be used.
+    Raises StageUnavailableError: the executable is not there, or not a Blender that can be used.
     """
     from render.blender import BlenderUnavailableError, require_supported_executable
 
@@ -37,20 +33,8 @@ def blender_version(executable: str | None) -> str:
 def by_content(table: M) -> M:
     """A table of the job with its mesh files named by what is in them: where they lie has no effect.
 
-    Raises:
-        MissingInputError: a file cannot be read.
+    Raises MissingInputError: a file cannot be read.
     """
-
-    def named(shape: MeshShape) -> MeshShape:
-        return shape.model_copy(update={"file": content_name(shape.file, "mesh")})
-
-    return with_meshes(table, named)
-
-
-def bodies_by_content(scene: SceneParameters) -> dict[str, object]:
-    """The scene's bodies for a fingerprint, mesh files named by their content.
-
-    Raises:
-        MissingInputError: a mesh file cannot be read.
-    """
-    return {kind.name: [by_content(body) for body in kind.bodies(scene)] for kind in KINDS.values()}
+    for path, shape in mesh_shapes(table):
+        table = with_value(table, (*path, "file"), content_name(shape.file, "mesh"))
+    return table

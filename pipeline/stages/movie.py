@@ -10,15 +10,15 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Task, TaskId
 from pipeline.model.job import Job
-from pipeline.stages.base import TaskContext
+from pipeline.stages.base import Stage, TaskContext
 from render.movie import SEGMENT_FRAMES
 
 
-class MovieStage:
+class MovieStage(Stage):
     """Segments of closed groups of pictures, joined without encoding again."""
 
     name = "movie"
-    version = 1
+    version = 2
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a segment, and one that joins them."""
@@ -26,7 +26,7 @@ class MovieStage:
             stage=self.name,
             version=self.version,
             tools={"av": tool_version("av")},
-            movie=job.movie.deciding(),
+            movie=job.movie.model_dump(exclude={"so_far"}) | {"crf": job.movie.rate_factor},
             fps=job.movie.playback_fps or job.fps,
         )
         starts = range(0, job.frame_count, SEGMENT_FRAMES)

@@ -12,8 +12,7 @@ WAITING = 1
 """Writes that may wait behind the one that is being done: with one, a write may take as long as a frame is computed
 without holding anything up; more would only take memory, as what is slower on average stays slower."""
 
-LOOK_AGAIN_S = 1.0
-"""How often who waits for a place in the queue looks whether the thread still lives."""
+LOOK_AGAIN_S = 1.0  # how often a waiting `submit` makes sure that the thread still lives
 
 
 class WriterLostError(RuntimeError):
@@ -21,7 +20,7 @@ class WriterLostError(RuntimeError):
 
 
 class OrderedWriter:
-    """A context manager that does writes in the order in which they were handed in, in a thread of its own.
+    """Writer of frames and checkpoints: a context manager that does writes in order, in a thread of its own.
 
     What was handed in before is done before, so a checkpoint that is handed in after its frames never gets ahead of
     them. The first write that fails is the last one tried; its error is raised, as it is, by the next call from the

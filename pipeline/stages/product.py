@@ -8,11 +8,11 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Resources, Task, TaskId
 from pipeline.kinds.base import Kind, Product
 from pipeline.model.job import Job
-from pipeline.stages.base import TaskContext
+from pipeline.stages.base import Stage, TaskContext
 from pipeline.store.cache import read_compact
 
 
-class ProductStage:
+class ProductStage(Stage):
     """One file a body and frame, each from that frame of the cache alone."""
 
     def __init__(self, kind: Kind, product: Product) -> None:
@@ -49,11 +49,7 @@ class ProductStage:
         return self._product.preflight() if self._kind.bodies(job) else []
 
     def run(self, context: TaskContext) -> None:
-        """Make the file of one body and frame.
-
-        Raises:
-            InvalidArtifactError: the cached frame is damaged, or holds what no body of the kind has.
-        """
+        """Make the file of one body and frame."""
         task = context.task
         cached = context.layout.path(task.inputs[0])
         body = read_compact(cached, task.subject)
@@ -63,8 +59,3 @@ class ProductStage:
             except InvalidArtifactError as error:
                 raise InvalidArtifactError(f'{cached}: {self._kind.name} "{task.subject}": {error}') from error
         context.progress(1, 1)
-
-
-def product_stages(kinds: dict[str, Kind]) -> tuple[ProductStage, ...]:
-    """A stage for each kind that has a product, in the order of the table."""
-    return tuple(ProductStage(kind, kind.product) for kind in kinds.values() if kind.product is not None)

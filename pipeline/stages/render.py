@@ -14,12 +14,11 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.job.input_files import split_blend
-from pipeline.kinds.table import products_of
+from pipeline.kinds.table import material_of, products_of
 from pipeline.model.job import Job
-from pipeline.model.looks import parts_of
+from pipeline.model.looks import BODY, parts_of
 from pipeline.model.problems import suggestion
-from pipeline.stages.base import TaskContext
-from pipeline.stages.flat_pictures import warn_of_flat_pictures
+from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
 from pipeline.stages.inputs import blender_version
 from pipeline.stages.render_drawing import CPU, FrameDrawing, close_renderers, may_be_empty
@@ -28,53 +27,33 @@ from pipeline.stages.texture_memory import own_picture_bytes
 from pipeline.stages.visibility import bodies_at, warn_if_invisible
 from render.spec import RenderSpec
 
-CORES = 2
-"""Threads a frame. Cycles with one keeps a second busy waiting: 7.0 s of processor time a frame against 3.7 s with two
-(quickstart, draft), so two frames beside each other on two cores take longer than one after the other. The pixels do
-not depend on it."""
+CORES = 2  # threads a frame: Cycles with one keeps a second busy waiting. The pixels do not depend on it
 
 WORKER_BYTES = 500_000_000
 BYTES_PER_PIXEL = 700
 """Measured peaks of the quickstart with denoising, Blender included: 538 MB at 480 x 270 and 1880 MB at 1920 x 1080."""
 
-COMBINED = "ViewLayer.Combined"
-"""Blender's name for the picture's layer among passes."""
+COMBINED = "ViewLayer.Combined"  # Blender's name for the picture's layer among passes
 
-BYTES_PER_PIXEL_AND_PASS = 200
-"""The largest, cryptomatte, has 24 floats a pixel, in Cycles and in what is saved."""
+BYTES_PER_PIXEL_AND_PASS = 200  # the largest, cryptomatte, has 24 floats a pixel, in Cycles and in what is saved
 
 _WITHOUT_EFFECT_ON_PIXELS: dict[str, Any] = {"version": True, "engine": True, "render": {"blender", "order"}}
 """The film is always of Cycles. The executable counts by its version. The device does count: CPU and GPU round
 differently."""
 
-_LATER_KEYS: dict[str, Any] = {"format": "png", "passes": []}
-_LATER_SET_KEYS: dict[str, Any] = {
-    **{"ground": None, "background": "set", "hdri": None, "rotation_deg": 0.0},
-    **{"sun_elevation_deg": 38.0, "sun_azimuth_deg": None},
-}
-_LATER_MATERIAL_KEYS: dict[str, Any] = {"blend": None, "caustics": False}
-"""Keys that earlier versions did not have, with their values where nothing is said: old frames stay up to date."""
-_TANK_REVISION = 2
-"""Raised when the same keys give other pixels of the glass tank; a look's stands in its row of the table."""
-_BLEND_ON_CLOTH_REVISION = 2
-"""The same of .blend materials on cloth: UV maps that they name were not found, and are the cloth's own now."""
-_SUN_REVISION = 2
-"""The same of extra lights that are suns, whose size counted for nothing."""
-
-_FORMER_COLOR = [0.22, 0.25, 0.29]
-"""A set's colour in the parameters of those versions, where the job gives none."""
+FLAT_PICTURES = "flat pictures"
 
 
-class RenderStage:
+class RenderStage(Stage):
     """One PNG a frame, and an EXR if the job asks for one. A worker keeps Blender and the scene warm between frames."""
 
     name = "render"
-    version = 3
+    version = 4
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
         """One task a frame."""
         drawn = render_spec(job, layout)
-        spec = _decisive(drawn, {cloth.name for cloth in job.cloth})
+        spec = _decisive(drawn)
         if job.camera.frames_action:
             # Where it is follows from these and from the box that it frames, which is an input.
             spec["camera"] = {"framing": job.placed_camera.model_dump(mode="json")}
@@ -123,11 +102,7 @@ class RenderStage:
             return [str(error)]
 
     def run(self, context: TaskContext) -> None:
-        """Draw one frame.
-
-        Raises:
-            InvalidArtifactError: its picture failed the checks twice.
-        """
+        """Draw one frame."""
         from render.blender import BlenderDiedError
         from render.pictures import validate_exr
 
@@ -145,7 +120,8 @@ class RenderStage:
         try:
             with ExitStack() as stack:
                 device = drawing.renderer.device
-                warn_of_flat_pictures(context, drawing.renderer.pictures_by_uv)
+                if task.frame == 0:
+                    _warn_of_flat_pictures(context, drawing.renderer.pictures_by_uv)
                 print(f"Cycles draws on {device}{'' if device == CPU else f', GPU {context.gpu}'}", flush=True)
                 masters = [
                     stack.enter_context(context.committing(output, validate_master, device=device))
@@ -190,8 +166,7 @@ def _missing_gpus(job: Job) -> Iterator[str]:
 def _missing_materials(job: Job) -> Iterator[str]:
     """Materials of .blend files that are not there: told before hours of simulation, not after.
 
-    Raises:
-        BlenderUnavailableError: Blender does not answer.
+    Raises BlenderUnavailableError: Blender does not answer.
     """
     from render.blend_file import read_material_names
     from render.errors import InvalidFileError
@@ -214,62 +189,58 @@ def _missing_materials(job: Job) -> Iterator[str]:
                 yield f'material.{body}.blend: {file} has no material "{name}"{hint}; {known}'
 
 
-def _decisive(spec: RenderSpec, cloths: Collection[str]) -> dict[str, Any]:
-    """The part of a specification that decides pixels: files by their content, keys of later versions only where used.
+def _decisive(spec: RenderSpec) -> dict[str, Any]:
+    """The part of a specification that decides pixels, files named by their content.
 
-    Args:
-        spec: the whole.
-        cloths: names of its objects that are cloth.
-
-    Raises:
-        MissingInputError: a file cannot be read.
+    Raises MissingInputError: a file cannot be read.
     """
     document = spec.model_dump(mode="json", exclude=_WITHOUT_EFFECT_ON_PIXELS)
     document["render"]["passes"].sort()  # their order changes nothing
-    for key, usual in _LATER_KEYS.items():
-        if document["render"][key] == usual:
-            del document["render"][key]
-    backdrop = document["stage"] = document.pop("set")  # as fingerprints have called it from the beginning
-    for key, unused in _LATER_SET_KEYS.items():
-        if backdrop[key] == unused:
-            del backdrop[key]
+    backdrop = document["set"]
     if spec.set.hdri is not None:
         backdrop["hdri"] = content_name(spec.set.hdri, "picture")
         backdrop["name"] = None  # its light and sky are not there
     else:
-        backdrop.pop("rotation_deg", None)  # there is nothing to turn
-    if backdrop["color"] is None and "ground" not in backdrop and backdrop["name"] != "window":
-        backdrop["color"] = _FORMER_COLOR
-    if backdrop["tank"]:
-        backdrop["tank_revision"] = _TANK_REVISION
+        del backdrop["rotation_deg"]  # there is nothing to turn
     # Where a pane is left out; the tank has none above or below.
     document["open_faces"] = sorted({face for face in spec.open_faces if face[0] in "xy"}) if backdrop["tank"] else []
-    if not document["open_faces"]:
-        del document["open_faces"]
-    for light in document["lights"]:
-        if light["type"] == "sun":
-            light["sun_revision"] = _SUN_REVISION
     for drawn in document["objects"]:
-        _keep_decisive(drawn, is_cloth=drawn["name"] in cloths)
+        material = drawn["material"]
+        if material["blend"] is not None:
+            file, name = split_blend(material["blend"])
+            drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
+        elif material["look"] is not None:
+            material["look_revision"] = LOOK_TABLE[material["look"]].revision
     return document
 
 
-def _keep_decisive(drawn: dict[str, Any], *, is_cloth: bool) -> None:
-    """Take out of an object what decides no pixel, as `_decisive` does."""
-    # Where fluids are wet has no revision yet: nothing was released since this key came.
-    if drawn.get("wets_within", ...) is None:
-        del drawn["wets_within"]
-    material = drawn["material"]
-    for key, unused in _LATER_MATERIAL_KEYS.items():
-        if material[key] == unused:
-            del material[key]
-    if material["look"] is not None and (revision := LOOK_TABLE[material["look"]].revision) > 1:
-        material["look_revision"] = revision
-    if "blend" in material:
-        file, name = split_blend(material["blend"])
-        drawn["material"] = {"blend": f"{content_name(file, '.blend file')}:{name}"}  # it says all
-        if is_cloth:
-            drawn["material"]["blend_revision"] = _BLEND_ON_CLOTH_REVISION
+def _warn_of_flat_pictures(context: TaskContext, pictures_by_uv: Collection[str]) -> None:
+    """Warn of pictures in .blend materials on what has no texture coordinates: all of it takes one colour of them.
+
+    `pictures_by_uv` are names of objects with pictures that lie by texture coordinates, as the renderer found them.
+    """
+    for name, blend in _without_coordinates(context.job, context.layout):
+        if name in pictures_by_uv:
+            context.warn(
+                FLAT_PICTURES,
+                f'"{name}" has no texture coordinates, so pictures in its material "{split_blend(blend)[1]}" show one '
+                "colour; give it a mesh file with a UV map, or let the material use generated or object coordinates",
+            )
+
+
+def _without_coordinates(job: Job, layout: JobLayout) -> Iterator[tuple[str, str]]:
+    """Objects with a .blend material and no texture coordinates: their names, and `file.blend:Name`."""
+    from render.meshes import read_ply
+
+    for body in job.rigid:
+        for part in parts_of(body.shape.type):
+            material = material_of(job, body.name, part)
+            mesh = layout.path(layout.body_mesh(body.name, part))
+            if material.blend is not None and read_ply(mesh).corner_uv is None:
+                yield body.name if part == BODY else f"{body.name}.{part}", material.blend
+    for fluid in job.fluid:
+        if (blend := material_of(job, fluid.name).blend) is not None:
+            yield fluid.name, blend
 
 
 def _frame_inputs(job: Job, layout: JobLayout, frame: int) -> list[ArtifactPath]:

@@ -29,24 +29,16 @@ if TYPE_CHECKING:
 SET_PIXELS = 96
 """Along the longer side of the empty set that pictures are held against: half a percent of it is 25 pixels."""
 
-WHITE_SHARE = 0.8
-"""Share of white pixels above which a picture is warned of; a white studio in twice its light has 0.4."""
+WHITE_SHARE = 0.8  # share of white pixels above which a picture is warned of; a white studio in twice its light has 0.4
 
 BAD_PICTURE = "bad picture"
 NEARLY_WHITE = "nearly white"
 NO_GPU = "no GPU"
-CPU = "CPU"
-"""A renderer's name for the processor."""
+CPU = "CPU"  # a renderer's name for the processor
 
 
 class FrameDrawing:
-    """The drawing of one frame. What Blender is given of the job is described once, when this is made.
-
-    Args:
-        context: of the frame's task.
-        view: of the camera at the frame.
-        bodies: what is to be seen.
-    """
+    """The drawing of one frame. What Blender is given of the job is described once, when this is made."""
 
     def __init__(self, context: TaskContext, view: View, bodies: Sequence[BodyAtFrame]) -> None:
         assert context.task.frame is not None
@@ -77,12 +69,7 @@ class FrameDrawing:
     def draw_until_good(self, picture: Path, masters: Sequence[Path] = ()) -> None:
         """Draw the frame, and once more if its picture fails the checks; a picture that fails again is kept.
 
-        Args:
-            picture: gets the PNG.
-            masters: gets the EXR, if the job asks for one.
-
-        Raises:
-            InvalidArtifactError: it failed again.
+        `masters` gets the EXR, if the job asks for one. Raises InvalidArtifactError if the picture failed again.
         """
         from render.errors import InvalidFileError
 
@@ -113,11 +100,7 @@ class FrameDrawing:
             return
 
     def require_checked(self, picture: Path) -> None:
-        """Refuse to commit a picture that `draw_until_good` has not decoded and passed; nothing is decoded twice.
-
-        Raises:
-            InvalidArtifactError: it was not checked.
-        """
+        """Refuse to commit a picture that `draw_until_good` has not decoded and passed; nothing is decoded twice."""
         if picture != self._checked:
             raise InvalidArtifactError(f"frame {self._frame}: the picture was not checked")
 
@@ -142,8 +125,7 @@ class FrameDrawing:
     def _check(self, path: Path) -> PictureStatistics:
         """Decode and check a picture; returns its statistics.
 
-        Raises:
-            InvalidFileError: it is damaged, black, of one colour, or shows the set without its bodies.
+        Raises InvalidFileError: it is damaged, black, of one colour, or shows the set without its bodies.
         """
         from render.pictures import check_pixels, over_black, read_picture, require_more_than_set
 
@@ -181,8 +163,7 @@ def may_be_empty(job: Job) -> bool:
 _WARM: dict[str, Renderer] = {}
 """The renderer of this worker process, by the digest of its specification, thread count and GPU; at most one."""
 
-_COMPILED: set[str] = set()
-"""The devices on which this process has drawn."""
+_COMPILED: set[str] = set()  # the devices on which this process has drawn
 
 _STILL_SET = "still"
 _EMPTY_SETS: dict[str, NDArray[np.uint8]] = {}

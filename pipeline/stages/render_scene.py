@@ -40,9 +40,7 @@ def render_spec(job: Job, layout: JobLayout, framed: NDArray[np.float64] | None 
 def camera_path(job: Job, framed: NDArray[np.float64] | None = None) -> CameraPath:
     """The path of a job's camera.
 
-    Args:
-        job: the job.
-        framed: points that it frames if it frames the action [m], (n, 3); the domain while they are not known.
+    `framed` are points that it frames if it frames the action [m], (n, 3); the domain while they are not known.
     """
     width, height = job.render.resolution
     starts = {body.name: body.position for body in job.rigid}
@@ -57,15 +55,10 @@ def framed_points(job: Job, layout: JobLayout) -> NDArray[np.float64] | None:
 
 
 def write_motion(job: Job, layout: JobLayout, frame: int, *, attempt: int) -> tuple[Poses, View]:
-    """Put where bodies and camera are at a frame where Blender finds it; returns it, too.
+    """Write where bodies and camera are at a frame into the job's folder, for Blender; returns it, too.
 
-    These documents are no artifacts, but a form of the cached frame and of the job.
-
-    Args:
-        job: the job.
-        layout: the folder that holds the cached frame, and gets the documents.
-        frame: which frame.
-        attempt: names the files that they are written to first.
+    These documents are no artifacts, but a form of the cached frame and of the job. `attempt` names the files that they
+    are written to first.
     """
     bodies, camera = job.moving_bodies, camera_path(job, framed_points(job, layout))
     cached = read_frame(layout.path(layout.frame_cache(frame)), kind="rigid").bodies if bodies else {}

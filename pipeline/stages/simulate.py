@@ -23,8 +23,8 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.kinds.table import KINDS, bodies
 from pipeline.model.job import Job
-from pipeline.stages.base import TaskContext
-from pipeline.stages.inputs import bodies_by_content
+from pipeline.stages.base import Stage, TaskContext
+from pipeline.stages.inputs import by_content
 from pipeline.stages.ordered_writer import WAITING, OrderedWriter
 from pipeline.store.cache import (
     Checkpoint,
@@ -52,42 +52,37 @@ WORKER_BYTES = 800_000_000
 """Interpreter, compiler and the driver's share of the host's memory; an estimate, on the safe side."""
 
 
-class SimulateStage:
+class SimulateStage(Stage):
     """One task for the whole job: it commits a frame at a time and continues where it stopped."""
 
     name = "simulate"
-    version = 8
+    version = 9
 
     def plan(self, job: Job, layout: JobLayout) -> list[Task]:
-        """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one.
-
-        A live take's frames are those of the take, whatever the job says of its scene.
-        """
-        scene = {name: getattr(job, name) for name in SceneParameters.model_fields}
+        """The one task. The number of frames is not in its fingerprint: a longer film continues a shorter one."""
         return [
             Task(
                 id=TaskId("simulate"),
                 stage=self.name,
                 inputs=(),
                 outputs=tuple(layout.frame_cache(frame) for frame in range(job.frame_count)),
-                parameters=self._parameters_of_take(job)
-                if job.recorded is not None
-                else ParameterSet.of(
-                    stage=self.name,
-                    version=self.version,
-                    tools={name: tool_version(name) for name in ("taichi", "libigl", "numpy", "scipy", "trimesh")},
-                    fps=job.fps,
-                    **scene | bodies_by_content(job),
-                ),
+                parameters=self._parameters(job),
                 resources=_resources(job),
                 checkpointed=True,
                 on_first_gpu=True,  # Taichi's own choice
             )
         ]
 
-    def _parameters_of_take(self, job: Job) -> ParameterSet:
-        """A take was made once, by hand: no version of anything makes another one of it."""
-        return ParameterSet.of(stage=self.name, version=0, tools={}, fps=job.fps, recorded=job.recorded)
+    def _parameters(self, job: Job) -> ParameterSet:
+        """What decides the frames; a live recording was made once, by hand, and nothing makes another one of it."""
+        if job.recorded is not None:
+            return ParameterSet.of(stage=self.name, version=0, tools={}, fps=job.fps, recorded=job.recorded)
+        scene = {name: getattr(job, name) for name in SceneParameters.model_fields}
+        bodies_by_content = {kind.name: [by_content(body) for body in kind.bodies(job)] for kind in KINDS.values()}
+        tools = {name: tool_version(name) for name in ("taichi", "libigl", "numpy", "scipy", "trimesh")}
+        return ParameterSet.of(
+            scene | bodies_by_content, stage=self.name, version=self.version, tools=tools, fps=job.fps
+        )
 
     def preflight(self, job: Job) -> list[str]:
         """A device that does not work here."""
@@ -108,12 +103,12 @@ class SimulateStage:
         """
         missing = [k for k, output in enumerate(context.task.outputs) if not context.is_committed(output)]
         if missing and context.job.recorded is not None:
-            raise _no_take_anew(context, missing[0])
+            raise _no_recording_anew(context, missing[0])
         if missing:
             _Simulation(context).run(missing)
 
 
-def _no_take_anew(context: TaskContext, frame: int) -> StageUnavailableError:
+def _no_recording_anew(context: TaskContext, frame: int) -> StageUnavailableError:
     job = context.job
     recorded_fps = _recorded_fps(context.layout, context.task.outputs[frame])
     if recorded_fps not in (None, job.fps):
@@ -257,7 +252,7 @@ def _saying(note: str) -> Iterator[None]:
 def _resources(job: Job) -> Resources:
     """All cores where the CPU computes, so that it runs alone; where the GPU does, that, one core and the frames' room.
 
-    A device that does not work here is no matter of the plan, but an obstacle to running it.
+    A device that does not work here is planned all the same; preflight reports it.
     """
     from sim.core.runtime import resolve_device
 

@@ -31,7 +31,7 @@ BYTES_PER_TEXTURE_PIXEL, BYTES_PER_FLOAT_TEXTURE_PIXEL = 11, 42
 def own_picture_bytes(spec: RenderSpec) -> int:
     """Memory of a renderer for them [bytes]. Each body has a material of its own, and so pictures of its own.
 
-    What cannot be read counts for nothing here: the checks of a job, and what keeps a stage from running, tell of it.
+    What cannot be read counts for nothing here: the checks of a job and the preflight of its stages report it.
     """
     total = 0
     if spec.set.hdri is not None:

@@ -10,51 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.base.layout import JobLayout
+from pipeline.kinds.table import drawn_bodies
 from pipeline.model.job import Job
-from pipeline.model.looks import parts_of
 from pipeline.stages.base import TaskContext
 from render.camera_path import View
 from render.meshes import read_ply
 from render.point_clouds import read_point_cloud
+from render.spec import MeshObject, MeshSequenceObject, PointSequenceObject, VolumeSequenceObject
 from render.visibility import covered_cells, in_picture, is_inside, points_of_box
 
 Array = NDArray[np.float64]
 
-MOST_POINTS = 20_000
-"""Of a body that are looked for in the picture; of more, every second, third, ..."""
-LEAST_SHARE = 0.005
-"""Of the picture that bodies must cover for it to be sure that something is to be seen."""
-ROUND_THE_DOMAIN = 0.02
-"""How far a body may reach out of the domain, in edges of it, and still be in front of the set."""
+MOST_POINTS = 20_000  # of a body that are looked for in the picture; of more, every second, third, ...
+LEAST_SHARE = 0.005  # of the picture that bodies must cover for it to be sure that something is to be seen
+ROUND_THE_DOMAIN = 0.02  # how far a body may reach out of the domain, in edges of it, and still be in front of the set
 NOTHING_SEEN, CAMERA_INSIDE = "nothing in the picture", "camera inside"
 
 
 @dataclass(frozen=True)
 class BodyAtFrame:
-    """A body at a frame.
-
-    Attributes:
-        name: of the body.
-        points: on or in it [m], (n, 3); none while it is not there.
-        faces: triangles of these points if they are those of a mesh, (k, 3).
-        closed: whether the mesh has an inside.
-    """
+    """A body at a frame."""
 
     name: str
-    points: Array
-    faces: NDArray[np.int32] | None = None
-    closed: bool = False
+    points: Array  # on or in it [m], (n, 3); none while it is not there
+    faces: NDArray[np.int32] | None = None  # triangles of these points if they are those of a mesh, (k, 3)
+    closed: bool = False  # whether the mesh has an inside
 
 
 def warn_if_invisible(context: TaskContext, view: View, bodies: Sequence[BodyAtFrame]) -> None:
     """Warn if nothing of the scene is in the picture of a frame, or the camera is inside of something.
 
     A picture may be meant so, or be empty as nothing has begun yet, so this is no failure.
-
-    Args:
-        context: of a frame's task, whose inputs are there.
-        view: of the camera at the frame.
-        bodies: all that is drawn.
     """
     frame = context.task.frame
     assert frame is not None
@@ -72,28 +58,25 @@ def bodies_at(
     job: Job, layout: JobLayout, frame: int, poses: Mapping[str, Mapping[str, NDArray[Any]]]
 ) -> Iterator[BodyAtFrame]:
     """All drawn bodies at a frame; of a smoke, its whole box."""
-    from sim.core.motion.rotation import from_degrees, rotated
+    from sim.core.motion.rotation import rotated
 
-    for body in job.rigid:
-        if body.kind == "static":
-            position, orientation = np.array(body.position), from_degrees(body.rotation_deg)
-        else:
-            position, orientation = poses[body.name]["position"], poses[body.name]["orientation"]
-        for part in parts_of(body.shape.type):
-            mesh = read_ply(layout.path(layout.body_mesh(body.name, part)))
-            placed = position + rotated(orientation, mesh.vertices.astype(np.float64))
-            yield BodyAtFrame(body.name, placed, mesh.faces, closed=True)
-    for fluid in job.fluid:
-        mesh = read_ply(layout.path(layout.surface(fluid.name, frame)))
-        yield BodyAtFrame(fluid.name, mesh.vertices.astype(np.float64), mesh.faces, closed=True)
-    for cloth in job.cloth:
-        mesh = read_ply(layout.path(layout.cloth(cloth.name, frame)))
-        yield BodyAtFrame(cloth.name, mesh.vertices.astype(np.float64), mesh.faces)
-    for name in job.whitewater:
-        cloud = read_point_cloud(layout.path(layout.whitewater(name, frame)))
-        yield BodyAtFrame(f"whitewater of {name}", cloud.position.astype(np.float64))
-    for smoke in job.smoke:
-        yield BodyAtFrame(smoke.name, points_of_box(*smoke.corners(job.domain)))
+    read: set[str] = set()
+    for kind, body, drawn in drawn_bodies(job, layout):
+        if isinstance(drawn, VolumeSequenceObject):
+            yield BodyAtFrame(body.name, points_of_box(drawn.box_min, drawn.box_max))
+            continue
+        path = layout.root / drawn.file.replace("{frame}", f"{frame:06d}")
+        if isinstance(drawn, PointSequenceObject):
+            if drawn.file not in read:  # each kind of whitewater is an object of one file
+                yield BodyAtFrame(f"whitewater of {body.name}", read_point_cloud(path).position.astype(np.float64))
+            read.add(drawn.file)
+            continue
+        mesh = read_ply(path)
+        points = mesh.vertices.astype(np.float64)
+        if not isinstance(drawn, MeshSequenceObject):
+            pose = vars(drawn) if isinstance(drawn, MeshObject) else poses[body.name]
+            points = np.array(pose["position"]) + rotated(np.array(pose["orientation"]), points)
+        yield BodyAtFrame(body.name, points, mesh.faces, closed=kind.is_closed)
 
 
 def expected_cells(

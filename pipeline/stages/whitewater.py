@@ -12,7 +12,7 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.kinds.fluid import most_particles
 from pipeline.model.job import Job
-from pipeline.stages.base import TaskContext
+from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.inputs import by_content
 from pipeline.store.cache import read_frame
 
@@ -21,21 +21,19 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sim.core.snapshots import Snapshot
-    from sim.shapes import LevelSet
+    from sim.shapes.level_set import LevelSet
     from sim.whitewater.cloud import WhitewaterCloud
     from sim.whitewater.obstacles import MovingObstacle
 
-CORES = 2
-"""Threads of the neighbour sums; the rest of a frame is numpy's, which takes one."""
+CORES = 2  # threads of the neighbour sums; the rest of a frame is numpy's, which takes one
 
 WORKER_BYTES = 600_000_000
-BYTES_PER_PARTICLE = 400
-"""Of the cloud."""
+BYTES_PER_PARTICLE = 400  # of the cloud
 BYTES_PER_FLUID_PARTICLE = 350
 """Two snapshots, their motion, and what a substep makes of it; measured with 1 and 3 million, without a cloud."""
 
 
-class WhitewaterStage:
+class WhitewaterStage(Stage):
     """One PLY a fluid and frame, each from that of the frame before and the fluids of the tank at both frames.
 
     So the frames of a fluid are made one after the other, each as soon as its own frame is cached. It always computes
@@ -58,15 +56,10 @@ class WhitewaterStage:
                 frame=frame,
                 resources=resources,
             )
-            for fluid, parameters, resources in (
-                (fluid, self._parameters(job, fluid), _resources(job, fluid)) for fluid in job.whitewater
-            )
+            for fluid in job.whitewater
+            for parameters, resources in ((self._parameters(job, fluid), _resources(job, fluid)),)
             for frame in range(job.frame_count)
         ]
-
-    def preflight(self, job: Job) -> list[str]:  # noqa: ARG002
-        """None: the simulation needs the same packages."""
-        return []
 
     def run(self, context: TaskContext) -> None:
         """Make one frame of one fluid's whitewater."""

@@ -33,8 +33,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from pipeline.base.errors import InvalidArtifactError, StaleAttemptError
 from pipeline.base.files import sync
@@ -65,117 +63,24 @@ def holds_frames(layout: JobLayout) -> bool:
 
 
 class Commit:
-    """An artifact on its way, as a context manager; see `committing`.
+    """An artifact on its way; see `committing`."""
 
-    Attributes:
-        path: where to write it: `.<name>.part.<attempt>`, in the artifact's own folder.
-        receipt: set once it is committed, on leaving the block.
-        kept_aside: where a file that was edited by hand went, if there was one in the way.
-    """
-
-    def __init__(
-        self,
-        layout: JobLayout,
-        artifact: ArtifactPath,
-        *,
-        task: Task,
-        attempt: int,
-        fingerprint: str,
-        validate: Callable[[Path], None],
-        inputs: Mapping[ArtifactPath, str],
-        device: str,
-    ) -> None:
-        self._layout = layout
-        self._artifact = artifact
-        self._task = task
-        self._attempt = attempt
-        self._fingerprint = fingerprint
-        self._validate = validate
-        self._inputs = dict(inputs)
-        self._device = device
-        self._target = layout.path(artifact)
-        self._started = 0.0
-        self._receipt: Receipt | None = None
-        self.path = _part_path(self._target, attempt)
-        self._receipt_part = _part_path(layout.receipt(artifact), attempt)
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        """Where to write it: `.<name>.part.<attempt>`, in the artifact's own folder."""
         self.kept_aside: ArtifactPath | None = None
+        """Where a file that was edited by hand went, if there was one in the way."""
+        self._receipt: Receipt | None = None
 
     @property
     def receipt(self) -> Receipt:
         """The receipt; there is one after the block has ended well."""
         if self._receipt is None:
-            raise RuntimeError(f"{self._artifact} is not committed yet")
+            raise RuntimeError(f"{self.path} is not committed yet")
         return self._receipt
 
-    def __enter__(self) -> Self:
-        self._started = _now_s()
-        _make_folder(self._target.parent)
-        self.path.unlink(missing_ok=True)
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            if error is None:
-                self._commit()
-        finally:
-            for part in (self.path, self._receipt_part):
-                with suppress(OSError):  # must not hide the error that is on its way; sweep_parts gets what stays
-                    part.unlink(missing_ok=True)
-
-    def _commit(self) -> None:
-        if not self.path.is_file():
-            raise InvalidArtifactError(f"{self._artifact}: nothing was written, or a newer run has swept it away")
-        self._validate(self.path)
-        job = keep_texts(self._layout, self._task.parameters)
-        receipt = self._describe_part(job)
-        receipt_path = self._layout.receipt(self._artifact)
-        _make_folder(receipt_path.parent)
-        self._receipt_part.write_text(receipt.to_json())
-        sync(self._receipt_part)
-        with _lock(receipt_path.with_name(_LOCK_NAME)):
-            self._fence()
-            self.kept_aside = _invalidate(self._layout, self._artifact)
-            self.path.replace(self._target)
-            sync(self._target.parent)
-            self._receipt_part.replace(receipt_path)
-            sync(receipt_path.parent)
-        self._receipt = receipt
-
-    def _describe_part(self, job: str) -> Receipt:
-        """Hash the part and force it to the disk; only then are its size and time settled."""
-        content_hash = hash_file(self.path)
-        sync(self.path)
-        status = self.path.stat()
-        return Receipt(
-            artifact=self._artifact,
-            task=self._task.id,
-            stage=self._task.stage,
-            attempt=self._attempt,
-            fingerprint=self._fingerprint,
-            parameters=self._task.parameters.digest,
-            size=status.st_size,
-            mtime_ns=status.st_mtime_ns,
-            hash=content_hash,
-            inputs=self._inputs,
-            job=job,
-            maker=maker(),
-            host=platform.node(),
-            device=self._device,
-            started=self._started,
-            finished=_now_s(),
-        )
-
-    def _fence(self) -> None:
-        existing = read_receipt(self._layout, self._artifact)
-        if existing is not None and existing.task == self._task.id and existing.attempt > self._attempt:
-            raise StaleAttemptError(
-                f"{self._artifact}: attempt {existing.attempt} of {self._task.id} has committed it; "
-                f"attempt {self._attempt} came too late"
-            )
-
-
+@contextmanager
 def committing(
     layout: JobLayout,
     artifact: ArtifactPath,
@@ -186,7 +91,7 @@ def committing(
     validate: Callable[[Path], None],
     inputs: Mapping[ArtifactPath, str] | None = None,
     device: str = "",
-) -> Commit:
+) -> Iterator[Commit]:
     """Commit one artifact: write to `commit.path` inside the block; after it `commit.receipt` is the Receipt.
 
     On leaving the block: validate, hash, fsync, fence, rename, receipt; the module's text gives the order and why. An
@@ -207,16 +112,53 @@ def committing(
         InvalidArtifactError: on leaving, if nothing was written or `validate` refused it.
         StaleAttemptError: on leaving, if a newer attempt of the same task has committed this artifact.
     """
-    return Commit(
-        layout,
-        artifact,
-        task=task,
-        attempt=attempt,
-        fingerprint=fingerprint,
-        validate=validate,
-        inputs=inputs or {},
-        device=device,
-    )
+    target, receipt_path = layout.path(artifact), layout.receipt(artifact)
+    commit, receipt_part = Commit(_part_path(target, attempt)), _part_path(receipt_path, attempt)
+    started = _now_s()
+    _make_folder(target.parent)
+    commit.path.unlink(missing_ok=True)
+    try:
+        yield commit
+        if not commit.path.is_file():
+            raise InvalidArtifactError(f"{artifact}: nothing was written, or a newer run has swept it away")
+        validate(commit.path)
+        job = keep_texts(layout, task.parameters)
+        content_hash = hash_file(commit.path)
+        sync(commit.path)
+        status = commit.path.stat()  # only now are its size and time settled
+        receipt = Receipt(
+            artifact=artifact,
+            task=task.id,
+            stage=task.stage,
+            attempt=attempt,
+            fingerprint=fingerprint,
+            parameters=task.parameters.digest,
+            size=status.st_size,
+            mtime_ns=status.st_mtime_ns,
+            hash=content_hash,
+            inputs=dict(inputs or {}),
+            job=job,
+            maker=maker(),
+            host=platform.node(),
+            device=device,
+            started=started,
+            finished=_now_s(),
+        )
+        _make_folder(receipt_path.parent)
+        receipt_part.write_text(receipt.to_json())
+        sync(receipt_part)
+        with _lock(receipt_path.with_name(_LOCK_NAME)):
+            _fence(layout, receipt)
+            commit.kept_aside = _invalidate(layout, artifact)
+            commit.path.replace(target)
+            sync(target.parent)
+            receipt_part.replace(receipt_path)
+            sync(receipt_path.parent)
+        commit._receipt = receipt
+    finally:
+        for part in (commit.path, receipt_part):
+            with suppress(OSError):  # must not hide the error that is on its way; sweep_parts gets what stays
+                part.unlink(missing_ok=True)
 
 
 def sweep_parts(layout: JobLayout) -> list[Path]:
@@ -233,6 +175,16 @@ def sweep_parts(layout: JobLayout) -> list[Path]:
                 path.unlink(missing_ok=True)
                 swept.append(path)
     return sorted(swept)
+
+
+def _fence(layout: JobLayout, receipt: Receipt) -> None:
+    """Raise StaleAttemptError if a newer attempt of the task has committed the artifact."""
+    existing = read_receipt(layout, receipt.artifact)
+    if existing is not None and existing.task == receipt.task and existing.attempt > receipt.attempt:
+        raise StaleAttemptError(
+            f"{receipt.artifact}: attempt {existing.attempt} of {receipt.task} has committed it; "
+            f"attempt {receipt.attempt} came too late"
+        )
 
 
 def _now_s() -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 from pipeline.base import wording
@@ -15,26 +16,17 @@ from pipeline.store.receipts import Receipt
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Origin of a group of a task's artifacts: the same job file, parameters, attempt and machine.
+    """Origin of a group of a task's artifacts: the same job file, parameters, attempt and machine."""
 
-    Attributes:
-        receipt: one of theirs.
-        artifacts: how many they are.
-        job_file: where the job file lies that they were made from; None if it was not kept.
-        tools: versions of the stage and of the tools that did the work; None if the parameters were not kept.
-        inputs: how many files they were made from.
-    """
-
-    receipt: Receipt
-    artifacts: int
-    job_file: str | None
-    tools: dict[str, str] | None
-    inputs: int
+    receipt: Receipt  # one of theirs
+    artifacts: int  # how many they are
+    job_file: str | None  # where the job file lies that they were made from; None if it was not kept
+    tools: dict[str, str] | None  # versions of the stage and of its tools; None if the parameters were not kept
 
     def lines(self) -> Iterator[str]:
         """For people."""
         receipt = self.receipt
-        count = "1 file" if self.artifacts == 1 else f"{self.artifacts} files"
+        count = wording.counted(self.artifacts, "file")
         yield f"origin  {count} by attempt {receipt.attempt} on {receipt.host}, {wording.moment(receipt.finished)}"
         if receipt.maker:
             yield f"        {receipt.maker}"
@@ -45,7 +37,7 @@ class Origin:
             yield f"        versions: {tools}"
         yield f"        job file: {self.job_file or 'not kept'}"
         key, fingerprint = receipt.parameters[:16], receipt.fingerprint[:16]
-        yield f"        parameters {key}, {self.inputs} inputs, together the fingerprint {fingerprint}"
+        yield f"        parameters {key}, {len(receipt.inputs)} inputs, together the fingerprint {fingerprint}"
 
     def as_json(self) -> dict[str, Any]:
         """For machines."""
@@ -66,22 +58,12 @@ class Origin:
 
 def origins_of(layout: JobLayout, receipts: Sequence[Receipt]) -> list[Origin]:
     """Origins of a task's artifacts, latest last; those that have it in common together."""
-    groups: dict[tuple[object, ...], list[Receipt]] = {}
+    in_common = attrgetter("attempt", "host", "maker", "device", "job", "parameters", "fingerprint")
+    groups: dict[object, list[Receipt]] = {}
     for receipt in receipts:
-        key = (
-            receipt.attempt,
-            receipt.host,
-            receipt.maker,
-            receipt.device,
-            receipt.job,
-            receipt.parameters,
-            receipt.fingerprint,
-        )
-        groups.setdefault(key, []).append(receipt)
-    return sorted(
-        (_origin(layout, members[-1], len(members)) for members in groups.values()),
-        key=lambda origin: origin.receipt.finished,
-    )
+        groups.setdefault(in_common(receipt), []).append(receipt)
+    latest_last = sorted(groups.values(), key=lambda members: members[-1].finished)
+    return [_origin(layout, members[-1], len(members)) for members in latest_last]
 
 
 def _origin(layout: JobLayout, receipt: Receipt, artifacts: int) -> Origin:
@@ -97,5 +79,4 @@ def _origin(layout: JobLayout, receipt: Receipt, artifacts: int) -> Origin:
         artifacts=artifacts,
         job_file=job_file.relative_to(layout.root).as_posix() if kept else None,
         tools=tools,
-        inputs=len(receipt.inputs),
     )

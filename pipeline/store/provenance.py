@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Callable, Iterator
-from functools import cache, lru_cache
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from blake3 import blake3
@@ -20,8 +20,7 @@ from pipeline.base.files import replace_durably, sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet, digest_of
 
-MAX_TEXT_BYTES = 64 * 2**20
-"""No job file or parameter set is larger."""
+MAX_TEXT_BYTES = 64 * 2**20  # no job file or parameter set is larger
 
 
 @cache
@@ -34,22 +33,16 @@ def maker() -> str:
 def keep_texts(layout: JobLayout, parameters: ParameterSet) -> str:
     """Make sure that the job file and a parameter set are kept, durably; returns the job file's digest, "" without one.
 
-    Raises:
-        OSError: they cannot be written, as on a full disk.
+    Raises OSError: they cannot be written, as on a full disk.
     """
-    _keep(layout.parameters_text(parameters.digest), lambda: parameters.canonical)
+    _keep(layout.parameters_text(parameters.digest), parameters.canonical)
     try:
-        status = layout.job_file.stat()
+        text = layout.job_file.read_text(encoding="utf-8")
     except FileNotFoundError:
         return ""
-    digest = _digest_of_job_file(layout.job_file, status.st_mtime_ns, status.st_size)
-    _keep(layout.job_text(digest), lambda: layout.job_file.read_text(encoding="utf-8"))
+    digest = digest_of(text)
+    _keep(layout.job_text(digest), text)
     return digest
-
-
-@lru_cache(maxsize=1)
-def _digest_of_job_file(path: Path, _mtime_ns: int, _size: int) -> str:
-    return digest_of(path.read_text(encoding="utf-8"))
 
 
 def read_text(path: Path) -> str | None:
@@ -71,29 +64,11 @@ def damaged_texts(layout: JobLayout) -> Iterator[Path]:
             yield path
 
 
-def restore(layout: JobLayout, path: Path, parameters: ParameterSet | None) -> bool:
-    """Write a damaged text anew from what else knows it; removes it otherwise. Returns whether it could be restored.
-
-    Args:
-        layout: the job's folder.
-        path: one of `damaged_texts`.
-        parameters: the parameter set of that digest, if the manifest knows it.
-    """
-    text = None if parameters is None else parameters.canonical
-    if text is None and layout.job_file.exists():
-        text = layout.job_file.read_text(encoding="utf-8")
-    path.unlink()
-    if text is None or digest_of(text) != path.stem:
-        return False
-    replace_durably(path, text)
-    return True
-
-
-def _keep(path: Path, text: Callable[[], str]) -> None:
+def _keep(path: Path, text: str) -> None:
     if path.exists():
         return
     if not path.parent.is_dir():
         path.parent.mkdir(parents=True, exist_ok=True)
         sync(path.parent.parent)
         sync(path.parent.parent.parent)
-    replace_durably(path, text())
+    replace_durably(path, text)

@@ -37,12 +37,10 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LEAST_TOKEN_LENGTH = 22
-LEAST_TOKEN_BITS = 72.0
-"""Of a token, if each character were drawn as often as it is in it: 22 that were drawn have 78 and more."""
+LEAST_TOKEN_BITS = 72.0  # by the frequencies of its characters: 22 that were drawn have 78 and more
 MOST_TOKEN_BYTES = 1024
 OF_OTHERS = stat.S_IRGRP | stat.S_IWGRP | stat.S_IROTH | stat.S_IWOTH
 SESSION_S = 7 * 24 * 3600.0
-"""Life of a browser's session [s]."""
 MOST_BODY_BYTES = 4096
 
 POLICY = "; ".join(
@@ -130,12 +128,7 @@ class Access:
 
 
 def access_of(host: str, port: int, token_file: Path | None) -> Access:
-    """Access as the command line asks for it: an address that others reach needs a token.
-
-    Args:
-        host: the address that it listens on.
-        port: the port.
-        token_file: holds the token; None: one is drawn where it is needed.
+    """Access as the command line asks for it: an address that others reach needs a token, drawn if no file holds it.
 
     Raises:
         PipelineError: the file cannot be read, others may read or write it, or its token is not hard to guess.
@@ -197,8 +190,7 @@ class Gate:
     `scope["session"]` is the session's name behind it.
 
     Args:
-        app: the application behind it.
-        access: the rules.
+        app, access: the application behind it, and the rules.
         refuse: makes the answer to a request that may not pass, of a status and a sentence.
         ask: makes the page that asks for the token, with a sentence about the one that was given.
         welcome: makes the page that leads on to the farm.
@@ -276,11 +268,7 @@ class Gate:
 
 
 async def form_of(request: Request) -> dict[str, str]:
-    """The fields of a form that was sent; one that is longer than any of ours counts as empty.
-
-    Raises:
-        ClientDisconnect: it was cut off.
-    """
+    """The fields of a form; one that is longer than any of ours counts as empty. Raises ClientDisconnect."""
     body = b""
     async for chunk in request.stream():
         body += chunk

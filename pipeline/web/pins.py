@@ -27,11 +27,7 @@ class JobPin(NamedTuple):
 
 
 def pins_of_job(job: Job) -> list[JobPin]:
-    """All pins of a job, in the order of its file.
-
-    Raises:
-        ShapeError, ValueError, OSError: a cloth cannot be built.
-    """
+    """All pins of a job, in the order of its file. Raises ShapeError, ValueError, OSError: a cloth cannot be built."""
     from sim.cloth.start import pins_of
 
     return [

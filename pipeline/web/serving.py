@@ -38,12 +38,9 @@ if TYPE_CHECKING:
     from websockets.datastructures import Headers
 
 LOCAL = "127.0.0.1"
-"""A viser page lets anybody who reaches it use its controls, so only this machine reaches it."""
-GRACE_S = 2
-"""Time that an answer may still take once the end is asked for [s]; a film that is played would take for ever."""
+GRACE_S = 2  # that an answer may still take once the end is asked for; a film that is played would take for ever
 MOST_CONNECTIONS = 512
-REQUEST_S = 10.0
-"""A connection whose request is not in after this time [s] is closed; ours are a few KB."""
+REQUEST_S = 10.0  # in which a request must be in; ours are a few KB
 
 _OPENING = threading.Lock()
 
@@ -123,13 +120,7 @@ def stop_event() -> Iterator[threading.Event]:
 
 
 def serve(application: ASGIApp, listening: socket.socket, ready: Callable[[], None]) -> None:
-    """Answer requests until Ctrl-C or a signal TERM; returns then.
-
-    Args:
-        application: answers them.
-        listening: where they arrive; closed at the end.
-        ready: called when the first one would be answered.
-    """
+    """Answer the requests that arrive at a socket until Ctrl-C or a signal TERM; calls `ready` when that begins."""
     with listening:
         Server(config_of(application), ready).run(sockets=[listening])
 
@@ -214,22 +205,12 @@ def page_server(*, host: str = LOCAL, port: int = 0, label: str | None = None) -
     """A viser server that answers its own pages only, and only on this machine, for the time of the block.
 
     Args:
-        host: address that it listens at.
-        port: of it; 0 takes one that is free.
+        host, port: address that it listens at; port 0 takes one that is free.
         label: of its panel.
 
     Raises:
         PipelineError: viser cannot be guarded, or the address cannot be had, or others reach it.
     """
-    server = open_server(host, port, label=label)
-    try:
-        yield server
-    finally:
-        close_server(server)
-
-
-def open_server(host: str = LOCAL, port: int = 0, *, label: str | None = None) -> viser.ViserServer:
-    """The same for longer than a block; the caller closes it."""
     _require_loopback(host, port)
     import viser
     from viser import _messages
@@ -244,16 +225,10 @@ def open_server(host: str = LOCAL, port: int = 0, *, label: str | None = None) -
             raise _taken(host, port)
         for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
             server._websock_server.unregister_handler(message)
-    except BaseException:
-        close_server(server)
-        raise
-    return server
-
-
-def close_server(server: viser.ViserServer) -> None:
-    """Stop a server; it says nothing."""
-    with _silence():
-        server.stop()
+        yield server
+    finally:
+        with _silence():
+            server.stop()
 
 
 def address(server: viser.ViserServer) -> str:
@@ -278,9 +253,8 @@ def refusal(headers: Headers, access: Access) -> str | None:
 def _guarded(access: Access) -> Iterator[list[bool]]:
     """Have a server that viser opens in the block refuse requests; yields a list that is filled when it does.
 
-    viser opens its server by `websockets.asyncio.server.serve` and leaves no way to hand it a check of its own, so that
-    name means another function until the block ends: viser's thread has called it by then. All that stays is the check
-    in the server that was opened.
+    viser opens its server by `websockets.asyncio.server.serve` and takes no check, so that name means another function
+    until the block ends: viser's thread has called it by then.
     """
     import websockets.asyncio.server
 
@@ -312,8 +286,7 @@ def _silence() -> contextlib.redirect_stdout[io.StringIO]:
 
 
 def _require_loopback(host: str, port: int) -> None:
-    """viser knows no passwords: whoever reaches its page may steer it, and a token in its address would be ours to keep
-    out of every message that it sends. ssh asks who comes, and keeps what is said from others."""
+    """viser knows no passwords: whoever reaches its page may steer it. ssh asks who comes, and hides what is said."""
     if is_loopback(host):
         return
     here = f"ssh -L {port or 'PORT'}:{LOCAL}:{port or 'PORT'} {socket.gethostname()}"

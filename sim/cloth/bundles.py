@@ -9,7 +9,7 @@ import taichi as ti
 
 from sim.core.arrays import Floats, Integers, LongIntegers, Matrices, Vectors
 from sim.core.bundles import bundle
-from sim.shapes.device_distances import Shapes
+from sim.shapes.device_shapes import Shapes
 
 Two = ti.types.vector(2, ti.i32)
 Four = ti.types.vector(4, ti.i32)

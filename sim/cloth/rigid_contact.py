@@ -24,7 +24,7 @@ from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
 from sim.core.walls import Wall
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.device_distances import distance_to
+from sim.shapes.device_shapes import distance_to
 
 Array = NDArray[np.float64]
 

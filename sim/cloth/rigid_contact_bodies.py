@@ -12,8 +12,7 @@ from sim.cloth.bundles import CollidingBodies, PushedBodies
 from sim.core.host_access import put, take
 from sim.core.motion.poses import Poses
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.device_distances import CAPSULE, SPHERE, TORUS
-from sim.shapes.device_shapes import DeviceShapes
+from sim.shapes.device_shapes import CAPSULE, SPHERE, TORUS, DeviceShapes
 
 Array = NDArray[np.float64]
 
@@ -127,7 +126,7 @@ class CollisionBodies(DeviceShapes):
         """Look at more than vertices where a body has sharp edges, or its box an edge that is shorter [m]."""
         if self.count:
             is_small = np.array([geometry.shortest_edge < length for geometry in self.geometries])
-            self.has_edges.from_numpy((~np.isin(self.kind.to_numpy(), _ROUND) | is_small).astype(np.int32))
+            self.has_edges.from_numpy((~np.isin(self.on_device.kind.to_numpy(), _ROUND) | is_small).astype(np.int32))
 
     def set_motion(self, shift: Array, turn: Array) -> None:
         """Say how the bodies would move in a substep without cloth.

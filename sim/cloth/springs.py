@@ -113,9 +113,14 @@ def _grid_diagonals(grid: Grid) -> Springs:
     nodes = np.concatenate([np.stack([one.ravel(), other.ravel()], axis=1) for one, other in ends])
     count = len(nodes)
     return Springs(
-        nodes, np.tile([1.0, -1.0], (count, 1)), np.full(count, length), np.full(count, share), _all(SHEAR, count),
-        np.concatenate([2 * row.ravel(), 2 * row.ravel() + 1]).astype(np.int32), _all(-1, count),
-    )  # fmt: skip
+        nodes,
+        np.tile([1.0, -1.0], (count, 1)),
+        np.full(count, length),
+        np.full(count, share),
+        _all(SHEAR, count),
+        np.concatenate([2 * row.ravel(), 2 * row.ravel() + 1]).astype(np.int32),
+        _all(-1, count),
+    )
 
 
 def _grid_threads(grid: Grid) -> Springs:
@@ -131,10 +136,15 @@ def _grid_threads(grid: Grid) -> Springs:
         colour = np.broadcast_to(2 * axis + piece % 2, width.shape)
         groups.append(
             Springs(
-                nodes, np.tile([1.0, -1.0], (count, 1)), np.full(count, step), (width / step).ravel(),
-                _all(STRETCH, count), colour.ravel().astype(np.int32), segment.ravel().astype(np.int32),
+                nodes,
+                np.tile([1.0, -1.0], (count, 1)),
+                np.full(count, step),
+                (width / step).ravel(),
+                _all(STRETCH, count),
+                colour.ravel().astype(np.int32),
+                segment.ravel().astype(np.int32),
             )
-        )  # fmt: skip
+        )
     return _joined(groups)
 
 
@@ -148,10 +158,15 @@ def _grid_bends(grid: Grid) -> Springs:
         colour = np.broadcast_to(3 * axis + np.arange(width.shape[1]) % 3, width.shape)
         groups.append(
             Springs(
-                nodes, np.tile([1.0, -2.0, 1.0], (count, 1)), np.zeros(count), bend_share(width, step).ravel(),
-                _all(BEND, count), colour.ravel().astype(np.int32), _all(-1, count),
+                nodes,
+                np.tile([1.0, -2.0, 1.0], (count, 1)),
+                np.zeros(count),
+                bend_share(width, step).ravel(),
+                _all(BEND, count),
+                colour.ravel().astype(np.int32),
+                _all(-1, count),
             )
-        )  # fmt: skip
+        )
     return _joined(groups)
 
 

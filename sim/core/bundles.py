@@ -17,10 +17,8 @@ A bundle is a named tuple whose fields have types that kernels take, other bundl
     fall(Particles(x, m), dt)
 
 A kernel that takes bundles is compiled as if each of their fields were an argument of its own, so bundling changes
-neither what the device does nor a bit of the result. Taichi's own `argpack` reads the address of an array anew wherever
-the array is used (docs/decisions/0037-kernel-arguments.md).
-
-This relies on how Taichi 1.7 reads the source of a kernel, as `sim.core.tracing` does.
+neither what the device does nor a bit of the result (docs/decisions/0037-kernel-arguments.md). This relies on how
+Taichi 1.7 reads the source of a kernel, as `sim.core.runtime` does.
 """
 
 from __future__ import annotations
@@ -33,8 +31,7 @@ from typing import Any, TypeVar
 import taichi as ti
 from taichi.lang import kernel_impl
 
-SEPARATOR = "__"
-"""Between the name of a bundle and that of its field, in the name of the argument that the field becomes."""
+SEPARATOR = "__"  # between the names of a bundle and its field, in that of an argument
 
 NamedTupleType = TypeVar("NamedTupleType", bound=type)
 
@@ -83,7 +80,13 @@ def with_fields_as_arguments(function: Callable[..., Any]) -> Callable[..., Any]
         ]
         function.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         function.__bundles__ = kinds  # type: ignore[attr-defined]
+        function.__used__ = set()  # type: ignore[attr-defined]
     return function
+
+
+def is_used(function: Callable[..., Any], argument: str) -> bool:
+    """Whether a kernel reads an argument, as far as it was compiled: of bundles often only a few fields."""
+    return SEPARATOR not in argument or argument in getattr(function, "__used__", ())
 
 
 def _leaves(name: str, kind: Any) -> Iterator[tuple[str, Any]]:
@@ -96,17 +99,20 @@ def _leaves(name: str, kind: Any) -> Iterator[tuple[str, Any]]:
 
 
 class _Fields:
-    """A bundle while a kernel is compiled: its fields are the kernel's arguments."""
+    """A bundle while a kernel is compiled: its fields are the kernel's arguments; those that it reads become `used`."""
 
-    def __init__(self, name: str, kind: Any, context: Any) -> None:
-        self._name, self._kinds, self._context = name, kind.__bundled__, context
+    def __init__(self, name: str, kind: Any, context: Any, used: set[str]) -> None:
+        self._name, self._kinds, self._context, self._used = name, kind.__bundled__, context, used
 
     def __getattr__(self, field: str) -> Any:
         kind = self._kinds.get(field)
         if kind is None:
             raise AttributeError(f"{self._name.replace(SEPARATOR, '.')} has no field {field}")
         name = f"{self._name}{SEPARATOR}{field}"
-        return _Fields(name, kind, self._context) if is_bundle(kind) else self._context.get_var_by_name(name)
+        if is_bundle(kind):
+            return _Fields(name, kind, self._context, self._used)
+        self._used.add(name)
+        return self._context.get_var_by_name(name)
 
 
 def _read_source(kernel: Any, *args: Any, **keywords: Any) -> tuple[ast.Module, Any]:
@@ -120,7 +126,7 @@ def _read_source(kernel: Any, *args: Any, **keywords: Any) -> tuple[ast.Module, 
             for name, _ in _leaves(argument.arg, kind):
                 arguments.args.append(ast.copy_location(ast.arg(name, argument.annotation), argument))
             if kind is not None:
-                context.global_vars[argument.arg] = _Fields(argument.arg, kind, context)
+                context.global_vars[argument.arg] = _Fields(argument.arg, kind, context, kernel.func.__used__)
     return tree, context
 
 

@@ -18,8 +18,7 @@ from sim.core.scan import scan_in_parallel, scan_scratch_length
 
 Cells = ti.types.vector(3, ti.i32)
 
-MAX_CELLS = 2**28
-"""Most cells of a grid: 1 GiB for each of its int32 arrays, however few the particles."""
+MAX_CELLS = 2**28  # most cells of a grid: 1 GiB for each of its int32 arrays, however few the particles
 
 
 @bundle
@@ -55,19 +54,12 @@ class SortArrays(NamedTuple):
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Cubic cells that cover a box, and a search radius around it.
+    """Cubic cells that cover a box, and a search radius around it."""
 
-    Attributes:
-        origin: lower corner of the outermost cells [m].
-        cell_size: edge of a cell, at least the search radius over `reach` [m].
-        shape: number of cells along x, y, z.
-        reach: cells to either side that a search looks into.
-    """
-
-    origin: tuple[float, float, float]
-    cell_size: float
-    shape: tuple[int, int, int]
-    reach: int = 1
+    origin: tuple[float, float, float]  # lower corner of the outermost cells [m]
+    cell_size: float  # edge of a cell, at least the search radius over `reach` [m]
+    shape: tuple[int, int, int]  # number of cells along x, y, z
+    reach: int = 1  # cells to either side that a search looks into
 
     @classmethod
     def covering(
@@ -75,46 +67,24 @@ class CellGrid:
     ) -> "CellGrid":
         """The grid for a box from `low` to `high` [m].
 
-        Args:
-            low: lower corner.
-            high: upper corner.
-            search_radius: within which neighbours are wanted [m].
-            reach: cells that it spans.
+        Cells of the wanted reach are used only where `MAX_CELLS` allow: smaller cells are faster, not necessary.
 
         Raises:
-            ValueError: the box holds more than `MAX_CELLS` cells, wherever the points are.
+            ValueError: the box holds more than `MAX_CELLS` cells as wide as the search radius [m].
         """
-        cell_size = search_radius / reach
-        size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
-        shape = _shape_covering(size, search_radius, reach)
-        if not shape.prod() <= MAX_CELLS:
-            raise ValueError(
-                f"a box of {' x '.join(f'{edge:g}' for edge in size)} m has {shape.prod():.3g} neighbour cells of "
-                f"{cell_size:g} m, more than {MAX_CELLS}; give a smaller domain or a larger particle radius"
-            )
-        origin = np.asarray(low, dtype=np.float64) - search_radius
-        return cls(tuple(origin.tolist()), cell_size, tuple(shape.astype(int).tolist()), reach)
-
-    @classmethod
-    def covering_as_finely_as_fits(
-        cls, low: NDArray[np.floating], high: NDArray[np.floating], search_radius: float, *, reach: int
-    ) -> "CellGrid":
-        """As `covering`, but with cells as wide as the radius where those of the wanted reach would be too many.
-
-        Smaller cells are only faster; a box that can be searched at all is not to be refused for them.
-
-        Args:
-            low: lower corner.
-            high: upper corner.
-            search_radius: within which neighbours are wanted [m].
-            reach: cells that it is to span.
-
-        Raises:
-            ValueError: the box holds more than `MAX_CELLS` cells as wide as the radius.
-        """
-        size = np.asarray(high, dtype=np.float64) - np.asarray(low, dtype=np.float64)
-        fits = _shape_covering(size, search_radius, reach).prod() <= MAX_CELLS
-        return cls.covering(low, high, search_radius, reach=reach if fits else 1)
+        low = np.asarray(low, dtype=np.float64)
+        size = np.asarray(high, dtype=np.float64) - low
+        for tried in (reach, 1):
+            cell_size = search_radius / tried
+            # Floats, as their product may be beyond any integer.
+            shape = np.maximum(np.ceil(size / cell_size), 1.0) + 2.0 * tried
+            if shape.prod() <= MAX_CELLS:
+                origin = low - search_radius
+                return cls(tuple(origin.tolist()), cell_size, tuple(shape.astype(int).tolist()), tried)
+        raise ValueError(
+            f"a box of {' x '.join(f'{edge:g}' for edge in size)} m has {shape.prod():.3g} neighbour cells of "
+            f"{cell_size:g} m, more than {MAX_CELLS}; give a smaller domain or a larger particle radius"
+        )
 
     @cached_property
     def on_device(self) -> Grid:
@@ -126,11 +96,6 @@ class CellGrid:
         """Number of cells, the outer layers included."""
         nx, ny, nz = self.shape
         return nx * ny * nz
-
-
-def _shape_covering(size: NDArray[np.float64], search_radius: float, reach: int) -> NDArray[np.float64]:
-    """Cells along each axis, the outer layers included; floats, as their product may be beyond any integer."""
-    return np.maximum(np.ceil(size / (search_radius / reach)), 1.0) + 2.0 * reach
 
 
 class CellSort:
@@ -162,14 +127,9 @@ class CellSort:
         keep_low: tuple[float, float, float],
         keep_high: tuple[float, float, float],
     ) -> int:
-        """Order the first `count` points; returns how many of them are kept.
+        """Order the first `count` points by cell, then by distinct ids; returns how many of them are kept.
 
-        Args:
-            positions: points [m], at least (count,) of 3-vectors.
-            ids: distinct numbers that decide the order within a cell, at least (count,).
-            count: number of points.
-            keep_low: points below this on any axis are dropped [m].
-            keep_high: points above this on any axis are dropped [m].
+        Points [m] below `keep_low` or above `keep_high` [m] on any axis are dropped.
         """
         dropped = sort_points_by_cell(positions, ids, count, self.grid.on_device, keep_low, keep_high, self._arrays)
         return count - int(dropped)
@@ -198,10 +158,9 @@ def sort_points_by_cell(
     keep_high: ti.math.vec3,
     arrays: SortArrays,
 ) -> ti.i32:
-    """Counting sort: points per cell, their sums, then the points of a cell next to each other, by id.
+    """Counting sort; returns how many points were dropped, which are in one cell more than the grid has.
 
-    One cell more than the grid has takes the dropped points; returns how many. Threads race for the places in a cell,
-    the insertion sort settles it.
+    Threads race for the places in a cell, the insertion sort settles it.
     """
     cell_count = grid.shape[0] * grid.shape[1] * grid.shape[2]
     for cell in range(cell_count + 1):

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from sim.core.parameters import Parameters, Vector3
 
 Face = Literal["x-", "x+", "y-", "y+", "z-", "z+"]
+
+
+def _each_once(faces: tuple[Face, ...]) -> tuple[Face, ...]:
+    if twice := [face for face in faces if faces.count(face) > 1]:
+        raise ValueError(f'names "{twice[0]}" more than once')
+    return faces
+
+
+Faces = Annotated[tuple[Face, ...], AfterValidator(_each_once)]
 
 
 class DomainParameters(Parameters):
@@ -16,7 +25,7 @@ class DomainParameters(Parameters):
 
     min: Vector3 = Field(default=(-0.5, -0.5, 0.0), description="Lower corner [m].")
     max: Vector3 = Field(default=(0.5, 0.5, 1.0), description="Upper corner [m].")
-    open_faces: tuple[Face, ...] = Field(
+    open_faces: Faces = Field(
         default=("z+",),
         description="Faces without a wall; fluid that leaves through them is removed and counted.",
     )

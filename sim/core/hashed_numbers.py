@@ -6,8 +6,7 @@ import taichi as ti
 
 ALL_BITS = 0xFFFFFFFF
 
-GOLDEN = 2654435769
-"""An odd factor that spreads small numbers over all 32 bits (Knuth)."""
+GOLDEN = 2654435769  # an odd factor that spreads small numbers over all 32 bits (Knuth)
 
 
 @ti.func

@@ -1,8 +1,7 @@
-"""Small arrays between the host and the device, in every substep.
+"""Copies of small arrays between the host and the device, in every substep.
 
-Taichi copies an array from or to the host by a kernel, which takes 0.2 ms however small the array is: the poses of one
-ball cost a sheet of 10 000 nodes a fifth of its substep. On a CPU the array's memory is the host's own. This relies on
-Taichi's internals, as `sim.core.launch` does.
+Taichi copies an array by a kernel, which takes 0.2 ms however small it is. On a CPU the memory is the host's own.
+This relies on Taichi's internals, as `sim.core.launch` does.
 """
 
 import ctypes
@@ -18,11 +17,7 @@ from sim.core.reductions import runs_on_gpu
 
 
 def put(array: ti.Ndarray, values: NDArray[np.generic]) -> None:
-    """Fill an array with numbers of its shape, vectors and matrices along the last axes, converted to its type.
-
-    Raises:
-        ValueError: the shapes differ.
-    """
+    """Fill an array with numbers of its shape, vectors and matrices along the last axes, converted to its type."""
     if not runs_on_gpu():
         own = _memory(array)
         if values.shape != own.shape:

@@ -1,12 +1,11 @@
 """Kernel launches that cost little of the host's time.
 
-Taichi looks at every argument of every call several times: the launch of a kernel with 17 arguments takes 0.14 ms of
-Python, longer than the kernel itself runs on a GPU for 100 000 particles. `fast_launch` has Taichi check the types of
-a call once, and from then on hands the arguments of calls with the same types straight to the runtime. On a CPU it also
-keeps what the runtime has of the arrays of a call, as most calls come again with the same ones. Measurements:
-docs/performance.md.
+Taichi looks at every argument of every call several times. `FastKernel` has Taichi check the types of a call once, and
+hands the arguments of later calls with the same types straight to the runtime, but for fields of bundles that the
+kernel does not read. On a CPU it also keeps the context of a launch, as most calls come again with the same arrays.
+Measurements: docs/performance.md.
 
-This relies on Taichi's internals, as `sim.core.tracing`, `sim.core.runtime` and `sim.core.reductions` do; the lock file
+This relies on Taichi's internals, as `sim.core.bundles`, `sim.core.runtime` and `sim.core.reductions` do; the lock file
 pins the release that they belong to.
 """
 
@@ -21,17 +20,15 @@ from taichi.lang.matrix import VectorType
 from taichi.types import primitive_types
 from taichi.types.ndarray_type import NdarrayType
 
-from sim.core.bundles import flattened, with_fields_as_arguments
+from sim.core.bundles import flattened, is_used, with_fields_as_arguments
 
 _REAL_TYPES = frozenset(primitive_types.real_types)
 
-MOST_LAUNCHES = 256
-"""Of so many combinations of arrays at most a kernel remembers the arguments."""
+MOST_LAUNCHES = 256  # most combinations of arrays whose launch context a kernel keeps
 
 
 class _Launch(NamedTuple):
-    """A call that a kernel remembers, until nobody else has one of its arrays any more; `numbers` are what the context
-    has, by argument."""
+    """A kept launch context, until one of its arrays is gone; `numbers` are what the context has, by argument."""
 
     compiled: Any
     context: Any
@@ -40,7 +37,7 @@ class _Launch(NamedTuple):
 
 
 def _forget(launches: dict[tuple[Any, ...], _Launch], key: tuple[Any, ...], _: object) -> None:
-    """Forget a call, one of whose arrays is gone: another may have its number from now on."""
+    """Drop a context, one of whose arrays is gone: another array may have its `id` from now on."""
     launches.pop(key, None)
 
 
@@ -49,6 +46,9 @@ class FastKernel:
 
     Arguments are arrays made by Taichi, numbers, vectors and compile-time values, all of them by position; the result
     is nothing, a number, or a list of a vector's numbers: Taichi's own vectors take 0.1 ms to make.
+
+    Raises:
+        TypeError: the kernel takes arguments of a type that it cannot pass.
     """
 
     def __init__(self, kernel: Any) -> None:
@@ -59,14 +59,7 @@ class FastKernel:
         self._compiled: dict[tuple[Any, ...], tuple[Any, Any]] = {}
         self._launches: dict[tuple[Any, ...], _Launch] = {}
         self._on_cpu = False
-        self._templates: list[int] = []
-        self._arrays: list[tuple[int, tuple[int]]] = []
-        self._floats: list[tuple[int, tuple[int]]] = []
-        self._integers: list[tuple[int, tuple[int]]] = []
-        self._float_vectors: list[tuple[int, list[tuple[int, int]]]] = []
-        self._integer_vectors: list[tuple[int, list[tuple[int, int]]]] = []
-        for index, argument in enumerate(self._primal.arguments):
-            self._sort_argument(index, argument.annotation)
+        self._sort_arguments()
 
     def __call__(self, *args: Any) -> Any:
         """Launch; waits for the device only where the kernel returns something."""
@@ -94,10 +87,10 @@ class FastKernel:
         return tuple(flattened(args))
 
     def _call_on_cpu(self, program: Any, args: tuple[Any, ...]) -> Any:
-        """Launch with what is known of these arrays from an earlier call.
+        """Launch with the context of an earlier call with these arrays.
 
-        Arrays are passed by their addresses, as those of other libraries are: Taichi's own it would have to look up in
-        every launch, and what it finds replaces what it was told. On a GPU the arguments do not outlive the launch.
+        Arrays are passed by their addresses, as those of other libraries are: Taichi would look up its own in every
+        launch. On a GPU the arguments do not outlive the launch.
         """
         arrays = [args[index] for index, _ in self._arrays]
         key = (*[args[index] for index in self._templates], *map(id, arrays))
@@ -127,10 +120,13 @@ class FastKernel:
     def _first_call(self, program: Any, args: tuple[Any, ...]) -> Any:
         """Call as Taichi does, which checks the types, compiles, and says what is wrong."""
         result = self._primal(*args)
+        if self._used_count != len(getattr(self._primal.func, "__used__", ())):
+            self._compiled, self._launches = {}, {}  # their keys are of other arguments
+            self._sort_arguments()
         kernel = self._primal.compiled_kernels[self._primal.ensure_compiled(*args)]
         compiled = program.compile_kernel(program.config(), program.get_device_caps(), kernel)
         self._compiled[self._key(args)] = kernel, compiled
-        return list(result) if self._returns_vector else result
+        return result.to_numpy().tolist() if self._returns_vector else result
 
     def _launch(self, program: Any, compiled: Any, context: Any, args: tuple[Any, ...], passed: list[Any]) -> Any:
         """Launch with arrays that the context has, and these numbers, of which it has those that are `passed`."""
@@ -150,12 +146,22 @@ class FastKernel:
         """As a method of a `ti.data_oriented` class: the owner is its first compile-time value."""
         return self if owner is None else functools.partial(self, owner)
 
-    def _sort_argument(self, index: int, annotation: Any) -> None:
-        """Note how argument `index` is passed, and at which place among those that are not compile-time values."""
-        if isinstance(annotation, ti.template):
-            self._templates.append(index)
-            return
-        place = index - len(self._templates)
+    def _sort_arguments(self) -> None:
+        """Note how each argument that is used is passed, and at which place among those that are no templates."""
+        self._templates: list[int] = []
+        self._arrays: list[tuple[int, tuple[int]]] = []
+        self._floats: list[tuple[int, tuple[int]]] = []
+        self._integers: list[tuple[int, tuple[int]]] = []
+        self._float_vectors: list[tuple[int, list[tuple[int, int]]]] = []
+        self._integer_vectors: list[tuple[int, list[tuple[int, int]]]] = []
+        for index, argument in enumerate(self._primal.arguments):
+            if isinstance(argument.annotation, ti.template):
+                self._templates.append(index)
+            elif is_used(self._primal.func, argument.name):
+                self._sort_argument(index, index - len(self._templates), argument.annotation)
+        self._used_count = len(getattr(self._primal.func, "__used__", ()))
+
+    def _sort_argument(self, index: int, place: int, annotation: Any) -> None:
         if isinstance(annotation, NdarrayType):
             self._arrays.append((index, (place,)))
         elif isinstance(annotation, VectorType):
@@ -166,7 +172,7 @@ class FastKernel:
         elif annotation in (ti.i32, ti.i64):
             self._integers.append((index, (place,)))
         else:
-            raise TypeError(f"fast_launch cannot pass arguments of type {annotation}")
+            raise TypeError(f"a fast kernel cannot pass arguments of type {annotation}")
 
     @property
     def _returns_vector(self) -> bool:
@@ -191,18 +197,9 @@ class FastKernel:
 
 
 def kernel(function: Callable[..., Any]) -> FastKernel:
-    """Decorator in place of `ti.kernel`: the kernel may take bundles, and its launches are fast.
-
-    Raises:
-        TypeError: it takes arguments of a type that cannot be passed fast.
-    """
+    """Decorator in place of `ti.kernel`: the kernel may take bundles, and its launches are fast."""
     return FastKernel(ti.kernel(with_fields_as_arguments(function)))
 
 
-def fast_launch(kernel: Any) -> FastKernel:
-    """Decorator that stands above `ti.kernel`.
-
-    Raises:
-        TypeError: the kernel takes arguments of a type that it cannot pass.
-    """
-    return FastKernel(kernel)
+fast_launch = FastKernel
+"""Decorator that stands above `ti.kernel`, for methods: Taichi looks at the frame that calls it for their class."""

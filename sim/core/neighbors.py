@@ -1,11 +1,8 @@
 """Neighbours within a fixed radius: one compact list for all particles.
 
 The cells (`sim.core.cells`) are cubes as wide as the search radius, or half as wide (`cells_per_radius`). The list is
-counted before it is filled and grows when it must, so no particle and no cell has a limit of its own.
-
-The list reaches a skin farther than the kernel's support (Verlet 1967), and stays valid until a particle has moved
-half of that skin. The order of the particles, and so of every sum over neighbours, changes only when it is rebuilt;
-within a cell it is the order of the particle ids, whatever the number of threads.
+counted before it is filled and grows when it must, so no particle and no cell has a limit of its own. Within a cell
+particles are in the order of their ids, whatever the number of threads.
 """
 
 from typing import NamedTuple
@@ -20,22 +17,14 @@ from sim.core.reductions import runs_on_gpu
 from sim.core.scan import scan_in_parallel, scan_scratch_length
 
 GROWTH = 1.25
-WARP = 32
-"""Threads of a GPU that read memory together."""
-
-MAX_LIST_LENGTH = 2**31 - 1
-"""Most entries of a neighbour list, as their places are int32."""
-
-LEAST_FINE_SUPPORT = 3.0
-"""Support radius in particle spacings from which on a GPU searches in cells of half a radius."""
-
-MASK_BITS, MASKS_A_ROW = 32, 2
-"""Candidates that one int32 has bits for, and int32 for each row of cells."""
-
-ROUNDING_MARGIN = 1.0e-5
-"""Relative margin on a squared radius: far above the rounding of float32, far below the spacing of particles."""
+WARP = 32  # threads of a GPU that read memory together
+MAX_LIST_LENGTH = 2**31 - 1  # most entries of a neighbour list, as their places are int32
+LEAST_FINE_SUPPORT = 3.0  # support radius in particle spacings from which on a GPU searches in cells of half a radius
+MASK_BITS, MASKS_A_ROW = 32, 2  # candidates that one int32 has bits for, and int32 for each row of cells
+ROUNDING_MARGIN = 1.0e-5  # on a squared radius: far above the rounding of float32, far below spacings
 
 Lengths = ti.types.vector(2, ti.i32)
+Point = ti.math.vec3
 
 
 @bundle
@@ -65,7 +54,7 @@ class Search(NamedTuple):
 
 @bundle
 class Slices(NamedTuple):
-    """Layout of the list: so many particles as the stride share a slice."""
+    """Layout of the list: as many particles as the stride share a slice."""
 
     count: ti.i32
     room: Integers  # places of each slice, (slices,)
@@ -108,15 +97,7 @@ class NeighborList:
         moving: SortedPoints | None,
         moving_index: ti.Ndarray,
     ) -> None:
-        """Find all neighbours of the first `count` particles, themselves excluded.
-
-        Args:
-            radius: search radius, at most the size of as many cells as the grid's reach [m].
-            points: the particles.
-            count: number of particles.
-            fixed: boundary samples that never move; their place among the sorted is their index.
-            moving: boundary samples that move, or None.
-            moving_index: index of each of the sorted moving samples.
+        """Find all neighbours of the first `count` particles within a radius [m]; see `Search`.
 
         Raises:
             OverflowError: there are more neighbours than `MAX_LIST_LENGTH`.
@@ -151,8 +132,7 @@ def list_stride() -> int:
 def cells_per_radius(support_in_spacings: float) -> int:
     """Cells that a search radius spans to either side, as is fastest on the device Taichi runs on.
 
-    On a GPU half as large cells leave out a third of the candidates, and bring particles of a warp nearer together.
-    They pay where they still hold several particles.
+    On a GPU half as large cells leave out a third of the candidates; they pay where they still hold several particles.
     """
     return 2 if runs_on_gpu() and support_in_spacings >= LEAST_FINE_SUPPORT else 1
 
@@ -163,7 +143,7 @@ def _slice_count(count: int, stride: int) -> int:
 
 @func
 def cells_in_reach(
-    point: ti.math.vec3, cell: Cells, dy: ti.i32, dz: ti.i32, grid: Grid, radius_squared: ti.f32
+    point: Point, cell: Cells, dy: ti.i32, dz: ti.i32, grid: Grid, radius_squared: ti.f32
 ) -> ti.math.ivec2:
     """Cells of a row that the sphere around a point touches: the first, and the one after the last, from its own."""
     cell_size = 1.0 / grid.inverse_cell_size
@@ -185,11 +165,11 @@ def cells_in_reach(
 
 @func
 def count_near(
-    point: ti.math.vec3, cell: Cells, points: SortedPoints, grid: Grid, radius_squared: ti.f32, on_gpu: ti.template()
+    point: Point, cell: Cells, points: SortedPoints, grid: Grid, radius_squared: ti.f32, on_gpu: ti.template()
 ) -> ti.i32:
     """Number of points within the radius; without a branch on the distance, so that it becomes vector code.
 
-    A CPU reads whole rows of cells: loops of uneven length cost it more than the points that they leave out.
+    A CPU reads whole rows of cells: loops of uneven length cost it more.
     """
     near = 0
     for dz in range(-grid.reach, grid.reach + 1):
@@ -206,15 +186,13 @@ def count_near(
 
 @func
 def count_neighbors(search: Search, lists: Neighbors):
-    """Bounds on the numbers of neighbours of each particle, itself included, and of boundary samples.
-
-    The radius is a little larger than that of the list: there a distance may be rounded differently.
-    """
+    """Upper bounds of the numbers of neighbours, the particle itself included, and of boundary samples."""
+    # A little more than the radius of the list, where a distance may be rounded differently.
     radius_squared = search.radius * search.radius * (1.0 + ROUNDING_MARGIN)
     on_gpu = ti.static(lists.stride > 1)
     ti.loop_config(block_dim=128)
     for i in range(search.count):
-        x_i = ti.math.vec3(search.points.x[i], search.points.y[i], search.points.z[i])
+        x_i = Point(search.points.x[i], search.points.y[i], search.points.z[i])
         cell = cell_of_point(x_i, search.grid)
         lists.fluid_count[i] = count_near(x_i, cell, search.points, search.grid, radius_squared, on_gpu)
         boundary_near = count_near(x_i, cell, search.fixed, search.grid, radius_squared, on_gpu)
@@ -228,13 +206,11 @@ def measure_lists(search: Search, lists: Neighbors, slices: Slices) -> Lengths:
     """Count neighbours, and lay out the list: each slice of `stride` particles gets `stride` times its longest list.
 
     Returns the places of all slices, as int32, and roughly the thousands of them, which do not overflow.
-
-    The count includes the particle itself: the list uses that place to write before it knows whether to keep.
-    A particle at NaN is not even near itself, and needs the place too.
     """
     count_neighbors(search, lists)
     total = 0.0
     for s in range(slices.count):
+        # Every particle has one place to write to before it knows whether to keep; one at NaN is not even near itself.
         longest = 1
         for i in range(s * lists.stride, ti.min((s + 1) * lists.stride, search.count)):
             longest = ti.max(longest, lists.fluid_count[i] + lists.boundary_count[i])
@@ -245,7 +221,7 @@ def measure_lists(search: Search, lists: Neighbors, slices: Slices) -> Lengths:
 
 
 @func
-def is_inside(point: ti.math.vec3, points: SortedPoints, j: ti.i32, own: ti.i32, radius_squared: ti.f32) -> ti.i32:
+def is_inside(point: Point, points: SortedPoints, j: ti.i32, own: ti.i32, radius_squared: ti.f32) -> ti.i32:
     """Whether a candidate is within the radius, and not `own`."""
     d_x, d_y, d_z = point[0] - points.x[j], point[1] - points.y[j], point[2] - points.z[j]
     return ti.cast(d_x * d_x + d_y * d_y + d_z * d_z < radius_squared, ti.i32) & ti.cast(j != own, ti.i32)
@@ -253,7 +229,7 @@ def is_inside(point: ti.math.vec3, points: SortedPoints, j: ti.i32, own: ti.i32,
 
 @func
 def mask_of_near(
-    point: ti.math.vec3, points: SortedPoints, first: ti.i32, last: ti.i32, own: ti.i32, radius_squared: ti.f32
+    point: Point, points: SortedPoints, first: ti.i32, last: ti.i32, own: ti.i32, radius_squared: ti.f32
 ) -> ti.i32:
     """Which of the first 32 points of a range are within the radius, but `own`, from the highest bit down."""
     mask = 0
@@ -263,83 +239,52 @@ def mask_of_near(
 
 
 @func
-def list_range(
-    point: ti.math.vec3,
-    points: SortedPoints,
-    first: ti.i32,
-    last: ti.i32,
-    own: ti.i32,
-    radius_squared: ti.f32,
-    lists: Neighbors,
-    start: ti.i32,
-    found: ti.i32,
+def list_row_by_row(
+    point: Point, points: SortedPoints, search: Search, own: ti.i32, lists: Neighbors, start: ti.i32, found: ti.i32
 ) -> ti.i32:
-    """Append the points of a range within the radius, but `own`; returns how many there are now.
+    """Append the points within the radius, but `own`; returns how many entries there are now.
 
-    A CPU writes every candidate, and the place moves on only for those inside: it would mispredict a branch for every
-    third. A GPU tests 32 candidates without a branch before it writes those inside.
+    A CPU writes every candidate, and the place moves on only for those inside, without a branch to mispredict. A GPU
+    tests 32 candidates before it writes those inside.
     """
     n = found
-    if ti.static(lists.stride > 1):
-        group = first
-        while group < last:
-            mask = mask_of_near(point, points, group, last, own, radius_squared)
-            while mask != 0:
-                k = ti.math.clz(mask)
-                mask ^= 1 << (MASK_BITS - 1 - k)
-                lists.indices[start + n * lists.stride] = group + k
-                n += 1
-            group += MASK_BITS
-    else:
-        for j in range(first, last):
-            inside = is_inside(point, points, j, own, radius_squared)
-            lists.indices[start + n * lists.stride] = j
-            n += inside
-    return n
-
-
-@func
-def list_row_by_row(
-    point: ti.math.vec3,
-    cell: Cells,
-    points: SortedPoints,
-    grid: Grid,
-    radius_squared: ti.f32,
-    own: ti.i32,
-    lists: Neighbors,
-    start: ti.i32,
-    found: ti.i32,
-) -> ti.i32:
-    """Append the points within the radius, but `own`; returns how many entries there are now."""
-    n = found
-    for dz in range(-grid.reach, grid.reach + 1):
-        for dy in range(-grid.reach, grid.reach + 1):
-            touched = cells_in_reach(point, cell, dy, dz, grid, radius_squared)
-            row = row_of_cell(cell, dy, dz, grid)
+    radius_squared = search.radius * search.radius
+    cell = cell_of_point(point, search.grid)
+    for dz in range(-search.grid.reach, search.grid.reach + 1):
+        for dy in range(-search.grid.reach, search.grid.reach + 1):
+            touched = cells_in_reach(point, cell, dy, dz, search.grid, radius_squared)
+            row = row_of_cell(cell, dy, dz, search.grid)
             first, last = points.cell_start[row + touched[0]], points.cell_start[row + touched[1]]
-            n = list_range(point, points, first, last, own, radius_squared, lists, start, n)
+            if ti.static(lists.stride > 1):
+                group = first
+                while group < last:
+                    mask = mask_of_near(point, points, group, last, own, radius_squared)
+                    while mask != 0:
+                        k = ti.math.clz(mask)
+                        mask ^= 1 << (MASK_BITS - 1 - k)
+                        lists.indices[start + n * lists.stride] = group + k
+                        n += 1
+                    group += MASK_BITS
+            else:
+                for j in range(first, last):
+                    inside = is_inside(point, points, j, own, radius_squared)
+                    lists.indices[start + n * lists.stride] = j
+                    n += inside
     return n
 
 
 @func
 def list_in_step(
-    point: ti.math.vec3,
-    cell: Cells,
-    points: SortedPoints,
-    grid: Grid,
-    radius_squared: ti.f32,
-    own: ti.i32,
-    lists: Neighbors,
-    start: ti.i32,
-    found: ti.i32,
+    point: Point, points: SortedPoints, search: Search, own: ti.i32, lists: Neighbors, start: ti.i32, found: ti.i32
 ) -> ti.i32:
     """As `list_row_by_row`, for a GPU: all candidates are tested before those within the radius are written.
 
-    The threads of a warp, whose lists are interleaved, then write their first entries at one time and at neighbouring
-    addresses, then their second ones, and so on; written as they are found, every entry is an access of its own. This
-    pays from hundreds of neighbours on. Rows of more candidates than the masks hold take more than one turn.
+    The threads of a warp, whose lists are interleaved, then write at neighbouring addresses at one time. This pays from
+    hundreds of neighbours on. Rows of more candidates than the masks hold take more than one turn.
     """
-    width = ti.static(2 * grid.reach + 1)
+    width = ti.static(2 * search.grid.reach + 1)
+    radius_squared = search.radius * search.radius
+    cell = cell_of_point(point, search.grid)
     n = found
     passed = 0
     while passed >= 0:
@@ -348,9 +293,9 @@ def list_in_step(
         entries = 0
         next_passed = -1
         for r in range(width * width):
-            dy, dz = r % width - grid.reach, r // width - grid.reach
-            touched = cells_in_reach(point, cell, dy, dz, grid, radius_squared)
-            row = row_of_cell(cell, dy, dz, grid)
+            dy, dz = r % width - search.grid.reach, r // width - search.grid.reach
+            touched = cells_in_reach(point, cell, dy, dz, search.grid, radius_squared)
+            row = row_of_cell(cell, dy, dz, search.grid)
             first, last = points.cell_start[row + touched[0]] + passed, points.cell_start[row + touched[1]]
             firsts[r] = first
             for part in ti.static(range(MASKS_A_ROW)):
@@ -375,44 +320,31 @@ def list_in_step(
 
 @func
 def list_near(
-    point: ti.math.vec3,
-    cell: Cells,
-    points: SortedPoints,
-    grid: Grid,
-    radius_squared: ti.f32,
-    own: ti.i32,
-    lists: Neighbors,
-    start: ti.i32,
-    found: ti.i32,
+    point: Point, points: SortedPoints, search: Search, own: ti.i32, lists: Neighbors, start: ti.i32, found: ti.i32
 ) -> ti.i32:
-    """Append the points within the radius, but `own`; returns how many entries there are now."""
+    """Append the points within the radius, but `own`, as suits the list; returns how many entries there are now."""
     n = found
-    if ti.static(lists.stride > 1 and grid.reach > 1):
-        n = list_in_step(point, cell, points, grid, radius_squared, own, lists, start, found)
+    if ti.static(lists.stride > 1 and search.grid.reach > 1):
+        n = list_in_step(point, points, search, own, lists, start, found)
     else:
-        n = list_row_by_row(point, cell, points, grid, radius_squared, own, lists, start, found)
+        n = list_row_by_row(point, points, search, own, lists, start, found)
     return n
 
 
 @kernel
 def list_neighbors(search: Search, lists: Neighbors, slices: Slices):
-    """Write the neighbours of each particle; `boundary_count` holds an upper bound of its boundary samples before.
-
-    Candidates are those of the rows of cells, as far along x as the sphere reaches into the row.
-    """
-    radius_squared = search.radius * search.radius
+    """Write the neighbours of each particle; `boundary_count` holds an upper bound of its boundary samples before."""
     ti.loop_config(block_dim=128)
     for i in range(search.count):
-        x_i = ti.math.vec3(search.points.x[i], search.points.y[i], search.points.z[i])
-        cell = cell_of_point(x_i, search.grid)
+        x_i = Point(search.points.x[i], search.points.y[i], search.points.z[i])
         first = slices.start[i // lists.stride] + i % lists.stride
-        fluid_found = list_near(x_i, cell, search.points, search.grid, radius_squared, i, lists, first, 0)
+        fluid_found = list_near(x_i, search.points, search, i, lists, first, 0)
         found = fluid_found
         if lists.boundary_count[i] > 0:
-            found = list_near(x_i, cell, search.fixed, search.grid, radius_squared, -1, lists, first, fluid_found)
+            found = list_near(x_i, search.fixed, search, -1, lists, first, fluid_found)
             if ti.static(search.with_moving):
                 fixed_found = found
-                found = list_near(x_i, cell, search.moving, search.grid, radius_squared, -1, lists, first, fixed_found)
+                found = list_near(x_i, search.moving, search, -1, lists, first, fixed_found)
                 for k in range(fixed_found, found):
                     place = first + k * lists.stride
                     lists.indices[place] = search.moving_index[lists.indices[place]]

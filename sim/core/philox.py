@@ -18,12 +18,7 @@ _SHIFT = np.uint64(32)
 
 
 def philox(counter: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike], key: tuple[int, int]) -> UInt32Array:
-    """Four random words for each counter, (4, n).
-
-    Args:
-        counter: four words each, integers below 2^32; arrays of (n,) or numbers.
-        key: two words, integers below 2^32.
-    """
+    """Four random words for each counter, (4, n); counters are arrays (n,) or numbers, all words are below 2^32."""
     words = [np.asarray(word, dtype=np.uint64) for word in np.broadcast_arrays(*map(np.atleast_1d, counter))]
     first, second = key
     for _ in range(_ROUNDS):

@@ -17,15 +17,9 @@ from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 
 CPU_LANES = 256
-GPU_LANES = 32768
-"""Few for a CPU, whose threads read best what lies together; enough for a GPU to be busy."""
-
-BRANCHES, LAST_BRANCHES = 128, 16
-"""Numbers that one node of the tree takes together: of lanes, and at last. A GPU, whose threads wait for every number
-that they add, has 256 nodes in between; a CPU has two."""
-
-MAX_QUANTITIES = 8
-"""Most maxima and sums of one reduction: a kernel returns so many at once, which costs less than to read an array."""
+GPU_LANES = 32768  # few for a CPU, whose threads read best what lies together; enough for a GPU to be busy
+BRANCHES, LAST_BRANCHES = 128, 16  # numbers that one node of the tree takes together: of lanes, and at last
+MAX_QUANTITIES = 8  # most maxima and sums of one reduction, which its kernel returns as a vector
 
 Results = ti.types.vector(MAX_QUANTITIES, ti.f32)
 
@@ -43,7 +37,7 @@ class Tree(NamedTuple):
 
 @bundle
 class Share(NamedTuple):
-    """A reduction over so many numbers: lane l has the numbers l * lane_step + k * item_step, k < items."""
+    """The numbers of each lane: lane l has the numbers l * lane_step + k * item_step, k < items."""
 
     items: ti.i32
     lane_step: ti.i32
@@ -127,8 +121,7 @@ def is_finite(value: ti.f32) -> ti.i32:
 
 @func
 def reduced(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, nodes: Floats) -> Results:
-    """More levels of the tree: `BRANCHES` lanes to a node, nodes to `LAST_BRANCHES`, these to one, in the same order
-    always.
+    """More levels of the tree: `BRANCHES` lanes to a node, nodes to `LAST_BRANCHES`, these to one, in a fixed order.
 
     For the outermost level of a kernel, after the loop over the lanes: its loops then run in parallel.
     """

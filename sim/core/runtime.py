@@ -1,15 +1,13 @@
-"""Start Taichi once, on a device that is known to work.
+"""Start of Taichi, on a device that is known to work; importing this module does not load Taichi.
 
 A driver that is half there can end the process inside `ti.init`, without an exception. So a back end other than the
 CPU is first tried in a child process (`python -m sim.core.runtime --probe cuda`), and the answer is remembered.
-
-Importing this module does not load Taichi. Floating-point code is compiled with `fast_math`: `x != x` is optimized
-away in kernels; test for NaN with `sim.core.reductions.is_finite`.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import contextlib
 import hashlib
 import io
@@ -25,24 +23,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from sim.core.parameters import Device
-from sim.core.tracing import tell_positions_unwrapped
 
 if TYPE_CHECKING:
     from types import ModuleType
 
-PREFERENCE = ("cuda", "metal", "vulkan", "cpu")
-"""The order in which `auto` takes a device."""
+PREFERENCE = ("cuda", "metal", "vulkan", "cpu")  # the order in which `auto` takes a device
 
 PROBE_TIMEOUT_S = 120.0
 STALE_LOCK_S = 600.0
 
-KEPT_KERNELS_BYTES = 2**30
-"""What is kept of compiled kernels. By itself Taichi keeps 100 MiB, a few scenes: the next one would compile anew."""
-
-MOST_FIELD_TREES = 512
-"""Taichi's `kMaxNumSnodeTreesLlvm`: it does not count, and what comes after would overwrite its thread pool."""
-FIELD_TREES_OF_A_SOLVER = 12
-"""Fields that are made before any of them is used share a tree; a smoke with its couplings makes no more of these."""
+KEPT_KERNELS_BYTES = 2**30  # Taichi by itself keeps 100 MiB, a few scenes
 OK = "ok"
 
 _in_use: dict[str, Any] = {}
@@ -67,7 +57,7 @@ class DeviceUnavailableError(RuntimeError):
 
 
 def initialize(device: Device = "auto", *, threads: int | None = None) -> str:
-    """Start Taichi on a device; the only `ti.init` of the project.
+    """Start Taichi on a device and return its back end, such as "cpu"; the only `ti.init` of the project.
 
     A second call that asks for what runs already (or for "auto") changes nothing.
 
@@ -75,16 +65,18 @@ def initialize(device: Device = "auto", *, threads: int | None = None) -> str:
         device: where to run; "auto" takes the first of `PREFERENCE` that works.
         threads: CPU threads; those that the process may use if omitted. Results do not depend on it.
 
-    Returns:
-        The back end in use: "cpu", "cuda", "vulkan" or "metal".
-
     Raises:
         DeviceUnavailableError: that device does not work here, or Taichi itself does not load.
         RuntimeError: Taichi runs already on another device or with another number of threads.
     """
     if _in_use:
-        _refuse_change(device, threads)
-        return str(_in_use["device"])
+        running, its_threads = _in_use["device"], _in_use["threads"]
+        if device not in ("auto", running) or threads not in (None, its_threads):
+            raise RuntimeError(
+                f'Taichi runs on "{running}" with {its_threads} threads in this process already, asked for "{device}" '
+                f"with {threads or its_threads}"
+            )
+        return str(running)
     backend = resolve_device(device)
     thread_count = threads if threads is not None else _usable_cores()
     _start_taichi(backend, thread_count)
@@ -99,7 +91,8 @@ def resolve_device(device: Device) -> str:
         DeviceUnavailableError: that device does not work here.
     """
     if device == "auto":
-        return _first_working_device()
+        devices = available_devices()
+        return next((name for name in PREFERENCE if devices.get(name) == OK), "cpu")
     if device != "cpu":
         reason = available_devices().get(device, "unknown device")
         if reason != OK:
@@ -110,8 +103,7 @@ def resolve_device(device: Device) -> str:
 def available_devices() -> dict[str, str]:
     """Every device by name: "ok", or the reason why it does not work on this machine.
 
-    Each back end is tried in a child process. The answers are kept in the user's cache folder until Taichi, the
-    driver or the visible devices change.
+    The answers are kept in the user's cache folder until Taichi, the driver or the visible devices change.
     """
     key = _machine_key()
     path = cache_folder() / "devices.json"
@@ -128,31 +120,8 @@ def available_devices() -> dict[str, str]:
     return answers
 
 
-def require_room_for_fields() -> None:
-    """See that a process can hold the fields of one more smoke, and of what is coupled to it.
-
-    Taichi keeps fields until the process ends. Scenes are simulated in processes of their own, so only one that builds
-    dozens of them, as tests do, can run out.
-
-    Raises:
-        RuntimeError: too many fields were made in this process.
-    """
-    from taichi.lang import impl
-
-    trees = impl.get_runtime().prog.get_snode_tree_size()
-    if trees + FIELD_TREES_OF_A_SOLVER > MOST_FIELD_TREES:
-        raise RuntimeError(
-            f"this process has made {trees} groups of Taichi fields, which are kept until it ends, and Taichi holds "
-            f"{MOST_FIELD_TREES}; build further scenes in another process"
-        )
-
-
 def import_taichi() -> ModuleType:
-    """Import Taichi, and say clearly what is missing where that fails.
-
-    Raises:
-        DeviceUnavailableError: Taichi is absent or a shared library that it needs is.
-    """
+    """Taichi; raises DeviceUnavailableError where it or a shared library that it needs is absent."""
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             import taichi
@@ -160,20 +129,6 @@ def import_taichi() -> ModuleType:
         remedy = "; install it with: apt-get install libx11-6" if "libX11" in str(error) else ""
         raise DeviceUnavailableError("cpu", f"Taichi does not load: {error}{remedy}") from error
     return taichi  # type: ignore[no-any-return]
-
-
-def _refuse_change(device: str, threads: int | None) -> None:
-    if device not in ("auto", _in_use["device"]):
-        raise RuntimeError(f'Taichi runs on "{_in_use["device"]}" in this process already, asked for "{device}"')
-    if threads not in (None, _in_use["threads"]):
-        raise RuntimeError(
-            f"Taichi runs with {_in_use['threads']} threads in this process already, asked for {threads}"
-        )
-
-
-def _first_working_device() -> str:
-    devices = available_devices()
-    return next((name for name in PREFERENCE if devices.get(name) == OK), "cpu")
 
 
 def _usable_cores() -> int:
@@ -184,7 +139,9 @@ def _usable_cores() -> int:
 
 def _start_taichi(device: str, threads: int) -> None:
     ti = import_taichi()
-    tell_positions_unwrapped()
+    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+    ASTTransformerContext.get_pos_info = _unwrapped_position
     kernel_cache = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or cache_folder() / "kernels")
     _remove_stale_lock(kernel_cache)
     # Taichi announces its back end with a bare print.
@@ -202,8 +159,22 @@ def _start_taichi(device: str, threads: int) -> None:
         )
 
 
+def _unwrapped_position(context: Any, node: ast.expr | ast.stmt) -> str:
+    """File, line and function of a node of a kernel, its source line, and its part of that line underlined.
+
+    Taichi says so of every expression that it traces, for errors that hardly any of them ever has. Its own wrapping of
+    both lines to 80 columns takes as long as all the rest of the tracing.
+    """
+    line = context.src[node.lineno - 1].rstrip()
+    start = context.indent + node.col_offset
+    one_line = node.end_lineno == node.lineno and node.end_col_offset is not None
+    end = context.indent + (node.end_col_offset or 0) if one_line else len(line)
+    place = f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}:'
+    return f"{place}\n{line}\n{' ' * start}{'^' * (end - start)}\n"
+
+
 def _remove_stale_lock(kernel_cache: Path) -> None:
-    """Remove the lock of a process that was killed while it wrote; else no kernel would be kept any more."""
+    """Remove the lock of a process that was killed while it wrote: with it no kernel would be kept any more."""
     for lock in kernel_cache.glob("**/*.lock"):
         with contextlib.suppress(FileNotFoundError):
             if time.time() - lock.stat().st_mtime > STALE_LOCK_S:

@@ -6,11 +6,8 @@ from sim.core.arrays import Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
 
-RUN = 32
-"""Values that a thread adds up: int32 of one cache line of a GPU, which its thread reads and no other."""
-
-LEVELS = 3
-"""Levels of the tree of runs, besides the values; what is left, 1 of 32768 sums, one thread adds up."""
+RUN = 32  # values that a thread adds up: int32 of one cache line of a GPU
+LEVELS = 3  # levels of the tree of runs, besides the values; one thread adds up what is left
 
 
 def scan_scratch_length(length: int) -> int:
@@ -20,18 +17,6 @@ def scan_scratch_length(length: int) -> int:
         level = _runs_of(level)
         total += level
     return max(total, 1)
-
-
-def exclusive_scan(values: ti.Ndarray, length: int, scratch: ti.Ndarray, result: ti.Ndarray) -> int:
-    """result[k] = sum of values[:k] for k = 0 ... length; returns the last of them.
-
-    Args:
-        values: int32, at least (length,).
-        length: how many there are.
-        scratch: int32, at least (scan_scratch_length(length),).
-        result: int32, at least (length + 1,).
-    """
-    return int(scan_values(values, length, scratch, result))
 
 
 def _runs_of(length: int) -> int:
@@ -94,6 +79,9 @@ def scan_in_parallel(values: Integers, length: ti.i32, scratch: Integers, result
 
 
 @kernel
-def scan_values(values: Integers, length: ti.i32, scratch: Integers, result: Integers) -> ti.i32:
-    """The scan alone."""
+def exclusive_scan(values: Integers, length: ti.i32, scratch: Integers, result: Integers) -> ti.i32:
+    """result[k] = sum of values[:k] for k = 0 ... length; returns the last of them.
+
+    `scratch` has at least `scan_scratch_length(length)` elements.
+    """
     return scan_in_parallel(values, length, scratch, result)

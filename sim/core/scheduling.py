@@ -1,17 +1,12 @@
 """Division of the loops of kernels among the threads of a CPU.
 
-Short loops stay on the thread that launches them: to give a loop to threads and wait for them costs some 50 us, to run
-it where it is launched nothing (`benchmarks.kernel_costs`). Which loops are short depends on the device and on sizes
-(of cloth also on the number of contacts, watched ones included), never on the number of threads: compiled either way, a
-loop may differ in its last bits. Nor does it depend on when lists were made: contacts are the same whatever the lists,
-and each loop over pairs of patches or elements is compiled one way on a device. On a GPU no loop is short, as a serial
-one would have one thread.
+Short loops stay on the thread that launches them: to give a loop to threads and wait for them costs some 50 us. Which
+loops are short depends on the device and on sizes, never on the number of threads: compiled either way, a loop may
+differ in its last bits. On a GPU no loop is short, as a serial one would have one thread.
 
 Loops whose items differ much in work are shared out while they run. Taichi cuts a loop into one run of neighbouring
-items for each thread, of 512 at least (`make_cpu_multithreaded_loop`; `block_dim` has no say): a loop of five hundred
-heavy items has one thread, and of a longer one the thread that has the heavy half, or that wakes late, is waited for.
-Here a kernel loops over workers instead, so many that each thread has one that works, and every worker takes some
-neighbouring items, and then the next that nobody has taken:
+items for each thread, of 512 at least, and waits for the thread with the heaviest run. Here a kernel loops over workers
+instead, enough for every thread to have one, and every worker takes the next few items that nobody has taken:
 
     begin_sharing(taken, 0)
     for worker in range(workers):
@@ -30,15 +25,9 @@ from taichi.lang import impl
 from sim.core.arrays import Integers
 from sim.core.reductions import runs_on_gpu
 
-LONGEST_NS = 250_000.0
-"""Work of a loop up to which two threads should gain nothing, by what waking both costs: an estimate [ns]. With many
-more threads the longest of these loops would be done sooner in parallel."""
-
-LEAST_RUN = 512
-"""Fewest items of a loop that Taichi gives to a thread of a CPU, where there are so many."""
-
-NO_MORE = 2**31 - 1
-"""Number of the item after the last."""
+LONGEST_NS = 250_000.0  # work of a loop up to which waking two threads costs more than they save: an estimate
+LEAST_RUN = 512  # fewest items of a loop that Taichi gives to a thread of a CPU, where there are so many
+NO_MORE = 2**31 - 1  # number of the item after the last
 
 
 def is_short(items: int, item_ns: float) -> bool:
@@ -60,14 +49,9 @@ def begin_sharing(taken: Integers, slot: ti.template()):
 
 @ti.func
 def next_item(item: ti.i32, worker: ti.i32, taken: Integers, slot: ti.template(), share: ti.template()) -> ti.i32:
-    """The item that a worker has after one, or at first, after -1; beyond the last where none is left.
+    """The item that a worker has after `item`, which is -1 at first; beyond the last where none is left.
 
-    Args:
-        item: that it is done with.
-        worker: its number.
-        taken: how many are taken, by slot.
-        slot: of the loop.
-        share: neighbouring items that it takes at a time, a power of two.
+    `taken` counts the taken items by slot; a worker takes `share` neighbouring ones, a power of two, at a time.
     """
     following = item + 1
     if ti.static(runs_on_gpu()):

@@ -45,15 +45,10 @@ class SimulationDivergedError(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Remedies:
-    """What a job may change where a solver fails: its own keys, in words.
+    """What a job may change where a solver fails: its own keys, in words."""
 
-    Attributes:
-        runaway: against a state that is not finite any more, or beyond all reason.
-        short_steps: against stable steps that get too short.
-    """
-
-    runaway: str
-    short_steps: str
+    runaway: str  # against a state that is not finite any more, or beyond all reason
+    short_steps: str  # against stable steps that get too short
 
 
 class Solver(Protocol):

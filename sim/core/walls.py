@@ -14,23 +14,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A closed face of the domain: a rectangle in a plane across an axis.
+    """A closed face of the domain: a rectangle in a plane across an axis."""
 
-    It holds bodies whose centre of mass is inside of its plane: what left through an open face falls on outside.
-
-    Attributes:
-        name: the face, such as "z-".
-        axis: the axis across it.
-        side: 1 if the domain lies on the side of larger coordinates, else -1.
-        offset: coordinate of its plane [m].
-        lower, upper: the rectangle's corners [m], (2,), on the two other axes in ascending order.
-    """
-
-    name: str
-    axis: int
-    side: float
-    offset: float
-    lower: Array
+    name: str  # the face, such as "z-"
+    axis: int  # the axis across it
+    side: float  # 1 if the domain lies on the side of larger coordinates, else -1
+    offset: float  # coordinate of its plane [m]
+    lower: Array  # the rectangle's corners [m], (2,), on the two other axes in ascending order
     upper: Array
 
     @property
@@ -45,7 +35,7 @@ class Wall:
         return float(lower[self.axis] - self.offset if self.side > 0.0 else self.offset - upper[self.axis])
 
     def holds(self, centre_of_mass: Array) -> bool:
-        """Whether a body with this centre of mass [m], (3,), is inside of its plane."""
+        """Whether a body's centre of mass [m], (3,), is inside of its plane: what left by an open face falls on."""
         return bool(self.side * (centre_of_mass[self.axis] - self.offset) > 0.0)
 
     def is_beside(self, points: Array) -> NDArray[np.bool_]:

@@ -15,30 +15,19 @@ from numpy.typing import NDArray
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Coupling, Diagnostics, SimulationDivergedError, Solver
 
-MAX_SUBSTEPS_PER_FRAME = 200_000
-"""More than this in one frame is a step size that collapses, not a simulation (1/60 s / 2e5 is 83 ns)."""
-
-SUBSTEPS_BETWEEN_CHECKS = 64
-"""How often the state is looked over within a frame: often enough to stop early, too rarely to cost anything."""
+MAX_SUBSTEPS_PER_FRAME = 200_000  # more than this is a step size that collapses (1/60 s / 2e5 is 83 ns)
+SUBSTEPS_BETWEEN_CHECKS = 64  # of the state within a frame: often enough to stop early
 
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What computing one frame took.
+    """What computing one frame took."""
 
-    Attributes:
-        frame: number of the frame just reached.
-        time_s: simulated time [s].
-        substeps: number of substeps of this frame, by solver.
-        smallest_dt_s: smallest substep of this frame [s], by solver.
-        diagnostics: physics and numerics after the frame, by solver.
-    """
-
-    frame: int
-    time_s: float
-    substeps: Mapping[str, int]
-    smallest_dt_s: Mapping[str, float]
-    diagnostics: Mapping[str, Diagnostics]
+    frame: int  # number of the frame just reached
+    time_s: float  # simulated time [s]
+    substeps: Mapping[str, int]  # number of substeps of this frame, by solver
+    smallest_dt_s: Mapping[str, float]  # smallest substep of this frame [s], by solver
+    diagnostics: Mapping[str, Diagnostics]  # physics and numerics after the frame, by solver
 
 
 class StaticBody(Protocol):
@@ -51,21 +40,21 @@ class StaticBody(Protocol):
 
 
 class World:
-    """Owns the loop over substeps; solvers own their arrays.
+    """The loop over substeps.
 
     Solvers that a coupling connects share their substeps; the others advance at their own step. A substep takes the
     solvers in the order given: a coupling exchanges impulses right before its second solver's turn, and tells the first
     what became of the second when all have had theirs. The second solver of a loose coupling keeps its own steps: the
-    solvers that it is coupled to go ahead to the end of its step, in as many substeps as they need, then it takes it.
+    solvers that it is coupled to first go to the end of its step, in as many substeps as they need.
+
+    All land exactly on the frame: the rest of it is cut into n = ceil(rest / dt_stable) equal steps, one is taken, and
+    the division is made anew for what is left; in the same way substeps land on a longer step.
 
     Attributes:
         frame: number of the frame that was reached last.
         max_substeps_per_frame: a frame that needs more counts as diverged; may be changed between frames.
-        watch: asked after every substep what is wrong with the frame, which counts as diverged then; None: nobody is.
+        watch: asked after every substep what is wrong with the frame, which counts as diverged then; may be None.
             What it raises leaves the frame half done: only `restore` goes on from there.
-
-    All land exactly on the frame: with dt_max stable, the rest of the frame is cut into n = ceil(rest / dt_max) equal
-    steps, one is taken, and the division is made anew for what is left; in the same way substeps land on a longer step.
     """
 
     def __init__(
@@ -175,32 +164,23 @@ class World:
         stable_dt, shortest = min(((solver.stable_dt(), solver) for solver in team.solvers), key=itemgetter(0))
         if not stable_dt > 0.0 or team.taken + remaining / stable_dt > self.max_substeps_per_frame:
             self._check(team, elapsed_s)
-            raise SimulationDivergedError(
-                " + ".join(solver.name for solver in team.solvers),
-                self.frame + 1,
-                self.time_s + elapsed_s,
-                f"the stable time step fell to {stable_dt:.3g} s",
-                shortest.remedies().short_steps,
-            )
+            finding = f"the stable time step fell to {stable_dt:.3g} s"
+            raise self._divergence(team.names, elapsed_s, finding, shortest.remedies().short_steps)
         return max(1, math.ceil(remaining / stable_dt * (1.0 - 1.0e-9)))
 
     def _ask_watch(self, team: _Team, elapsed_s: float) -> None:
         finding = None if self.watch is None else self.watch()
         if finding is not None:
-            names = " + ".join(solver.name for solver in team.solvers)
-            raise SimulationDivergedError(names, self.frame + 1, self.time_s + elapsed_s, finding)
+            raise self._divergence(team.names, elapsed_s, finding)
 
     def _check(self, team: _Team, elapsed_s: float) -> None:
         for solver in team.solvers:
             quantity = solver.first_bad_quantity()
             if quantity is not None:
-                raise SimulationDivergedError(
-                    solver.name,
-                    self.frame + 1,
-                    self.time_s + elapsed_s,
-                    quantity,
-                    solver.remedies().runaway,
-                )
+                raise self._divergence(solver.name, elapsed_s, quantity, solver.remedies().runaway)
+
+    def _divergence(self, names: str, elapsed_s: float, finding: str, hint: str = "") -> SimulationDivergedError:
+        return SimulationDivergedError(names, self.frame + 1, self.time_s + elapsed_s, finding, hint)
 
 
 class _Team:
@@ -208,6 +188,7 @@ class _Team:
 
     Attributes:
         solvers: in the order of their turns.
+        names: of all of them, for messages.
         couplings: those whose second solver is one of them.
         ahead: solvers that have to get to the end of a step before these take it.
         taken: substeps in this frame.
@@ -216,6 +197,7 @@ class _Team:
 
     def __init__(self, solvers: Sequence[Solver], couplings: Sequence[Coupling], ahead: _Team | None = None) -> None:
         self.solvers, self.ahead = tuple(solvers), ahead
+        self.names = " + ".join(solver.name for solver in solvers)
         names = {solver.name for solver in solvers}
         self.couplings = tuple(coupling for coupling in couplings if coupling.bodies[1] in names)
         self.begin_frame()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,46 +11,36 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from scipy.stats import qmc
 
-from sim.fluid.boundary_akinci2012 import BoundarySamples, sink_samples
+from sim.fluid.boundary_akinci2012 import BoundarySamples, SignedDistance, outward_normals, sink_samples
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, wall_calibration
 
 if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver
 
-SignedDistance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-
+# Points at which a body's field is compared with the fluid that it displaces, at most.
 MOST_PROBES = 3000
-"""Points at which a body's field is compared with the fluid that it displaces, at most: a cube of 22 spacings has so
-many samples."""
 
+# Binary digits of the number of points in a cube around each; half of them are within the support.
 QUADRATURE_BITS = 8
-"""Binary digits of the number of points in a cube around each; half of them are within the support."""
 
+# The distances of some hundred points around each are asked for together: 6 MiB of points.
 PROBES_AT_A_TIME = 1000
-"""The distances of some hundred points around each are asked for together: 6 MiB of points."""
 
+# Steps by which points of the surface are moved out to where particles touch it.
 OUTWARD_ROUNDS = 4
-"""Steps by which points of the surface are moved out to where particles touch it."""
 
 LEAST_FACTOR = 0.25
 """Least factor at the usual support: with a quarter a particle amid the samples of a sheet still has 6/4 of the rest
-density from them alone, so that none gets through. Samples for a wider support are weaker, 4 at 2.5 spacings and 2.5 at
-4 instead of 6, and `least_factor` is larger."""
+density from them alone, so that none gets through."""
 
 
 def samples_of_moving_bodies(
     rigid: RigidSolver, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS
 ) -> BoundarySamples:
-    """Samples of every moving body, relative to its centre of mass and in its axes.
-
-    Args:
-        rigid: the bodies, at rest or not: samples belong to the shape.
-        spacing: particle spacing of the fluid [m].
-        support_in_spacings: support radius of its kernel.
-    """
+    """Samples of every moving body, relative to its centre of mass and in its axes."""
     samples = []
     for index in range(len(rigid.bodies)):
-        surface, signed_distance = rigid.body_samples(index, spacing), rigid.signed_distance_in_body_frame(index)
+        surface, signed_distance = rigid.solids[index].samples(spacing), rigid.solids[index].signed_distance
         sunk = sink_samples(surface, signed_distance, spacing, support_in_spacings)
         factors = completing_factors(sunk, surface, signed_distance, spacing, support_in_spacings)
         samples.append(sunk.scaled(factors))
@@ -86,9 +75,9 @@ def completing_factors(
     Args:
         samples: sunk into the body.
         surface: points spread evenly over its surface [m], (k, 3).
-        signed_distance: of points (n, 3) to the surface [m], (n,); negative inside.
-        spacing: particle spacing of the fluid [m].
-        support_in_spacings: support radius of its kernel.
+        signed_distance: to the surface [m]; negative inside.
+        spacing: of the particles [m].
+        support_in_spacings: support radius of the kernel.
     """
     support = support_in_spacings * spacing
     chosen = np.random.default_rng(0).permutation(len(surface))[:MOST_PROBES]
@@ -152,12 +141,7 @@ def _flat_share(spacing: float, support_in_spacings: float) -> float:
 
 def _moved_out(points: NDArray[np.float64], signed_distance: SignedDistance, distance: float) -> NDArray[np.float64]:
     """Points moved along the gradient of the distance to where it has this value [m], (n, 3)."""
-    step = 0.1 * distance
     for _ in range(OUTWARD_ROUNDS):
-        shifts = [np.eye(3)[axis] * step for axis in range(3)]
-        gradient = np.stack(
-            [signed_distance(points + shift) - signed_distance(points - shift) for shift in shifts], axis=1
-        )
-        normal = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+        normal = outward_normals(signed_distance, points, 0.1 * distance)
         points = points + (distance - signed_distance(points))[:, None] * normal
     return points

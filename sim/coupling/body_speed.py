@@ -1,4 +1,4 @@
-"""How fast bodies and cloths will become, as far as their start and their paths tell."""
+"""Largest speeds of bodies and cloths, as far as their start and their paths tell."""
 
 from __future__ import annotations
 
@@ -30,12 +30,6 @@ def expected_body_speed(
     For a dynamic body that is the initial one with a fall of its centre of mass to the domain's deepest corner, and its
     initial spin; for a kinematic one the largest on its path, wherever that leads. What collisions of bodies add is
     not foreseen.
-
-    Args:
-        parameters: the dynamic and kinematic bodies.
-        geometries: of each of them.
-        domain: how deep they can fall.
-        gravity: [m/s²].
     """
     speeds = [0.0]
     for body, geometry in zip(parameters, geometries, strict=True):
@@ -53,13 +47,9 @@ def expected_body_speed(
 def expected_cloth_speed(
     parameters: Sequence[ClothParameters], positions: NDArray[np.floating], domain: DomainParameters, gravity: Vector3
 ) -> float:
-    """Largest speed [m/s] to expect of cloths: the initial one with a fall to the domain's deepest corner, or of pins.
+    """Largest speed [m/s] to expect of cloths, at these positions (n, 3) [m], or of their pins.
 
-    Args:
-        parameters: of the cloths.
-        positions: of points of all of them [m], (n, 3).
-        domain: how deep they can fall.
-        gravity: [m/s²].
+    That is the initial one with a fall to the domain's deepest corner.
     """
     fastest = max(math.hypot(*cloth.velocity) for cloth in parameters)
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.load import NodeLoad
 from sim.cloth.solver import ClothSolver
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, reduced_tree
@@ -76,24 +76,16 @@ class ClothFluidCoupling:
     is_loose = False
 
     def __init__(self, fluid: SPHFluid, cloth: ClothSolver, samples: ClothSamples) -> None:
-        """Couple the two; places the fluid's samples where the cloths are.
-
-        Args:
-            fluid: made with the sheets of these samples.
-            cloth: of the same cloths.
-            samples: of the cloths.
-        """
+        """Couple the two; places the samples of the cloths, which the fluid was made with, where these are."""
         sheets = fluid.body_forces.sheets
         assert sheets is not None
         self.bodies = (fluid.name, cloth.name)
         self._fluid, self._cloth, self._sheets = fluid, cloth, sheets
         count, node_count = len(samples.nodes), cloth.state.vertex_count
-        self._samples = SampleNodes(ti.Vector.ndarray(3, ti.i32, count), ti.Vector.ndarray(3, ti.f32, count))
-        self._samples.nodes.from_numpy(samples.nodes)
-        self._samples.weights.from_numpy(samples.weights.astype(np.float32))
+        self._samples = SampleNodes(on_device(samples.nodes), on_device(samples.weights))
         order = np.argsort(samples.nodes.ravel(), kind="stable")
         start = np.searchsorted(samples.nodes.ravel()[order], np.arange(node_count + 1))
-        self._entries = Entries(_integers(start), _integers(order))
+        self._entries = Entries(on_device(start), on_device(order))
         self._change = ti.Vector.ndarray(3, ti.f32, count)
         self._reduction = LaneReduction(maxima=MAXIMA, sums=0)
         self._load = NodeLoad(node_count)
@@ -126,12 +118,6 @@ class ClothFluidCoupling:
 
     def resume(self) -> None:
         """Nothing to make up for: the fluid saves where the samples are, and what it expects of them."""
-
-
-def _integers(values: NDArray[np.integer]) -> ti.Ndarray:
-    array = ti.ndarray(ti.i32, len(values))
-    array.from_numpy(values.astype(np.int32))
-    return array
 
 
 @func

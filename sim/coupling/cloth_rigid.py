@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim.core.domain import DomainParameters
 from sim.core.motion import rotation
@@ -22,8 +21,8 @@ if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver
 
 
+# Cloth that is laid onto a body, in decimal numbers, may be this deep in it [m].
 ROUND_OFF = 1.0e-6
-"""Cloth that is laid onto a body, in decimal numbers, may be so deep in it [m]."""
 
 
 class ClothRigidCoupling:
@@ -31,17 +30,14 @@ class ClothRigidCoupling:
 
     A coupled step: contacts of the cloth's substep foresee how bodies move in it, gravity included, and push both sides
     in every iteration, so that light bodies answer within the step; the bodies take the impulses, then gravity and
-    contacts among themselves, and move; the cloth's contacts follow. Impulses are opposite contact by contact, and act
-    on both sides at the same point: linear and angular momentum are kept to rounding. Contacts are inelastic, and
-    friction opposes sliding, so that they take energy away. Kinematic bodies push and feel nothing.
+    contacts among themselves, and move; the cloth's contacts follow. Impulses are opposite contact by contact: linear
+    and angular momentum are kept to rounding. Kinematic bodies push and feel nothing.
 
     Approximate: contacts among bodies in the same step are not foreseen. Cloth carries a heavy body over what stands
     (`sim.cloth.continuous_response`), but gives way between two bodies that both move, or in several layers.
 
     Attributes:
         bodies: names of the cloth's and of the rigid solver.
-        force: mean force of the cloths on each moving body in the last step [N], (m, 3).
-        torque: likewise, about the centres of mass [N m], (m, 3).
     """
 
     is_loose = False
@@ -50,15 +46,12 @@ class ClothRigidCoupling:
         """Couple the two; `contacts` are those of the cloth, with the bodies of the rigid solver first."""
         self.bodies = (cloth.name, rigid.name)
         self._cloth, self._rigid, self._contacts = cloth, rigid, contacts
-        self.force: NDArray[np.float64] = np.zeros((len(rigid.bodies), 3))
-        self.torque: NDArray[np.float64] = np.zeros((len(rigid.bodies), 3))
         self.follow(0.0)
 
     def exchange(self, dt: float) -> None:
         """Hand the cloth's impulses of its substep of dt [s] to the bodies."""
         linear, angular = (each[: len(self._rigid.bodies)] for each in self._contacts.take_impulses(dt))
         self._rigid.bodies.apply_impulses(linear, angular)
-        self.force, self.torque = linear / dt, angular / dt
 
     def follow(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Tell the cloth's contacts where the bodies are after a substep of dt [s]; 0 before the first."""
@@ -76,7 +69,7 @@ class ClothRigidCoupling:
 
     def resume(self) -> None:
         """Tell the cloth's contacts where the restored bodies are, and how rough they are now."""
-        self._contacts.rigid.bodies.set_friction(self._rigid.friction)
+        self._contacts.rigid.bodies.set_friction(self._rigid.surfaces.friction)
         self.follow(0.0)
 
 
@@ -87,13 +80,7 @@ def contacts_of_cloths(
     domain: DomainParameters,
     rigid: RigidSolver | None = None,
 ) -> ContinuousContacts:
-    """The contacts of all cloths with themselves, with bodies and with walls.
-
-    Args:
-        cloth: the cloths.
-        bodies: all rigid bodies of the scene.
-        domain: its closed faces are walls.
-        rigid: the solver of the bodies that move, if any do.
+    """The contacts of all cloths with themselves, with all rigid bodies and with walls.
 
     Raises:
         ValueError: a cloth starts inside a body.
@@ -125,12 +112,9 @@ def _poses_of_static_bodies(bodies: Sequence[RigidBodyParameters], geometries: S
 def _refuse_start_inside(
     state: ClothState, names: Sequence[str], geometries: Sequence[BodyGeometry], poses: Poses
 ) -> None:
-    """Cloth that starts in a body would be pulled out of it through the nearest side, which need not be the right one.
+    """Refuse cloth that starts in a body: it would be pulled out through the nearest side, be it the wrong one.
 
     Pinned nodes are where the job wants them, be it in a post.
-
-    Raises:
-        ValueError: some other nodes do; says which, and where.
     """
     positions, is_free = state.positions(), state.inverse_mass.to_numpy() > 0.0
     for number, (name, geometry) in enumerate(zip(names, geometries, strict=True)):

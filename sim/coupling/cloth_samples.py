@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.cloth.sheet import RestSheet, build_sheet, triangle_areas
+from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS
-from sim.fluid.sheet_samples import SheetSamples, kept_away
+from sim.fluid.sheet_samples import SheetSamples, kept_away, sheet_factor
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sim.cloth.solver import ClothSolver
 
+# Longest edge of the part of a triangle that a sample stands for [spacings].
 LONGEST_EDGE = 1.5
-"""Of the part of a triangle that a sample stands for, at most [spacings]: two of them are a square of side 1.06."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +70,9 @@ class ClothSamples:
             ]
         ).astype(np.int32)
         weights = np.concatenate([weights for _, weights in placed])
+        boundary = BoundarySamples.of_bodies(*rest).scaled(sheet_factor(support_in_spacings))
         return cls(
-            SheetSamples.of(rest, np.concatenate(mass), np.concatenate(missing), support_in_spacings),
+            SheetSamples(boundary, np.concatenate(mass), np.concatenate(missing)),
             nodes,
             weights,
             np.einsum("mc,mcx->mx", weights, cloth.state.host.position[nodes]),

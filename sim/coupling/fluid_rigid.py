@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.fluid.boundary import BodyStates
+
 if TYPE_CHECKING:
     from sim.fluid.fluid import SPHFluid
     from sim.rigid.solver import RigidSolver
@@ -23,7 +25,6 @@ class FluidRigidCoupling:
     Attributes:
         bodies: names of the fluid's and of the rigid solver.
         force: mean force of the fluid on each body in the last step [N], (n, 3); kinematic bodies have one too.
-        torque: likewise, about the centres of mass [N m], (n, 3).
     """
 
     is_loose = False
@@ -33,28 +34,23 @@ class FluidRigidCoupling:
         self.bodies = (fluid.name, rigid.name)
         self._fluid, self._rigid = fluid, rigid
         self.force: NDArray[np.float64] = np.zeros((len(rigid.bodies), 3))
-        self.torque: NDArray[np.float64] = np.zeros((len(rigid.bodies), 3))
         self.follow(0.0)
 
     def exchange(self, dt: float) -> None:
         """Hand the fluid's impulses of its substep of dt [s] to the bodies."""
         linear, angular = self._fluid.body_forces.take_impulses()
         self._rigid.bodies.apply_impulses(linear, angular)
-        self.force, self.torque = linear / dt, angular / dt
+        self.force = linear / dt
 
     def follow(self, dt: float) -> None:
         """Put the fluid's samples where the bodies are after a substep of dt [s]; 0 before the first."""
         bodies = self._rigid.bodies
-        self._fluid.tank.move_bodies(
-            bodies.position, bodies.rotation(), bodies.velocity, bodies.angular_velocity, elapsed_s=dt
-        )
-        self._tell_mobility()
+        states = BodyStates(bodies.position, bodies.rotation(), bodies.velocity, bodies.angular_velocity)
+        self._fluid.tank.move_bodies(states, elapsed_s=dt)
+        self.resume()
 
     def resume(self) -> None:
-        """Hand the inverse masses of the restored bodies to the restored fluid, which has saved where they are."""
-        self._tell_mobility()
-
-    def _tell_mobility(self) -> None:
+        """Hand the inverse masses of the bodies to the fluid, which saves where they are."""
         bodies, response = self._rigid.bodies, self._fluid.body_forces.response
         if response is not None:
             response.set_mobility(bodies.inverse_mass, bodies.inverse_inertia())

@@ -1,13 +1,17 @@
 """Two-way coupling of smoke and the cloths that hang in it."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import taichi as ti
 
 from sim.cloth.air import WIND, Triangles
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
+from sim.smoke.arrays import Faces, new_floats
+from sim.smoke.lanes import Grid, cell_counts, row_start
 from sim.smoke.obstacles import time_of_travel
 
 if TYPE_CHECKING:
@@ -21,7 +25,39 @@ MOST_CELLS_PASSED = 1.0
 """Most cells of air that may pass a cloth in a step of the smoke: what it takes from them is taken where they are."""
 
 
-@ti.data_oriented
+@bundle
+class Sums(NamedTuple):
+    """Sums over the triangles around each face, flat, in units of `QUANTUM`."""
+
+    x: LongIntegers
+    y: LongIntegers
+    z: LongIntegers
+
+
+@bundle
+class Box(NamedTuple):
+    """The smoke around the triangles."""
+
+    number: ti.i32  # of the smoke
+    origin: ti.math.vec3  # [m]
+    cell_size: ti.f32  # [m]
+    cells: Grid
+    sums: Sums
+
+
+@bundle
+class Hanging(NamedTuple):
+    """The triangles of all cloths, (k,) each, and what they are told of the air; see `ClothAir`."""
+
+    triangles: Triangles
+    density: Floats
+    source: Integers
+    velocity: Vectors
+    inverse_mass: Floats
+    impulse: Vectors
+    place: Vectors  # of the middle in the smoke's box [cells]
+
+
 class SmokeClothCoupling:
     """Moving smoke drags cloth, and cloth slows the smoke.
 
@@ -60,40 +96,42 @@ class SmokeClothCoupling:
         """
         self.bodies = (cloth.name, smoke.name)
         self._cloth, self._smoke, self._number = cloth, smoke, number
-        grid = smoke.grid
-        self._nx, self._ny, self._nz = grid.cells
-        self._step_x, self._step_y, self._size = grid.padded[1] * grid.padded[2], grid.padded[2], grid.size
-        self._u, self._v, self._w = smoke.u_face_x, smoke.v_face_y, smoke.w_face_z
-        self._open_x, self._open_y, self._open_z = smoke.openness
-        self._sums_x, self._sums_y, self._sums_z = (ti.field(ti.i64, shape=grid.size) for _ in range(3))
-        self._place = ti.Vector.ndarray(3, ti.f32, cloth.state.triangle_count)
-        self._fastest = ti.field(ti.f32, shape=2)
+        grid, triangles = smoke.grid, cloth.state.triangle_count
+        sums = Sums(*(ti.ndarray(ti.i64, grid.size) for _ in range(3)))
+        self._box = Box(number, ti.math.vec3(grid.origin), grid.cell_size, smoke.obstacles.box, sums)
+        self._place = ti.Vector.ndarray(3, ti.f32, triangles)
+        self._fastest = new_floats(2)
         self._fastest_past = 0.0
         self._reaches_cloth = False
         smoke.air_forces.append(self)
         cloth.air.is_shared = True
         self.follow(0.0)
 
+    @property
+    def _hanging(self) -> Hanging:
+        air = self._cloth.air
+        return Hanging(
+            self._cloth.state.triangles,
+            air.density,
+            air.source,
+            air.velocity,
+            air.inverse_mass,
+            air.impulse,
+            self._place,
+        )
+
     # --- the coupling -----------------------------------------------------------------------------------------------
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Collect the impulses that the air of the cells gave, for `accelerate`."""
-        air = self._cloth.air
         if self._reaches_cloth:
-            self._clear_sums()
-            self._collect_impulses(self._place, air.source, air.density, air.impulse)
+            _collect_impulses(self._box, self._hanging)
 
     def follow(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Tell every triangle of the air around it."""
         state, air = self._cloth.state, self._cloth.air
-        self._clear_sums()
-        self._find_triangles(
-            state.position, state.triangles, air.density, air.wind, air.source, air.velocity, air.inverse_mass,
-            air.impulse, self._place,
-        )  # fmt: skip
-        self._ask_air(
-            state.velocity, state.triangles, air.share, air.source, air.velocity, air.inverse_mass, self._place
-        )  # fmt: skip
+        _find_triangles(self._box, self._hanging, state.position, air.wind)
+        _ask_air(self._box, self._hanging, self._smoke.state.velocity, state.velocity, air.share, self._fastest)
         fastest, found = (float(value) for value in self._fastest.to_numpy())
         self._fastest_past, self._reaches_cloth = fastest, found > 0.0
 
@@ -112,116 +150,117 @@ class SmokeClothCoupling:
     def accelerate(self, dt: float) -> None:  # noqa: ARG002  (impulses are in place of forces)
         """Give the air what the last `exchange` collected."""
         if self._reaches_cloth:
-            self._push_air()
+            _push_air(self._box.sums, self._smoke.openness, self._smoke.state.velocity)
 
-    # --- kernels ----------------------------------------------------------------------------------------------------
 
-    @ti.func
-    def _corner(self, place, axis: ti.template()):
-        """The lowest of the eight faces across an axis around a place in cells, and the offset from it in cells."""
-        low = ti.Vector([0, 0, 0])
-        offset = ti.Vector([0.0, 0.0, 0.0])
-        for a in ti.static(range(3)):
-            last = ti.static((self._nx, self._ny, self._nz)[a] + (a == axis))
-            inside = ti.max(1.0, ti.min(place[a] + ti.static(1.0 if a == axis else 0.5), float(last)))
-            low[a] = ti.max(1, ti.min(int(inside), last - 1))
-            offset[a] = inside - low[a]
-        return low[0] * self._step_x + low[1] * self._step_y + low[2], offset
+@func
+def _corner(cells: Grid, place, axis: ti.template()):
+    """The lowest of the eight faces across an axis around a place in cells, and the offset from it in cells."""
+    low = ti.Vector([0, 0, 0])
+    offset = ti.Vector([0.0, 0.0, 0.0])
+    for a in ti.static(range(3)):
+        last = cell_counts(cells)[a] + ti.static(int(a == axis))
+        inside = ti.max(1.0, ti.min(place[a] + ti.static(1.0 if a == axis else 0.5), float(last)))
+        low[a] = ti.max(1, ti.min(int(inside), last - 1))
+        offset[a] = inside - low[a]
+    return row_start(cells, low[0], low[1]) + low[2], offset
 
-    @ti.func
-    def _weight(self, offset, n: ti.template()):
-        """Trilinear weight of corner n, and how far it is from the lowest one in the arrays."""
-        weight = 1.0
-        for a in ti.static(range(3)):
-            weight *= offset[a] if ti.static((n >> (2 - a)) & 1) else 1.0 - offset[a]
-        return weight, ti.static((n >> 2) * self._step_x + (n >> 1 & 1) * self._step_y + (n & 1))
 
-    @ti.func
-    def _spread(self, sums: ti.template(), axis: ti.template(), place, value: ti.f32):
-        """Add a value to the faces around a place; integers, so that the order does not matter."""
-        at, offset = self._corner(place, axis)
-        for n in ti.static(range(8)):
-            weight, step = self._weight(offset, n)
-            ti.atomic_add(sums[at + step], ti.round(weight * value / QUANTUM, ti.i64))
+@func
+def _weight(cells: Grid, offset, n: ti.template()):
+    """Trilinear weight of corner n, and how far it is from the lowest one in the arrays."""
+    weight = 1.0
+    for a in ti.static(range(3)):
+        weight *= offset[a] if ti.static((n >> (2 - a)) & 1) else 1.0 - offset[a]
+    return weight, (n >> 2) * cells.step_x + (n >> 1 & 1) * cells.step_y + (n & 1)
 
-    @ti.kernel
-    def _clear_sums(self):
-        for at in range(self._size):
-            for sums in ti.static((self._sums_x, self._sums_y, self._sums_z)):
-                sums[at] = ti.cast(0, ti.i64)
 
-    @ti.kernel
-    def _find_triangles(
-        self, position: Vectors, triangles: Triangles, density: Floats, wind: Vectors, source: Integers,
-        velocity: Vectors, inverse_mass: Floats, impulse: Vectors, place: Vectors,
-    ):  # fmt: skip
-        """Which triangles are in the box, where, and how much of them shares the air of each face, A / (rho h³)."""
-        origin, size = ti.static(self._smoke.grid.origin, self._smoke.grid.cell_size)
-        end = ti.Vector([float(self._nx), float(self._ny), float(self._nz)])
-        for t in range(triangles.shape[0]):
-            x_a, x_b, x_c = position[triangles[t][0]], position[triangles[t][1]], position[triangles[t][2]]
-            middle = ((x_a + x_b + x_c) / 3.0 - ti.Vector(origin)) / size
-            if (middle >= 0.0).all() and (middle <= end).all() and density[t] > 0.0:
-                place[t] = middle
-                if source[t] != self._number:
-                    source[t] = self._number
-                    impulse[t] = ti.math.vec3(0.0)
-                share = 0.5 * (x_b - x_a).cross(x_c - x_a).norm() / (density[t] * size**3)
-                for axis, sums in ti.static(enumerate((self._sums_x, self._sums_y, self._sums_z))):
-                    self._spread(sums, axis, middle, share)
-            elif source[t] == self._number:
-                source[t] = WIND
-                velocity[t] = wind[t]
-                inverse_mass[t] = 0.0
+@func
+def _spread(cells: Grid, sums: LongIntegers, axis: ti.template(), place, value: ti.f32):
+    """Add a value to the faces around a place; integers, so that the order does not matter."""
+    at, offset = _corner(cells, place, axis)
+    for n in ti.static(range(8)):
+        weight, step = _weight(cells, offset, n)
+        ti.atomic_add(sums[at + step], ti.round(weight * value / QUANTUM, ti.i64))
 
-    @ti.kernel
-    def _ask_air(
-        self, node_velocity: Vectors, triangles: Triangles, node_share: Floats, source: Integers, velocity: Vectors,
-        inverse_mass: Floats, place: Vectors,
-    ):  # fmt: skip
-        """Velocity of the air at each triangle in the box, and how little of it there is; the largest past a cloth."""
-        for k in range(2):
-            self._fastest[k] = 0.0
-        for t in range(triangles.shape[0]):
-            if source[t] == self._number:
-                air = ti.math.vec3(0.0)
-                reach = ti.math.vec3(0.0)
-                for axis, face, sums in ti.static(
-                    ((0, self._u, self._sums_x), (1, self._v, self._sums_y), (2, self._w, self._sums_z))
-                ):
-                    at, offset = self._corner(place[t], axis)
-                    for n in ti.static(range(8)):
-                        weight, step = self._weight(offset, n)
-                        air[axis] += weight * face[at + step]
-                        reach[axis] += weight * (ti.cast(sums[at + step], ti.f32) * QUANTUM)
-                velocity[t] = air
-                inverse_mass[t] = reach.max()
-                past = air
-                for k in ti.static(range(3)):
-                    past -= node_share[triangles[t][k]] * node_velocity[triangles[t][k]]
-                ti.atomic_max(self._fastest[0], past.norm())
-                ti.atomic_max(self._fastest[1], 1.0)
 
-    @ti.kernel
-    def _collect_impulses(self, place: Vectors, source: Integers, density: Floats, impulse: Vectors):
-        """Changes of the velocity of each face's air [m/s], -sum_t w_tf J_t / (rho h³); impulses start anew."""
-        cell_volume = ti.static(self._smoke.grid.cell_size**3)
-        for t in range(source.shape[0]):
-            if source[t] == self._number and density[t] > 0.0:  # the air may have been taken away since, live
-                change = -impulse[t] / (density[t] * cell_volume)
-                for axis, sums in ti.static(enumerate((self._sums_x, self._sums_y, self._sums_z))):
-                    self._spread(sums, axis, place[t], change[axis])
-                impulse[t] = ti.math.vec3(0.0)
+@func
+def _clear(sums: Sums):
+    for at in range(sums.x.shape[0]):
+        for values in ti.static((sums.x, sums.y, sums.z)):
+            values[at] = ti.cast(0, ti.i64)
 
-    @ti.kernel
-    def _push_air(self):
-        for at in range(self._size):
-            for face, openness, sums in ti.static(
-                (
-                    (self._u, self._open_x, self._sums_x),
-                    (self._v, self._open_y, self._sums_y),
-                    (self._w, self._open_z, self._sums_z),
-                )
+
+@kernel
+def _find_triangles(box: Box, cloth: Hanging, position: Vectors, wind: Vectors):
+    """Which triangles are in the box, where, and how much of them shares the air of each face, A / (rho h³)."""
+    _clear(box.sums)
+    for t in range(cloth.triangles.shape[0]):
+        corners = cloth.triangles[t]
+        x_a, x_b, x_c = position[corners[0]], position[corners[1]], position[corners[2]]
+        middle = ((x_a + x_b + x_c) / 3.0 - box.origin) / box.cell_size
+        end = ti.cast(cell_counts(box.cells), ti.f32)
+        if (middle >= 0.0).all() and (middle <= end).all() and cloth.density[t] > 0.0:
+            cloth.place[t] = middle
+            if cloth.source[t] != box.number:
+                cloth.source[t] = box.number
+                cloth.impulse[t] = ti.math.vec3(0.0)
+            share = 0.5 * (x_b - x_a).cross(x_c - x_a).norm() / (cloth.density[t] * box.cell_size**3)
+            for axis, sums in ti.static(enumerate((box.sums.x, box.sums.y, box.sums.z))):
+                _spread(box.cells, sums, axis, middle, share)
+        elif cloth.source[t] == box.number:
+            cloth.source[t] = WIND
+            cloth.velocity[t] = wind[t]
+            cloth.inverse_mass[t] = 0.0
+
+
+@kernel
+def _ask_air(box: Box, cloth: Hanging, faces: Faces, node_velocity: Vectors, node_share: Floats, fastest: Floats):
+    """Velocity of the air at each triangle in the box, and how little of it there is; the largest past a cloth."""
+    for k in range(2):
+        fastest[k] = 0.0
+    for t in range(cloth.triangles.shape[0]):
+        if cloth.source[t] == box.number:
+            air = ti.math.vec3(0.0)
+            reach = ti.math.vec3(0.0)
+            for axis, face, sums in ti.static(
+                ((0, faces.x, box.sums.x), (1, faces.y, box.sums.y), (2, faces.z, box.sums.z))
             ):
-                if openness[at] > 0.0:
-                    face[at] += ti.cast(sums[at], ti.f32) * QUANTUM
+                at, offset = _corner(box.cells, cloth.place[t], axis)
+                for n in ti.static(range(8)):
+                    weight, step = _weight(box.cells, offset, n)
+                    air[axis] += weight * face[at + step]
+                    reach[axis] += weight * (ti.cast(sums[at + step], ti.f32) * QUANTUM)
+            cloth.velocity[t] = air
+            cloth.inverse_mass[t] = reach.max()
+            past = air
+            for k in ti.static(range(3)):
+                past -= node_share[cloth.triangles[t][k]] * node_velocity[cloth.triangles[t][k]]
+            ti.atomic_max(fastest[0], past.norm())
+            ti.atomic_max(fastest[1], 1.0)
+
+
+@kernel
+def _collect_impulses(box: Box, cloth: Hanging):
+    """Changes of the velocity of each face's air [m/s], -sum_t w_tf J_t / (rho h³); impulses start anew."""
+    _clear(box.sums)
+    for t in range(cloth.triangles.shape[0]):
+        if cloth.source[t] == box.number and cloth.density[t] > 0.0:  # the air may have been taken away since, live
+            change = -cloth.impulse[t] / (cloth.density[t] * box.cell_size**3)
+            for axis, sums in ti.static(enumerate((box.sums.x, box.sums.y, box.sums.z))):
+                _spread(box.cells, sums, axis, cloth.place[t], change[axis])
+            cloth.impulse[t] = ti.math.vec3(0.0)
+
+
+@kernel
+def _push_air(sums: Sums, openness: Faces, velocity: Faces):
+    for at in range(sums.x.shape[0]):
+        for face, is_open, change in ti.static(
+            (
+                (velocity.x, openness.x, sums.x),
+                (velocity.y, openness.y, sums.y),
+                (velocity.z, openness.z, sums.z),
+            )
+        ):
+            if is_open[at] > 0.0:
+                face[at] += ti.cast(change[at], ti.f32) * QUANTUM

@@ -1,14 +1,19 @@
 """Water as an obstacle for smoke and air."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import taichi as ti
 
-from sim.core.arrays import Vectors
+from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
+from sim.core.bundles import bundle
 from sim.core.domain import DomainParameters
+from sim.core.launch import kernel
 from sim.coupling.water_room import room_for_water
+from sim.smoke.arrays import new_floats
+from sim.smoke.lanes import Grid, cell_counts, row_start
+from sim.smoke.obstacles import Marks, mark
 
 if TYPE_CHECKING:
     from sim.fluid.fluid import SPHFluid
@@ -31,7 +36,28 @@ MOMENTUM_QUANTUM = 2.0**-40
 """Unit of the sums of volume fraction times velocity [m/s]; they hold up to 8e6."""
 
 
-@ti.data_oriented
+@bundle
+class Sums(NamedTuple):
+    """Water in the cells of a smoke, flat; integers, so that their order does not matter."""
+
+    fraction: Integers  # of volume, in units of `FRACTION_QUANTUM`
+    momentum_x: LongIntegers  # volume fraction times velocity, in units of `MOMENTUM_QUANTUM`
+    momentum_y: LongIntegers
+    momentum_z: LongIntegers
+    inside: Floats  # part of the weight at a cell's centre that walls and static bodies leave
+
+
+@bundle
+class Reach(NamedTuple):
+    """The box of a smoke, and how far from a particle the weight of its water goes."""
+
+    low: ti.math.vec3  # corner of the box [m]
+    high: ti.math.vec3
+    cell_size: ti.f32  # [m]
+    in_cells: ti.f32  # half-width R of the weight [cells]
+    volume: ti.f32  # of a particle over R³
+
+
 class SmokeFluidCoupling:
     """Air cannot enter water, and moves with its surface.
 
@@ -48,8 +74,6 @@ class SmokeFluidCoupling:
     beside closed faces of the domain and static bodies is made up for by dividing by the part of the weight that is
     free of them, of static bodies as the cells have them. A lone drop
     blocks no air, nor does a sheet of one layer of particles; two layers do where cells are as fine as particles.
-
-    Sums are integers, so that their order does not matter.
 
     Steps are cut so that no particle gets farther than a cell within its reach of the box, with its velocity and
     gravity. What pressure gives it in a step of the smoke is not foreseen, nor are particles that an emitter has yet to
@@ -72,16 +96,18 @@ class SmokeFluidCoupling:
         self.bodies = (fluid.name, smoke.name)
         self._fluid, self._smoke = fluid, smoke
         grid = smoke.grid
-        self._nx, self._ny, self._nz = grid.cells
-        self._step_x, self._step_y, self._size = grid.padded[1] * grid.padded[2], grid.padded[2], grid.size
         reach = max(REACH_IN_SPACINGS * fluid.spacing, grid.cell_size)
-        self._reach_in_cells = reach / grid.cell_size
-        self._volume_over_reach = (fluid.spacing / reach) ** 3
-        self._fraction = ti.field(ti.i32, shape=grid.size)
-        self._momentum_x, self._momentum_y, self._momentum_z = (ti.field(ti.i64, shape=grid.size) for _ in range(3))
-        self._inside = ti.field(ti.f32, shape=grid.size)
-        self._inside.from_numpy(grid.pad(room_for_water(grid, domain, reach)).astype(np.float32).ravel())
-        self._shortest_time = ti.field(ti.f32, shape=())
+        self._reach = Reach(
+            ti.math.vec3(grid.origin),
+            ti.math.vec3(grid.upper),
+            grid.cell_size,
+            reach / grid.cell_size,
+            (fluid.spacing / reach) ** 3,
+        )
+        momentum = (ti.ndarray(ti.i64, grid.size) for _ in range(3))
+        self._sums = Sums(ti.ndarray(ti.i32, grid.size), *momentum, new_floats(grid.size))
+        self._sums.inside.from_numpy(grid.pad(room_for_water(grid, domain, reach)).astype(np.float32).ravel())
+        self._shortest_time = new_floats(1)
         self._gravity = float(np.linalg.norm(fluid.gravity))
         smoke.obstacles.movers.append(self)
         self.exchange(0.0)
@@ -89,16 +115,19 @@ class SmokeFluidCoupling:
     def stable_dt(self) -> float:
         """Largest step [s] in which no particle gets farther than a cell in the box, as far as is foreseen."""
         particles = self._fluid.particles
-        self._find_shortest_time(particles.position, particles.velocity, particles.count)
-        time_s = float(self._shortest_time[None])
+        count = particles.count
+        _find_shortest_time(
+            self._reach, self._gravity, particles.position, particles.velocity, count, self._shortest_time
+        )
+        time_s = float(self._shortest_time[0])
         return time_s if time_s < NEVER else math.inf
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Mark the cells that hold water now, after the steps of the fluid."""
         particles = self._fluid.particles
-        self._clear_sums()
-        self._splat(particles.position, particles.velocity, particles.count)
-        self._mark_water()
+        box, marks = self._smoke.obstacles.box, self._smoke.obstacles.marks
+        _splat(self._reach, box, self._sums, particles.position, particles.velocity, particles.count)
+        _mark_water(box, self._sums, marks)
 
     def follow(self, dt: float) -> None:
         """Water does not feel the air."""
@@ -106,69 +135,64 @@ class SmokeFluidCoupling:
     def resume(self) -> None:
         """Which cells were water the smoke has saved itself."""
 
-    @ti.kernel
-    def _find_shortest_time(self, position: Vectors, velocity: Vectors, count: ti.i32):
-        """Least time in which a particle comes to the box and a cell into it, v t + g t² = d (`time_of_travel`)."""
-        size = ti.static(self._smoke.grid.cell_size)
-        low = ti.Vector(ti.static(self._smoke.grid.origin)) - ti.static(self._reach_in_cells) * size
-        high = ti.Vector(ti.static(self._smoke.grid.upper)) + ti.static(self._reach_in_cells) * size
-        gravity = ti.static(self._gravity)
-        self._shortest_time[None] = NEVER
-        for n in range(count):
-            x_n = position[n]
-            distance = ti.max(low - x_n, x_n - high, 0.0).norm() + size
-            speed = velocity[n].norm()
-            root = speed + ti.sqrt(speed * speed + 4.0 * gravity * distance)
-            if root > 0.0:
-                ti.atomic_min(self._shortest_time[None], 2.0 * distance / root)
 
-    @ti.kernel
-    def _clear_sums(self):
-        for at in range(self._size):
-            self._fraction[at] = 0
-            for momentum in ti.static((self._momentum_x, self._momentum_y, self._momentum_z)):
-                momentum[at] = ti.cast(0, ti.i64)
+@kernel
+def _find_shortest_time(
+    reach: Reach, gravity: ti.f32, position: Vectors, velocity: Vectors, count: ti.i32, shortest: Floats
+):
+    """Least time in which a particle comes to the box and a cell into it, v t + g t² = d (`time_of_travel`)."""
+    margin = reach.in_cells * reach.cell_size
+    shortest[0] = NEVER
+    for n in range(count):
+        x_n = position[n]
+        outside = ti.max(reach.low - margin - x_n, x_n - (reach.high + margin), 0.0)
+        distance = outside.norm() + reach.cell_size
+        speed = velocity[n].norm()
+        root = speed + ti.sqrt(speed * speed + 4.0 * gravity * distance)
+        if root > 0.0:
+            ti.atomic_min(shortest[0], 2.0 * distance / root)
 
-    @ti.kernel
-    def _splat(self, position: Vectors, velocity: Vectors, count: ti.i32):
-        """Add every particle to the cells whose centres it reaches."""
-        origin, size = ti.static(self._smoke.grid.origin, self._smoke.grid.cell_size)
-        reach = ti.static(self._reach_in_cells)
-        cells = ti.Vector([self._nx, self._ny, self._nz])
-        for n in range(count):
-            # In cells, such that the centre of cell i, counted from 1, is at i.
-            x_n = (position[n] - ti.Vector(origin)) / size + 0.5
-            if (x_n > 1.0 - reach).all() and (x_n < ti.cast(cells, ti.f32) + reach).all():
-                low = ti.max(ti.cast(ti.floor(x_n - reach), ti.i32) + 1, 1)
-                high = ti.min(ti.cast(ti.ceil(x_n + reach), ti.i32) - 1, cells)
-                for i in range(low[0], high[0] + 1):
-                    weight_x = self._volume_over_reach * (1.0 - ti.abs(float(i) - x_n[0]) / reach)
-                    for j in range(low[1], high[1] + 1):
-                        weight_xy = weight_x * (1.0 - ti.abs(float(j) - x_n[1]) / reach)
-                        for k in range(low[2], high[2] + 1):
-                            weight = weight_xy * (1.0 - ti.abs(float(k) - x_n[2]) / reach)
-                            at = i * self._step_x + j * self._step_y + k
-                            ti.atomic_add(self._fraction[at], ti.round(weight / FRACTION_QUANTUM, ti.i32))
-                            for axis, momentum in ti.static(
-                                enumerate((self._momentum_x, self._momentum_y, self._momentum_z))
-                            ):
-                                share = weight * velocity[n][axis]
-                                ti.atomic_add(momentum[at], ti.round(share / MOMENTUM_QUANTUM, ti.i64))
 
-    @ti.kernel
-    def _mark_water(self):
-        """Mark the cells that are water."""
-        for i, j in ti.ndrange((1, self._nx + 1), (1, self._ny + 1)):
-            for k in range(1, self._nz + 1):
-                at = i * self._step_x + j * self._step_y + k
-                fraction = ti.cast(self._fraction[at], ti.f32) * FRACTION_QUANTUM
-                if fraction > WATER * self._inside[at]:
-                    momentum = ti.Vector(
-                        [
-                            ti.cast(self._momentum_x[at], ti.f32),
-                            ti.cast(self._momentum_y[at], ti.f32),
-                            ti.cast(self._momentum_z[at], ti.f32),
-                        ]
-                    )
-                    velocity = momentum * (MOMENTUM_QUANTUM / fraction)
-                    self._smoke.obstacles.mark(i, j, k, velocity)
+@kernel
+def _splat(reach: Reach, box: Grid, sums: Sums, position: Vectors, velocity: Vectors, count: ti.i32):
+    """Add every particle to the cells whose centres it reaches, in sums that begin at zero."""
+    for at in range(sums.fraction.shape[0]):
+        sums.fraction[at] = 0
+        for momentum in ti.static((sums.momentum_x, sums.momentum_y, sums.momentum_z)):
+            momentum[at] = ti.cast(0, ti.i64)
+    for n in range(count):
+        cells, width = cell_counts(box), reach.in_cells
+        # In cells, such that the centre of cell i, counted from 1, is at i.
+        x_n = (position[n] - reach.low) / reach.cell_size + 0.5
+        if (x_n > 1.0 - width).all() and (x_n < ti.cast(cells, ti.f32) + width).all():
+            low = ti.max(ti.cast(ti.floor(x_n - width), ti.i32) + 1, 1)
+            high = ti.min(ti.cast(ti.ceil(x_n + width), ti.i32) - 1, cells)
+            for i in range(low[0], high[0] + 1):
+                weight_x = reach.volume * (1.0 - ti.abs(float(i) - x_n[0]) / width)
+                for j in range(low[1], high[1] + 1):
+                    weight_xy = weight_x * (1.0 - ti.abs(float(j) - x_n[1]) / width)
+                    for k in range(low[2], high[2] + 1):
+                        weight = weight_xy * (1.0 - ti.abs(float(k) - x_n[2]) / width)
+                        at = row_start(box, i, j) + k
+                        ti.atomic_add(sums.fraction[at], ti.round(weight / FRACTION_QUANTUM, ti.i32))
+                        for axis, momentum in ti.static(enumerate((sums.momentum_x, sums.momentum_y, sums.momentum_z))):
+                            share = weight * velocity[n][axis]
+                            ti.atomic_add(momentum[at], ti.round(share / MOMENTUM_QUANTUM, ti.i64))
+
+
+@kernel
+def _mark_water(box: Grid, sums: Sums, marks: Marks):
+    """Mark the cells that are water."""
+    for i, j in ti.ndrange((1, box.nx + 1), (1, box.ny + 1)):
+        for k in range(1, box.nz + 1):
+            at = row_start(box, i, j) + k
+            fraction = ti.cast(sums.fraction[at], ti.f32) * FRACTION_QUANTUM
+            if fraction > WATER * sums.inside[at]:
+                momentum = ti.Vector(
+                    [
+                        ti.cast(sums.momentum_x[at], ti.f32),
+                        ti.cast(sums.momentum_y[at], ti.f32),
+                        ti.cast(sums.momentum_z[at], ti.f32),
+                    ]
+                )
+                mark(marks, at, momentum * (MOMENTUM_QUANTUM / fraction))

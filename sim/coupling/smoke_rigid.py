@@ -1,24 +1,36 @@
 """Rigid bodies that move through smoke."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import taichi as ti
 
-from sim.core.arrays import Floats, Integers, Matrices, Vectors
-from sim.core.motion.arc_length import ArcLength
-from sim.core.motion.paths import Path
-from sim.shapes.device_distances import CountTriples, distance_at
-from sim.shapes.device_shapes import DeviceShapes
-from sim.smoke.obstacles import time_of_travel
+from sim.core.arrays import Matrices, Vectors
+from sim.core.bundles import bundle
+from sim.core.launch import kernel
+from sim.core.motion.paths import ArcLength, Path
+from sim.shapes.device_shapes import DeviceShapes, Shapes, distance_to
+from sim.smoke.lanes import Grid, row_start
+from sim.smoke.obstacles import Marks, mark, time_of_travel
 
 if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver
     from sim.smoke.solver import SmokeSolver
 
 
-@ti.data_oriented
+@bundle
+class Bodies(NamedTuple):
+    """Moving bodies, (b,) each."""
+
+    shapes: Shapes
+    centre_of_mass: Vectors  # in the frame of the shape [m]
+    position: Vectors  # of the centre of mass [m]
+    rotation: Matrices
+    velocity: Vectors  # [m/s]
+    spin: Vectors  # [1/s]
+
+
 class SmokeRigidCoupling:
     """Bodies are obstacles for the air, and push it with the velocity of their surface, v + omega x r.
 
@@ -42,10 +54,11 @@ class SmokeRigidCoupling:
         Bodies should be no thinner than a cell (`smoke_reach.too_thin_bodies`).
         """
         self.bodies = (rigid.name, smoke.name)
-        self._rigid, self._smoke, self._obstacles = rigid, smoke, smoke.obstacles
-        self._shapes = DeviceShapes(rigid.solids)
-        self._position, self._velocity, self._spin = (ti.Vector.ndarray(3, ti.f32, len(rigid.solids)) for _ in range(3))
-        self._rotation = ti.Matrix.ndarray(3, 3, ti.f32, len(rigid.solids))
+        self._rigid, self._smoke = rigid, smoke
+        shapes, count = DeviceShapes(rigid.solids), len(rigid.solids)
+        position, velocity, spin = (ti.Vector.ndarray(3, ti.f32, count) for _ in range(3))
+        rotation = ti.Matrix.ndarray(3, 3, ti.f32, count)
+        self._bodies = Bodies(shapes.on_device, shapes.centre_of_mass, position, rotation, velocity, spin)
         self._ways: dict[int, tuple[Path, ArcLength]] = {}
         smoke.obstacles.movers.append(self)
 
@@ -78,13 +91,13 @@ class SmokeRigidCoupling:
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Mark the cells that the bodies fill at the end of a step of the smoke of dt [s]."""
-        bodies, shapes = self._rigid.bodies, self._shapes
-        grid, turned = self._smoke.grid, bodies.rotation()
+        bodies, grid, obstacles = self._rigid.bodies, self._smoke.grid, self._smoke.obstacles
+        turned = bodies.rotation()
         for array, values in (
-            (self._position, bodies.position),
-            (self._rotation, turned),
-            (self._velocity, bodies.velocity),
-            (self._spin, bodies.angular_velocity),
+            (self._bodies.position, bodies.position),
+            (self._bodies.rotation, turned),
+            (self._bodies.velocity, bodies.velocity),
+            (self._bodies.spin, bodies.angular_velocity),
         ):
             array.from_numpy(values.astype(np.float32))
         for number, geometry in enumerate(self._rigid.solids):
@@ -96,22 +109,16 @@ class SmokeRigidCoupling:
             low = [int(n) for n in np.clip(first, 1, np.add(grid.cells, 1))]
             high = [int(n) for n in np.clip(last, 0, grid.cells)]
             if all(begin <= end for begin, end in zip(low, high, strict=True)):
-                self._mark(
+                origin = ti.math.vec3(grid.origin)
+                _mark_body(
                     number,
-                    ti.Vector(low),
-                    ti.Vector(high),
-                    shapes.kind,
-                    shapes.size,
-                    shapes.centre_of_mass,
-                    shapes.grid_values,
-                    shapes.grid_first,
-                    shapes.grid_origin,
-                    shapes.grid_spacing,
-                    shapes.grid_shape,
-                    self._position,
-                    self._rotation,
-                    self._velocity,
-                    self._spin,
+                    ti.math.ivec3(low),
+                    ti.math.ivec3(high),
+                    origin,
+                    grid.cell_size,
+                    obstacles.box,
+                    obstacles.marks,
+                    self._bodies,
                 )
 
     def follow(self, dt: float) -> None:
@@ -120,20 +127,24 @@ class SmokeRigidCoupling:
     def resume(self) -> None:
         """Where the bodies are the smoke has saved itself."""
 
-    @ti.kernel
-    def _mark(
-        self, body: ti.i32, low: ti.math.ivec3, high: ti.math.ivec3, kind: Integers, size: Vectors,
-        centre_of_mass: Vectors, grid_values: Floats, grid_first: Integers, grid_origin: Vectors,
-        grid_spacing: Floats, grid_shape: CountTriples, position: Vectors, rotation: Matrices,
-        velocity: Vectors, spin: Vectors,
-    ):  # fmt: skip
-        """Mark the cells from `low` to `high` whose centres lie in a body."""
-        for i, j in ti.ndrange((low[0], high[0] + 1), (low[1], high[1] + 1)):
-            for k in range(low[2], high[2] + 1):
-                arm = self._obstacles.centre(i, j, k) - position[body]
-                place = rotation[body].transpose() @ arm + centre_of_mass[body]
-                distance = distance_at(
-                    place, body, kind, size, grid_values, grid_first, grid_origin, grid_spacing, grid_shape
-                )
-                if distance < 0.0:
-                    self._obstacles.mark(i, j, k, velocity[body] + spin[body].cross(arm))
+
+@kernel
+def _mark_body(
+    body: ti.i32,
+    low: ti.math.ivec3,
+    high: ti.math.ivec3,
+    origin: ti.math.vec3,
+    cell_size: ti.f32,
+    box: Grid,
+    marks: Marks,
+    bodies: Bodies,
+):
+    """Mark the cells from `low` to `high` whose centres lie in a body."""
+    for i, j in ti.ndrange((low[0], high[0] + 1), (low[1], high[1] + 1)):
+        for k in range(low[2], high[2] + 1):
+            centre = origin + cell_size * (ti.Vector([float(i), float(j), float(k)]) - 0.5)
+            arm = centre - bodies.position[body]
+            place = bodies.rotation[body].transpose() @ arm + bodies.centre_of_mass[body]
+            if distance_to(place, body, bodies.shapes) < 0.0:
+                velocity = bodies.velocity[body] + bodies.spin[body].cross(arm)
+                mark(marks, row_start(box, i, j) + k, velocity)

@@ -25,8 +25,7 @@ class BodyFriction:
         M/V u + dt sum_ib J_b^T k_ib x_ib x_ib^T (J_b u - dv_i) = dt sum_ib J_b^T k_ib x_ib x_ib^T (v_i - v_b)
 
     The same k_ib is in both kinds of rows, so that the whole matrix stays symmetric and positive definite. Friction
-    that is explicit in the velocity of the body throws a light body back and forth: the fluid that sticks to it within
-    a step of dt, sqrt(nu dt) deep, is heavier than the body.
+    that is explicit in the body's velocity would throw a light body back and forth.
 
     Few numbers, in float64 on the host. Preconditioner: the 6 x 6 block of each body. Bodies on given paths are no
     unknowns; they have zeros.
@@ -35,9 +34,9 @@ class BodyFriction:
         changes: J_b u of each boundary sample for the vector that was spread last [m/s]; 0 for the fixed ones.
     """
 
-    def __init__(self, boundary: Boundary, response: BodyResponse | None) -> None:
-        """Take the bodies whose samples the fluid has, and how they move; None where there are none."""
-        self._boundary, self._response = boundary, response
+    def __init__(self, boundary: Boundary, response: BodyResponse | None, volume: float, rest_density: float) -> None:
+        """Take the samples of the bodies, how they move, and the particles in whose number their mass counts."""
+        self._boundary, self._response, self._volume, self._rest_density = boundary, response, volume, rest_density
         self._twists = ti.ndarray(ti.f32, max(boundary.body_count, 1) * WRENCH_WIDTH)
         self.changes = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
         self._found = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
@@ -50,41 +49,25 @@ class BodyFriction:
         """Whether any body is an unknown; if not, only `forget` and `found_velocity` may be called."""
         return self._response is not None and self._response.is_needed
 
-    def prepare(
-        self,
-        friction: Friction,
-        velocity: ti.Ndarray,
-        nothing: ti.Ndarray,
-        *,
-        volume: float,
-        rest_density: float,
-        dt: float,
-    ) -> None:
-        """Find the blocks of the matrix and the right-hand side of a step.
+    def prepare(self, friction: Friction, velocity: ti.Ndarray, nothing: ti.Ndarray, dt: float) -> None:
+        """Find the blocks of the matrix and the right-hand side of a step of dt [s].
 
-        Args:
-            friction: of the fluid.
-            velocity: of the particles [m/s].
-            nothing: velocity 0 of each particle [m/s].
-            volume: V of a particle [m³].
-            rest_density: rho0; a body counts as so many particles as have its mass [kg/m³].
-            dt: the step [s].
+        `velocity` is that of the particles, and `nothing` 0 for each of them [m/s].
         """
         assert self._response is not None
-        weight = dt / volume
-        self._friction, self._weight, self._rest_density = friction, weight, rest_density
-        self._inverse_mass = volume * self._response.inverse_masses
+        self._friction, self._weight = friction, dt / self._volume
+        self._inverse_mass = self._volume * self._response.inverse_masses
         is_free = self._inverse_mass[:, 0, 0] > 0.0
         self._mass = np.zeros_like(self._inverse_mass)
         self._mass[is_free] = np.linalg.inv(self._inverse_mass[is_free])
         blocks = self._mass.copy()
         for entry in range(WRENCH_WIDTH):
             self.spread(np.broadcast_to(np.eye(WRENCH_WIDTH)[entry], self._change.shape) * is_free[:, None])
-            blocks[:, :, entry] -= weight * friction(nothing, self.changes)
+            blocks[:, :, entry] -= self._weight * friction(nothing, self.changes)
         self._inverse = np.zeros_like(blocks)
         # Both halves are rounded sums of the same numbers.
         self._inverse[is_free] = np.linalg.inv(0.5 * (blocks + blocks.transpose(0, 2, 1))[is_free])
-        self._given = self._projected(weight * friction(velocity, self._boundary.samples.velocity))
+        self._given = self._projected(self._weight * friction(velocity, self._boundary.samples.velocity))
 
     def guess(self, change: ti.Ndarray) -> None:
         """Begin with the change of the bodies at which their own rows hold, for this one of the particles [m/s]."""
@@ -112,13 +95,13 @@ class BodyFriction:
         asked_squared = _dot(asked, _times(self._mass, asked)) / self._rest_density
         return self._square(self._residual), self._square(self._given), asked_squared
 
-    def multiply(self, preconditioned: ti.Ndarray) -> None:
-        """The bodies' rows times u, which is spread, and this one of the particles [m/s]."""
-        self._product = self._multiplied(self._preconditioned, preconditioned)
-
     def spread_preconditioned(self) -> None:
         """Fill `changes` with u, the preconditioned residual."""
         self.spread(self._preconditioned)
+
+    def multiply(self, preconditioned: ti.Ndarray) -> None:
+        """The bodies' rows times u, which is spread, and this one of the particles [m/s]."""
+        self._product = self._multiplied(self._preconditioned, preconditioned)
 
     def products(self) -> tuple[float, float, float]:
         """The bodies' part in what `sum_products` sums."""

@@ -6,30 +6,30 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
-from sim.core.neighbors import Neighbors
+from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
 from sim.fluid.boundary import NO_BODY, STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples
+from sim.fluid.device import Fluid
 from sim.fluid.discretization import Discretization
 from sim.fluid.kernels import TINY_DISTANCE, spline, spline_slope
-from sim.fluid.particles import Particles
 
+# Numbers of a body's mobility: inverse mass, then the inverse inertia tensor row by row, in world axes.
 MOBILITY_WIDTH = 10
-"""Numbers of a body's mobility: inverse mass, then the inverse inertia tensor row by row, in world axes."""
 
+# Sums over particles are of 32-bit integers, which are exact in any order; one bit is the sign's, one is spare.
 LARGEST_SHARE = 2**30
-"""Sums over particles are of 32-bit integers, which are exact in any order; one bit is the sign's, one is spare."""
 
+# More particles than this cannot be within the support of a sample for each of them: they lie in three layers.
 PARTICLES_PER_SAMPLE = 8
-"""More particles than this cannot be within the support of a sample for each of them: they lie in three layers."""
 
+# |sum_b V_b grad W_ib| of a particle that is pressed onto samples, over 1/d; it is 0.9 at rest beside them.
 LARGEST_PUSH = 6.0
-"""|sum_b V_b grad W_ib| of a particle that is pressed onto samples, over 1/d; it is 0.9 at rest beside them."""
 
+# Stands for an error that is infinite or not a number, which the larger of two numbers would hide.
 NOT_FINITE = 1.0e30
-"""Stands for an error that is infinite or not a number, which the larger of two numbers would hide."""
 
 
 @bundle
@@ -59,8 +59,7 @@ class BodyResponse:
     change the density of particle i by -n_i . u, with the wrench n_i = sum_b V_b (grad W_ib, r_b x grad W_ib) that a
     unit of V P_i puts on the body. As the same n_i is in the force and in the rate, A = V D M^-1 D^T over particles and
     bodies stays symmetric and positive semi-definite, and the solve finds the pressure at which fluid and bodies move
-    together. Explicit coupling diverges where the fluid that a body has to push aside is heavier than the body, and
-    lets a light body start with g (rho_s - rho_f)/rho_s instead of g (rho_s - rho_f)/(rho_s + rho_f/2), a sphere's.
+    together. Explicit coupling diverges where the fluid that a body has to push aside is heavier than the body.
 
     Free bodies fall by gravity in their predicted velocity; contacts of the step are not foreseen.
 
@@ -71,39 +70,23 @@ class BodyResponse:
         no_acceleration: of all boundary samples where none is [m/s²].
     """
 
-    def __init__(self, boundary: Boundary, gravity: tuple[float, float, float], spacing: float) -> None:
-        """Prepare for the bodies of a boundary; they do not answer before `set_mobility`.
-
-        Args:
-            boundary: holds the bodies' samples.
-            gravity: [m/s²].
-            spacing: of the particles [m].
-        """
-        self._boundary, self._gravity, self._spacing = boundary, ti.math.vec3(*gravity), spacing
+    def __init__(self, boundary: Boundary, gravity: Vector3, discretization: Discretization) -> None:
+        """Prepare for the bodies of a boundary; they do not answer before `set_mobility`."""
+        self._boundary, self._gravity, self._discretization = boundary, ti.math.vec3(*gravity), discretization
         bodies = max(boundary.body_count, 1)
         self._mobility = Mobility(
-            ti.ndarray(ti.f32, bodies * MOBILITY_WIDTH),
-            ti.ndarray(ti.f32, bodies),
-            ti.ndarray(ti.f32, bodies),
-            ti.ndarray(ti.i32, bodies),
+            inverse_mass=on_device(np.zeros(bodies * MOBILITY_WIDTH)),
+            cap=ti.ndarray(ti.f32, bodies),
+            share_scale=ti.ndarray(ti.f32, bodies),
+            share=ti.ndarray(ti.i32, bodies),
         )
-        self._mobility.inverse_mass.fill(0.0)
-        self._no_wrench = ti.ndarray(ti.f32, bodies * WRENCH_WIDTH)
-        self._no_wrench.fill(0.0)
-        self._acceleration = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
-        self._acceleration.fill(0.0)
+        self._no_wrench = on_device(np.zeros(bodies * WRENCH_WIDTH))
+        self._acceleration, self.no_acceleration = (on_device(np.zeros((boundary.count, 3))) for _ in range(2))
         self.is_needed = False
         self.inverse_masses: NDArray[np.float64] = np.zeros((boundary.body_count, WRENCH_WIDTH, WRENCH_WIDTH))
-        self.no_acceleration = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
-        self.no_acceleration.fill(0.0)
 
     def set_mobility(self, inverse_mass: NDArray[np.float64], inverse_inertia: NDArray[np.float64]) -> None:
-        """Say how easily the bodies move where they are now.
-
-        Args:
-            inverse_mass: [1/kg], (bodies,); 0 for bodies on given paths.
-            inverse_inertia: in world axes [1/(kg m²)], (bodies, 3, 3).
-        """
+        """Take inverse masses [1/kg], (bodies,), 0 on given paths, and tensors in world axes, (bodies, 3, 3)."""
         rows = np.concatenate([inverse_mass[:, None], inverse_inertia.reshape(-1, 9)], axis=1)
         self.is_needed = bool((inverse_mass > 0.0).any())
         self.inverse_masses[:, :3, :3] = inverse_mass[:, None, None] * np.eye(3)
@@ -112,7 +95,7 @@ class BodyResponse:
             return
         self._mobility.inverse_mass.from_numpy(np.ascontiguousarray(rows, dtype=np.float32).ravel())
         turning = np.trace(inverse_inertia, axis1=1, axis2=2) * self._boundary.reach**2
-        cap = LARGEST_PUSH / self._spacing * np.sqrt(inverse_mass + turning)
+        cap = LARGEST_PUSH / self._discretization.spacing * np.sqrt(inverse_mass + turning)
         particles = PARTICLES_PER_SAMPLE * (np.diff(self._boundary.body_start) + PARTICLES_PER_SAMPLE)
         scale = np.divide(LARGEST_SHARE, particles * cap, out=np.zeros_like(cap), where=cap > 0.0)
         self._mobility.cap.from_numpy(cap.astype(np.float32))
@@ -132,14 +115,7 @@ class BodyResponse:
         accelerate_samples(boundary.samples, boundary.bodies, wrench, self._mobility.inverse_mass, self._acceleration)
         return self._acceleration
 
-    def add_to_diagonal(
-        self,
-        particles: Particles,
-        near: Neighbors,
-        discretization: Discretization,
-        relaxation: float,
-        inverse_diagonal: ti.Ndarray,
-    ) -> None:
+    def add_to_diagonal(self, fluid: Fluid, relaxation: float, inverse_diagonal: ti.Ndarray) -> None:
         """Add the bodies' share in A to its diagonal, such that relaxation by the diagonal converges.
 
         The bodies' part of A, B_ij = V n_i . M^-1 n_j, couples all particles around a body, so that its own diagonal
@@ -147,24 +123,12 @@ class BodyResponse:
         the body over the body's. But with |n|² = n . M^-1 n and Cauchy's inequality, x . B x <= V (sum |n_i| |x_i|)²
         <= V sum_j |n_j| sum_i |n_i| x_i²: the diagonal matrix of V |n_i| sum_j |n_j| bounds B.
 
-        Args:
-            particles: of the fluid.
-            near: their neighbours.
-            discretization: of the fluid.
-            relaxation: omega that multiplies the inverse diagonal in the solve; the bound needs none.
-            inverse_diagonal: 1/A_ii [kg/m]; becomes 1/(A_ii + omega times the bound). A particle that has 0 keeps it.
+        1/A_ii becomes 1/(A_ii + omega times the bound), as the bound needs no relaxation omega; 0 stays 0.
         """
-        boundary = self._boundary
+        d = self._discretization
+        weight = relaxation * d.particle_volume
         add_bodies_to_diagonal(
-            particles,
-            near,
-            boundary.samples,
-            boundary.bodies,
-            self._mobility,
-            discretization.gradient_factor,
-            1.0 / discretization.support_radius,
-            relaxation * discretization.particle_volume,
-            inverse_diagonal,
+            fluid, self._boundary.bodies, self._mobility, d.gradient_factor, weight, inverse_diagonal
         )
 
     def _push(self, wrench: ti.Ndarray, dt: float, gravity_share: float) -> None:
@@ -220,11 +184,11 @@ def accelerate_samples(samples: Samples, bodies: Bodies, wrench: Floats, mobilit
 
 
 @func
-def next_body(last: ti.i32, first: ti.i32, count: ti.i32, near: Neighbors, bodies: Bodies) -> ti.i32:
-    """Lowest number above `last` of the bodies with a sample among these neighbours, or a huge one."""
+def next_body(fluid: Fluid, bodies: Bodies, first: ti.i32, count: ti.i32, last: ti.i32) -> ti.i32:
+    """Lowest number above `last` of the bodies with a sample among these neighbours, or `NO_BODY`."""
     found = NO_BODY
     for k in range(count):
-        b = near.indices[first + k * near.stride]
+        b = fluid.near.indices[first + k * fluid.near.stride]
         if b >= bodies.first:
             own = bodies.body[b - bodies.first]
             if own > last:
@@ -234,109 +198,71 @@ def next_body(last: ti.i32, first: ti.i32, count: ti.i32, near: Neighbors, bodie
 
 @func
 def wrench_norm(
+    fluid: Fluid,
+    bodies: Bodies,
+    mobility: Floats,
     x_i: ti.math.vec3,
     first: ti.i32,
     count: ti.i32,
-    wanted: ti.i32,
-    near: Neighbors,
-    samples: Samples,
-    bodies: Bodies,
-    mobility: Floats,
+    body: ti.i32,
     gradient_factor: ti.f32,
-    inverse_support: ti.f32,
 ) -> ti.f32:
-    """|n_i| = sqrt(n_i . M^-1 n_i) for the body `wanted`."""
-    s, m = wanted * STATE_WIDTH, wanted * MOBILITY_WIDTH
+    """|n_i| = sqrt(n_i . M^-1 n_i) for a body."""
+    s, m = body * STATE_WIDTH, body * MOBILITY_WIDTH
     centre = ti.math.vec3(bodies.states[s], bodies.states[s + 1], bodies.states[s + 2])
     force = ti.math.vec3(0.0)
     torque = ti.math.vec3(0.0)
     for k in range(count):
-        b = near.indices[first + k * near.stride]
-        if b >= bodies.first and bodies.body[b - bodies.first] == wanted:
-            x_ib = x_i - samples.position[b]
+        b = fluid.near.indices[first + k * fluid.near.stride]
+        if b >= bodies.first and bodies.body[b - bodies.first] == body:
+            x_ib = x_i - fluid.samples.position[b]
             r = x_ib.norm()
-            f = samples.volume[b] * spline_slope(r * inverse_support) / (r + TINY_DISTANCE) * x_ib
+            f = fluid.samples.volume[b] * spline_slope(r * fluid.inverse_support) / (r + TINY_DISTANCE) * x_ib
             force += f
-            torque += (samples.position[b] - centre).cross(f)
+            torque += (fluid.samples.position[b] - centre).cross(f)
     squared = mobility[m] * force.norm_sqr() + torque.dot(times_inverse_inertia(m, mobility, torque))
     return gradient_factor * ti.sqrt(ti.max(squared, 0.0))
 
 
 @kernel
 def add_bodies_to_diagonal(
-    particles: Particles,
-    near: Neighbors,
-    samples: Samples,
-    bodies: Bodies,
-    mobility: Mobility,
-    gradient_factor: ti.f32,
-    inverse_support: ti.f32,
-    weight: ti.f32,
-    inverse_diagonal: Floats,
+    fluid: Fluid, bodies: Bodies, mobility: Mobility, gradient_factor: ti.f32, weight: ti.f32, inverse_diagonal: Floats
 ):
     """1/A_ii becomes 1/(A_ii + weight sum over bodies of |n_i| sum_j |n_j|); the sums over j are of integers."""
     for k in range(bodies.count):
         mobility.share[k] = 0
-    for i in range(particles.count):
-        first = near.start[i] + near.fluid_count[i] * near.stride
-        count = near.boundary_count[i]
-        own = next_body(-1, first, count, near, bodies)
-        while own < NO_BODY:
-            norm = wrench_norm(
-                particles.position[i],
-                first,
-                count,
-                own,
-                near,
-                samples,
-                bodies,
-                mobility.inverse_mass,
-                gradient_factor,
-                inverse_support,
-            )
-            units = ti.ceil(ti.min(norm, mobility.cap[own]) * mobility.share_scale[own])
-            ti.atomic_add(mobility.share[own], ti.cast(units, ti.i32))
-            own = next_body(own, first, count, near, bodies)
-    for i in range(particles.count):
-        first = near.start[i] + near.fluid_count[i] * near.stride
-        count = near.boundary_count[i]
-        own = next_body(-1, first, count, near, bodies)
+    for i in range(fluid.particles.count):
+        x_i, count = fluid.particles.position[i], fluid.near.boundary_count[i]
+        first = fluid.near.start[i] + fluid.near.fluid_count[i] * fluid.near.stride
+        body = next_body(fluid, bodies, first, count, -1)
+        while body < NO_BODY:
+            norm = wrench_norm(fluid, bodies, mobility.inverse_mass, x_i, first, count, body, gradient_factor)
+            units = ti.ceil(ti.min(norm, mobility.cap[body]) * mobility.share_scale[body])
+            ti.atomic_add(mobility.share[body], ti.cast(units, ti.i32))
+            body = next_body(fluid, bodies, first, count, body)
+    for i in range(fluid.particles.count):
+        x_i, count = fluid.particles.position[i], fluid.near.boundary_count[i]
+        first = fluid.near.start[i] + fluid.near.fluid_count[i] * fluid.near.stride
+        body = next_body(fluid, bodies, first, count, -1)
         bound = 0.0
-        while own < NO_BODY:
-            norm = wrench_norm(
-                particles.position[i],
-                first,
-                count,
-                own,
-                near,
-                samples,
-                bodies,
-                mobility.inverse_mass,
-                gradient_factor,
-                inverse_support,
-            )
-            if mobility.share_scale[own] > 0.0:
-                bound += norm * ti.cast(mobility.share[own], ti.f32) / mobility.share_scale[own]
-            own = next_body(own, first, count, near, bodies)
+        while body < NO_BODY:
+            norm = wrench_norm(fluid, bodies, mobility.inverse_mass, x_i, first, count, body, gradient_factor)
+            if mobility.share_scale[body] > 0.0:
+                bound += norm * ti.cast(mobility.share[body], ti.f32) / mobility.share_scale[body]
+            body = next_body(fluid, bodies, first, count, body)
         inverse = inverse_diagonal[i]
         inverse_diagonal[i] = inverse / (1.0 + weight * bound * inverse)
 
 
 @kernel
-def weigh_errors(
-    samples: Samples,
-    near: NearParticles,
-    particles: Particles,
-    error: SolveError,
-    inverse_support: ti.f32,
-    weighed: Vectors,
-):
+def weigh_errors(near: NearParticles, fluid: Fluid, error: SolveError, weighed: Vectors):
     """Errors of the particles near each sample as a pressure solve counts them, and their weights, V_b w_ib each."""
     for b in range(near.sample_count):
         total = ti.math.vec3(0.0)
         for k in range(near.start[b], near.start[b] + near.count[b]):
             i = near.particles[k]
             if error.inverse_diagonal[i] > 0.0:
-                weight = spline((particles.position[i] - samples.position[near.first + b]).norm() * inverse_support)
+                x_ib = fluid.particles.position[i] - fluid.samples.position[near.first + b]
+                weight = spline(x_ib.norm() * fluid.inverse_support)
                 total += weight * ti.math.vec3(error_left(error, i), 1.0, 0.0)
-        weighed[b] = samples.volume[near.first + b] * total
+        weighed[b] = fluid.samples.volume[near.first + b] * total

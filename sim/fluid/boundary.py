@@ -7,7 +7,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle
 from sim.core.cells import CellGrid, CellSort, SortedPoints
 from sim.core.launch import kernel
@@ -15,9 +15,8 @@ from sim.core.solver import Arrays
 from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.discretization import Discretization
 
-EVERYWHERE = 1.0e30
-"""Stands for "no limit" where samples are sorted [m]."""
-
+EVERYWHERE = (-1.0e30,) * 3, (1.0e30,) * 3
+"""Corners of a box that holds every sample [m]."""
 
 STATE_WIDTH = 18
 """Numbers of a body's state: centre of mass, rotation row by row, velocity, angular velocity."""
@@ -71,22 +70,27 @@ class NearParticles(NamedTuple):
     particles: Integers  # in the order of the sorted particles
 
 
+class BodyStates(NamedTuple):
+    """Moving bodies as they are now."""
+
+    position: NDArray[np.float64]  # centres of mass [m], (bodies, 3)
+    rotation: NDArray[np.float64]  # from body to world axes, (bodies, 3, 3)
+    velocity: NDArray[np.float64]  # of the centres of mass [m/s], (bodies, 3)
+    angular_velocity: NDArray[np.float64]  # [rad/s], (bodies, 3)
+
+
 class Boundary:
     """Samples of walls and bodies, as the sums over neighbours read them.
 
     The fixed samples come first, sorted by cell; the moving ones follow in the order they were given, body by body, and
-    after them those of sheets, which whoever moves the sheets places.
+    after them those of sheets, which the coupling with the sheets places.
 
     Attributes:
-        given_count: number of fixed samples given.
-        fixed_count: number of those near enough to the grid to matter.
-        moving_count: number of samples of moving bodies and of sheets.
-        body_sample_count: number of those of moving bodies.
-        sheet_count: number of those of sheets.
-        body_count: number of moving bodies.
+        given_count, fixed_count: fixed samples given, and those of them near enough to the grid to matter.
+        moving_count: samples of moving bodies and of sheets, `body_sample_count` and `sheet_count`.
+        body_count: moving bodies.
         samples: all samples on the device.
-        bodies: the moving bodies on the device.
-        sheets: which samples are those of sheets.
+        bodies, sheets: which samples are of bodies, and of sheets, on the device.
         index: row in the fixed samples given of each fixed sample here, (fixed,), on the host.
         body_start: first moving sample of each body, (bodies + 1,), on the host.
         reach: largest distance of a sample from the centre of mass of its body [m], (bodies,), on the host.
@@ -114,9 +118,9 @@ class Boundary:
         self.body_sample_count, self.sheet_count = len(moving.positions), len(sheets.positions)
         self.moving_count = self.body_sample_count + self.sheet_count
         self.body_count = body_count
-        ids = _device_array(near.astype(np.int32))
+        ids = on_device(near)
         cells = CellSort(grid, self.fixed_count)
-        cells.sort(_device_array(fixed.positions[near]), ids, self.fixed_count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3)
+        cells.sort(on_device(fixed.positions[near]), ids, self.fixed_count, *EVERYWHERE)
         self.index: NDArray[np.int64] = near[cells.order.to_numpy()[: self.fixed_count]]
         fixed_positions = fixed.positions[self.index]
         self.fixed_points = _sorted_points(fixed_positions, cells)
@@ -129,22 +133,22 @@ class Boundary:
         frictional = volumes.copy()
         frictional[: self.fixed_count][is_smooth[self.index]] = 0.0
         self.samples = Samples(
-            position=_device_array(np.concatenate([fixed_positions, moving_positions])),
-            velocity=_device_array(np.zeros((self.fixed_count + self.moving_count, 3), dtype=np.float32)),
-            volume=_device_array(volumes.astype(np.float32)),
-            friction_volume=_device_array(frictional.astype(np.float32)),
+            position=on_device(np.concatenate([fixed_positions, moving_positions])),
+            velocity=on_device(np.zeros((self.fixed_count + self.moving_count, 3), dtype=np.float32)),
+            volume=on_device(volumes),
+            friction_volume=on_device(frictional),
             with_moving=self.moving_count > 0,
         )
         no_body = np.full(self.sheet_count, NO_BODY, dtype=np.int32)
         self.bodies = Bodies(
             first=self.fixed_count,
             sample_count=self.body_sample_count,
-            body=_device_array(np.concatenate([moving.body, no_body])),
+            body=on_device(np.concatenate([moving.body, no_body])),
             count=body_count,
             states=ti.ndarray(ti.f32, max(body_count, 1) * STATE_WIDTH),
         )
         self.sheets = Sheets(self.fixed_count + self.body_sample_count, self.body_sample_count, self.sheet_count)
-        self._offset = _device_array(moving.positions)
+        self._offset = on_device(moving.positions)
         self.body_start: NDArray[np.int64] = np.searchsorted(moving.body, np.arange(body_count + 1))
         distance = np.linalg.norm(moving.positions.astype(np.float64), axis=1)
         self.reach: NDArray[np.float64] = np.array(
@@ -152,40 +156,26 @@ class Boundary:
         )
         self._host_states = self._reference_states = self.bodies.states.to_numpy()
         self._moving_cells = CellSort(grid, self.moving_count) if self.moving_count else None
-        self._moving_ids = _device_array(np.arange(self.moving_count, dtype=np.int32))
+        self._moving_ids = on_device(np.arange(self.moving_count, dtype=np.int32))
         self._moving_position = ti.Vector.ndarray(3, ti.f32, max(self.moving_count, 1))
         self._moving_points = _sorted_points(moving_positions, self._moving_cells) if self._moving_cells else None
-        self._reference_sheets = _device_array(sheets.positions)
-        self.moving_index = _device_array(np.zeros(self.moving_count, dtype=np.int32))
+        self._reference_sheets = on_device(sheets.positions)
+        self.moving_index = on_device(np.zeros(self.moving_count, dtype=np.int32))
 
     @property
     def count(self) -> int:
         """Samples of walls, of all bodies and of sheets."""
         return self.fixed_count + self.moving_count
 
-    def place(
-        self,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
-        velocity: NDArray[np.float64],
-        angular_velocity: NDArray[np.float64],
-    ) -> float:
-        """Put the moving samples where their bodies are, at the velocity of that point of the body.
-
-        Args:
-            position: centres of mass [m], (bodies, 3).
-            rotation: from body to world axes, (bodies, 3, 3).
-            velocity: of the centres of mass [m/s], (bodies, 3).
-            angular_velocity: [rad/s], (bodies, 3).
-
-        Returns:
-            How far any sample got at most [m].
-        """
+    def place(self, states: BodyStates) -> float:
+        """Put the moving samples where their bodies are; returns the largest displacement of one [m]."""
         if not self.body_count:
             return 0.0
-        states = np.concatenate([position, rotation.reshape(-1, 9), velocity, angular_velocity], axis=1)
+        rows = np.concatenate(
+            [states.position, states.rotation.reshape(-1, 9), states.velocity, states.angular_velocity], axis=1
+        )
         before = self._host_states
-        self._place(np.ascontiguousarray(states, dtype=np.float32).ravel())
+        self._place(np.ascontiguousarray(rows, dtype=np.float32).ravel())
         # In float64 of the float32 states, which a checkpoint holds: a run that continues finds the same.
         moved = (self._host_states.astype(np.float64) - before).reshape(-1, STATE_WIDTH)
         # Two rotations by an angle a apart differ by 2 sqrt(2) sin(a/2), and points at a distance of 1 by 2 sin(a/2).
@@ -233,7 +223,7 @@ class Boundary:
         count, first = self.moving_count, self.fixed_count
         take_samples(self.samples.position, first, count, self._moving_position)
         take_samples(self.samples.position, self.sheets.first, self.sheet_count, self._reference_sheets)
-        self._moving_cells.sort(self._moving_position, self._moving_ids, count, (-EVERYWHERE,) * 3, (EVERYWHERE,) * 3)
+        self._moving_cells.sort(self._moving_position, self._moving_ids, count, *EVERYWHERE)
         order_samples(
             self._moving_position, self._moving_cells.order, count, first, self._moving_points, self.moving_index
         )
@@ -241,17 +231,8 @@ class Boundary:
 
 
 def _sorted_points(positions: NDArray[np.float32], cells: CellSort) -> SortedPoints:
-    x, y, z = (_device_array(np.ascontiguousarray(positions[:, axis])) for axis in range(3))
+    x, y, z = (on_device(positions[:, axis]) for axis in range(3))
     return SortedPoints(x, y, z, cells.cell_start)
-
-
-def _device_array(values: NDArray[np.generic]) -> ti.Ndarray:
-    """Device array of these rows; one of zeros where there is none, as kernels take no empty arrays."""
-    rows = values if len(values) else np.zeros((1, *values.shape[1:]), dtype=values.dtype)
-    dtype = ti.i32 if rows.dtype == np.int32 else ti.f32
-    array = ti.ndarray(dtype, len(rows)) if rows.ndim == 1 else ti.Vector.ndarray(3, dtype, len(rows))
-    array.from_numpy(np.ascontiguousarray(rows))
-    return array
 
 
 @kernel
@@ -276,7 +257,7 @@ def place_samples(offset: Vectors, bodies: Bodies, samples: Samples):
 
 @kernel
 def take_samples(position: Vectors, first: ti.i32, count: ti.i32, taken: Vectors):
-    """Copy of so many samples from `first` on."""
+    """Copy of `count` samples from `first` on."""
     for b in range(count):
         taken[b] = position[first + b]
 

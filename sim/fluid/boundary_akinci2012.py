@@ -21,25 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sim.fluid.kernels import (
-    SUPPORT_IN_SPACINGS,
-    evaluate,
-    layer_field,
-    particle_volume,
-    wall_calibration,
-    wall_layers,
-)
+from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, layer_field, particle_volume, wall_calibration, wall_layers
 
 if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
 
 SignedDistance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
+# Rounds in which samples sink into a body, each by this part of what is left: 0.4 % of the depth is left then.
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6
-"""Rounds in which samples sink into a body, each by this part of the way that is left: 0.4 % of it is left then."""
 
+# Part of the second layer's depth at which its samples still do what they should; less in a body has one layer.
 DEEP_ENOUGH = 0.95
-"""Part of the second layer's depth at which its samples still do what they should; less in a body has one layer."""
 
 FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
@@ -100,12 +93,7 @@ class BoundarySamples:
         return replace(self, factor=factor * _or_filled(self.factor, 1.0, len(self.positions)))
 
     def volumes(self, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> NDArray[np.float64]:
-        """Volume V_b of each sample [m³], (m,); a fluid's Psi_b is rho0 V_b.
-
-        Args:
-            spacing: particle spacing of the fluid [m].
-            support_in_spacings: support radius of its kernel.
-        """
+        """Volume V_b of each sample [m³], (m,); a fluid's Psi_b is rho0 V_b."""
         support = support_in_spacings * spacing
         count = len(self.positions)
         known = _or_filled(self.known_volume, 0.0, count)
@@ -135,14 +123,8 @@ def domain_wall_samples(
 
     With a support wider than usual a wall has two layers, and their sums reach far around edges. There the samples
     are the products of three lines, one along each axis: points like a lattice of fluid within the domain, and at
-    either end one for each layer of the wall, which weighs as much as a sample of the layer. The three-dimensional
-    kernel is nearly a product of three lines' too, so that a block of fluid has the density in corners that it has
-    inside, to 1.5 %; layers that go around the corner would compress it by 18 %.
-
-    Args:
-        domain: the box and its open faces.
-        spacing: particle spacing of the fluid [m].
-        support_in_spacings: support radius of its kernel; the samples lie deeper where it is wider than usual.
+    either end one for each layer of the wall, which weighs as much as a sample of the layer. As the kernel is nearly
+    such a product too, fluid has the density in corners that it has inside, to 1.5 %.
     """
     if len(wall_layers(support_in_spacings)) > 1:
         return _product_wall_samples(domain, spacing, support_in_spacings)
@@ -163,20 +145,13 @@ def sink_samples(
     spacing: float,
     support_in_spacings: float = SUPPORT_IN_SPACINGS,
 ) -> BoundarySamples:
-    """Samples 0.95 spacings inside of a body's surface, so that fluid at rest touches the surface.
+    """Samples (m, 3) of a body's surface [m], moved 0.95 spacings inside, so that fluid at rest touches the surface.
 
     Where a body is thinner than twice that, its samples stop at the middle, and fluid keeps a gap.
 
     With a support wider than usual there are two layers of them. What cannot lie quite as deep as the second one should
     has as much less volume as leaves its field at the fluid that touches the surface the same. Where the body is too
-    thin for the second layer, one layer stands for both: the first of two has about the volume of a layer of fluid,
-    which has less than rest density when it is alone, and keeps nothing out.
-
-    Args:
-        samples: points on the surface [m], (m, 3).
-        signed_distance: distance of points (k, 3) to the surface [m], (k,); negative inside.
-        spacing: particle spacing of the fluid [m].
-        support_in_spacings: support radius of its kernel.
+    thin for the second layer, one layer stands for both: the first of two, alone, would keep nothing out.
     """
     alone = wall_calibration(support_in_spacings)
     positions, _ = _sunk(samples, signed_distance, spacing, (alone.standoff_in_spacings - 0.5) * spacing)
@@ -195,19 +170,21 @@ def sink_samples(
     return BoundarySamples(positions, np.zeros(len(positions), dtype=np.int32), factor=factor, layer=layer)
 
 
+def outward_normals(signed_distance: SignedDistance, points: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """Unit vectors along the gradient of a distance, by differences over twice a step [m], (n, 3)."""
+    shifts = [np.eye(3)[axis] * step for axis in range(3)]
+    gradient = np.stack([signed_distance(points + shift) - signed_distance(points - shift) for shift in shifts], axis=1)
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+
+
 def _sunk(
     samples: NDArray[np.floating], signed_distance: SignedDistance, spacing: float, depth: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Samples of a surface moved to a depth under it [m], (m, 3), and how deep they are then [m], (m,)."""
     points = np.array(samples, dtype=np.float64)
     distance = signed_distance(points)
-    step = 0.05 * spacing
     for _ in range(SINKING_ROUNDS):
-        shifts = [np.eye(3)[axis] * step for axis in range(3)]
-        gradient = np.stack(
-            [signed_distance(points + shift) - signed_distance(points - shift) for shift in shifts], axis=1
-        )
-        normal = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+        normal = outward_normals(signed_distance, points, 0.05 * spacing)
         moved = points - SINKING_FRACTION * (distance + depth)[:, None] * normal
         moved_distance = signed_distance(moved)
         # Only moves that come nearer to the wanted depth count: behind the middle of a thin part they would not.

@@ -5,33 +5,26 @@ import taichi as ti
 
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
-from sim.core.neighbors import Neighbors
-from sim.core.solver import Diagnostics
-from sim.fluid.boundary import Samples
-from sim.fluid.discretization import Smoothing
-from sim.fluid.fluid import SPHFluid
+from sim.fluid.device import Fluid
 from sim.fluid.kernels import evaluate, lattice_offsets, particle_volume
-from sim.fluid.particles import Particles
-from sim.fluid.pressure import RUNAWAY, PressureSolver
+from sim.fluid.pressure import IncompressibleFluid
 from sim.fluid.pressure_kernels import PressureSystem, add_scaled, density_rate, not_negative
 from sim.fluid.sheet_forces import DIVERGENCE
-from sim.fluid.solve_record import SolveRecord
 from sim.fluid.tank import FluidStart
-from sim.fluid.time_step import CFL_NUMBER
 
-NOT_SOLVED = -1.0e6
-"""Relative compression of a particle that takes no part in a solve: so much room that its pressure stays 0."""
-
+# Iterations of the density and the divergence solve in any case (Bender & Koschier 2015, algorithms 3 and 2).
 LEAST_ITERATIONS, LEAST_DIVERGENCE_ITERATIONS = 2, 1
-"""Iterations of the density and the divergence solve in any case (Bender & Koschier 2015, algorithms 3 and 2)."""
+
+# Relative compression of a particle that takes no part in a solve: so much room that its pressure stays 0.
+NOT_SOLVED = -1.0e6
 
 AT_SURFACE = 0.8
 """A particle that lacks more than this share of what the first layer at a flat surface lacks of the rest density is at
-a free surface: it has room, and no divergence. The usual criterion, fewer than 20 neighbours, is none for
-walls of few samples."""
+a free surface: it has room, and no divergence. The usual criterion, fewer than 20 neighbours, fails at walls of few
+samples."""
 
 
-class DFSPHSolver(SPHFluid):
+class DFSPHSolver(IncompressibleFluid):
     """A fluid without divergence and without compression, by two pressure solves a step.
 
     With rho_i relative to the rest density and (D v)_i its rate of change (`sim.fluid.pressure`):
@@ -47,123 +40,59 @@ class DFSPHSolver(SPHFluid):
     iterated themselves, at least 0, so that a solve is one linear complementarity problem, and that of the density
     solve is what one would measure; it starts from that of the step before. Relaxation has momentum
     (`sim.fluid.pressure.momentum`). And of a compression that a particle has already, from walls or the error of
-    linearization, a step takes back a part only (`PressureSolver.correction`), as it turns into speed.
+    linearization, a step takes back a part only (`IncompressibleFluid.correction`), as it turns into speed.
 
     Momentum of fluid pairs is conserved to rounding. `pressures` and `boundary_forces` are those of the density solve;
     the divergence solve adds impulses that are small but where fluid hits something.
 
     Attributes:
-        cfl_number: largest displacement of a particle in a step [spacings].
-        gravity_number: largest step over sqrt(d/g), whatever the speed.
-        pressure: the solves.
         least_density: below which a particle has no divergence [-].
     """
 
-    carried = ("pressure",)
-    runaway = RUNAWAY
-    sheets_answer = True
-    cfl_number = CFL_NUMBER
-    # A column of 20 layers is stable up to 0.13, and not at 0.18.
-    gravity_number = 0.1
+    solved_for = ("density", "divergence")
 
     def __init__(self, start: FluidStart) -> None:
         """Take particles, walls and bodies."""
         super().__init__(start)
-        self.pressure = PressureSolver(self.tank, self.forces, self.phases, self.expected_speed)
         self._divergence_pressure = ti.ndarray(ti.f32, self.particles.capacity)
         self.least_density = 1.0 - AT_SURFACE * (1.0 - surface_density(self.discretization.support_in_spacings))
-        self._density_solves, self._divergence_solves = SolveRecord(), SolveRecord()
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         self.compute_density()
-        self.pressure.begin_sheets()
+        self.begin_sheets()
         self.correct_divergence_error(dt)
         self.forces.compute(dt)
-        self.pressure.predict_compression(dt)
+        self.predict_compression(dt)
         self.correct_density_error(dt)
         self.advance(dt)
 
-    def compute_density(self) -> None:
-        """Relative density of each particle by summation, and the diagonal of the pressure's matrix."""
-        self.pressure.compute_density_and_alpha()
-
     def correct_divergence_error(self, dt: float) -> None:
         """Make the velocities free of divergence, for a step of dt [s]."""
-        particles, system, pressure = self.particles, self.pressure.system, self._divergence_pressure
+        pressure, tolerance = self._divergence_pressure, self.parameters.divergence_tolerance
         self.forces.recoil_sheets(DIVERGENCE, dt)
-        compute_divergence(
-            particles.arrays,
-            particles.near,
-            self.boundary.samples,
-            self.discretization.smoothing,
-            system,
-            dt,
-            self.least_density,
-            pressure,
-        )
-        tolerance = self.parameters.divergence_tolerance
-        error = self.pressure.mean_error(pressure, 0.0, system.compression)
+        compute_divergence(self.tank.on_device, self.system, dt, self.least_density, pressure)
+        error = self.mean_error(pressure, 0.0, self.system.compression)
+        record, least = self.solves["divergence"], LEAST_DIVERGENCE_ITERATIONS
         if error <= tolerance:
             # One relaxation leaves less than there was. To measure how much less would take as long as to make it.
-            self.pressure.accelerate_by(pressure)
-            self._divergence_solves.add(LEAST_DIVERGENCE_ITERATIONS, error, converged=True)
+            self.accelerate_by(pressure)
+            record.add(least, error, converged=True)
         else:
-            pressure = self.pressure.solve(
-                self._divergence_solves, pressure, dt, least=LEAST_DIVERGENCE_ITERATIONS, tolerance=tolerance
-            )
+            pressure = self.solve(record, pressure, dt, least=least, tolerance=tolerance)
         self._divergence_pressure = pressure
         self.forces.react(pressure, dt)
-        add_scaled(particles.velocity, self.pressure.acceleration, dt, particles.count)
+        add_scaled(self.particles.velocity, self.pressure_acceleration, dt, self.particles.count)
 
     def correct_density_error(self, dt: float) -> None:
         """Add the acceleration by the pressure that leaves no compression after a step of dt [s]."""
-        carried = self.particles.carried
-        self.pressure.start_from(carried["pressure"])
-        carried["pressure"] = self.pressure.solve(
-            self._density_solves,
-            carried["pressure"],
-            dt,
-            least=LEAST_ITERATIONS,
-            tolerance=self.parameters.density_tolerance,
+        carried, tolerance = self.particles.carried, self.parameters.density_tolerance
+        self.start_from(carried["pressure"])
+        carried["pressure"] = self.solve(
+            self.solves["density"], carried["pressure"], dt, least=LEAST_ITERATIONS, tolerance=tolerance
         )
         self.forces.react(carried["pressure"], dt)
-        add_scaled(self.forces.acceleration, self.pressure.acceleration, 1.0, self.particles.count)
-
-    def adapt_time_step(self) -> float:
-        """Largest time step [s] for the current state."""
-        return self.pressure.adapt_time_step(
-            cfl=self.parameters.cfl,
-            cfl_number=self.cfl_number,
-            gravity_number=self.gravity_number,
-            viscosity=self.limiting_viscosity,
-            cohesion_rate=self.cohesion_rate,
-        )
-
-    @property
-    def pressure_term(self) -> ti.Ndarray:
-        """P_i of the density solve of each particle [Pa]."""
-        return self.particles.carried["pressure"]
-
-    @property
-    def solves(self) -> dict[str, SolveRecord]:
-        """The solves of this frame, by what they are for."""
-        return {**super().solves, "density": self._density_solves, "divergence": self._divergence_solves}
-
-    def begin_frame(self, time_s: float) -> None:
-        """Restart the counters of the frame."""
-        super().begin_frame(time_s)
-        self._density_solves, self._divergence_solves = SolveRecord(), SolveRecord()
-
-    def diagnostics(self) -> Diagnostics:
-        """As for every particle fluid, with the iterations and errors of the solves of this frame."""
-        return {
-            **super().diagnostics(),
-            "iterations": self._density_solves.mean_iterations,
-            "density_error": self._density_solves.worst_error,
-            "divergence_iterations": self._divergence_solves.mean_iterations,
-            "divergence_error": self._divergence_solves.worst_error,
-        }
+        add_scaled(self.forces.acceleration, self.pressure_acceleration, 1.0, self.particles.count)
 
 
 def surface_density(support_in_spacings: float) -> float:
@@ -174,25 +103,16 @@ def surface_density(support_in_spacings: float) -> float:
 
 
 @kernel
-def compute_divergence(
-    particles: Particles,
-    near: Neighbors,
-    samples: Samples,
-    smoothing: Smoothing,
-    system: PressureSystem,
-    dt: ti.f32,
-    least_density: ti.f32,
-    pressure: Floats,
-):
+def compute_divergence(fluid: Fluid, system: PressureSystem, dt: ti.f32, least_density: ti.f32, pressure: Floats):
     """Relative compression s_i = dt (D v)_i, and the first relaxation of it from P = 0.
 
     Below the least density a particle is `NOT_SOLVED`.
     """
     ti.loop_config(block_dim=128)
-    for i in range(particles.count):
-        rate = density_rate(i, particles.velocity, samples.velocity, particles, near, samples, smoothing)
+    for i in range(fluid.particles.count):
+        rate = density_rate(fluid, i, fluid.particles.velocity, fluid.samples.velocity)
         s_i = dt * rate
-        if particles.density[i] < least_density:
+        if fluid.particles.density[i] < least_density:
             s_i = NOT_SOLVED
         p_i = not_negative(system.relaxation / (dt * dt) * system.inverse_diagonal[i] * s_i)
         system.compression[i] = s_i

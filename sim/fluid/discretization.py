@@ -2,21 +2,8 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
-import taichi as ti
-
-from sim.core.bundles import bundle
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS, normalization, particle_volume
-
-
-@bundle
-class Smoothing(NamedTuple):
-    """Numbers of the discretization that sums over neighbours take."""
-
-    volume: ti.f32  # V of a particle [m³]
-    sigma: ti.f32  # factor of the kernel, 8/(pi h³) [1/m³]
-    inverse_support: ti.f32  # 1/h [1/m]
 
 
 @dataclass(frozen=True)
@@ -37,6 +24,11 @@ class Discretization:
         return self.support_in_spacings * self.spacing
 
     @cached_property
+    def inverse_support(self) -> float:
+        """1/h [1/m]."""
+        return 1.0 / self.support_radius
+
+    @cached_property
     def particle_volume(self) -> float:
         """Volume V of a particle [m³]."""
         return particle_volume(self.spacing, self.support_in_spacings)
@@ -50,8 +42,3 @@ class Discretization:
     def gradient_factor(self) -> float:
         """Factor of the kernel's gradient, sigma/h [1/m⁴]."""
         return self.sigma / self.support_radius
-
-    @cached_property
-    def smoothing(self) -> Smoothing:
-        """The numbers that kernels take."""
-        return Smoothing(self.particle_volume, self.sigma, 1.0 / self.support_radius)

@@ -8,16 +8,12 @@ from numpy.typing import NDArray
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Vector3
 
+# Where neither gravity nor an initial velocity says what to expect [m/s].
 SLOWEST_EXPECTED_SPEED = 0.1
-"""Where neither gravity nor an initial velocity says what to expect [m/s]."""
 
 COHESION_SPEED_FACTOR = 10.0
 """Square of the speed to expect from cohesion over the stress with which that pulls a filled lattice together, per
-density.
-
-At rest the stress compresses the lattice by 0.1 % at this factor. The collapse of a cube to a drop compresses it more:
-1.7 % for 5³ particles, 1.1 % for 8³ and 0.9 % for 12³, whatever kappa; half of the factor doubles that.
-"""
+density: at rest it compresses the lattice by 0.1 %, and a cube that collapses to a drop by 1 to 2 %."""
 
 
 def expected_speed(

@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from sim.fluid.parameters import FluidParameters
     from sim.shapes.solid import Solid
 
+# A particle's centre keeps half a lattice spacing, its radius, from walls and solids.
 CLEARANCE_IN_SPACINGS = 0.5
-"""A particle's centre keeps half a lattice spacing, its radius, from walls and solids."""
 
+# A place is taken where a particle is nearer than this; particles as near as that push each other apart at once.
 TAKEN_IN_SPACINGS = 0.9
-"""A place is taken where a particle is nearer than this; particles as near as that push each other apart at once."""
 
 NO_POINTS = np.empty((0, 3))
 
+# Particles that a domain holds at most over those that fill it at rest; emitters stop there.
 FULL_DOMAIN = 1.1
-"""Particles that a domain holds at most over those that fill it at rest; emitters stop there."""
 
 ROUNDING = 1.0e-3
 """Share of the clearance that a particle may come nearer: lattice points are float32, and a block that rests on a
@@ -50,10 +50,6 @@ class FluidFilling:
     velocities: NDArray[np.float32]
     phase: NDArray[np.int32]
 
-    def count_of(self, fluids: int) -> NDArray[np.int64]:
-        """Particles of each of so many fluids, (k,)."""
-        return np.bincount(self.phase, minlength=fluids)
-
 
 def fill_fluids(
     fluids: Sequence[FluidParameters],
@@ -64,12 +60,7 @@ def fill_fluids(
     """Fill the blocks of all fluids on lattices of spacing 2r, clear of walls, solids and each other.
 
     A place in two blocks belongs to the first, of the first fluid that has it.
-
-    Args:
-        fluids: of the tank.
-        domain: that they are in.
-        solids: what is in the way.
-        pipes: boundary samples of the emitters' pipes [m], (m, 3); fluid keeps its distance from them too.
+    Fluid keeps its distance from the boundary samples of pipes and sheets [m], (m, 3), too.
 
     Raises:
         ShapeError: a block's shape cannot be built.
@@ -79,7 +70,7 @@ def fill_fluids(
     velocities: list[NDArray[np.float32]] = [np.empty((0, 3), dtype=np.float32)]
     phase: list[NDArray[np.int32]] = [np.empty(0, dtype=np.int32)]
     for index, fluid in enumerate(fluids):
-        spacing = 2.0 * fluid.particle_radius
+        spacing = fluid.spacing
         for number, block in enumerate(fluid.block):
             points = fill_with_particles(build_solid(block), spacing, lower=domain.min, upper=domain.max)
             points = free_places(points, spacing, solids, np.concatenate(positions))
@@ -100,14 +91,7 @@ def fill_fluids(
 def free_places(
     points: NDArray[np.float32], spacing: float, solids: Sequence[Solid], taken: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """The points that are neither in a solid nor where a particle is, (m, 3) [m].
-
-    Args:
-        points: lattice points [m], (n, 3).
-        spacing: of the particles [m].
-        solids: what is in the way.
-        taken: particles that are there already [m], (k, 3).
-    """
+    """The lattice points [m], (n, 3), that are neither in a solid nor where a particle is, `taken`, (k, 3)."""
     clearance = (1.0 - ROUNDING) * CLEARANCE_IN_SPACINGS * spacing
     for solid in solids:
         points = points[solid.signed_distance(points.astype(np.float64)) >= clearance]
@@ -118,24 +102,15 @@ def free_places(
 
 
 def particle_capacity(
-    fluids: Sequence[FluidParameters], domain: DomainParameters, filled: NDArray[np.int64], particle_volume: float
+    fluids: Sequence[FluidParameters], domain: DomainParameters, filling: FluidFilling, particle_volume: float
 ) -> int:
-    """Most particles that there can be: those at the start, and what emitters may add to a domain that is not full.
-
-    Args:
-        fluids: of the tank.
-        domain: that they are in.
-        filled: particles of each fluid at the start, (k,).
-        particle_volume: of a particle [m³].
-
-    Raises:
-        ValueError: an opening is too narrow.
-    """
-    spacing = 2.0 * fluids[0].particle_radius
+    """Most particles that there can be: those at the start, and what emitters may add to a domain that is not full."""
     total = 0.0
-    for fluid, count in zip(fluids, filled.tolist(), strict=True):
-        openings = [Opening.of(each, spacing, particle_volume, fluid.support_in_spacings) for each in fluid.emitter]
+    for fluid, count in zip(fluids, np.bincount(filling.phase, minlength=len(fluids)).tolist(), strict=True):
+        openings = [
+            Opening.of(each, fluid.spacing, particle_volume, fluid.support_in_spacings) for each in fluid.emitter
+        ]
         most = count + sum(opening.total_particles() for opening in openings)
         total += max(count, min(most, math.inf if fluid.max_particles is None else fluid.max_particles))
     full = FULL_DOMAIN * math.prod(np.subtract(domain.max, domain.min)) / particle_volume
-    return max(int(filled.sum()), int(min(total, full)))
+    return max(len(filling.phase), int(min(total, full)))

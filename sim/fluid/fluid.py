@@ -16,6 +16,7 @@ from sim.fluid.expected_speed import expected_speed
 from sim.fluid.forces import Forces
 from sim.fluid.opening import Opening
 from sim.fluid.phases import Phases
+from sim.fluid.solve_record import SolveRecord
 from sim.fluid.surface_tension import Cohesion
 from sim.fluid.tank import FluidStart, ParticleTank
 from sim.fluid.viscosity import LAPLACIAN_FACTOR
@@ -24,21 +25,15 @@ from sim.fluid.viscosity_implicit import CARRIED, is_implicit
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sim.core.parameters import Vector3
     from sim.core.solver import Arrays, Diagnostics
-    from sim.fluid.body_forces import BodyForces
-    from sim.fluid.boundary import Boundary
     from sim.fluid.parameters import FluidParameters
-    from sim.fluid.particles import ParticleSet
-    from sim.fluid.solve_record import SolveRecord
 
 SQUEEZED = 0.2
-"""Relative compression of a particle from which on a frame is counted as squeezed. The mean error of a pressure solve,
-which decides whether it converged, says nothing about single particles; those in corners of a filled box start at
-0.06, and gaps that close reach just under 0.2."""
+"""Relative compression of a particle from which on a frame is counted as squeezed. A pressure solve converges by its
+mean error, which says nothing about single particles; those in corners of a filled box start at 0.06."""
 
+# As in a job file.
 LARGEST_CFL = 2.0
-"""As in a job file."""
 
 
 class SPHFluid(ABC):
@@ -50,6 +45,7 @@ class SPHFluid(ABC):
 
     Attributes:
         carried: scalars per particle that the solver keeps from step to step, by name.
+        solved_for: what it solves for in a step, by name.
         speed_ratio: speed of the signals that limit the time step over the largest expected speed [-].
         runaway: multiple of the speed of signals beyond which speeds are numerical [-], and the name of that speed.
         sheets_answer: whether sheets answer to pressures that are tried within a step.
@@ -57,11 +53,13 @@ class SPHFluid(ABC):
         parameters: of the first fluid, for what all fluids of a tank have in common.
         expected_speed: largest speed to expect [m/s].
         signal_speed: speed of the signals that limit the time step [m/s].
-        tank: the particles, and what is around them.
+        tank: the particles, and what is around them: `particles`, `boundary` and `body_forces`.
         forces: all but those of pressure.
+        solves: the iterative solves of this frame, by what they are for.
     """
 
     carried: ClassVar[tuple[str, ...]] = ()
+    solved_for: ClassVar[tuple[str, ...]] = ()
     speed_ratio: ClassVar[float] = 1.0
     runaway: ClassVar[tuple[float, str]]
     sheets_answer: ClassVar[bool] = False
@@ -81,7 +79,7 @@ class SPHFluid(ABC):
         self.expected_speed = _expected_speed(start, self.discretization, self._cohesion.stress)
         self.signal_speed = self.parameters.sound_speed or self.speed_ratio * self.expected_speed
         self._stiffest = float(self.phases.viscosities.max()) * max(1.0, self.parameters.wall_friction)
-        with_implicit = self._asks_for_implicit_viscosity(self.parameters, self._stiffest)
+        with_implicit = is_implicit(self.parameters, self._stiffest, self.signal_speed)
         self.tank = ParticleTank(
             start,
             self.phases,
@@ -91,50 +89,20 @@ class SPHFluid(ABC):
             sheets_answer=self.sheets_answer,
             looks_ahead=self.looks_ahead,
         )
+        self.particles, self.boundary = self.tank.particles, self.tank.boundary
+        self.body_forces = self.tank.body_forces
+        self.gravity, self.spacing = start.gravity, self.discretization.spacing
+        self.particle_volume = self.discretization.particle_volume
         self.forces = Forces(
             self.tank, self.phases, self._cohesion, signal_speed=self.signal_speed, with_implicit=with_implicit
         )
+        self.solves = {**self.forces.solves, **{name: SolveRecord() for name in self.solved_for}}
         self._first_bad: str | None = None
-
-    @property
-    def particles(self) -> ParticleSet:
-        """The particles, for those that look at them between two substeps."""
-        return self.tank.particles
-
-    @property
-    def boundary(self) -> Boundary:
-        """Samples of walls, bodies and sheets."""
-        return self.tank.boundary
-
-    @property
-    def body_forces(self) -> BodyForces:
-        """Reaction of the fluid on bodies and sheets."""
-        return self.tank.body_forces
-
-    @property
-    def gravity(self) -> Vector3:
-        """Acceleration [m/s²]."""
-        return self.tank.gravity
-
-    @property
-    def spacing(self) -> float:
-        """Spacing of the particles at rest [m]."""
-        return self.discretization.spacing
-
-    @property
-    def particle_volume(self) -> float:
-        """Volume of a particle [m³]."""
-        return self.discretization.particle_volume
 
     @property
     def particle_count(self) -> int:
         """Particles that are still in the domain."""
         return self.particles.count
-
-    @property
-    def particles_removed(self) -> int:
-        """Particles that left the domain since the start."""
-        return self.tank.removed
 
     @abstractmethod
     def substep(self, dt: float) -> None:
@@ -153,11 +121,6 @@ class SPHFluid(ABC):
     def pressure_term(self) -> ti.Ndarray:
         """P_i = p_i/(rho_i/rho0)² of each particle [Pa]."""
 
-    @property
-    def solves(self) -> dict[str, SolveRecord]:
-        """The solves of this frame, by what they are for."""
-        return self.forces.solves
-
     def stable_dt(self) -> float:
         """Largest time step [s] for the current state, or the fixed one that the parameters name."""
         dt = self.parameters.dt
@@ -166,7 +129,8 @@ class SPHFluid(ABC):
     def begin_frame(self, time_s: float) -> None:  # noqa: ARG002  a fluid's counters do not depend on the time
         """Restart the counters of the frame, and its largest speed at the present one."""
         self.tank.begin_frame()
-        self.forces.begin_frame()
+        for record in self.solves.values():
+            record.clear()
 
     def advance(self, dt: float, frequency_squared: ti.Ndarray | None = None) -> None:
         """Move the particles by their acceleration, for a step of dt [s]."""
@@ -175,7 +139,7 @@ class SPHFluid(ABC):
 
     @property
     def limiting_viscosity(self) -> float:
-        """Viscosity that limits the time step [m²/s], the artificial one included; without that which is solved for."""
+        """Viscosity that limits the time step [m²/s], the artificial one included; not that which is solved for."""
         physical = self._stiffest if self.forces.implicit_viscosity is None else 0.0
         return physical + self.forces.artificial_viscosity / LAPLACIAN_FACTOR * max(1.0, self.parameters.wall_friction)
 
@@ -190,11 +154,12 @@ class SPHFluid(ABC):
         particles = self.particles
         order = particles.order_by_id()
         phase = particles.host(particles.arrays.phase)[order]
+        pressure = (particles.host(self.pressure_term) * particles.host(particles.density) ** 2).astype(np.float32)
         arrays = {
             "position": particles.host(particles.position)[order],
             "velocity": particles.host(particles.velocity)[order],
             "density": particles.host(particles.density)[order],
-            "pressure": self._pressures()[order],
+            "pressure": pressure[order],
             "particle_id": particles.host(particles.arrays.particle_id)[order],
         }
         snapshots = {}
@@ -204,11 +169,6 @@ class SPHFluid(ABC):
             attributes = {"particle_radius": fluid.particle_radius, "rest_density": fluid.rest_density}
             snapshots[fluid.name] = Snapshot(kind="fluid", arrays=own, attributes=attributes)
         return snapshots
-
-    def pressures(self) -> NDArray[np.float32]:
-        """Pressure of each particle [Pa], (n,), by particle id."""
-        self.compute_density()
-        return self._pressures()[self.particles.order_by_id()]
 
     def boundary_forces(self) -> NDArray[np.float32]:
         """Pressure force of the fluid on each fixed boundary sample, in the order they were given [N], (m, 3)."""
@@ -228,16 +188,8 @@ class SPHFluid(ABC):
         self.tank.restore(arrays, self.name)
         self._first_bad = None
 
-    def synchronize(self) -> None:
-        """Wait until the device has done all that it was asked to, as measurements of time need."""
-        ti.sync()
-
     def diagnostics(self) -> Diagnostics:
-        """Mass, momentum and energies, summed in float64 by particle id, and the numbers of this frame's steps.
-
-        `max_speed` is the largest of the whole frame, every substep of it [m/s]; `squeezed` is 1 where a particle is
-        compressed by more than `SQUEEZED` at its end, else 0.
-        """
+        """Mass, momentum and energies, summed in float64 by particle id, and the numbers of this frame's steps."""
         self.compute_density()
         particles = self.particles
         order = particles.order_by_id()
@@ -266,9 +218,9 @@ class SPHFluid(ABC):
         numbers["squeezed"] = float(compression > SQUEEZED)
         if self.solves:
             numbers["not_converged"] = float(sum(record.not_converged for record in self.solves.values()))
-        if self.forces.implicit_viscosity is not None:
-            record = self.forces.implicit_viscosity.record
-            numbers |= {"viscosity_iterations": record.mean_iterations, "viscosity_error": record.worst_error}
+        for kind, record in self.solves.items():
+            iterations = "iterations" if kind == "density" else f"{kind}_iterations"
+            numbers |= {iterations: record.mean_iterations, f"{kind}_error": record.worst_error}
         return numbers
 
     def remedies(self) -> Remedies:
@@ -279,10 +231,7 @@ class SPHFluid(ABC):
         )
 
     def first_bad_quantity(self) -> str | None:
-        """The first non-finite or runaway quantity of any step since the start or `restore`, in words; costs nothing.
-
-        A particle that diverged may leave the domain or come to rest at a wall before anybody asks.
-        """
+        """The first non-finite or runaway quantity of any step since the start or `restore`, in words."""
         return self._first_bad
 
     def set_viscosity(self, name: str, viscosity: float) -> None:
@@ -315,26 +264,11 @@ class SPHFluid(ABC):
 
     def _require_same_viscosity_solver(self, change: str, parameters: FluidParameters, stiffest: float) -> None:
         implicit = self.forces.implicit_viscosity is not None
-        if self._asks_for_implicit_viscosity(parameters, stiffest) != implicit:
+        if is_implicit(parameters, stiffest, self.signal_speed) != implicit:
             raise ValueError(
                 f"with {change} viscosity would be {'explicit' if implicit else 'implicit'}, which is decided at the "
                 f"start; set it in the job, or viscosity_solver there"
             )
-
-    def _asks_for_implicit_viscosity(self, parameters: FluidParameters, stiffest: float) -> bool:
-        """Whether these parameters, with this largest viscosity, against walls too [m²/s], have it solved for."""
-        return is_implicit(
-            parameters.viscosity_solver,
-            viscosity=stiffest,
-            spacing=parameters.spacing,
-            speed=self.signal_speed,
-            dt=parameters.dt,
-            cfl=parameters.cfl,
-        )
-
-    def _pressures(self) -> NDArray[np.float32]:
-        density, term = self.particles.host(self.particles.density), self.particles.host(self.pressure_term)
-        return (term * density**2).astype(np.float32)
 
     def _bad_motion(self) -> str | None:
         """Quantity of the last step that is not finite or ran away, in words, or None."""

@@ -6,18 +6,15 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle
 from sim.core.cells import Grid, cell_of_point, row_of_cell
 from sim.core.launch import kernel
-from sim.core.neighbors import Neighbors
 from sim.fluid.body_forces import Exerted
 from sim.fluid.body_friction import BodyFriction
-from sim.fluid.boundary import Samples
-from sim.fluid.discretization import Smoothing
+from sim.fluid.device import Fluid
 from sim.fluid.kernels import inverse_distance, spline_slope
-from sim.fluid.particles import Particles
-from sim.fluid.phases import Materials, Phases, device_table
+from sim.fluid.phases import Phases
 from sim.fluid.sheet_forces import DENSITY
 from sim.fluid.solve_record import SolveRecord
 from sim.fluid.surface_tension import Cohesion, cohesion_becker_teschner2007
@@ -49,39 +46,36 @@ class Forces:
         acceleration: of each particle [m/s²], (capacity,) of 3-vectors.
         artificial_viscosity: alpha c h/2 [m²/s], which stands where 2 (d + 2) nu does.
         implicit_viscosity: the solve for stiff fluids; None where viscosity is explicit.
+        solves: that solve, by its name.
     """
 
     def __init__(
         self, tank: ParticleTank, phases: Phases, cohesion: Cohesion, *, signal_speed: float, with_implicit: bool
     ) -> None:
-        """Prepare for the particles of a tank.
-
-        Args:
-            tank: holds them.
-            phases: their materials.
-            cohesion: surface tension of the materials.
-            signal_speed: speed c in the artificial viscosity [m/s].
-            with_implicit: whether viscosity is solved for.
-        """
-        self._tank, self._phases, self._cohesion = tank, phases, cohesion
-        parameters, support = phases.shared, tank.discretization.support_radius
-        capacity = tank.particles.capacity
+        """Prepare for the particles of a tank; `signal_speed` is c in the artificial viscosity [m/s]."""
+        self._tank, self._cohesion = tank, cohesion
+        parameters, d = phases.shared, tank.discretization
+        support, capacity = d.support_radius, tank.particles.capacity
         self.acceleration = ti.Vector.ndarray(3, ti.f32, capacity)
         self.artificial_viscosity = parameters.artificial_viscosity * signal_speed * support / 2.0
         wall_friction = parameters.wall_friction
         self._viscosity = Viscosity(
             SOFTENING * support**2, self.artificial_viscosity, wall_friction, wall_friction > 0.0
         )
-        self._materials = phases.materials
+        self._volume_gradient_factor = d.particle_volume * d.sigma / support
+        self._explicit_materials = phases.materials
         self.implicit_viscosity: ImplicitViscosity | None = None
+        self.solves: dict[str, SolveRecord] = {}
         if with_implicit:
-            tank.body_forces.let_bodies_respond(tank.gravity, tank.discretization.spacing)
-            bodies = BodyFriction(tank.boundary, tank.body_forces.response)
-            self.implicit_viscosity = ImplicitViscosity(capacity, bodies, wall_friction)
-            nothing = device_table(np.zeros(len(phases)))
-            self._materials = phases.materials._replace(dynamic_viscosity=nothing)
+            tank.body_forces.let_bodies_respond(tank.gravity, d)
+            heaviest = float(phases.rest_densities.max())
+            bodies = BodyFriction(tank.boundary, tank.body_forces.response, d.particle_volume, heaviest)
+            self.implicit_viscosity = ImplicitViscosity(capacity, bodies, wall_friction, d)
+            self.solves["viscosity"] = self.implicit_viscosity.record
+            nothing = on_device(np.zeros(len(phases)))
+            self._explicit_materials = phases.materials._replace(dynamic_viscosity=nothing)
         self._akinci2013 = (
-            SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, tank.discretization)
+            SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, d)
             if cohesion.is_akinci2013
             else None
         )
@@ -89,29 +83,20 @@ class Forces:
         self._no_pressure = Elastic(density, density, 0.0, False)
 
     @property
-    def solves(self) -> dict[str, SolveRecord]:
-        """The solves of this frame, by what they are for."""
-        return {} if self.implicit_viscosity is None else {"viscosity": self.implicit_viscosity.record}
-
-    def begin_frame(self) -> None:
-        """Restart the counters of the frame."""
-        if self.implicit_viscosity is not None:
-            self.implicit_viscosity.record = SolveRecord()
+    def _fluid(self) -> Fluid:
+        """The fluid with the viscosity that forces know before the step."""
+        return self._tank.on_device._replace(materials=self._explicit_materials)
 
     def begin_sheets(self) -> None:
         """Find the fluid that touches sheets at the start of a step, before anything acts between them."""
         if self._tank.body_forces.sheets is not None:
-            self._tank.body_forces.sheets.begin_step(self._tank.particles, self._tank.body_forces.near)
+            self._tank.body_forces.sheets.begin_step(self._tank.on_device, self._tank.body_forces.near)
 
     def compute(self, dt: float, elastic: Elastic | None = None) -> None:
         """Fill `acceleration` with all forces known before a step of dt [s], and count their reaction."""
         tank = self._tank
         compute_acceleration(
-            tank.particles.arrays,
-            tank.particles.near,
-            tank.boundary.samples,
-            tank.discretization.smoothing,
-            self._materials,
+            self._fluid,
             self._no_pressure if elastic is None else elastic,
             self._viscosity,
             tank.gravity,
@@ -120,22 +105,17 @@ class Forces:
             self.acceleration,
         )
         if self._akinci2013 is not None:
-            self._akinci2013.add_acceleration(
-                tank.particles.arrays, tank.particles.near, tank.boundary.samples, self.acceleration
-            )
+            self._akinci2013.add_acceleration(tank.on_device, self.acceleration)
         self._begin_reaction(None if elastic is None else elastic.pressure_term, dt)
         self.add_implicit_viscosity(dt)
 
     def exerted(self, pressure_term: ti.Ndarray | None, *, with_friction: bool) -> Exerted:
         """Forces on bodies by pressure, by explicit friction or by both."""
-        tank = self._tank
-        d = tank.discretization
+        fluid = self._fluid
         return Exerted(
-            particles=tank.particles.arrays,
-            pressure_term=tank.particles.density if pressure_term is None else pressure_term,
-            materials=self._materials,
-            volume_gradient_factor=d.particle_volume * d.sigma / d.support_radius,
-            inverse_support=1.0 / d.support_radius,
+            fluid=fluid,
+            pressure_term=fluid.particles.density if pressure_term is None else pressure_term,
+            volume_gradient_factor=self._volume_gradient_factor,
             viscosity=self._viscosity,
             with_pressure=pressure_term is not None,
             with_friction=with_friction and self._viscosity.with_wall_friction,
@@ -164,9 +144,7 @@ class Forces:
         forces = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
         exerted = self.exerted(pressure_term, with_friction=False)
         cell_start = self._tank.particles.cells.cell_start
-        gather_boundary_forces(
-            boundary.samples, boundary.fixed_count, cell_start, self._tank.grid.on_device, exerted, forces
-        )
+        gather_boundary_forces(exerted, boundary.fixed_count, cell_start, self._tank.grid.on_device, forces)
         result = np.zeros((boundary.given_count, 3), dtype=np.float32)
         result[boundary.index] = forces.to_numpy()[: boundary.fixed_count]
         return result
@@ -184,36 +162,36 @@ class Forces:
             body_forces.response.fall(dt)
         if sheets is not None:
             sheets.recoil(dt)
-            sheets.add_missing_weight(self._tank.particles, body_forces.near, dt)
+            sheets.add_missing_weight(self._tank.on_device, body_forces.near, dt)
 
     def add_implicit_viscosity(self, dt: float) -> None:
         """Add viscosity to all other accelerations, where it is implicit, and count its friction on bodies."""
         solver, tank = self.implicit_viscosity, self._tank
         if solver is None:
             return
-        viscous = self.exerted(None, with_friction=True)._replace(
-            materials=self._phases.materials, viscosity=self._viscosity._replace(artificial=0.0), with_friction=True
-        )
+        fluid, body_forces = tank.on_device, tank.body_forces
+        viscosity = self._viscosity._replace(artificial=0.0)
+
+        def friction_at(velocity: ti.Ndarray, sample_velocity: ti.Ndarray) -> Exerted:
+            moving = fluid._replace(
+                particles=fluid.particles._replace(velocity=velocity),
+                samples=fluid.samples._replace(velocity=sample_velocity),
+            )
+            return self.exerted(None, with_friction=True)._replace(
+                fluid=moving, viscosity=viscosity, with_friction=True
+            )
 
         def friction(velocity: ti.Ndarray, sample_velocity: ti.Ndarray) -> NDArray[np.float64]:
-            moving = viscous._replace(particles=viscous.particles._replace(velocity=velocity))
-            return tank.body_forces.measure(moving, sample_velocity)
+            return body_forces.measure(friction_at(velocity, sample_velocity))
 
-        solver.add_acceleration(
-            tank.particles, tank.boundary.samples, self._phases, tank.discretization, friction, self.acceleration, dt
-        )
+        solver.add_acceleration(tank.particles, fluid, friction, self.acceleration, dt)
         if self._viscosity.with_wall_friction:
-            found = viscous._replace(particles=viscous.particles._replace(velocity=solver.velocity))
-            tank.body_forces.gather(found, dt, sample_velocity=solver.bodies.found_velocity())
+            body_forces.gather(friction_at(solver.velocity, solver.bodies.found_velocity()), dt)
 
 
 @kernel
 def compute_acceleration(
-    particles: Particles,
-    near: Neighbors,
-    samples: Samples,
-    smoothing: Smoothing,
-    materials: Materials,
+    fluid: Fluid,
     elastic: Elastic,
     viscosity: Viscosity,
     gravity: ti.math.vec3,
@@ -225,101 +203,107 @@ def compute_acceleration(
 
     With pressure also the square of the frequency at which a particle would swing against the pressures that its own
     displacement makes, dp/d(rho/rho0) A_ii with A_ii as in `sim.fluid.pressure`: high where a particle is squeezed, or
-    close to boundary samples.
+    close to boundary fluid.samples.
     """
-    gradient_factor = smoothing.sigma * smoothing.inverse_support
+    gradient_factor = fluid.sigma * fluid.inverse_support
     ti.loop_config(block_dim=128)
-    for i in range(particles.count):
-        x_i, v_i, rho_i = particles.position[i], particles.velocity[i], particles.density[i]
+    for i in range(fluid.particles.count):
+        x_i, v_i, rho_i = fluid.particles.position[i], fluid.particles.velocity[i], fluid.particles.density[i]
         pressure_i = 0.0
         if ti.static(elastic.is_given):
             pressure_i = elastic.pressure_term[i]
         own = 0
-        if ti.static(materials.several):
-            own = particles.phase[i]
-        rho0, mu = materials.rest_density[own], LAPLACIAN_FACTOR * materials.dynamic_viscosity[own]
+        if ti.static(fluid.materials.several):
+            own = fluid.particles.phase[i]
+        rho0, mu = fluid.materials.rest_density[own], LAPLACIAN_FACTOR * fluid.materials.dynamic_viscosity[own]
         fluid_sum = ti.math.vec3(0.0)
         gradient_sum = ti.math.vec3(0.0)
         square_sum = 0.0
         cohesion_sum = ti.math.vec3(0.0)
-        first = near.start[i]
-        for k in range(near.fluid_count[i]):
-            j = near.indices[first + k * near.stride]
-            x_ij = x_i - particles.position[j]
+        first = fluid.near.start[i]
+        for k in range(fluid.near.fluid_count[i]):
+            j = fluid.near.indices[first + k * fluid.near.stride]
+            x_ij = x_i - fluid.particles.position[j]
             r_squared = x_ij.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             r = r_squared * inverse_r
-            v_dot_x = (v_i - particles.velocity[j]).dot(x_ij)
+            v_dot_x = (v_i - fluid.particles.velocity[j]).dot(x_ij)
             mu_ij, rho0_ij, alike = mu, rho0, 1.0
-            if ti.static(materials.several):
-                other = particles.phase[j]
+            if ti.static(fluid.materials.several):
+                other = fluid.particles.phase[j]
                 alike = ti.cast(other == own, ti.f32)
-                mu_ij = pair_viscosity(mu, LAPLACIAN_FACTOR * materials.dynamic_viscosity[other])
-                rho0_ij = 0.5 * (rho0 + materials.rest_density[other])
+                mu_ij = pair_viscosity(mu, LAPLACIAN_FACTOR * fluid.materials.dynamic_viscosity[other])
+                rho0_ij = 0.5 * (rho0 + fluid.materials.rest_density[other])
             viscous = viscous_factor(v_dot_x, r_squared, viscosity.softening, mu_ij, viscosity.artificial * rho0_ij)
-            scale = 2.0 * viscous / (rho_i + particles.density[j])
+            scale = 2.0 * viscous / (rho_i + fluid.particles.density[j])
             if ti.static(elastic.is_given):
                 scale -= pressure_i + elastic.pressure_term[j]
-            slope = spline_slope(r * smoothing.inverse_support)
+            slope = spline_slope(r * fluid.inverse_support)
             gradient = slope * inverse_r * x_ij
             fluid_sum += scale * gradient
             if ti.static(elastic.is_given):
                 gradient_sum += gradient
                 lightness = 1.0
-                if ti.static(materials.several):
-                    lightness = rho0 / materials.rest_density[particles.phase[j]]
+                if ti.static(fluid.materials.several):
+                    lightness = rho0 / fluid.materials.rest_density[fluid.particles.phase[j]]
                 square_sum += slope * slope * lightness
             if ti.static(with_cohesion):
-                cohesion_sum += alike * cohesion_becker_teschner2007(r, smoothing.inverse_support, spacing) * x_ij
+                cohesion_sum += alike * cohesion_becker_teschner2007(r, fluid.inverse_support, spacing) * x_ij
         boundary_sum = ti.math.vec3(0.0)
         boundary_gradient = ti.math.vec3(0.0)
-        first += near.fluid_count[i] * near.stride
-        for k in range(near.boundary_count[i]):
-            b = near.indices[first + k * near.stride]
-            x_ib = x_i - samples.position[b]
+        first += fluid.near.fluid_count[i] * fluid.near.stride
+        for k in range(fluid.near.boundary_count[i]):
+            b = fluid.near.indices[first + k * fluid.near.stride]
+            x_ib = x_i - fluid.samples.position[b]
             r_squared = x_ib.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             r = r_squared * inverse_r
-            slope = spline_slope(r * smoothing.inverse_support)
+            slope = spline_slope(r * fluid.inverse_support)
             if ti.static(viscosity.with_wall_friction):
                 v_ib = v_i
-                if ti.static(samples.with_moving):
-                    v_ib -= samples.velocity[b]
+                if ti.static(fluid.samples.with_moving):
+                    v_ib -= fluid.samples.velocity[b]
                 viscous = viscous_factor(
                     v_ib.dot(x_ib), r_squared, viscosity.softening, mu, viscosity.artificial * rho0
                 )
                 boundary_sum += (
-                    viscosity.wall_friction * viscous / rho_i * samples.friction_volume[b] * slope * inverse_r * x_ib
+                    viscosity.wall_friction
+                    * viscous
+                    / rho_i
+                    * fluid.samples.friction_volume[b]
+                    * slope
+                    * inverse_r
+                    * x_ib
                 )
-            gradient = samples.volume[b] * slope * inverse_r * x_ib
+            gradient = fluid.samples.volume[b] * slope * inverse_r * x_ib
             boundary_sum -= pressure_i * gradient
             boundary_gradient += gradient
         if ti.static(elastic.is_given):
-            volume = smoothing.volume
+            volume = fluid.volume
             diagonal = (volume * gradient_sum + boundary_gradient).norm_sqr() + volume * volume * square_sum
             stiffer = rho_i * rho_i * rho_i
             elastic.frequency_squared[i] = elastic.slope / rho0 * stiffer * stiffer * gradient_factor**2 * diagonal
-        a_i = gravity + gradient_factor / rho0 * (smoothing.volume * fluid_sum + boundary_sum)
+        a_i = gravity + gradient_factor / rho0 * (fluid.volume * fluid_sum + boundary_sum)
         if ti.static(with_cohesion):
-            a_i -= materials.surface_tension[own] * smoothing.sigma * cohesion_sum
+            a_i -= fluid.materials.surface_tension[own] * fluid.sigma * cohesion_sum
         acceleration[i] = a_i
 
 
 @kernel
-def gather_boundary_forces(
-    samples: Samples, count: ti.i32, cell_start: Integers, grid: Grid, exerted: Exerted, force: Vectors
-):
+def gather_boundary_forces(exerted: Exerted, count: ti.i32, cell_start: Integers, grid: Grid, force: Vectors):
     """Reaction to the pressure acceleration that each sample causes, summed in the order of the sorted particles."""
     for b in range(count):
-        x_b = samples.position[b]
+        x_b = exerted.fluid.samples.position[b]
         cell = cell_of_point(x_b, grid)
         total = ti.math.vec3(0.0)
         for dz in range(-grid.reach, grid.reach + 1):
             for dy in range(-grid.reach, grid.reach + 1):
                 row = row_of_cell(cell, dy, dz, grid)
                 for i in range(cell_start[row - grid.reach], cell_start[row + grid.reach + 1]):
-                    x_ib = exerted.particles.position[i] - x_b
+                    x_ib = exerted.fluid.particles.position[i] - x_b
                     inverse_r = inverse_distance(x_ib.norm_sqr())
                     r = x_ib.norm_sqr() * inverse_r
-                    total += exerted.pressure_term[i] * spline_slope(r * exerted.inverse_support) * inverse_r * x_ib
-        force[b] = exerted.volume_gradient_factor * samples.volume[b] * total
+                    total += (
+                        exerted.pressure_term[i] * spline_slope(r * exerted.fluid.inverse_support) * inverse_r * x_ib
+                    )
+        force[b] = exerted.volume_gradient_factor * exerted.fluid.samples.volume[b] * total

@@ -26,8 +26,8 @@ TINY_DISTANCE = 1.0e-12
 SUPPORT_IN_SPACINGS = 2.0
 """Usual support radius over lattice spacing: 4r over 2r."""
 
+# Between these distances from the fluid is the first of two layers of samples, at every support up to 4.
 NEAR_LAYER_IN_SPACINGS = 0.3, 1.2
-"""Between these distances from the fluid is the first of two layers of samples, at every support up to 4."""
 
 
 @func
@@ -48,10 +48,7 @@ def spline_slope(q: ti.f32) -> ti.f32:
 
 @func
 def inverse_distance(r_squared: ti.f32) -> ti.f32:
-    """1/|x| from |x|², finite at 0: `r_squared * inverse_distance(r_squared)` is |x|.
-
-    GPUs have an instruction for it, and none for the square root: sums over neighbours take a tenth less time.
-    """
+    """1/|x| from |x|², finite at 0, where |x| is `r_squared * inverse_distance(r_squared)`; fast on a GPU."""
     return ti.rsqrt(r_squared + TINY_DISTANCE * TINY_DISTANCE)
 
 
@@ -93,8 +90,7 @@ def lattice_offsets(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> NDArray
 def particle_volume(spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
     """Volume V of a particle [m³] with which a filled lattice has exactly rest density: V = 1 / sum_j W_ij.
 
-    It is d³ to 0.03 % at the usual support, and to 0.2 % at any from 2 to 4 spacings; see
-    docs/decisions/0010-particle-volume.md.
+    It is d³ to 0.2 % (docs/decisions/0010-particle-volume.md).
     """
     distances = np.linalg.norm(lattice_offsets(support_in_spacings), axis=1) * spacing
     return float(1.0 / evaluate(distances, support_in_spacings * spacing).sum())
@@ -126,9 +122,8 @@ def wall_calibration(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> WallCa
     finds D, about 1.45 d. A smaller factor with nearer samples (gamma = 0.7 at D = d, Band et al. 2018) has the density
     right and half of the push; fluid then sinks into the wall.
 
-    Only one layer is missing at the usual support of 2 spacings. A wider one reaches past the first layer of particles,
-    whose density and push stay right; of the second's density one layer of samples leaves out up to 7 % (at 4
-    spacings). `wall_layers` has those that complete it.
+    A support wider than the usual 2 spacings reaches past the first layer of particles, whose density and push stay
+    right; of the second's density one layer of samples leaves out up to 7 %. `wall_layers` has those that complete it.
     """
     low, high = 1.0, 1.0 + 0.95 * (support_in_spacings - 1.0)
     fluid_field, fluid_slope = _missing_field(1, support_in_spacings)
@@ -192,8 +187,7 @@ def _missing_field(layer: int, support_in_spacings: float) -> tuple[float, float
 
 def _lattice_axis(half_width: float) -> NDArray[np.float64]:
     """Whole numbers as far from 0 as a support of `half_width` spacings reaches."""
-    reach = math.ceil(half_width)
-    return np.arange(-reach, reach + 1, dtype=np.float64)
+    return np.arange(-math.ceil(half_width), math.ceil(half_width) + 1, dtype=np.float64)
 
 
 def _layer_field(distance: float, support_in_spacings: float, *, shifts: int = 8) -> tuple[float, float]:

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sim.fluid.opening import NEAREST_IN_SPACINGS, pipe_clearance
+from sim.fluid.opening import NEAREST_IN_SPACINGS, obstruction, pipe_clearance
 
 if TYPE_CHECKING:
+    from sim.core.domain import DomainParameters
     from sim.fluid.opening import Opening
+    from sim.shapes.solid import Solid
 
+# Nozzles whose particles, and whose sides, differ by less are one.
 SAME_IN_SPACINGS = 1.0e-3
-"""Nozzles whose particles, and whose sides, differ by less are one."""
 
 
 def is_same_nozzle(one: Opening, other: Opening, spacing: float) -> bool:
-    """Whether two emitters have one opening and one pipe, as when an inflow changes its speed.
-
-    Args:
-        one: an opening.
-        other: another one.
-        spacing: of the particles [m].
-    """
+    """Whether two emitters have one opening and one pipe, as when an inflow changes its speed."""
 
     def is_equal(own: object, others: object) -> bool:
         return bool(np.allclose(own, others, rtol=0.0, atol=SAME_IN_SPACINGS * spacing))  # type: ignore[arg-type]
@@ -40,16 +36,10 @@ def is_same_nozzle(one: Opening, other: Opening, spacing: float) -> bool:
 
 
 def nozzle_collision(one: Opening, other: Opening, name: str, spacing: float) -> str | None:
-    """Why two emitters cannot be in one tank, or None.
+    """Why an emitter cannot be in one tank with another one, of this name, or None.
 
-    Particles of one nozzle must not be where those of the other are at the same time, and not at its pipe, which stays
-    when its emitter has ended. Both move as they are told, so nothing would push them apart.
-
-    Args:
-        one: an opening.
-        other: another one.
-        name: of the other, for the message.
-        spacing: of the particles [m].
+    Particles of one nozzle must not be where those of the other are at the same time, as nothing would push them apart,
+    and not at its pipe, which stays when its emitter has ended.
     """
     if is_same_nozzle(one, other, spacing):
         if one.start_s < other.end_s and other.start_s < one.end_s:
@@ -70,13 +60,25 @@ def nozzle_collision(one: Opening, other: Opening, name: str, spacing: float) ->
     return None
 
 
-def pipes(openings: Sequence[Opening], spacing: float) -> list[NDArray[np.float64]]:
-    """Boundary samples of the pipes of all openings [m], (m_k, 3) each; emitters with one nozzle share its pipe.
+def opening_problem(
+    opening: Opening,
+    spacing: float,
+    domain: DomainParameters,
+    solids: Sequence[Solid],
+    earlier: Mapping[str, Opening],
+) -> str | None:
+    """Why an opening cannot be where it is, or None: it is not free, or in the way of an earlier one.
 
-    Args:
-        openings: of the tank.
-        spacing: of the particles [m].
+    The earlier ones are named as messages call them.
     """
+    reason = obstruction(opening, spacing, domain, solids)
+    for name, other in earlier.items():
+        reason = reason or nozzle_collision(opening, other, name, spacing)
+    return reason
+
+
+def pipes(openings: Sequence[Opening], spacing: float) -> list[NDArray[np.float64]]:
+    """Boundary samples of the pipes of all openings [m], (m_k, 3) each; emitters with one nozzle share its pipe."""
     return [
         opening.pipe(spacing)
         for number, opening in enumerate(openings)
@@ -87,16 +89,11 @@ def pipes(openings: Sequence[Opening], spacing: float) -> list[NDArray[np.float6
 def is_felt_in_nozzles(
     positions: NDArray[np.floating], openings: Sequence[Opening], support_radius: float
 ) -> NDArray[np.bool_]:
-    """Whether particles in any of the nozzles may feel a sample that stands here, (m,).
+    """Whether particles in any of the nozzles may feel a sample at one of these positions [m], (m, 3); (m,).
 
     Such samples, of pipes and of walls and bodies at rest that an opening lies in, exert no friction. A nozzle gives
     its particles their velocity once a step, but within it they are unknowns of the viscosity as all others are: held
-    by samples at rest, they would brake the jet that they push. A fluid that sticks to walls would hardly come out.
-
-    Args:
-        positions: of the samples [m], (m, 3).
-        openings: of the tank.
-        support_radius: of the kernel [m].
+    by samples at rest, they would brake the jet that they push.
     """
     felt = np.zeros(len(positions), dtype=np.bool_)
     for opening in openings:

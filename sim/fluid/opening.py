@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
@@ -18,21 +18,17 @@ if TYPE_CHECKING:
     from sim.fluid.parameters import EmitterParameters
     from sim.shapes.solid import Solid
 
+# How near particles of a layer, and layers, may be to each other: nearer, they would burst from the opening.
 NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35
-"""How near particles of a layer, and layers, may be to each other: nearer, they would burst from the opening."""
 
+# How much nearer to a pipe than at rest particles may start: the lattice of a block lies anywhere beside it.
 PIPE_PLAY_IN_SPACINGS = 0.05
-"""How much nearer to a pipe than at rest particles may start: the lattice of a block lies anywhere beside it."""
 
+# Lattice constants between 0.9 and 1.1 spacings that are tried for a disc.
 LATTICES_TRIED = 41
-"""Lattice constants between 0.9 and 1.1 spacings that are tried for a disc."""
 
+# By how much the area of a disc and that of the lattice cells in it may differ.
 CELL_MISMATCH = 0.05
-"""By how much the area of a disc and that of the lattice cells in it may differ."""
-
-PARTICLE_RADIUS_IN_SPACINGS = 0.5
-
-GRAVITY_FREE_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -68,16 +64,10 @@ class Opening:
     def of(
         cls, emitter: EmitterParameters, spacing: float, particle_volume: float, support_in_spacings: float
     ) -> Opening:
-        """The opening of an emitter.
-
-        Args:
-            emitter: what flows in, and where.
-            spacing: of the particles [m].
-            particle_volume: of a particle [m³].
-            support_in_spacings: support radius of the fluid's kernel.
+        """The opening of an emitter, for particles of this spacing [m] and volume [m³].
 
         Raises:
-            ValueError: it is too narrow for particles of this spacing.
+            ValueError: it is too narrow for them.
         """
         direction = np.array(emitter.direction, dtype=np.float64)
         direction /= np.linalg.norm(direction)
@@ -115,10 +105,9 @@ class Opening:
 
     @property
     def nozzle_layers(self) -> int:
-        """Layers in the nozzle: whoever is in it moves at the speed of the inflow, whatever pushes.
+        """Layers in the nozzle, where particles move at the speed of the inflow, whatever pushes.
 
-        They are a support radius deep: a particle that leaves has a whole lattice behind it, and pressure cannot push
-        the flow back.
+        They are a support radius deep: a particle that leaves has a whole lattice behind it.
         """
         return math.ceil(self.support_in_spacings)
 
@@ -129,7 +118,7 @@ class Opening:
 
     @property
     def drained_s(self) -> float:
-        """When the nozzle no longer holds anything [s]."""
+        """When the nozzle becomes empty [s]."""
         return self.end_s + self.nozzle_depth / self.speed
 
     def nozzle_places(self) -> NDArray[np.float64]:
@@ -154,12 +143,9 @@ class Opening:
         It keeps surrounding fluid from flowing into the gap that opens behind a layer before the next one fills it.
         The samples are as far outside of the nozzle as those of a wall that touches the fluid. They push, and exert no
         friction (`sim.fluid.nozzles.is_felt_in_nozzles`).
-
-        Args:
-            spacing: of the particles [m].
         """
         depths = np.arange(0.0, self.nozzle_depth, spacing)
-        outside = (_wall_standoff(self.support_in_spacings) - PARTICLE_RADIUS_IN_SPACINGS) * spacing
+        outside = (_wall_standoff(self.support_in_spacings) - 0.5) * spacing
         rim = _rim(tuple(half + outside for half in self.half_size), self.is_round, spacing)
         around = self.centre + rim @ np.stack(self.axes)
         return (around[None] + depths[:, None, None] * self.direction).reshape(-1, 3)
@@ -187,7 +173,7 @@ def pipe_clearance(support_in_spacings: float) -> float:
     return _wall_standoff(support_in_spacings) - PIPE_PLAY_IN_SPACINGS
 
 
-def obstruction(opening: Opening, spacing: float, domain: DomainParameters, solids: list[Solid]) -> str | None:
+def obstruction(opening: Opening, spacing: float, domain: DomainParameters, solids: Sequence[Solid]) -> str | None:
     """Why fluid cannot enter here, or None: particles of the opening outside the domain, or in a solid."""
     outside = ((opening.points < domain.min) | (opening.points > domain.max)).any(axis=1)
     if outside.any():
@@ -281,7 +267,7 @@ def _rim(half_size: tuple[float, ...], is_round: bool, spacing: float) -> NDArra
 
 def _axes_across(direction: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two unit vectors across a direction; the first is horizontal."""
-    sideways = np.cross(GRAVITY_FREE_AXIS, direction)
+    sideways = np.cross([0.0, 0.0, 1.0], direction)
     if np.linalg.norm(sideways) < 1.0e-6:
         sideways = np.array([0.0, 1.0, 0.0])
     first = sideways / np.linalg.norm(sideways)

@@ -13,7 +13,7 @@ from sim.core.cells import CellGrid, CellSort, SortedPoints
 from sim.core.launch import kernel
 from sim.core.neighbors import NeighborList, Neighbors, list_stride
 
-HostArrays = Mapping[str, NDArray[np.generic]]
+HOST_NAMES = ("position", "velocity", "particle_id", "phase")
 
 
 @bundle
@@ -57,16 +57,21 @@ class ParticleSet:
     """
 
     def __init__(self, grid: CellGrid, capacity: int, *, carried: tuple[str, ...] = ()) -> None:
-        density = _floats(capacity)
+        places = max(capacity, 1)
+        density = ti.ndarray(ti.f32, places)
         self.arrays, self._spare = (
-            Particles(_vectors(capacity), _vectors(capacity), _integers(capacity), _integers(capacity), density, 0)
+            Particles(
+                *(ti.Vector.ndarray(3, ti.f32, places) for _ in range(2)),
+                *(ti.ndarray(ti.i32, places) for _ in range(2)),
+                density,
+                0,
+            )
             for _ in range(2)
         )
-        self.carried = {name: _floats(capacity) for name in carried}
-        self._carried_out = _floats(capacity) if carried else _floats(1)
+        self.carried = {name: ti.ndarray(ti.f32, places) for name in carried}
+        self._carried_out = ti.ndarray(ti.f32, places)
         self.cells = CellSort(grid, capacity)
-        x, y, z = (_floats(capacity) for _ in range(3))
-        self.sorted_points = SortedPoints(x, y, z, self.cells.cell_start)
+        self.sorted_points = SortedPoints(*(ti.ndarray(ti.f32, places) for _ in range(3)), self.cells.cell_start)
         self.neighbors = NeighborList(grid, capacity, stride=list_stride())
 
     @property
@@ -99,27 +104,20 @@ class ParticleSet:
         """The neighbour list as kernels read it."""
         return self.neighbors.lists
 
-    def load(self, arrays: HostArrays) -> None:
-        """Take particles from the host.
+    def load(self, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+        """Take `position` and `velocity` (n, 3), `particle_id` and `phase` (n,) from the host, n at most the capacity.
 
-        Args:
-            arrays: `position` (n, 3), `velocity` (n, 3), `particle_id` (n,) and `phase` (n,), n at most the capacity;
-                carried scalars (n,) by name, 0 where there is none of the name.
+        Carried scalars (n,) by name, too; 0 where there is none of the name.
         """
         count = len(arrays["particle_id"])
         self.arrays = self.arrays._replace(count=count)
-        for name in ("position", "velocity", "particle_id", "phase"):
+        for name in HOST_NAMES:
             getattr(self.arrays, name).from_numpy(_padded(arrays[name], self.capacity))
         for name, array in self.carried.items():
             array.from_numpy(_padded(arrays.get(name, np.zeros(count, dtype=np.float32)), self.capacity))
 
     def append(self, layer: Layer, added: int) -> None:
-        """Add the particles of the places to take, their carried scalars 0, without neighbours before the next sort.
-
-        Args:
-            layer: the particles.
-            added: number of places taken; there must be room for them.
-        """
+        """Add the particles of the places to take, as many as `added`; without neighbours before the next sort."""
         append_particles(layer, self.arrays)
         for values in self.carried.values():
             clear_scalars(values, self.count, added)
@@ -127,8 +125,7 @@ class ParticleSet:
 
     def host_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Copies of what `load` takes, in the order of the particles."""
-        names = ("position", "velocity", "particle_id", "phase")
-        arrays = {name: getattr(self.arrays, name) for name in names} | self.carried
+        arrays = {name: getattr(self.arrays, name) for name in HOST_NAMES} | self.carried
         return {name: self.host(array) for name, array in arrays.items()}
 
     def sort(self, keep_low: tuple[float, float, float], keep_high: tuple[float, float, float]) -> int:
@@ -149,18 +146,6 @@ class ParticleSet:
     def order_by_id(self) -> NDArray[np.int64]:
         """Indices of the particles by ascending id, (n,)."""
         return np.argsort(self.host(self.arrays.particle_id))
-
-
-def _vectors(length: int) -> ti.Ndarray:
-    return ti.Vector.ndarray(3, ti.f32, max(length, 1))
-
-
-def _floats(length: int) -> ti.Ndarray:
-    return ti.ndarray(ti.f32, max(length, 1))
-
-
-def _integers(length: int) -> ti.Ndarray:
-    return ti.ndarray(ti.i32, max(length, 1))
 
 
 def _padded(rows: NDArray[np.generic], length: int) -> NDArray[np.generic]:

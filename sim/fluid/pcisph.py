@@ -8,32 +8,27 @@ import taichi as ti
 from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import bundle
 from sim.core.launch import kernel
-from sim.core.neighbors import Neighbors
 from sim.core.solver import Diagnostics
-from sim.fluid.boundary import Samples
-from sim.fluid.discretization import Smoothing
-from sim.fluid.fluid import SPHFluid
+from sim.fluid.device import Fluid
 from sim.fluid.kernels import distance, spline
 from sim.fluid.particles import Particles
-from sim.fluid.phases import Materials
-from sim.fluid.pressure import RUNAWAY, PressureSolver, Relax, momentum
+from sim.fluid.pressure import IncompressibleFluid, Relax, momentum
 from sim.fluid.pressure_kernels import PressureSystem, add_scaled, copy_scalars, not_negative
 from sim.fluid.solve_record import SolveRecord
 from sim.fluid.tank import FluidStart
-from sim.fluid.time_step import CFL_NUMBER
 
+# Iterations in any case (Solenthaler & Pajarola 2009, algorithm 2): fewer let the pressure fluctuate.
 LEAST_ITERATIONS = 3
-"""Iterations in any case (Solenthaler & Pajarola 2009, algorithm 2): fewer let the pressure fluctuate."""
 
+# A solve whose error grows beyond this multiple diverges.
 LARGEST_ERROR_GROWTH = 2.0
-"""A solve whose error grows beyond this multiple diverges: from there on it goes to 1, not down again."""
 
 LARGEST_DISPLACEMENT = 0.5
 """Displacement [spacings] beyond which a predicted position means nothing: two particles may have passed each other
 unseen, or one has left the neighbours that it knows and finds no compression where it is. Steps are made for 0.2."""
 
+# Stands for the compression left of a particle that goes farther; no solve with one of them has a small mean error.
 ASTRAY = 1.0e10
-"""Stands for the compression left of a particle that goes farther; no solve with one of them has a small mean error."""
 
 
 @bundle
@@ -47,7 +42,7 @@ class Correction(NamedTuple):
     largest_displacement_squared: ti.f32  # of a prediction [m²]
 
 
-class PCISPHSolver(SPHFluid):
+class PCISPHSolver(IncompressibleFluid):
     """A fluid whose pressure is corrected until the positions that it leads to have rest density.
 
     Each step, with v the velocities and a all accelerations but that by pressure:
@@ -60,140 +55,60 @@ class PCISPHSolver(SPHFluid):
     A_i is that of a filled lattice, which makes delta the paper's (eq. 8), or the particle's own A_ii where that is
     larger: beside the strong samples of a wall and among lighter particles the paper's constant overshoots. The paper's
     factor 1/2 is 1/lambda here, with the largest eigenvalue lambda of A over its diagonal, as P goes on with momentum.
-    Two more things differ from the paper. The first guess is the pressure of the step before, not 0, so that a deep
-    tank need not be pressurized from nothing in every step. And a compression from before is taken back gradually
-    (`PressureSolver.correction`), as it turns into speed. The error is the mean over all particles, not the
-    largest: that one hangs on single particles that hit a corner, and their number does not shrink with the spacing.
+    Three more things differ from the paper. The first guess is the pressure of the step before, not 0. A compression
+    from before is taken back gradually (`IncompressibleFluid.correction`), as it turns into speed. The error is the
+    mean over all particles, not the largest, which hangs on single particles that hit a corner.
 
     Where a body closes a gap of about one layer of particles, that does not converge: densities are those at x*, but
-    forces act along gradients at x, and a particle squeezed out of the gap is pushed farther the denser it gets. Such a
-    solve is given up (`LARGEST_ERROR_GROWTH`, `LARGEST_DISPLACEMENT`, or the iteration limit), and this step's pressure
-    is that of the linear problem of divergence-free SPH, s - dt² A P, from the same first guess: it always has a
-    solution.
+    forces act along gradients at x. Such a solve is given up (`LARGEST_ERROR_GROWTH`, `LARGEST_DISPLACEMENT`, or the
+    iteration limit), and this step's pressure is that of the linear problem of divergence-free SPH, s - dt² A P, from
+    the same first guess: it always has a solution.
 
     Positions are predicted, so the list of neighbours is renewed where a step as long as the last could use up what is
-    left of its skin, and steps are half as long as those of divergence-free SPH. That is no guarantee: the skin is
-    0.2 d between two particles at the usual support, and a step may bring them 0.4 d closer. A pair that the list does
-    not have, farther than 2.2 d apart, may so be predicted at 1.8 d, where each adds 6e-4 to the density of the other;
-    that much is seen a step late. From a support of 4 spacings on the skin is 0.4 d, and nothing is.
-
-    Attributes:
-        cfl_number: largest displacement of a particle in a step [spacings].
-        gravity_number: largest step over sqrt(d/g), whatever the speed.
-        pressure: the solves.
+    left of its skin, and steps are half as long as those of divergence-free SPH. A pair may still be predicted at
+    1.8 d that the list does not have, where each adds 6e-4 to the density of the other a step late.
     """
 
-    carried = ("pressure",)
-    runaway = RUNAWAY
-    sheets_answer = True
     looks_ahead = True
-    cfl_number = 0.5 * CFL_NUMBER
-    # At 0.1 the first solve of a column of 20 layers does not converge.
-    gravity_number = 0.05
 
     def __init__(self, start: FluidStart) -> None:
         """Take particles, walls and bodies."""
         super().__init__(start)
-        self.pressure = PressureSolver(self.tank, self.forces, self.phases, self.expected_speed)
         self._predicted = ti.Vector.ndarray(3, ti.f32, self.particles.capacity)
         self._first_guess = ti.ndarray(ti.f32, self.particles.capacity)
-        self._density_solves, self._linear_solves = SolveRecord(), 0
+        self._linear_solves = 0
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]."""
         self.compute_density()
-        self.pressure.begin_sheets()
+        self.begin_sheets()
         self.forces.compute(dt)
         self.correct_density_error(dt)
         self.advance(dt)
 
-    def compute_density(self) -> None:
-        """Relative density of each particle by summation, and the diagonal of the pressure's matrix."""
-        self.pressure.compute_density_and_alpha()
-
     def correct_density_error(self, dt: float) -> None:
         """Find the pressure of a step of dt [s], if need be the linear one, and add its acceleration."""
-        particles, record = self.particles, SolveRecord()
+        particles = self.particles
         copy_scalars(particles.carried["pressure"], particles.count, self._first_guess)
 
         def predict_and_correct(pressure: ti.Ndarray, iteration: int) -> None:
             self.predict_and_correct(pressure, dt, iteration)
 
-        self._solve(record, dt, error_growth=LARGEST_ERROR_GROWTH, relax=predict_and_correct)
-        if record.not_converged:
-            record = SolveRecord(iterations=record.iterations)
+        found, given_up = self._solve(dt, error_growth=LARGEST_ERROR_GROWTH, relax=predict_and_correct), 0
+        if found.not_converged:
+            given_up = found.iterations
             copy_scalars(self._first_guess, particles.count, particles.carried["pressure"])
-            self.pressure.predict_compression(dt)
-            self._solve(record, dt)
+            self.predict_compression(dt)
+            found = self._solve(dt)
             self._linear_solves += 1
-        self._density_solves.merge(record)
+        self.solves["density"].add(given_up + found.iterations, found.worst_error, converged=not found.not_converged)
         self.forces.react(particles.carried["pressure"], dt)
-        add_scaled(self.forces.acceleration, self.pressure.acceleration, 1.0, particles.count)
+        add_scaled(self.forces.acceleration, self.pressure_acceleration, 1.0, particles.count)
 
-    def predict_and_correct(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
-        """Predict positions and densities with a pressure [Pa] for a step of dt [s], and correct it by them."""
-        particles, solver = self.particles, self.pressure
-        predict_positions(particles.arrays, self.forces.acceleration, solver.acceleration, dt, self._predicted)
-        correct_pressure(
-            particles.arrays,
-            particles.near,
-            self.boundary.samples,
-            self.phases.materials,
-            self.discretization.smoothing,
-            solver.system,
-            self._predicted,
-            solver.boundary_response,
-            Correction(
-                dt=dt,
-                share=solver.correction(dt),
-                momentum=momentum(iteration),
-                filled_diagonal=solver.filled_diagonal,
-                largest_displacement_squared=(LARGEST_DISPLACEMENT * self.spacing) ** 2,
-            ),
-            pressure,
-            solver.next_pressure,
-        )
-
-    def adapt_time_step(self) -> float:
-        """Largest time step [s] for the current state."""
-        return self.pressure.adapt_time_step(
-            cfl=self.parameters.cfl,
-            cfl_number=self.cfl_number,
-            gravity_number=self.gravity_number,
-            viscosity=self.limiting_viscosity,
-            cohesion_rate=self.cohesion_rate,
-        )
-
-    @property
-    def pressure_term(self) -> ti.Ndarray:
-        """P_i of each particle [Pa]."""
-        return self.particles.carried["pressure"]
-
-    @property
-    def solves(self) -> dict[str, SolveRecord]:
-        """The solves of this frame, by what they are for."""
-        return {**super().solves, "density": self._density_solves}
-
-    def begin_frame(self, time_s: float) -> None:
-        """Restart the counters of the frame."""
-        super().begin_frame(time_s)
-        self._density_solves, self._linear_solves = SolveRecord(), 0
-
-    def diagnostics(self) -> Diagnostics:
-        """As for every particle fluid, with the iterations and errors of this frame, and its linear solves."""
-        return {
-            **super().diagnostics(),
-            "iterations": self._density_solves.mean_iterations,
-            "density_error": self._density_solves.worst_error,
-            "linear_solves": float(self._linear_solves),
-        }
-
-    def _solve(
-        self, record: SolveRecord, dt: float, *, error_growth: float = math.inf, relax: Relax | None = None
-    ) -> None:
-        carried = self.particles.carried
-        self.pressure.start_from(carried["pressure"])
-        carried["pressure"] = self.pressure.solve(
+    def _solve(self, dt: float, *, error_growth: float = math.inf, relax: Relax | None = None) -> SolveRecord:
+        carried, record = self.particles.carried, SolveRecord()
+        self.start_from(carried["pressure"])
+        carried["pressure"] = self.solve(
             record,
             carried["pressure"],
             dt,
@@ -202,6 +117,31 @@ class PCISPHSolver(SPHFluid):
             error_growth=error_growth,
             relax=relax,
         )
+        return record
+
+    def predict_and_correct(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
+        """Predict positions and densities with a pressure [Pa] for a step of dt [s], and correct it by them."""
+        fluid = self.tank.on_device
+        predict_positions(fluid.particles, self.forces.acceleration, self.pressure_acceleration, dt, self._predicted)
+        correction = Correction(
+            dt=dt,
+            share=self.correction(dt),
+            momentum=momentum(iteration),
+            filled_diagonal=self.filled_diagonal,
+            largest_displacement_squared=(LARGEST_DISPLACEMENT * self.spacing) ** 2,
+        )
+        correct_pressure(
+            fluid, self.system, self._predicted, self.boundary_response, correction, pressure, self.next_pressure
+        )
+
+    def begin_frame(self, time_s: float) -> None:
+        """Restart the counters of the frame."""
+        super().begin_frame(time_s)
+        self._linear_solves = 0
+
+    def diagnostics(self) -> Diagnostics:
+        """As for every particle fluid, with the linear solves of this frame."""
+        return {**super().diagnostics(), "linear_solves": float(self._linear_solves)}
 
 
 @kernel
@@ -217,11 +157,7 @@ def predict_positions(
 
 @kernel
 def correct_pressure(
-    particles: Particles,
-    near: Neighbors,
-    samples: Samples,
-    materials: Materials,
-    smoothing: Smoothing,
+    fluid: Fluid,
     system: PressureSystem,
     predicted: Vectors,
     boundary_response: Vectors,
@@ -236,31 +172,31 @@ def correct_pressure(
     """
     dt = correction.dt
     ti.loop_config(block_dim=128)
-    for i in range(particles.count):
+    for i in range(fluid.particles.count):
         x_i = predicted[i]
         own = 0
-        if ti.static(materials.several):
-            own = particles.phase[i]
+        if ti.static(fluid.materials.several):
+            own = fluid.particles.phase[i]
         fluid_sum = 1.0  # w(0): the particle itself
-        first = near.start[i]
-        for k in range(near.fluid_count[i]):
-            x_j = predicted[near.indices[first + k * near.stride]]
-            fluid_sum += spline(distance((x_i - x_j).norm_sqr()) * smoothing.inverse_support)
+        first = fluid.near.start[i]
+        for k in range(fluid.near.fluid_count[i]):
+            x_j = predicted[fluid.near.indices[first + k * fluid.near.stride]]
+            fluid_sum += spline(distance((x_i - x_j).norm_sqr()) * fluid.inverse_support)
         boundary_sum = 0.0
-        first += near.fluid_count[i] * near.stride
-        for k in range(near.boundary_count[i]):
-            b = near.indices[first + k * near.stride]
-            x_b = samples.position[b]
-            if ti.static(samples.with_moving):
-                x_b += dt * (samples.velocity[b] + dt * boundary_response[b])
-            boundary_sum += samples.volume[b] * spline(distance((x_i - x_b).norm_sqr()) * smoothing.inverse_support)
-        excess = ti.max(particles.density[i] - 1.0, 0.0)
-        density = smoothing.sigma * (smoothing.volume * fluid_sum + boundary_sum)
+        first += fluid.near.fluid_count[i] * fluid.near.stride
+        for k in range(fluid.near.boundary_count[i]):
+            b = fluid.near.indices[first + k * fluid.near.stride]
+            x_b = fluid.samples.position[b]
+            if ti.static(fluid.samples.with_moving):
+                x_b += dt * (fluid.samples.velocity[b] + dt * boundary_response[b])
+            boundary_sum += fluid.samples.volume[b] * spline(distance((x_i - x_b).norm_sqr()) * fluid.inverse_support)
+        excess = ti.max(fluid.particles.density[i] - 1.0, 0.0)
+        density = fluid.sigma * (fluid.volume * fluid_sum + boundary_sum)
         left = density - 1.0 - (1.0 - correction.share) * excess
-        stiffer = ti.min(system.inverse_diagonal[i], materials.rest_density[own] / correction.filled_diagonal)
+        stiffer = ti.min(system.inverse_diagonal[i], fluid.materials.rest_density[own] / correction.filled_diagonal)
         delta = system.relaxation / (dt * dt) * stiffer
         relaxed = not_negative(pressure[i] + delta * left)
         next_pressure[i] = not_negative(relaxed + correction.momentum * (relaxed - system.relaxed_before[i]))
         system.relaxed_before[i] = relaxed
-        is_astray = (x_i - particles.position[i]).norm_sqr() > correction.largest_displacement_squared
+        is_astray = (x_i - fluid.particles.position[i]).norm_sqr() > correction.largest_displacement_squared
         system.remaining[i] = ti.select(is_astray, ASTRAY, left)

@@ -7,7 +7,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats
+from sim.core.arrays import Floats, on_device
 from sim.core.bundles import bundle
 from sim.fluid.parameters import FluidParameters
 
@@ -39,9 +39,9 @@ class Phases:
         self.rest_densities = np.array([fluid.rest_density for fluid in parameters])
         self.viscosities = np.array([fluid.viscosity for fluid in parameters])
         self.materials = Materials(
-            rest_density=device_table(self.rest_densities),
-            dynamic_viscosity=device_table(self.rest_densities * self.viscosities),
-            surface_tension=device_table(np.array([fluid.surface_tension for fluid in parameters])),
+            rest_density=on_device(self.rest_densities),
+            dynamic_viscosity=on_device(self.rest_densities * self.viscosities),
+            surface_tension=on_device(np.array([fluid.surface_tension for fluid in parameters])),
             several=len(self.parameters) > 1,
         )
 
@@ -62,10 +62,3 @@ class Phases:
     def density_contrast(self) -> float:
         """Largest rest density over the smallest."""
         return float(self.rest_densities.max() / self.rest_densities.min())
-
-
-def device_table(values: np.ndarray) -> ti.Ndarray:
-    """Numbers of the fluids on the device, float32, (k,)."""
-    array = ti.ndarray(ti.f32, len(values))
-    array.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
-    return array

@@ -1,4 +1,4 @@
-"""Implicit pressure: the linear system that the solvers with one share, its iteration, its accuracy and cost.
+"""Implicit pressure: the linear system that the solvers with one share, and its iteration.
 
 With D the matrix of the rates of change, D rho_i/Dt = (D v)_i relative to the rest density,
 
@@ -16,9 +16,8 @@ import taichi as ti
 
 from sim.core.reductions import LaneReduction
 from sim.fluid.body_response import SolveError
-from sim.fluid.forces import Forces
+from sim.fluid.fluid import SPHFluid
 from sim.fluid.kernels import evaluate_slope, lattice_offsets
-from sim.fluid.phases import Phases
 from sim.fluid.pressure_kernels import (
     PressureSystem,
     accelerate_by_pressure,
@@ -29,101 +28,91 @@ from sim.fluid.pressure_kernels import (
     sum_errors,
 )
 from sim.fluid.solve_record import SolveRecord
-from sim.fluid.tank import ParticleTank
+from sim.fluid.tank import FluidStart
 from sim.fluid.time_step import CFL_NUMBER, stable_time_step
+from sim.fluid.traits import TRAITS
 
-RUNAWAY = 30.0, "the largest expected speed"
-"""Speeds beyond this multiple of the largest expected one are numerical: the same bound as in WCSPH."""
-
+# Share of a particle's compression that is taken back while the largest expected speed crosses a spacing.
 CORRECTED_PER_CROSSING = 0.5
-"""Share of a particle's compression that is taken back while the largest expected speed crosses a spacing."""
 
+# Most iterations from one look at the error to the next.
 MOST_ITERATIONS_AHEAD = 4
-"""Iterations between two looks at the error, at most."""
 
+# Largest eigenvalue of A over its diagonal in disorder and at walls, over that of a lattice; 1.26 is measured.
 DISORDER = 1.3
-"""Largest eigenvalue of A over its diagonal among particles in disorder and at walls, over that of a lattice.
 
-It is 1.26 after random shifts by 0.3 d.
-"""
-
+# Share of a filled neighbourhood's A_ii below which a particle can have no pressure: it has no neighbour.
 LEAST_DIAGONAL = 1.0e-6
-"""Share of a filled neighbourhood's A_ii below which a particle can have no pressure: it has no neighbour."""
 
+# Means of errors beyond it contain one of a particle that is `NOT_FINITE`.
 LARGEST_ERROR = 1.0e20
-"""Means of errors beyond it contain one of a particle that is `NOT_FINITE`."""
 
+# How much smaller the error is kept near moving bodies: a light one is accelerated by it for many steps.
 CARE_NEAR_BODIES = 10.0
-"""Factor by which the error is kept smaller near moving bodies: what is left around a light one accelerates it for many
-steps in the same direction."""
-
 
 Relax = Callable[[ti.Ndarray, int], None]
 """From a pressure that is tried, and the number of the iteration, to the compression left and the next pressure."""
 
 
-class PressureSolver:
-    """Pressure that keeps particles from being compressed in a step.
+class IncompressibleFluid(SPHFluid):
+    """A fluid whose pressure keeps particles from being compressed in a step.
 
     A solve looks for P >= 0 such that the compression that is left, s - dt² A P, is 0 where P > 0 and not positive
     elsewhere: a linear complementarity problem, as pressure cannot pull. An iteration computes the accelerations by P,
     lets the moving bodies respond to the same P, measures the compression that both leave, and relaxes P by it. It
     stops when the mean over all particles of the compression left is below the tolerance (its absolute value, but where
-    it is negative no more than taking P_i away would change); P and the accelerations are those that left it, and so
-    belong together to rounding.
+    it is negative no more than taking P_i away would change); P and the accelerations are those that left it.
 
     Attributes:
-        acceleration: by the pressure of the last iteration [m/s²], (capacity,) of 3-vectors.
-        boundary_response: acceleration of each boundary sample by it [m/s²].
-        next_pressure: the pressure to try next [Pa], (capacity,).
         system: right-hand side, diagonal and what is left.
         relaxation: omega, on the inverse diagonal [-].
         filled_diagonal: rho0 A_ii of a particle amid a filled lattice [1/m²].
+        pressure_acceleration: by the pressure of the last iteration [m/s²], (capacity,) of 3-vectors.
+        boundary_response: acceleration of each boundary sample by it [m/s²].
+        next_pressure: the pressure to try next [Pa], (capacity,).
     """
 
-    def __init__(self, tank: ParticleTank, forces: Forces, phases: Phases, expected_speed: float) -> None:
-        """Prepare for the particles of a tank of this largest expected speed [m/s]; bodies answer from now on."""
-        self._tank, self._forces, self._phases = tank, forces, phases
-        self._expected_speed = expected_speed
-        capacity = tank.particles.capacity
-        support = tank.discretization.support_in_spacings
+    carried = ("pressure",)
+    solved_for = ("density",)
+    # As in WCSPH, whose speed of sound is ten times the largest expected one.
+    runaway = 30.0, "the largest expected speed"
+    sheets_answer = True
+
+    def __init__(self, start: FluidStart) -> None:
+        """Take particles, walls and bodies, which answer within the step."""
+        super().__init__(start)
+        capacity, support = self.particles.capacity, self.discretization.support_in_spacings
         self.relaxation = 1.0 / (DISORDER * largest_eigenvalue(support))
-        self.filled_diagonal = filled_diagonal(tank.discretization.spacing, support)
-        self.acceleration = ti.Vector.ndarray(3, ti.f32, capacity)
+        self.filled_diagonal = filled_diagonal(self.spacing, support)
+        self.pressure_acceleration = ti.Vector.ndarray(3, ti.f32, capacity)
         self.boundary_response = ti.Vector.ndarray(3, ti.f32, 1)
         self.next_pressure = ti.ndarray(ti.f32, capacity)
         self.system = PressureSystem(*(ti.ndarray(ti.f32, capacity) for _ in range(4)), self.relaxation)
-        self._least_diagonal = LEAST_DIAGONAL * self.filled_diagonal / float(phases.rest_densities.max())
+        self._least_diagonal = LEAST_DIAGONAL * self.filled_diagonal / float(self.phases.rest_densities.max())
         self._reduction = LaneReduction(maxima=0, sums=1)
-        tank.body_forces.let_bodies_respond(tank.gravity, tank.discretization.spacing)
+        self.body_forces.let_bodies_respond(self.gravity, self.discretization)
 
-    def compute_density_and_alpha(self) -> None:
+    @property
+    def pressure_term(self) -> ti.Ndarray:
+        """P_i of the density solve of each particle [Pa]."""
+        return self.particles.carried["pressure"]
+
+    def compute_density(self) -> None:
         """Relative density of each particle by summation, and 1/A_ii, for its current neighbours."""
-        tank = self._tank
-        tank.update_neighbors()
-        particles = tank.particles
-        compute_density_and_alpha(
-            particles.arrays,
-            particles.near,
-            tank.boundary.samples,
-            self._phases.materials,
-            tank.discretization.smoothing,
-            self._least_diagonal,
-            self.system.inverse_diagonal,
-        )
-        response = tank.body_forces.response
+        self.tank.update_neighbors()
+        fluid, inverse_diagonal = self.tank.on_device, self.system.inverse_diagonal
+        compute_density_and_alpha(fluid, self._least_diagonal, inverse_diagonal)
+        response = self.body_forces.response
         if response is not None and response.is_needed:
-            response.add_to_diagonal(
-                particles.arrays, particles.near, tank.discretization, self.relaxation, self.system.inverse_diagonal
-            )
+            response.add_to_diagonal(fluid, self.relaxation, inverse_diagonal)
 
     def begin_sheets(self) -> None:
         """Find the fluid that touches sheets, and add their share in A to its diagonal."""
-        self._forces.begin_sheets()
-        body_forces = self._tank.body_forces
-        if body_forces.sheets is not None:
-            body_forces.sheets.add_to_diagonal(
-                self._tank.particles, body_forces.near, self.relaxation, self.system.inverse_diagonal
+        self.forces.begin_sheets()
+        sheets = self.body_forces.sheets
+        if sheets is not None:
+            sheets.add_to_diagonal(
+                self.tank.on_device, self.body_forces.near, self.relaxation, self.system.inverse_diagonal
             )
 
     def correction(self, dt: float) -> float:
@@ -131,29 +120,25 @@ class PressureSolver:
 
         Taken back in one step it would drive particles apart at a speed that grows as the step shrinks.
         """
-        return min(1.0, CORRECTED_PER_CROSSING * self._expected_speed * dt / self._tank.discretization.spacing)
+        return min(1.0, CORRECTED_PER_CROSSING * self.expected_speed * dt / self.spacing)
 
     def predict_compression(self, dt: float) -> None:
         """Compression that a step of dt [s] without pressure leads to, linear in the velocities.
 
-        The velocities that it leads to stand in `acceleration` until the solve needs that.
+        The velocities that it leads to stand in `pressure_acceleration` until the solve needs that.
         """
-        tank = self._tank
         predict_compression(
-            tank.particles.arrays,
-            tank.particles.near,
-            tank.boundary.samples,
-            tank.discretization.smoothing,
-            self._forces.acceleration,
+            self.tank.on_device,
+            self.forces.acceleration,
             dt,
             self.correction(dt),
-            self.acceleration,
+            self.pressure_acceleration,
             self.system.compression,
         )
 
     def start_from(self, pressure: ti.Ndarray) -> None:
         """Note the first guess of a solve, from which its first change of pressure counts."""
-        copy_scalars(pressure, self._tank.particles.count, self.system.relaxed_before)
+        copy_scalars(pressure, self.particles.count, self.system.relaxed_before)
 
     def solve(
         self,
@@ -166,10 +151,10 @@ class PressureSolver:
         error_growth: float = math.inf,
         relax: Relax | None = None,
     ) -> ti.Ndarray:
-        """Iterate until the error is below the tolerance, and count; `acceleration` has the result.
+        """P with an error below the tolerance; `pressure_acceleration` is what it causes.
 
         Args:
-            record: where to count.
+            record: counts the solve.
             pressure: the first guess of P [Pa]; afterwards it may hold anything.
             dt: the step [s].
             least: iterations to make in any case.
@@ -178,16 +163,13 @@ class PressureSolver:
                 times the tolerance, whichever is larger [-].
             relax: fills `system.remaining` with the compression that the accelerations leave, and `next_pressure`; as
                 the linear system has it if omitted.
-
-        Returns:
-            P, in this array or in another one.
         """
-        limit = max(self._phases.shared.max_iterations, least)
+        limit = max(self.parameters.max_iterations, least)
         iteration, next_look, bound = 0, least, math.inf
         while True:
             self.accelerate_by(pressure)
             if relax is None:
-                self.relax_linearly(pressure, dt, iteration)
+                self._relax_linearly(pressure, dt, iteration)
             else:
                 relax(pressure, iteration)
             iteration += 1
@@ -203,33 +185,20 @@ class PressureSolver:
 
     def accelerate_by(self, pressure: ti.Ndarray) -> None:
         """Accelerations of particles and of moving samples by a pressure that is tried [Pa]."""
-        tank = self._tank
-        accelerate_by_pressure(
-            tank.particles.arrays,
-            tank.particles.near,
-            tank.boundary.samples,
-            self._phases.materials,
-            tank.discretization.smoothing,
-            pressure,
-            self.acceleration,
-        )
-        response = tank.body_forces.response
+        accelerate_by_pressure(self.tank.on_device, pressure, self.pressure_acceleration)
+        response = self.body_forces.response
         if response is None:
             return
         self.boundary_response = response.no_acceleration
-        if tank.body_forces.answer:
-            self.boundary_response = tank.body_forces.respond(self._forces.exerted(pressure, with_friction=False))
+        if self.body_forces.answer:
+            self.boundary_response = self.body_forces.respond(self.forces.exerted(pressure, with_friction=False))
 
-    def relax_linearly(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
+    def _relax_linearly(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
         """Compression left, s - dt² A P with s from `system.compression`, and the pressure to try next."""
-        tank = self._tank
         relax_pressure(
-            tank.particles.arrays,
-            tank.particles.near,
-            tank.boundary.samples,
-            tank.discretization.smoothing,
+            self.tank.on_device,
             self.system,
-            self.acceleration,
+            self.pressure_acceleration,
             self.boundary_response,
             dt**2,
             momentum(iteration),
@@ -240,67 +209,47 @@ class PressureSolver:
     def mean_error(self, pressure: ti.Ndarray, dt: float, remaining: ti.Ndarray | None = None) -> float:
         """Mean error over all particles, or ten times that among those near a moving body, whichever is larger.
 
-        Infinite where that of any particle is not finite.
-
-        Args:
-            pressure: with which compression is left [Pa].
-            dt: the step [s]; 0 for what is left where no pressure has acted yet.
-            remaining: compression that is left of each particle [-]; that of the last relaxation if omitted.
+        Infinite where that of any particle is not finite. The error is what a pressure [Pa] leaves in a step of dt [s]:
+        `remaining`, or that of the last relaxation; dt is 0 where no pressure has acted yet.
         """
-        tank, count = self._tank, self._tank.particles.count
+        count = self.particles.count
         left = self.system.remaining if remaining is None else remaining
         error_of_each = SolveError(left, pressure, self.system.inverse_diagonal, dt**2)
         results = sum_errors(error_of_each, count, self._reduction.over(count))
-        everywhere = float(self._reduction.unpack(results)[0]) / max(count, 1)
-        response = tank.body_forces.response
-        if response is None or not response.is_needed:
-            return everywhere if everywhere < LARGEST_ERROR else math.inf
-        # A light body answers to the few particles around it, whose error the mean over all of them would hide.
-        near_bodies = tank.body_forces.worst_mean_near_bodies(
-            tank.particles.arrays, error_of_each, 1.0 / tank.discretization.support_radius
-        )
-        error = max(everywhere, CARE_NEAR_BODIES * near_bodies)
+        error = float(self._reduction.unpack(results)[0]) / max(count, 1)
+        response = self.body_forces.response
+        if response is not None and response.is_needed:
+            # A light body answers to the few particles around it, whose error the mean over all of them would hide.
+            near_bodies = self.body_forces.worst_mean_near_bodies(self.tank.on_device, error_of_each)
+            error = max(error, CARE_NEAR_BODIES * near_bodies)
         return error if error < LARGEST_ERROR else math.inf
 
-    def adapt_time_step(
-        self, *, cfl: float, cfl_number: float, gravity_number: float, viscosity: float, cohesion_rate: float
-    ) -> float:
+    def adapt_time_step(self) -> float:
         """Largest time step [s] for the current state.
 
         No particle goes farther than a share of the spacing, accelerated for the whole step by what accelerated it in
         the last one, or by gravity where that is more.
-
-        Args:
-            cfl: the user's factor on the step [-].
-            cfl_number: largest displacement of a particle in a step [spacings].
-            gravity_number: largest step over sqrt(d/g), whatever the speed [-].
-            viscosity: that limits the step [m²/s].
-            cohesion_rate: square of the frequency of a particle on the spring that cohesion is [1/s²].
         """
-        tank, spacing = self._tank, self._tank.discretization.spacing
+        tank, cfl, traits = self.tank, self.parameters.cfl, TRAITS[self.parameters.solver]
         speed = max(tank.motion.max_speed, tank.boundary_speed)
         gravity = float(np.linalg.norm(tank.gravity))
-        distance = cfl * cfl_number * spacing
+        distance = cfl * traits.cfl_number * self.spacing
         # (v + a dt) dt = distance, solved for the speed at the end of such a step.
         fastest = 0.5 * (speed + math.sqrt(speed**2 + 4.0 * distance * max(tank.motion.max_acceleration, gravity)))
         limit = stable_time_step(
-            spacing=spacing,
+            spacing=self.spacing,
             signal_speed=fastest,
             acceleration=0.0,
-            viscosity=viscosity,
-            cohesion_rate=cohesion_rate,
-            cfl=cfl * cfl_number / CFL_NUMBER,
+            viscosity=self.limiting_viscosity,
+            cohesion_rate=self.cohesion_rate,
+            cfl=cfl * traits.cfl_number / CFL_NUMBER,
         )
-        at_rest = gravity_number * math.sqrt(spacing / gravity) if gravity > 0.0 else math.inf
+        at_rest = traits.gravity_number * math.sqrt(self.spacing / gravity) if gravity > 0.0 else math.inf
         return min(limit, at_rest, tank.emission.longest_step(distance))
 
 
 def iterations_ahead(error: float, tolerance: float) -> int:
-    """Iterations until the next look at the error: 1 within 1.26 times the tolerance, 4 from twice that on.
-
-    A look is a sum over all particles, and the device waits for the host to read it. An iteration takes away some
-    tenths of the error at first, and less later.
-    """
+    """Iterations until the next look at the error, for which the device waits: more the farther it is to go."""
     if not math.isfinite(error):
         return MOST_ITERATIONS_AHEAD
     return min(1 + int(3.0 * math.log2(max(error / tolerance, 1.0))), MOST_ITERATIONS_AHEAD)
@@ -329,9 +278,9 @@ def largest_eigenvalue(support_in_spacings: float) -> float:
 
 
 def momentum(iteration: int) -> float:
-    """Share of the last change by which the pressure goes on (Nesterov 1983), (k - 1)/(k + 2), from k = 7 on.
+    """Share of the last change by which the pressure goes on (Nesterov 1983), (k - 1)/(k + 2).
 
-    The first guess is near the solution, so that small shares at first would only cost iterations: 15 % of them.
+    From k = 7 on: the first guess is near the solution, so that small shares would only cost iterations.
     """
     k = iteration + 7.0
     return (k - 1.0) / (k + 2.0)

@@ -7,12 +7,9 @@ import taichi as ti
 from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import bundle
 from sim.core.launch import kernel
-from sim.core.neighbors import Neighbors
 from sim.fluid.boundary import NearParticles, Samples, Sheets
-from sim.fluid.discretization import Smoothing
+from sim.fluid.device import Fluid
 from sim.fluid.kernels import TINY_DISTANCE, distance, spline, spline_slope
-from sim.fluid.particles import Particles
-from sim.fluid.phases import Materials
 
 
 @bundle
@@ -24,43 +21,34 @@ class Contacts(NamedTuple):
     count: ti.i32  # particles there were
 
 
+@bundle
+class OneSide(NamedTuple):
+    """Fluid at rest on one side of a sheet, as a sample sees it."""
+
+    field: ti.f32  # V sum_i W_ib [-]
+    tilt: ti.f32  # length of the mean unit vector to the particles, weighted by W [-]
+
+
 @kernel
-def weigh_contacts(
-    particles: Particles,
-    near: Neighbors,
-    materials: Materials,
-    samples: Samples,
-    sheets: Sheets,
-    smoothing: Smoothing,
-    full_field: ti.f32,
-    contacts: Contacts,
-):
+def weigh_contacts(fluid: Fluid, sheets: Sheets, full_field: ti.f32, contacts: Contacts):
     """Mass of each particle that touches sheets, m_i min(1, s_i/s_full), over s_i = sum_b V_b W_ib [kg], and where."""
-    for i in range(particles.count):
-        x_i = particles.position[i]
+    for i in range(fluid.particles.count):
+        x_i = fluid.particles.position[i]
         field = 0.0
-        first = near.start[i] + near.fluid_count[i] * near.stride
-        for k in range(near.boundary_count[i]):
-            b = near.indices[first + k * near.stride]
+        first = fluid.near.start[i] + fluid.near.fluid_count[i] * fluid.near.stride
+        for k in range(fluid.near.boundary_count[i]):
+            b = fluid.near.indices[first + k * fluid.near.stride]
             if b >= sheets.first:
-                r = distance((x_i - samples.position[b]).norm_sqr())
-                field += samples.volume[b] * spline(r * smoothing.inverse_support)
-        field *= smoothing.sigma
-        mass = smoothing.volume * materials.rest_density[particles.phase[i]]
+                r = distance((x_i - fluid.samples.position[b]).norm_sqr())
+                field += fluid.samples.volume[b] * spline(r * fluid.inverse_support)
+        field *= fluid.sigma
+        mass = fluid.volume * fluid.materials.rest_density[fluid.particles.phase[i]]
         contacts.position[i] = x_i
         contacts.mass[i] = ti.select(field > 0.0, mass / ti.max(field, full_field), 0.0)
 
 
 @kernel
-def gather_contact_mass(
-    particles: Particles,
-    near: NearParticles,
-    samples: Samples,
-    sheets: Sheets,
-    smoothing: Smoothing,
-    contact: Floats,
-    mass: Floats,
-):
+def gather_contact_mass(fluid: Fluid, near: NearParticles, sheets: Sheets, contact: Floats, mass: Floats):
     """m_b = sum_i contact_i V_b W_ib: each sample's share of the fluid that touches sheets."""
     for s in range(sheets.count):
         b = sheets.first + s
@@ -68,9 +56,9 @@ def gather_contact_mass(
         total = 0.0
         for k in range(near.start[m], near.start[m] + near.count[m]):
             i = near.particles[k]
-            r = distance((particles.position[i] - samples.position[b]).norm_sqr())
-            total += contact[i] * spline(r * smoothing.inverse_support)
-        mass[s] = smoothing.sigma * samples.volume[b] * total
+            r = distance((fluid.particles.position[i] - fluid.samples.position[b]).norm_sqr())
+            total += contact[i] * spline(r * fluid.inverse_support)
+        mass[s] = fluid.sigma * fluid.samples.volume[b] * total
 
 
 @kernel
@@ -113,104 +101,81 @@ def accelerate_sheet_samples(force: Vectors, sheets: Sheets, mass: Floats, accel
 
 @kernel
 def sum_sheet_gradients(
-    particles: Particles,
-    near: NearParticles,
-    samples: Samples,
-    sheets: Sheets,
-    gradient_factor: ti.f32,
-    inverse_support: ti.f32,
-    mass: Floats,
-    answer: Floats,
+    fluid: Fluid, near: NearParticles, sheets: Sheets, gradient_factor: ti.f32, mass: Floats, answer: Floats
 ):
     """V_b sum_i |V_b grad W_ib| / m_b: what a sample has in the bound of `add_sheets_to_diagonal`."""
     for s in range(sheets.count):
-        x_b = samples.position[sheets.first + s]
+        x_b = fluid.samples.position[sheets.first + s]
         m = sheets.skipped + s
         total = 0.0
         for k in range(near.start[m], near.start[m] + near.count[m]):
-            r = distance((particles.position[near.particles[k]] - x_b).norm_sqr())
-            total -= spline_slope(r * inverse_support)
-        v_b = samples.volume[sheets.first + s]
+            r = distance((fluid.particles.position[near.particles[k]] - x_b).norm_sqr())
+            total -= spline_slope(r * fluid.inverse_support)
+        v_b = fluid.samples.volume[sheets.first + s]
         answer[s] = gradient_factor * v_b * v_b * total / mass[s]
 
 
 @kernel
 def add_sheets_to_diagonal(
-    particles: Particles,
-    near: Neighbors,
-    samples: Samples,
-    sheets: Sheets,
-    answer: Floats,
-    gradient_factor: ti.f32,
-    inverse_support: ti.f32,
-    weight: ti.f32,
-    inverse_diagonal: Floats,
+    fluid: Fluid, sheets: Sheets, answer: Floats, gradient_factor: ti.f32, weight: ti.f32, inverse_diagonal: Floats
 ):
     """1/A_ii becomes 1/(A_ii + weight sum_b |n_ib| sum_j |n_jb| / m_b), n_ib = V_b grad W_ib."""
-    for i in range(particles.count):
-        x_i = particles.position[i]
+    for i in range(fluid.particles.count):
+        x_i = fluid.particles.position[i]
         bound = 0.0
-        first = near.start[i] + near.fluid_count[i] * near.stride
-        for k in range(near.boundary_count[i]):
-            b = near.indices[first + k * near.stride]
+        first = fluid.near.start[i] + fluid.near.fluid_count[i] * fluid.near.stride
+        for k in range(fluid.near.boundary_count[i]):
+            b = fluid.near.indices[first + k * fluid.near.stride]
             if b >= sheets.first:
-                r = distance((x_i - samples.position[b]).norm_sqr())
-                bound -= answer[b - sheets.first] * spline_slope(r * inverse_support)
+                r = distance((x_i - fluid.samples.position[b]).norm_sqr())
+                bound -= answer[b - sheets.first] * spline_slope(r * fluid.inverse_support)
         inverse = inverse_diagonal[i]
         inverse_diagonal[i] = inverse / (1.0 + weight * gradient_factor * bound * inverse)
 
 
 @kernel
 def add_missing_weight(
-    particles: Particles,
+    fluid: Fluid,
     near: NearParticles,
-    materials: Materials,
-    samples: Samples,
     sheets: Sheets,
     missing_volume: Floats,
     factor: ti.f32,
-    one_side: ti.f32,
-    one_sided_tilt: ti.f32,
-    inverse_support: ti.f32,
+    one_side: OneSide,
     gravity_dt: ti.math.vec3,
     impulse: Vectors,
 ):
     """J_b += dt g rho0 V of the fluid that would be where samples keep it away, if they had no more volume than cloth.
 
     Nothing where it is on one side only, where the mean of the unit vectors to the particles, weighted by W, is
-    `one_sided_tilt` long; all of it from half of that on, which disorder alone may give on both sides; and less where
-    the sum of V W is less than that on one side at rest, `one_side`.
+    `one_side.tilt` long; all of it from half of that on, which disorder alone may give on both sides; and less where
+    the sum of V W is less than that on one side at rest.
     """
     for s in range(sheets.count):
-        x_b = samples.position[sheets.first + s]
+        x_b = fluid.samples.position[sheets.first + s]
         m = sheets.skipped + s
         total = 0.0
         weighted = 0.0
         tilt = ti.math.vec3(0.0)
         for k in range(near.start[m], near.start[m] + near.count[m]):
             i = near.particles[k]
-            x_ib = particles.position[i] - x_b
+            x_ib = fluid.particles.position[i] - x_b
             r = distance(x_ib.norm_sqr())
-            weight = spline(r * inverse_support)
+            weight = spline(r * fluid.inverse_support)
             total += weight
             tilt += weight / (r + TINY_DISTANCE) * x_ib
-            weighted += weight * materials.rest_density[particles.phase[i]]
+            weighted += weight * fluid.materials.rest_density[fluid.particles.phase[i]]
         if total > 0.0:
-            tilted = tilt.norm() / (one_sided_tilt * total)
-            part = ti.min(factor * total / one_side, 1.0) * ti.min(ti.max(2.0 - 2.0 * tilted, 0.0), 1.0)
+            tilted = tilt.norm() / (one_side.tilt * total)
+            part = ti.min(factor * total / one_side.field, 1.0) * ti.min(ti.max(2.0 - 2.0 * tilted, 0.0), 1.0)
             impulse[s] += part * missing_volume[s] * weighted / total * gravity_dt
 
 
 @kernel
 def take_sheet_motion(
-    particles: Particles,
-    near: Neighbors,
-    materials: Materials,
+    fluid: Fluid,
     contacts: Contacts,
-    samples: Samples,
     sheets: Sheets,
     change: Vectors,
-    smoothing: Smoothing,
     dt: ti.f32,
     wall_low: ti.math.vec3,
     wall_high: ti.math.vec3,
@@ -223,19 +188,19 @@ def take_sheet_motion(
         if contacts.mass[i] > 0.0:
             x_i = contacts.position[i]
             total = ti.math.vec3(0.0)
-            first = near.start[i] + near.fluid_count[i] * near.stride
-            for k in range(near.boundary_count[i]):
-                b = near.indices[first + k * near.stride]
+            first = fluid.near.start[i] + fluid.near.fluid_count[i] * fluid.near.stride
+            for k in range(fluid.near.boundary_count[i]):
+                b = fluid.near.indices[first + k * fluid.near.stride]
                 if b >= sheets.first:
-                    r = distance((x_i - samples.position[b]).norm_sqr())
-                    total += samples.volume[b] * spline(r * smoothing.inverse_support) * change[b - sheets.first]
-            mass = smoothing.volume * materials.rest_density[particles.phase[i]]
-            dv = smoothing.sigma * contacts.mass[i] / mass * total
-            v_i = particles.velocity[i] + dv
-            free = particles.position[i] + dt * dv
+                    r = distance((x_i - fluid.samples.position[b]).norm_sqr())
+                    total += fluid.samples.volume[b] * spline(r * fluid.inverse_support) * change[b - sheets.first]
+            mass = fluid.volume * fluid.materials.rest_density[fluid.particles.phase[i]]
+            dv = fluid.sigma * contacts.mass[i] / mass * total
+            v_i = fluid.particles.velocity[i] + dv
+            free = fluid.particles.position[i] + dt * dv
             x_end = ti.min(ti.max(free, wall_low), wall_high)
             for axis in ti.static(range(3)):
                 if x_end[axis] != free[axis]:
                     v_i[axis] = 0.0
-            particles.velocity[i] = v_i
-            particles.position[i] = x_end
+            fluid.particles.velocity[i] = v_i
+            fluid.particles.position[i] = x_end

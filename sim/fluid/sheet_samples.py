@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -24,8 +23,7 @@ if TYPE_CHECKING:
 
 AMID_SAMPLES = 2.5
 """Relative density of a particle in the middle of a sheet by the sheet's samples alone: so far above 1 that none gets
-through, and no more than that, so that fluid at rest comes near. With 1.5 a block of water of 20 cm that fell on a
-taut sheet at 2 m/s left 4 particles below."""
+through, and no more than that, so that fluid at rest comes near."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,18 +40,6 @@ class SheetSamples:
     boundary: BoundarySamples
     own_mass: NDArray[np.float64]
     missing_volume: NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls,
-        rest: Sequence[NDArray[np.floating]],
-        own_mass: NDArray[np.float64],
-        missing_volume: NDArray[np.float64],
-        support_in_spacings: float = SUPPORT_IN_SPACINGS,
-    ) -> SheetSamples:
-        """Samples of sheets at rest [m], each (m_k, 3), with what each stands for, (m,) for all of them."""
-        boundary = BoundarySamples.of_bodies(*rest).scaled(sheet_factor(support_in_spacings))
-        return cls(boundary, own_mass, missing_volume)
 
 
 def sheet_factor(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:

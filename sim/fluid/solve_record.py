@@ -21,17 +21,18 @@ class SolveRecord:
     not_converged: int = 0
 
     def add(self, iterations: int, error: float, *, converged: bool) -> None:
-        """Take one solve into account."""
-        self.merge(SolveRecord(1, iterations, error, int(not converged)))
-
-    def merge(self, other: "SolveRecord") -> None:
-        """Take all solves of another record into account."""
-        self.solves += other.solves
-        self.iterations += other.iterations
+        """Count one solve."""
+        self.solves += 1
+        self.iterations += iterations
         # A NaN is larger than any number here, and stays.
-        if not (other.worst_error <= self.worst_error or math.isnan(self.worst_error)):
-            self.worst_error = other.worst_error
-        self.not_converged += other.not_converged
+        if not (error <= self.worst_error or math.isnan(self.worst_error)):
+            self.worst_error = error
+        self.not_converged += not converged
+
+    def clear(self) -> None:
+        """Begin a frame."""
+        self.solves = self.iterations = self.not_converged = 0
+        self.worst_error = 0.0
 
     @property
     def mean_iterations(self) -> float:

@@ -1,16 +1,46 @@
 """Steps of the particles: their motion, the walls that stop them, and measures of both."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import taichi as ti
 
 from sim.core.arrays import Floats, Vectors
+from sim.core.domain import DomainParameters
 from sim.core.launch import kernel
+from sim.core.parameters import Vector3
 from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduced_tree
-from sim.fluid.box import Box
 
 MAXIMA, COUNTS = 4, 3
+
+# Coordinate that no particle reaches [m].
+UNLIMITED = 1.0e30
+
+
+@dataclass(frozen=True)
+class Box:
+    """The box that holds the particles: closed faces stop them, open faces let them go.
+
+    Attributes:
+        walls: lower and upper corner of the closed faces [m]; out of reach where a face is open.
+        openings: lower and upper corner of the open faces [m]; out of reach where a face is closed.
+    """
+
+    walls: tuple[Vector3, Vector3]
+    openings: tuple[Vector3, Vector3]
+
+    @classmethod
+    def of_domain(cls, domain: DomainParameters) -> Self:
+        """The box of a domain."""
+        return cls(_corners(domain, of_open_faces=False), _corners(domain, of_open_faces=True))
+
+
+def _corners(domain: DomainParameters, *, of_open_faces: bool) -> tuple[Vector3, Vector3]:
+    is_open = np.array([[f"{axis}{side}" in domain.open_faces for axis in "xyz"] for side in "-+"])
+    low = np.where(is_open[0] == of_open_faces, domain.min, -UNLIMITED)
+    high = np.where(is_open[1] == of_open_faces, domain.max, UNLIMITED)
+    return tuple(low.tolist()), tuple(high.tolist())
 
 
 @dataclass(frozen=True)
@@ -52,15 +82,9 @@ class ParticleStepper:
         dt: float,
         frequency_squared: ti.Ndarray | None = None,
     ) -> MotionSummary:
-        """v_i += dt a_i, x_i += dt v_i; then whoever passed a wall is put back onto it.
+        """v_i += dt a_i, x_i += dt v_i; then particles that passed a wall are put back onto it.
 
-        Args:
-            position: of the particles [m], at least (count,) of 3-vectors.
-            velocity: [m/s], likewise.
-            acceleration: [m/s²], likewise.
-            count: number of particles.
-            dt: the step [s].
-            frequency_squared: square of the frequency at which each particle can swing [1/s²], at least (count,).
+        `frequency_squared` is that at which each particle can swing against its own pressure [1/s²].
         """
         reduction, with_frequency = self._reduction, frequency_squared is not None
         results = advance_particles(

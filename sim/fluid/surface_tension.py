@@ -10,11 +10,7 @@ from sim.core.bundles import func
 from sim.fluid.discretization import Discretization
 from sim.fluid.kernels import evaluate, lattice_offsets, spline
 from sim.fluid.parameters import FluidParameters
-from sim.fluid.surface_tension_akinci2013 import (
-    COHESION_PER_TENSION,
-    RATE_PER_COHESION,
-    cohesion_stress_akinci2013,
-)
+from sim.fluid.surface_tension_akinci2013 import COHESION_PER_TENSION, RATE_PER_COHESION, cohesion_stress_akinci2013
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +58,7 @@ def cohesion_becker_teschner2007(distance: ti.f32, inverse_support: ti.f32, spac
 
 
 def cohesion_stress(support_in_spacings: float) -> float:
-    """Stress with which this cohesion pulls a filled lattice together, over rho kappa/d: sum_j |x_ij|² W_ij d/6 [-].
-
-    0.15 at the usual support, four times that at twice the support, where the farther neighbours pull as well.
-    """
+    """Stress with which this cohesion pulls a filled lattice together, over rho kappa/d: sum_j |x_ij|² W_ij d/6 [-]."""
     distances = _neighbor_distances(support_in_spacings)
     return float((distances**2 * evaluate(distances, support_in_spacings)).sum()) / 6.0
 

@@ -5,29 +5,21 @@ from typing import NamedTuple
 import numpy as np
 import taichi as ti
 
-from sim.core.arrays import Floats, Vectors
+from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
-from sim.core.neighbors import Neighbors
-from sim.fluid.boundary import Samples
+from sim.fluid.device import Fluid
 from sim.fluid.discretization import Discretization
 from sim.fluid.kernels import inverse_distance, lattice_offsets, particle_volume, spline_slope
 from sim.fluid.parameters import FluidParameters
-from sim.fluid.particles import Particles
-from sim.fluid.phases import device_table
 
 COHESION_PER_TENSION = 100.0
-"""Cohesion c [m/s²] over sigma/(rho0 h²) with which a drop oscillates as one of surface tension sigma does (Rayleigh).
-
-Measured. A sharp surface of particles that attract each other with the force m c V C(r) would have the tension
-sigma = pi/8 rho0 c int C(r) r⁴ dr (Fowler 1937), which asks for 335; area forces and the layers that form under the
-surface make it stronger.
-"""
+"""Cohesion c [m/s²] over sigma/(rho0 h²) with which a drop oscillates as one of surface tension sigma does (Rayleigh);
+measured."""
 
 RATE_PER_COHESION = 1.0
-"""Square of the frequency of a particle on the springs of its neighbours' cohesion over c/h [-]: at the usual support
-the slope of V C is at most 0.135/h between two particles of a lattice, and six are as near as that. At wider ones the
-sum of all slopes is at most 1.44/h, and no displacement is along more than a third of it."""
+"""Square of the frequency of a particle on the springs of its neighbours' cohesion over c/h [-]: the slope of V C is at
+most 0.135/h between two particles of a lattice, and six are as near as that."""
 
 AREA_SHARE = 1.0e-3
 """Coefficient of the area forces over that of cohesion, both as accelerations. The paper has one gamma for both: its
@@ -57,21 +49,17 @@ class SurfaceTensionAkinci2013:
     def __init__(
         self, capacity: int, fluids: tuple[FluidParameters, ...], cohesion: np.ndarray, discretization: Discretization
     ) -> None:
-        """Prepare for so many particles of these fluids, whose cohesion is c [m/s²], (k,)."""
-        self._normal = ti.Vector.ndarray(3, ti.f32, max(capacity, 1))
+        """Prepare for particles of these fluids, whose cohesion is c [m/s²], (k,)."""
+        self._normal = ti.Vector.ndarray(3, ti.f32, capacity)
         self._discretization = discretization
         adhesion = np.array([fluid.adhesion for fluid in fluids])
-        self._attraction = Attraction(device_table(cohesion), device_table(adhesion), bool((adhesion > 0.0).any()))
+        self._attraction = Attraction(on_device(cohesion), on_device(adhesion), bool((adhesion > 0.0).any()))
 
-    def add_acceleration(
-        self, particles: Particles, near: Neighbors, samples: Samples, acceleration: ti.Ndarray
-    ) -> None:
+    def add_acceleration(self, fluid: Fluid, acceleration: ti.Ndarray) -> None:
         """Add the accelerations by surface tension to all others [m/s²]."""
         d = self._discretization
-        compute_normals(particles, near, d.sigma * d.particle_volume, 1.0 / d.support_radius, self._normal)
-        add_surface_tension(
-            particles, near, samples, self._attraction, d.particle_volume, d.support_radius, self._normal, acceleration
-        )
+        compute_normals(fluid, d.sigma * d.particle_volume, self._normal)
+        add_surface_tension(fluid, self._attraction, d.support_radius, self._normal, acceleration)
 
 
 @func
@@ -83,10 +71,7 @@ def cohesion_akinci2013(q: ti.f32) -> ti.f32:
 
 
 def cohesion_stress_akinci2013(support_in_spacings: float) -> float:
-    """Stress with which cohesion pulls a filled lattice together, over rho0 c h: sum_j V C(|x_ij|) |x_ij| / (6 h) [-].
-
-    0.028 at the usual support, 0.024 to 0.025 at wider ones.
-    """
+    """Stress of cohesion in a filled lattice over rho0 c h: sum_j V C(|x_ij|) |x_ij| / (6 h) [-]."""
     q = np.linalg.norm(lattice_offsets(support_in_spacings), axis=1) / support_in_spacings
     bump = (1.0 - q) ** 3 * q**3
     cohesion = 32.0 / np.pi * np.where(q > 0.5, bump, 2.0 * bump - 1.0 / 64.0) / support_in_spacings**3
@@ -100,61 +85,56 @@ def adhesion_akinci2013(q: ti.f32) -> ti.f32:
 
 
 @kernel
-def compute_normals(
-    particles: Particles, near: Neighbors, sigma_volume: ti.f32, inverse_support: ti.f32, normal: Vectors
-):
+def compute_normals(fluid: Fluid, sigma_volume: ti.f32, normal: Vectors):
     """n_i = h sum_j V/rho_j grad W_ij over the particle's own fluid: 0 within, into the fluid at its surface."""
     ti.loop_config(block_dim=128)
-    for i in range(particles.count):
-        x_i = particles.position[i]
+    for i in range(fluid.particles.count):
+        x_i = fluid.particles.position[i]
         total = ti.math.vec3(0.0)
-        first = near.start[i]
-        for k in range(near.fluid_count[i]):
-            j = near.indices[first + k * near.stride]
-            if particles.phase[j] == particles.phase[i]:
-                x_ij = x_i - particles.position[j]
+        first = fluid.near.start[i]
+        for k in range(fluid.near.fluid_count[i]):
+            j = fluid.near.indices[first + k * fluid.near.stride]
+            if fluid.particles.phase[j] == fluid.particles.phase[i]:
+                x_ij = x_i - fluid.particles.position[j]
                 r_squared = x_ij.norm_sqr()
                 inverse_r = inverse_distance(r_squared)
-                slope = spline_slope(r_squared * inverse_r * inverse_support)
-                total += slope * inverse_r / particles.density[j] * x_ij
+                slope = spline_slope(r_squared * inverse_r * fluid.inverse_support)
+                total += slope * inverse_r / fluid.particles.density[j] * x_ij
         normal[i] = sigma_volume * total
 
 
 @kernel
 def add_surface_tension(
-    particles: Particles,
-    near: Neighbors,
-    samples: Samples,
-    attraction: Attraction,
-    volume: ti.f32,
-    support_radius: ti.f32,
-    normal: Vectors,
-    acceleration: Vectors,
+    fluid: Fluid, attraction: Attraction, support_radius: ti.f32, normal: Vectors, acceleration: Vectors
 ):
     """Cohesion, area forces and adhesion; the equations stand at the class."""
     inverse_support = 1.0 / support_radius
     per_volume = inverse_support * inverse_support * inverse_support
     ti.loop_config(block_dim=128)
-    for i in range(particles.count):
-        x_i, n_i, own = particles.position[i], normal[i], particles.phase[i]
+    for i in range(fluid.particles.count):
+        x_i, n_i, own = fluid.particles.position[i], normal[i], fluid.particles.phase[i]
         total = ti.math.vec3(0.0)
-        first = near.start[i]
-        for k in range(near.fluid_count[i]):
-            j = near.indices[first + k * near.stride]
-            x_ij = x_i - particles.position[j]
+        first = fluid.near.start[i]
+        for k in range(fluid.near.fluid_count[i]):
+            j = fluid.near.indices[first + k * fluid.near.stride]
+            x_ij = x_i - fluid.particles.position[j]
             r_squared = x_ij.norm_sqr()
-            if particles.phase[j] == own and r_squared < support_radius * support_radius:
+            if fluid.particles.phase[j] == own and r_squared < support_radius * support_radius:
                 inverse_r = inverse_distance(r_squared)
-                pull = volume * per_volume * cohesion_akinci2013(r_squared * inverse_r * inverse_support) * inverse_r
-                symmetric = 2.0 / (particles.density[i] + particles.density[j])
+                pull = (
+                    fluid.volume * per_volume * cohesion_akinci2013(r_squared * inverse_r * inverse_support) * inverse_r
+                )
+                symmetric = 2.0 / (fluid.particles.density[i] + fluid.particles.density[j])
                 total += symmetric * (pull * x_ij + AREA_SHARE * (n_i - normal[j]))
         if ti.static(attraction.with_adhesion):
-            first += near.fluid_count[i] * near.stride
-            for k in range(near.boundary_count[i]):
-                b = near.indices[first + k * near.stride]
-                x_ib = x_i - samples.position[b]
+            first += fluid.near.fluid_count[i] * fluid.near.stride
+            for k in range(fluid.near.boundary_count[i]):
+                b = fluid.near.indices[first + k * fluid.near.stride]
+                x_ib = x_i - fluid.samples.position[b]
                 r_squared = x_ib.norm_sqr()
                 inverse_r = inverse_distance(r_squared)
-                pull = samples.volume[b] * per_volume * adhesion_akinci2013(r_squared * inverse_r * inverse_support)
+                pull = (
+                    fluid.samples.volume[b] * per_volume * adhesion_akinci2013(r_squared * inverse_r * inverse_support)
+                )
                 total += attraction.adhesion[own] * pull * inverse_r * x_ib
         acceleration[i] -= attraction.cohesion[own] * total

@@ -11,16 +11,15 @@ import taichi as ti
 from sim.core.cells import CellGrid
 from sim.core.neighbors import cells_per_radius
 from sim.fluid.body_forces import BodyForces
-from sim.fluid.boundary import Boundary
+from sim.fluid.boundary import BodyStates, Boundary
 from sim.fluid.boundary_akinci2012 import BoundarySamples
-from sim.fluid.box import Box, check_particles
-from sim.fluid.checkpoints import check_checkpoint
+from sim.fluid.device import Fluid
 from sim.fluid.discretization import Discretization
 from sim.fluid.emitter import Emission
 from sim.fluid.nozzles import is_felt_in_nozzles
-from sim.fluid.particles import ParticleSet
+from sim.fluid.particles import HOST_NAMES, ParticleSet
 from sim.fluid.sheet_forces import SheetForces
-from sim.fluid.stepping import MotionSummary, ParticleStepper
+from sim.fluid.stepping import Box, MotionSummary, ParticleStepper
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,6 +32,10 @@ if TYPE_CHECKING:
     from sim.fluid.sheet_samples import SheetSamples
 
 
+# What a checkpoint has of the last motion of the particles.
+MEASURES = ("max_speed", "max_acceleration", "max_frequency", "max_displacement")
+
+
 @dataclass(frozen=True, eq=False)
 class FluidStart:
     """A tank of fluids as it starts.
@@ -41,8 +44,7 @@ class FluidStart:
         fluids: parameters of each fluid in the tank.
         domain: the box they live in.
         gravity: acceleration [m/s²].
-        positions: particles [m], (n, 3), float32.
-        velocities: their velocities [m/s], (n, 3), float32.
+        positions, velocities: of the particles [m], [m/s], (n, 3), float32.
         boundary: samples of walls and of bodies that never move.
         phase: number of the fluid of each particle, (n,); 0 for all if omitted.
         moving: samples of moving bodies, relative to the centre of mass and in the axes of each.
@@ -73,8 +75,6 @@ class ParticleTank:
     one that passes an open face is removed and counted.
 
     Attributes:
-        gravity: [m/s²].
-        discretization: of all fluids.
         particles: with their neighbours.
         boundary: samples of walls, bodies and sheets.
         body_forces: what the fluid exerts on bodies and sheets.
@@ -82,8 +82,7 @@ class ParticleTank:
         motion: of the particles in the last step.
         last_speed: largest speed of a particle in the last step [m/s]; `motion` foresees the inflow as well.
         peak_speed: largest speed of this frame [m/s].
-        body_speed: largest speed of a sample of a body [m/s].
-        sheet_speed: and of one of a sheet [m/s].
+        body_speed, sheet_speed: largest speed of a sample of a body, and of a sheet [m/s].
         removed: particles removed since the start.
     """
 
@@ -98,22 +97,13 @@ class ParticleTank:
         sheets_answer: bool,
         looks_ahead: bool,
     ) -> None:
-        """Take particles, walls and bodies.
-
-        Args:
-            start: all of them.
-            phases: materials of the particles.
-            discretization: of the fluids.
-            skin: reach of the neighbour list beyond the support [support radii].
-            carried: scalars per particle that its solver keeps from step to step, by name.
-            sheets_answer: whether sheets answer to pressures that are tried within a step.
-            looks_ahead: whether the next step looks at particles as far ahead as they went in the last one.
+        """Take particles, walls and bodies; `sim.fluid.fluid.SPHFluid` has the other arguments.
 
         Raises:
             ValueError: arrays of the wrong shape, not finite, or with particles outside the domain.
         """
-        check_particles(start.positions, start.velocities, start.domain)
-        self.gravity, self.discretization = start.gravity, discretization
+        _check_particles(start)
+        self.gravity, self.discretization, self._materials = start.gravity, discretization, phases.materials
         self._looks_ahead = looks_ahead
         self.removed = 0
         self._travelled = self._boundary_travelled = 0.0
@@ -121,21 +111,20 @@ class ParticleTank:
         self._box = Box.of_domain(start.domain)
         self._stepper = ParticleStepper(self._box)
         self._search_radius = (1.0 + skin) * discretization.support_radius
-        self.grid = CellGrid.covering_as_finely_as_fits(
+        self.grid = CellGrid.covering(
             np.array(start.domain.min),
             np.array(start.domain.max),
             self._search_radius,
             reach=cells_per_radius(discretization.support_in_spacings),
         )
         self.emission = Emission(start.fluids, discretization, self.grid)
-        sheets = BoundarySamples.of_bodies() if start.sheets is None else start.sheets.boundary
         self.boundary = Boundary(
             start.boundary,
             start.moving,
             is_smooth=is_felt_in_nozzles(
                 start.boundary.positions, self.emission.openings, discretization.support_radius
             ),
-            sheets=sheets,
+            sheets=BoundarySamples.of_bodies() if start.sheets is None else start.sheets.boundary,
             body_count=start.body_count,
             grid=self.grid,
             discretization=discretization,
@@ -151,7 +140,6 @@ class ParticleTank:
                 gravity=start.gravity,
                 capacity=self.particles.capacity,
                 discretization=discretization,
-                materials=phases.materials,
                 answers=sheets_answer,
             )
         self._without_neighbors = False
@@ -172,6 +160,20 @@ class ParticleTank:
         self.find_neighbors()
 
     @property
+    def on_device(self) -> Fluid:
+        """The fluid as kernels read it."""
+        particles, d = self.particles, self.discretization
+        return Fluid(
+            particles.arrays,
+            particles.near,
+            self.boundary.samples,
+            self._materials,
+            d.particle_volume,
+            d.sigma,
+            d.inverse_support,
+        )
+
+    @property
     def boundary_speed(self) -> float:
         """Largest speed of a boundary sample [m/s]."""
         return float(np.maximum(self.body_speed, self.sheet_speed))  # which is NaN where either is
@@ -182,62 +184,39 @@ class ParticleTank:
         self._wall_contacts = self._neighbor_searches = self._substeps = 0
         self.emission.begin_frame()
 
-    def move_bodies(
-        self,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
-        velocity: NDArray[np.float64],
-        angular_velocity: NDArray[np.float64],
-        *,
-        elapsed_s: float,
-    ) -> None:
-        """Put the moving bodies where they are now.
-
-        Args:
-            position: centres of mass [m], (bodies, 3).
-            rotation: from body to world axes, (bodies, 3, 3).
-            velocity: of the centres of mass [m/s], (bodies, 3).
-            angular_velocity: [rad/s], (bodies, 3).
-            elapsed_s: time since they were placed last [s]; 0 where they are put there anew.
-        """
-        self._boundary_travelled += self.boundary.place(position, rotation, velocity, angular_velocity)
-        speed = np.linalg.norm(velocity, axis=1) + np.linalg.norm(angular_velocity, axis=1) * self.boundary.reach
+    def move_bodies(self, states: BodyStates, *, elapsed_s: float) -> None:
+        """Put the moving bodies where they are; 0 s have elapsed since the last time where they are put there anew."""
+        self._boundary_travelled += self.boundary.place(states)
+        spin = np.linalg.norm(states.angular_velocity, axis=1)
+        speed = np.linalg.norm(states.velocity, axis=1) + spin * self.boundary.reach
         self.body_speed = float(speed.max(initial=0.0))
         self._without_neighbors |= elapsed_s == 0.0
 
     def sheets_moved(self, distance: float, speed: float, *, elapsed_s: float) -> None:
-        """Take note that the samples of sheets were placed anew.
+        """Take note that the samples of sheets were placed anew: largest displacement [m] and speed of one [m/s].
 
-        Args:
-            distance: largest displacement of one of them [m].
-            speed: the largest of them [m/s].
-            elapsed_s: time since they were placed last [s]; 0 where they are put there anew.
+        `elapsed_s` is the time since they were placed last [s]; 0 where they are put there anew.
         """
         self._boundary_travelled += distance
         self.sheet_speed = speed
         self._without_neighbors |= elapsed_s == 0.0
 
     def take_sheet_motion(self, change: ti.Ndarray, largest_change: float, dt: float) -> None:
-        """Let the fluid that touched sheets in the last step move along with them.
+        """Let the fluid that touched sheets in the last step, of dt [s], move along with them.
 
-        Args:
-            change: what the velocity of each sample of a sheet differs by from what the last step took it for [m/s].
-            largest_change: norm of the largest of them [m/s].
-            dt: that step [s].
+        `change` is what the velocity of each sample of a sheet differs by from what that step took it for [m/s], and
+        `largest_change` the norm of the largest of them.
         """
         sheets = self.body_forces.sheets
         assert sheets is not None
-        sheets.take_motion(self.particles, change, dt, self._box.walls)
+        sheets.take_motion(self.on_device, change, dt, self._box.walls)
         self._travelled += dt * largest_change
         self.motion = replace(self.motion, max_speed=self.motion.max_speed + largest_change)
 
     def advance(self, acceleration: ti.Ndarray, dt: float, frequency_squared: ti.Ndarray | None = None) -> None:
-        """v_i += dt a_i, x_i += dt v_i, within the walls; then the emitters.
+        """v_i += dt a_i, x_i += dt v_i, within the walls; then the emitters. In nozzles a_i becomes 0.
 
-        Args:
-            acceleration: of the particles [m/s²]; 0 afterwards for those in a nozzle.
-            dt: the step [s].
-            frequency_squared: square of the frequency at which each particle can swing [1/s²].
+        `frequency_squared` is that at which each particle can swing against its own pressure [1/s²].
         """
         particles = self.particles
         self.emission.drive(particles, acceleration)
@@ -255,10 +234,7 @@ class ParticleTank:
         self._substeps += 1
 
     def update_neighbors(self) -> None:
-        """Find the neighbours anew where a pair could have closed the skin between them, or particles left or came.
-
-        Whatever reads the neighbours asks for this first; so bodies and particles both have moved by then.
-        """
+        """Find the neighbours anew where a pair could have closed the skin between them, or particles left or came."""
         travelled = self._travelled + (self.motion.max_displacement if self._looks_ahead else 0.0)
         closed = travelled + max(travelled, self._boundary_travelled)
         skin = self._search_radius - self.discretization.support_radius
@@ -296,9 +272,11 @@ class ParticleTank:
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The particles in the order of the neighbour list, and the positions that it was made from."""
         self.update_neighbors()
-        particles, motion = self.particles, self.motion
+        return self._state()
+
+    def _state(self) -> dict[str, NDArray[np.generic]]:
+        particles, sheets = self.particles, self.body_forces.sheets
         reference = particles.sorted_points[:3]
-        sheets = self.body_forces.sheets
         return {
             **particles.host_arrays(),
             **self.boundary.checkpoint(),
@@ -307,10 +285,7 @@ class ParticleTank:
             "travelled": np.array([self._travelled], dtype=np.float64),
             "boundary_travelled": np.array([self._boundary_travelled], dtype=np.float64),
             "boundary_speed": np.array([self.body_speed, self.sheet_speed], dtype=np.float64),
-            "max_speed": np.array([motion.max_speed], dtype=np.float64),
-            "max_acceleration": np.array([motion.max_acceleration], dtype=np.float64),
-            "max_frequency": np.array([motion.max_frequency], dtype=np.float64),
-            "max_displacement": np.array([motion.max_displacement], dtype=np.float64),
+            **{measure: np.array([getattr(self.motion, measure)], dtype=np.float64) for measure in MEASURES},
             "particles_removed": np.array([self.removed], dtype=np.int64),
             "next_particle_id": np.array([self._next_particle_id], dtype=np.int64),
             **({} if sheets is None else sheets.checkpoint()),
@@ -323,14 +298,7 @@ class ParticleTank:
             ValueError: the arrays are not a checkpoint of the fluid of this name.
         """
         particles = self.particles
-        check_checkpoint(
-            arrays,
-            name,
-            capacity=particles.capacity,
-            carried=tuple(particles.carried),
-            body_states=self.boundary.bodies.states.shape,
-            sheet_samples=self.boundary.sheet_count,
-        )
+        self._check_checkpoint(arrays, name)
         # The neighbour list has to be made from the positions it was made from before, then all move on.
         particles.load({**arrays, "position": arrays["reference_position"]})
         self.boundary.restore_reference(arrays)
@@ -340,8 +308,7 @@ class ParticleTank:
         self.body_speed, self.sheet_speed = arrays["boundary_speed"].tolist()
         self._travelled = float(arrays["travelled"][0])
         self._boundary_travelled = float(arrays["boundary_travelled"][0])
-        measures = ("max_speed", "max_acceleration", "max_frequency", "max_displacement")
-        self.motion = MotionSummary(**{measure: float(arrays[measure][0]) for measure in measures})
+        self.motion = MotionSummary(**{measure: float(arrays[measure][0]) for measure in MEASURES})
         self.removed = int(arrays["particles_removed"][0])
         self._next_particle_id = int(arrays["next_particle_id"][0])
         self.emission.restore(arrays)
@@ -349,6 +316,34 @@ class ParticleTank:
         if self.body_forces.sheets is not None:
             self.body_forces.sheets.restore(arrays)
 
+    def _check_checkpoint(self, arrays: Arrays, name: str) -> None:
+        """Refuse arrays that are no checkpoint of this tank, whatever the number of particles."""
+        expected = self._state()
+        if missing := sorted(set(expected) - set(arrays)):
+            raise ValueError(f'not a checkpoint of "{name}": it lacks {", ".join(missing)}')
+        count, capacity = len(arrays["particle_id"]), self.particles.capacity
+        if count > capacity:
+            raise ValueError(f'the checkpoint has {count} particles, "{name}" has room for {capacity}')
+        of_particles = {*HOST_NAMES, *self.particles.carried, "reference_position"}
+        for key, own in expected.items():
+            found, shape = arrays[key], (count, *own.shape[1:]) if key in of_particles else own.shape
+            if found.shape != shape or found.dtype != own.dtype:
+                raise ValueError(
+                    f'checkpoint of "{name}": {key} must be {own.dtype} {shape}, got {found.dtype} {found.shape}'
+                )
+
     def _expect_inflow(self) -> None:
         """Let the next time step be right for what flows in during it."""
         self.motion = replace(self.motion, max_speed=max(self.motion.max_speed, self.emission.speed))
+
+
+def _check_particles(start: FluidStart) -> None:
+    """Refuse particles of the wrong shape, not finite, or outside the domain."""
+    positions, velocities, domain = start.positions, start.velocities, start.domain
+    if positions.ndim != 2 or positions.shape[1] != 3 or velocities.shape != positions.shape:
+        raise ValueError(f"positions and velocities must both be (n, 3), got {positions.shape} and {velocities.shape}")
+    if not (np.isfinite(positions).all() and np.isfinite(velocities).all()):
+        raise ValueError("positions and velocities must be finite numbers")
+    outside = ((positions < np.float32(domain.min)) | (positions > np.float32(domain.max))).any(axis=1).sum()
+    if outside:
+        raise ValueError(f"{outside} of {len(positions)} particles start outside the domain")

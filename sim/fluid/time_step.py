@@ -1,23 +1,22 @@
-"""How long a step may be."""
+"""Stable time steps."""
 
 import math
 
+# Fraction of the particle spacing that a signal may cross in a step (Monaghan 1992).
 CFL_NUMBER = 0.4
-"""Fraction of the particle spacing that a signal may cross in a step (Monaghan 1992)."""
 
+# Fraction of sqrt(d / |a|) (Monaghan 1992, section 10.3).
 FORCE_NUMBER = 0.25
-"""Fraction of sqrt(d / |a|) (Monaghan 1992, section 10.3)."""
 
+# Fraction of d² / nu (Morris, Fox & Zhu 1997, eq. 20).
 VISCOUS_NUMBER = 0.125
-"""Fraction of d² / nu (Morris, Fox & Zhu 1997, eq. 20)."""
 
+# Fraction of the inverse of the highest frequency of particles against each other's pressure; symplectic Euler is
+# stable up to 2. Particles that are squeezed, or pressed against boundary samples, are the stiffest.
 PRESSURE_NUMBER = 1.0
-"""Fraction of the inverse of the highest frequency of particles against each other's pressure; symplectic Euler is
-stable up to 2. Particles in a fluid at rest reach 0.44 by the limit on signals; those that are squeezed, or pressed
-against boundary samples, are several times stiffer."""
 
+# Fraction of the inverse frequency of a particle on the spring that its neighbours' cohesion is.
 COHESION_NUMBER = 0.25
-"""Fraction of the inverse frequency of a particle on the spring that its neighbours' cohesion is."""
 
 
 def stable_time_step(

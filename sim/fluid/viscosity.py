@@ -6,12 +6,11 @@ import taichi as ti
 
 from sim.core.bundles import bundle, func
 
-DIMENSIONS = 3
-LAPLACIAN_FACTOR = 2.0 * (DIMENSIONS + 2)
-"""2 (d + 2) of Monaghan's viscosity."""
+# 2 (d + 2) of Monaghan's viscosity in d = 3 dimensions.
+LAPLACIAN_FACTOR = 10.0
 
+# Keeps |x_ij|² + 0.01 h² away from zero for particles that meet.
 SOFTENING = 0.01
-"""Keeps |x_ij|² + 0.01 h² away from zero for particles that meet."""
 
 
 @bundle
@@ -33,14 +32,8 @@ def viscous_factor(v_dot_x: ti.f32, r_squared: ti.f32, softening: ti.f32, mu: ti
     Artificial part, Monaghan 1992, eq. 4.1 with beta = 0, between particles that approach each other only:
     a_i = alpha c_s h_s sum_j (m_j / rho_ij) min(v_ij . x_ij, 0) / (|x_ij|² + 0.01 h²) grad W_ij,
     with the smoothing length h_s = h/2. Both conserve momentum pair by pair as rho_ij = (rho_i + rho_j)/2. Particles of
-    equal volume V have m_j = rho0 V; written with mu = rho0 nu, the force holds between two fluids as well.
-
-    Args:
-        v_dot_x: (v_i - v_j) . (x_i - x_j) [m²/s].
-        r_squared: |x_i - x_j|² [m²].
-        softening: 0.01 h² [m²].
-        mu: dynamic viscosity times 2 (d+2) [Pa s].
-        artificial: rho0 alpha c_s h_s [Pa s].
+    equal volume V have m_j = rho0 V; so the force holds between two fluids as well. `softening` is 0.01 h² [m²], `mu`
+    2 (d+2) rho0 nu, and `artificial` rho0 alpha c_s h_s [Pa s].
     """
     return (mu * v_dot_x + artificial * ti.min(v_dot_x, 0.0)) / (r_squared + softening)
 

@@ -7,10 +7,10 @@ import taichi as ti
 
 from sim.core.reductions import LaneReduction
 from sim.fluid.body_friction import BodyFriction, Friction
-from sim.fluid.boundary import Samples
+from sim.fluid.device import Fluid
 from sim.fluid.discretization import Discretization
+from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import ParticleSet
-from sim.fluid.phases import Phases
 from sim.fluid.solve_record import SolveRecord
 from sim.fluid.time_step import CFL_NUMBER, VISCOUS_NUMBER
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING
@@ -30,37 +30,32 @@ from sim.fluid.viscosity_kernels import (
 
 TOLERANCE = 1.0e-3
 """Where the iteration stops: the residual as a velocity, over the velocity changes that viscosity asks for, both as
-root mean squares. Both are 0 for a fluid that moves as a rigid body, however fast."""
+root mean squares."""
 
+# A solve that needs more is counted as not converged; its velocities are used as they are.
 MAX_ITERATIONS = 200
-"""A solve that needs more is counted as not converged; its velocities are used as they are."""
 
 CARRIED = ("viscous_change_x", "viscous_change_y", "viscous_change_z")
 """Velocity change of each particle in the step before [m/s], from which the next solve starts."""
 
+# A restart whose residual is more than this share of that of the restart before has met the limits of float32.
 STAGNATION = 0.5
-"""A restart whose residual is more than this share of that of the restart before has met the limits of float32."""
 
+# Velocity changes whose squares add up to less are nothing, and no reason to iterate [m²/s²].
 LEAST_SQUARE = 1.0e-24
-"""Velocity changes whose squares add up to less are nothing, and no reason to iterate [m²/s²]."""
 
 SUMS = 3
 
 
-def is_implicit(solver: str, *, viscosity: float, spacing: float, speed: float, dt: float | str, cfl: float) -> bool:
-    """Whether viscosity is solved for: as `solver` says, or for "auto" where it would limit the time step.
+def is_implicit(parameters: FluidParameters, viscosity: float, speed: float) -> bool:
+    """Whether viscosity is solved for: as the parameters say, or for "auto" where it would limit the time step.
 
-    Args:
-        solver: "explicit", "implicit" or "auto".
-        viscosity: kinematic viscosity of the stiffest fluid, against walls too [m²/s].
-        spacing: particle spacing [m].
-        speed: of the signals that limit the step otherwise [m/s].
-        dt: the time step [s], or "adaptive".
-        cfl: the user's factor on the step.
+    `viscosity` is that of the stiffest fluid, against walls too [m²/s], and `speed` that of signals [m/s].
     """
-    if solver != "auto" or viscosity == 0.0:
-        return solver == "implicit" and viscosity > 0.0
-    other = float(dt) if dt != "adaptive" else cfl * CFL_NUMBER * spacing / speed
+    if parameters.viscosity_solver != "auto" or viscosity == 0.0:
+        return parameters.viscosity_solver == "implicit" and viscosity > 0.0
+    dt, spacing = parameters.dt, parameters.spacing
+    other = float(dt) if dt != "adaptive" else parameters.cfl * CFL_NUMBER * spacing / speed
     return VISCOUS_NUMBER * spacing**2 / viscosity < other
 
 
@@ -76,10 +71,10 @@ class ImplicitViscosity:
     and with dv_b = 0 for walls and driven bodies, that of the body for free ones, whose velocities are unknowns too
     (`sim.fluid.body_friction`). The matrix is symmetric and positive definite for every time step: conjugate gradients
     with the 3 x 3 blocks of its diagonal as preconditioner (Weiler et al. 2018, section 3.2), in the form with one
-    reduction an iteration (Chronopoulos & Gear 1989). That form carries the residual along, which drifts from the true
-    one; so the true one is computed where the carried one says that it is done, and if need be the iteration starts
-    again from there. In the end the residual over rho0 is added to the change, which is the pair sum with the
-    velocities found: linear and angular momentum are conserved to rounding, wherever the iteration stopped.
+    reduction an iteration (Chronopoulos & Gear 1989). That form carries the residual along, which drifts; so the true
+    one is computed where the carried one says that it is done, and if need be the iteration starts again from there.
+    In the end the residual over rho0 is added to the change, which is the pair sum with the velocities found: momentum
+    is conserved to rounding, wherever the iteration stopped.
 
     Attributes:
         velocity: of the particles with the change found, those that the pair sums were taken at [m/s].
@@ -87,77 +82,48 @@ class ImplicitViscosity:
         record: of the solves of this frame; its error is the true residual in the unit of `TOLERANCE`.
     """
 
-    def __init__(self, capacity: int, bodies: BodyFriction, wall_friction: float) -> None:
-        """Prepare for so many particles, for bodies, and for a viscosity against walls over that of the fluid [-]."""
+    def __init__(
+        self, capacity: int, bodies: BodyFriction, wall_friction: float, discretization: Discretization
+    ) -> None:
+        """Prepare for particles, for bodies, and for a viscosity against walls over that of the fluid [-]."""
         self.record = SolveRecord()
         self.bodies = bodies
-        self._wall_friction = wall_friction
+        self._wall_friction, self._discretization = wall_friction, discretization
         self._reduction = LaneReduction(maxima=0, sums=SUMS)
-        vectors = [ti.Vector.ndarray(3, ti.f32, max(capacity, 1)) for _ in range(9)]
-        self.velocity, self._iterate = vectors[0], Iterate(*vectors[1:7])
+        self.velocity, *vectors = (ti.Vector.ndarray(3, ti.f32, capacity) for _ in range(9))
+        self._iterate, self._blocks = Iterate(*vectors[:6]), Blocks(*vectors[6:])
         # The right-hand side has been read when the first direction is written.
         self._given = self._iterate.direction_product
-        self._blocks = Blocks(*vectors[7:])
 
     @property
     def change(self) -> ti.Ndarray:
         """Change of the particles' velocities that the last solve found [m/s]."""
         return self._iterate.change
 
-    def begin_frame(self) -> None:
-        """Restart the counters of the frame."""
-        self.record = SolveRecord()
-
     def add_acceleration(
-        self,
-        particles: ParticleSet,
-        samples: Samples,
-        phases: Phases,
-        discretization: Discretization,
-        friction: Friction,
-        acceleration: ti.Ndarray,
-        dt: float,
+        self, particles: ParticleSet, fluid: Fluid, friction: Friction, acceleration: ti.Ndarray, dt: float
     ) -> None:
-        """Add the viscous acceleration of a step to all others; leaves the new velocities in `velocity`.
+        """Add the viscous acceleration of a step of dt [s] to all others [m/s²]; `velocity` becomes the new velocities.
 
-        Args:
-            particles: before the step, with the scalars `CARRIED`.
-            samples: of the boundary.
-            phases: materials of the particles.
-            discretization: of the fluid.
-            friction: of the particles on the bodies.
-            acceleration: by all other forces [m/s²]; that by viscosity is added.
-            dt: the step [s].
+        The particles have the scalars `CARRIED`, and `fluid` is the same with the viscosities to solve for.
         """
         carried = Carried(*(particles.carried[name] for name in CARRIED))
-        bodies, iterate = self.bodies, self._iterate
+        bodies, iterate, d = self.bodies, self._iterate, self._discretization
         bodies.forget()
         if particles.count == 0:
             return
         self._with_bodies = bodies.are_free and self._wall_friction > 0.0
         self._matrix = ViscousMatrix(
-            particles=particles.arrays,
-            near=particles.near,
-            samples=samples,
-            materials=phases.materials,
-            factor=dt * LAPLACIAN_FACTOR * discretization.gradient_factor,
-            volume=discretization.particle_volume,
-            inverse_support=1.0 / discretization.support_radius,
-            softening=SOFTENING * discretization.support_radius**2,
+            fluid=fluid,
+            factor=dt * LAPLACIAN_FACTOR * d.gradient_factor,
+            softening=SOFTENING * d.support_radius**2,
             wall_friction=self._wall_friction,
         )
         self._share = self._reduction.over(particles.count)
         predict_velocity(particles.velocity, acceleration, particles.count, dt, carried, self.velocity, iterate.change)
         if self._with_bodies:
             iterate.product.fill(0.0)
-            bodies.prepare(
-                friction,
-                self.velocity,
-                iterate.product,
-                volume=discretization.particle_volume,
-                rest_density=float(phases.rest_densities.max()),
-                dt=dt,
-            )
+            bodies.prepare(friction, self.velocity, iterate.product, dt)
             bodies.guess(iterate.change)
         self._solve()
         finish_solve(self._matrix, iterate, dt, carried, acceleration, self.velocity)
@@ -208,7 +174,7 @@ class ImplicitViscosity:
             if left <= wanted or not (curvature > 0.0 and gamma > 0.0):
                 return iteration
             alpha, gamma_before = gamma / curvature, gamma
-            advance_solve(self._matrix.particles.count, alpha, beta, self._blocks, iterate)
+            advance_solve(self._matrix.fluid.particles.count, alpha, beta, self._blocks, iterate)
             if self._with_bodies:
                 bodies.advance(alpha, beta)
         return most

@@ -7,12 +7,9 @@ import taichi as ti
 from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
-from sim.core.neighbors import Neighbors
 from sim.core.reductions import Share
-from sim.fluid.boundary import Samples
+from sim.fluid.device import Fluid
 from sim.fluid.kernels import TINY_DISTANCE, spline_slope
-from sim.fluid.particles import Particles
-from sim.fluid.phases import Materials
 from sim.fluid.viscosity import pair_viscosity
 
 
@@ -20,13 +17,8 @@ from sim.fluid.viscosity import pair_viscosity
 class ViscousMatrix(NamedTuple):
     """Matrix of implicit viscosity: what its entries are computed from wherever they are needed."""
 
-    particles: Particles
-    near: Neighbors
-    samples: Samples
-    materials: Materials
+    fluid: Fluid
     factor: ti.f32  # dt 2 (d + 2) sigma/h
-    volume: ti.f32  # V of a particle [m³]
-    inverse_support: ti.f32  # 1/h [1/m]
     softening: ti.f32  # 0.01 h² [m²]
     wall_friction: ti.f32  # viscosity against boundaries over that of the fluid [-]
 
@@ -64,15 +56,15 @@ class Carried(NamedTuple):
 def friction_coefficient(matrix: ViscousMatrix, r_squared: ti.f32, mean_density: ti.f32, mu: ti.f32) -> ti.f32:
     """mu |w'|/(rho |x| (|x|² + 0.01 h²)): k without its constant factors."""
     r = ti.sqrt(r_squared)
-    slope = -spline_slope(r * matrix.inverse_support)
+    slope = -spline_slope(r * matrix.fluid.inverse_support)
     return mu * slope / (mean_density * (r + TINY_DISTANCE) * (r_squared + matrix.softening))
 
 
 @func
 def fluid_coefficient(matrix: ViscousMatrix, i: ti.i32, j: ti.i32, x_ij: ti.math.vec3, mu: ti.f32) -> ti.f32:
     """k_ij without its constant factors, of particle i of viscosity mu."""
-    mean_density = 0.5 * (matrix.particles.density[i] + matrix.particles.density[j])
-    mu_ij = pair_viscosity(mu, matrix.materials.dynamic_viscosity[matrix.particles.phase[j]])
+    mean_density = 0.5 * (matrix.fluid.particles.density[i] + matrix.fluid.particles.density[j])
+    mu_ij = pair_viscosity(mu, matrix.fluid.materials.dynamic_viscosity[matrix.fluid.particles.phase[j]])
     return friction_coefficient(matrix, x_ij.norm_sqr(), mean_density, mu_ij)
 
 
@@ -108,36 +100,36 @@ def start_solve(
 ):
     """Blocks of the diagonal, inverted; `given`: the right-hand side; residual of the change so far."""
     ti.loop_config(block_dim=128)
-    for i in range(matrix.particles.count):
-        x_i, v_i, dv_i = matrix.particles.position[i], velocity[i], iterate.change[i]
-        own = matrix.particles.phase[i]
-        rho0, mu = matrix.materials.rest_density[own], matrix.materials.dynamic_viscosity[own]
+    for i in range(matrix.fluid.particles.count):
+        x_i, v_i, dv_i = matrix.fluid.particles.position[i], velocity[i], iterate.change[i]
+        own = matrix.fluid.particles.phase[i]
+        rho0, mu = matrix.fluid.materials.rest_density[own], matrix.fluid.materials.dynamic_viscosity[own]
         right = ti.math.vec3(0.0)
         left = rho0 * dv_i
         diagonal = ti.math.vec3(rho0)
         mixed = ti.math.vec3(0.0)
-        first = matrix.near.start[i]
-        for k in range(matrix.near.fluid_count[i]):
-            j = matrix.near.indices[first + k * matrix.near.stride]
-            x_ij = x_i - matrix.particles.position[j]
-            k_ij = matrix.factor * matrix.volume * fluid_coefficient(matrix, i, j, x_ij, mu)
+        first = matrix.fluid.near.start[i]
+        for k in range(matrix.fluid.near.fluid_count[i]):
+            j = matrix.fluid.near.indices[first + k * matrix.fluid.near.stride]
+            x_ij = x_i - matrix.fluid.particles.position[j]
+            k_ij = matrix.factor * matrix.fluid.volume * fluid_coefficient(matrix, i, j, x_ij, mu)
             right -= k_ij * (v_i - velocity[j]).dot(x_ij) * x_ij
             left += k_ij * (dv_i - iterate.change[j]).dot(x_ij) * x_ij
             diagonal += k_ij * x_ij * x_ij
             mixed += k_ij * ti.math.vec3(x_ij[0] * x_ij[1], x_ij[0] * x_ij[2], x_ij[1] * x_ij[2])
-        first += matrix.near.fluid_count[i] * matrix.near.stride
+        first += matrix.fluid.near.fluid_count[i] * matrix.fluid.near.stride
         if matrix.wall_friction > 0.0:
-            for k in range(matrix.near.boundary_count[i]):
-                b = matrix.near.indices[first + k * matrix.near.stride]
-                x_ib = x_i - matrix.samples.position[b]
+            for k in range(matrix.fluid.near.boundary_count[i]):
+                b = matrix.fluid.near.indices[first + k * matrix.fluid.near.stride]
+                x_ib = x_i - matrix.fluid.samples.position[b]
                 k_ib = (
                     matrix.factor
-                    * matrix.samples.friction_volume[b]
+                    * matrix.fluid.samples.friction_volume[b]
                     * friction_coefficient(
-                        matrix, x_ib.norm_sqr(), matrix.particles.density[i], matrix.wall_friction * mu
+                        matrix, x_ib.norm_sqr(), matrix.fluid.particles.density[i], matrix.wall_friction * mu
                     )
                 )
-                right -= k_ib * (v_i - matrix.samples.velocity[b]).dot(x_ib) * x_ib
+                right -= k_ib * (v_i - matrix.fluid.samples.velocity[b]).dot(x_ib) * x_ib
                 left += k_ib * (dv_i - boundary_change[b]).dot(x_ib) * x_ib
                 diagonal += k_ib * x_ib * x_ib
                 mixed += k_ib * ti.math.vec3(x_ib[0] * x_ib[1], x_ib[0] * x_ib[2], x_ib[1] * x_ib[2])
@@ -164,26 +156,26 @@ def start_solve(
 def multiply(matrix: ViscousMatrix, vector: Vectors, boundary_vector: Vectors, product: Vectors):
     """The particles' rows of the matrix times a vector, which is 0 for boundary samples that are no unknowns."""
     ti.loop_config(block_dim=128)
-    for i in range(matrix.particles.count):
-        x_i, dv_i, own = matrix.particles.position[i], vector[i], matrix.particles.phase[i]
-        rho0, mu = matrix.materials.rest_density[own], matrix.materials.dynamic_viscosity[own]
+    for i in range(matrix.fluid.particles.count):
+        x_i, dv_i, own = matrix.fluid.particles.position[i], vector[i], matrix.fluid.particles.phase[i]
+        rho0, mu = matrix.fluid.materials.rest_density[own], matrix.fluid.materials.dynamic_viscosity[own]
         fluid_sum = ti.math.vec3(0.0)
-        first = matrix.near.start[i]
-        for k in range(matrix.near.fluid_count[i]):
-            j = matrix.near.indices[first + k * matrix.near.stride]
-            x_ij = x_i - matrix.particles.position[j]
+        first = matrix.fluid.near.start[i]
+        for k in range(matrix.fluid.near.fluid_count[i]):
+            j = matrix.fluid.near.indices[first + k * matrix.fluid.near.stride]
+            x_ij = x_i - matrix.fluid.particles.position[j]
             fluid_sum += fluid_coefficient(matrix, i, j, x_ij, mu) * (dv_i - vector[j]).dot(x_ij) * x_ij
         boundary_sum = ti.math.vec3(0.0)
-        first += matrix.near.fluid_count[i] * matrix.near.stride
+        first += matrix.fluid.near.fluid_count[i] * matrix.fluid.near.stride
         if matrix.wall_friction > 0.0:
-            for k in range(matrix.near.boundary_count[i]):
-                b = matrix.near.indices[first + k * matrix.near.stride]
-                x_ib = x_i - matrix.samples.position[b]
-                k_ib = matrix.samples.friction_volume[b] * friction_coefficient(
-                    matrix, x_ib.norm_sqr(), matrix.particles.density[i], matrix.wall_friction * mu
+            for k in range(matrix.fluid.near.boundary_count[i]):
+                b = matrix.fluid.near.indices[first + k * matrix.fluid.near.stride]
+                x_ib = x_i - matrix.fluid.samples.position[b]
+                k_ib = matrix.fluid.samples.friction_volume[b] * friction_coefficient(
+                    matrix, x_ib.norm_sqr(), matrix.fluid.particles.density[i], matrix.wall_friction * mu
                 )
                 boundary_sum += k_ib * (dv_i - boundary_vector[b]).dot(x_ib) * x_ib
-        product[i] = rho0 * dv_i + matrix.factor * (matrix.volume * fluid_sum + boundary_sum)
+        product[i] = rho0 * dv_i + matrix.factor * (matrix.fluid.volume * fluid_sum + boundary_sum)
 
 
 @kernel
@@ -195,8 +187,8 @@ def sum_norms(matrix: ViscousMatrix, residual: Vectors, given: Vectors, blocks: 
         asked = 0.0
         for k in range(share.items):
             i = lane * share.lane_step + k * share.item_step
-            if i < matrix.particles.count:
-                rho0 = matrix.materials.rest_density[matrix.particles.phase[i]]
+            if i < matrix.fluid.particles.count:
+                rho0 = matrix.fluid.materials.rest_density[matrix.fluid.particles.phase[i]]
                 left += (residual[i] / rho0).norm_sqr()
                 right += (given[i] / rho0).norm_sqr()
                 asked += solve_block(blocks.diagonal[i], blocks.mixed[i], given[i]).norm_sqr()
@@ -214,10 +206,12 @@ def sum_products(matrix: ViscousMatrix, iterate: Iterate, share: Share):
         norm = 0.0
         for k in range(share.items):
             i = lane * share.lane_step + k * share.item_step
-            if i < matrix.particles.count:
+            if i < matrix.fluid.particles.count:
                 gamma += iterate.residual[i].dot(iterate.preconditioned[i])
                 delta += iterate.product[i].dot(iterate.preconditioned[i])
-                norm += (iterate.residual[i] / matrix.materials.rest_density[matrix.particles.phase[i]]).norm_sqr()
+                norm += (
+                    iterate.residual[i] / matrix.fluid.materials.rest_density[matrix.fluid.particles.phase[i]]
+                ).norm_sqr()
         share.tree.partial[lane] = gamma
         share.tree.partial[share.tree.lanes + lane] = delta
         share.tree.partial[2 * share.tree.lanes + lane] = norm
@@ -249,8 +243,8 @@ def finish_solve(
 
     `velocity` becomes the velocities found, those of which the sum is.
     """
-    for i in range(matrix.particles.count):
-        rho0 = matrix.materials.rest_density[matrix.particles.phase[i]]
+    for i in range(matrix.fluid.particles.count):
+        rho0 = matrix.fluid.materials.rest_density[matrix.fluid.particles.phase[i]]
         dv_i = iterate.change[i] + iterate.residual[i] / rho0
         carried.x[i], carried.y[i], carried.z[i] = dv_i[0], dv_i[1], dv_i[2]
         acceleration[i] += dv_i / dt

@@ -7,23 +7,18 @@ import taichi as ti
 
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
-from sim.core.neighbors import Neighbors
 from sim.core.solver import Diagnostics
-from sim.fluid.boundary import Samples
-from sim.fluid.discretization import Smoothing
+from sim.fluid.device import Fluid
 from sim.fluid.fluid import SPHFluid
 from sim.fluid.forces import Elastic
 from sim.fluid.kernels import distance, spline
-from sim.fluid.particles import Particles
 from sim.fluid.pressure import largest_eigenvalue
 from sim.fluid.tank import FluidStart
 from sim.fluid.time_step import CFL_NUMBER, stable_time_step
+from sim.fluid.traits import TRAITS
 
+# Exponent of Tait's equation; the kernel multiplies it out.
 GAMMA = 7
-"""Exponent of Tait's equation; the kernel multiplies it out."""
-
-SPEED_RATIO = 10.0
-"""Speed of sound over the largest expected speed: keeps compression near 1 % (Monaghan 1994)."""
 
 
 class WCSPHSolver(SPHFluid):
@@ -39,17 +34,15 @@ class WCSPHSolver(SPHFluid):
     whatever the densities.
 
     The force of a boundary sample (Akinci et al. 2012, eq. 9) has no mirrored second term p_i/rho0²: only this form
-    is the derivative of the fluid's internal energy. With the second term walls feed energy into the fluid.
-
-    Momentum of fluid pairs is conserved to rounding; energy is not gained, but lost to viscosity and to the clamping
-    of the pressure at 0.
+    is the derivative of the fluid's internal energy. Momentum of fluid pairs is conserved to rounding; energy is lost
+    to viscosity and to the clamping of the pressure at 0.
 
     Attributes:
         elastic: pressures of the present positions.
         frequency_ratio: frequency of the stiffest swing of many particles over that of one against its own pressure.
     """
 
-    speed_ratio = SPEED_RATIO
+    speed_ratio = TRAITS["wcsph"].speed_ratio
     runaway = 3.0, "the speed of sound"
 
     def __init__(self, start: FluidStart) -> None:
@@ -70,14 +63,7 @@ class WCSPHSolver(SPHFluid):
     def compute_density(self) -> None:
         """Relative density of each particle by summation, and its pressure by Tait's equation."""
         self.tank.update_neighbors()
-        compute_density_and_pressure(
-            self.particles.arrays,
-            self.particles.near,
-            self.boundary.samples,
-            self.discretization.smoothing,
-            self._stiffness,
-            self.elastic.pressure_term,
-        )
+        compute_density_and_pressure(self.tank.on_device, self._stiffness, self.elastic.pressure_term)
 
     def adapt_time_step(self) -> float:
         """Largest time step [s] for the current state."""
@@ -118,31 +104,24 @@ class WCSPHSolver(SPHFluid):
 
 
 @kernel
-def compute_density_and_pressure(
-    particles: Particles,
-    near: Neighbors,
-    samples: Samples,
-    smoothing: Smoothing,
-    stiffness: ti.f32,
-    pressure_term: Floats,
-):
+def compute_density_and_pressure(fluid: Fluid, stiffness: ti.f32, pressure_term: Floats):
     """rho_i/rho0 = sum_j V W_ij + sum_b V_b W_ib, and P_i by Tait's equation with p_i >= 0."""
     ti.loop_config(block_dim=128)
-    for i in range(particles.count):
-        x_i = particles.position[i]
+    for i in range(fluid.particles.count):
+        x_i = fluid.particles.position[i]
         fluid_sum = 1.0  # w(0): the particle itself
-        first = near.start[i]
-        for k in range(near.fluid_count[i]):
-            x_j = particles.position[near.indices[first + k * near.stride]]
-            fluid_sum += spline(distance((x_i - x_j).norm_sqr()) * smoothing.inverse_support)
+        first = fluid.near.start[i]
+        for k in range(fluid.near.fluid_count[i]):
+            x_j = fluid.particles.position[fluid.near.indices[first + k * fluid.near.stride]]
+            fluid_sum += spline(distance((x_i - x_j).norm_sqr()) * fluid.inverse_support)
         boundary_sum = 0.0
-        first += near.fluid_count[i] * near.stride
-        for k in range(near.boundary_count[i]):
-            b = near.indices[first + k * near.stride]
-            r = distance((x_i - samples.position[b]).norm_sqr())
-            boundary_sum += samples.volume[b] * spline(r * smoothing.inverse_support)
-        ratio = smoothing.sigma * (smoothing.volume * fluid_sum + boundary_sum)
+        first += fluid.near.fluid_count[i] * fluid.near.stride
+        for k in range(fluid.near.boundary_count[i]):
+            b = fluid.near.indices[first + k * fluid.near.stride]
+            r = distance((x_i - fluid.samples.position[b]).norm_sqr())
+            boundary_sum += fluid.samples.volume[b] * spline(r * fluid.inverse_support)
+        ratio = fluid.sigma * (fluid.volume * fluid_sum + boundary_sum)
         ratio_3 = ratio * ratio * ratio
         p_i = ti.max(stiffness * (ratio_3 * ratio_3 * ratio - 1.0), 0.0)
-        particles.density[i] = ratio
+        fluid.particles.density[i] = ratio
         pressure_term[i] = p_i / (ratio * ratio)

@@ -13,28 +13,26 @@ from sim.rigid.contacts import AnchoredContacts, Array, Contacts, Indices, Key
 from sim.rigid.manifold import reduce_manifold
 from sim.shapes.body_geometry import BodyGeometry
 
-CONTACT_BAND = 5.0e-3
-"""Points this near, in shortest edges of the smaller body, belong to a contact: a resting face keeps its corners."""
-
-TRUSTED_MOTION = 1.0e-3
-"""Contacts are followed, not looked for, until surfaces have moved so far, in shortest edges of the smaller body."""
-
-SLANT = 0.03
-SLANT_ON_GRIDS = 0.3
-"""How far outside of a ball's cone a contact normal may be [rad]; distance grids have normals no better than this."""
+CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact
+TRUSTED_MOTION = 1.0e-3  # contacts are looked for anew after surfaces moved so far, in the same unit
+SLANT = 0.03  # how far outside of a ball's cone a contact normal may be [rad]
+SLANT_ON_GRIDS = 0.3  # likewise, on distance grids, whose normals are no better than this [rad]
 
 
 class CollisionDetector:
     """Finds the contacts of bodies with each other and with walls.
 
     Bodies are numbered: moving ones, static ones, and last the domain, which stands still at the origin. A pair is
-    examined again when its surfaces may have moved by more than `TRUSTED_MOTION` since; until then its contacts are
-    followed (`AnchoredContacts`), and no other can have come up, as all within that distance were taken along.
+    examined again when its surfaces may have moved by more than `TRUSTED_MOTION`; until then its contacts are followed
+    (`AnchoredContacts`), all within that distance included.
 
     Args:
         geometries: of all bodies but the domain.
         can_move: which of them forces move, (n,) bool; pairs without one have no contacts.
         walls: walls of the domain.
+
+    Attributes:
+        followed: the contacts that are being followed.
     """
 
     def __init__(self, geometries: Sequence[BodyGeometry], can_move: NDArray[np.bool_], walls: Sequence[Wall]) -> None:
@@ -59,12 +57,7 @@ class CollisionDetector:
         """Examine every pair anew at the next step."""
         self._budget = np.full(len(self._first), -np.inf)
         self._found: list[list[AnchoredContacts]] = [[] for _ in self._first]
-        self._all = AnchoredContacts.joined([])
-
-    @property
-    def found(self) -> AnchoredContacts:
-        """The contacts that are being followed."""
-        return self._all
+        self.followed = AnchoredContacts.joined([])
 
     def find(self, poses: Poses, motion: Array, last: frozenset[Key]) -> Contacts:
         """The contacts of a pose.
@@ -84,11 +77,11 @@ class CollisionDetector:
             separation = self._separations(stale, poses)
             near = separation <= margin[stale]
             if self._examine(stale[near], poses, margin, last) | self._drop(stale[~near]):
-                self._all = AnchoredContacts.joined([part for parts in self._found for part in parts])
+                self.followed = AnchoredContacts.joined([part for parts in self._found for part in parts])
             # Boxes that are apart touch no sooner than they have come together.
             apart = separation - self._band[stale]
             self._budget[stale] = np.where(near, self._trusted[stale] + ahead[stale], apart)
-        return self._all.at(poses)
+        return self.followed.at(poses)
 
     def follow(self, motion: Array) -> None:
         """Note how far the surface of each body got at most in the step just taken [m], (n + 1,)."""
@@ -102,8 +95,7 @@ class CollisionDetector:
         partner = np.where(walls, 0, second)
         between = np.maximum(lower[first] - upper[partner], lower[partner] - upper[first]).max(axis=1)
         to_walls = np.minimum(lower[first] - self._closed[0], self._closed[1] - upper[first]).min(axis=1)
-        separations: Array = np.where(walls, to_walls, between)
-        return separations
+        return np.where(walls, to_walls, between)
 
     def _boxes(self, poses: Poses) -> tuple[Array, Array]:
         """Lower and upper corners of all bodies' axis-aligned boxes [m], (n, 3) each."""

@@ -10,34 +10,23 @@ from numpy.typing import NDArray
 
 from sim.core.solver import Arrays
 from sim.rigid.contact_solver import RELATIVE_TOLERANCE, ContactSystem, solve_positions
-from sim.rigid.contacts import Contacts, Indices, Key, key_set
+from sim.rigid.contacts import Array, Contacts, Indices, Key
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
-Array = NDArray[np.float64]
+SEPARATION_TIME_S, LARGEST_SEPARATION = 0.02, 0.2
+"""Overlaps decay within about this time, and by this share a step at most."""
 
-SEPARATION_TIME_S = 0.02
-"""Overlaps decay within about this time: the longest that nobody sees, and no more than a fifth a step."""
-
-LARGEST_SEPARATION = 0.2
-SLOP = 1.0e-6
-"""Overlap that stays [m]: below what anybody sees, above what rounding makes."""
-
-WEIGHT_TOLERANCE = 1.0e-4
-"""Of the speed that gravity gives in a step: what the last sweep may still change. In 10 s a body creeps by microns."""
+SLOP = 1.0e-6  # overlap that stays [m]: below what anybody sees, above what rounding makes
+WEIGHT_TOLERANCE = 1.0e-4  # of the speed that gravity gives in a step: what the last sweep may still change
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """How surfaces rub and rebound, by number of the body; a wall is like whatever touches it.
+    """How surfaces rub and rebound, by number of the body; a wall is like whatever touches it."""
 
-    Attributes:
-        friction: [-], (n,).
-        restitution: [-], (n,).
-    """
-
-    friction: Array
-    restitution: Array
+    friction: Array  # [-], (n,)
+    restitution: Array  # [-], (n,)
 
     def of_pairs(self, first: Indices, second: Indices) -> tuple[Array, Array]:
         """Friction, the geometric mean, and restitution, the larger of two, of pairs of bodies, (k,) each."""
@@ -50,23 +39,14 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What the contacts of a step did besides changing velocities.
+    """What the contacts of a step did besides changing velocities."""
 
-    Attributes:
-        extra_velocity: added to the velocity in this step's change of poses only [m/s], (n, 3).
-        extra_angular_velocity: [rad/s], (n, 3).
-        is_touched: bodies that got an impulse, (n,) bool.
-        is_held: bodies that got one from what cannot move, (n,) bool.
-        iterations: sweeps of the solver.
-        converged: whether it converged.
-    """
-
-    extra_velocity: Array
-    extra_angular_velocity: Array
-    is_touched: NDArray[np.bool_]
-    is_held: NDArray[np.bool_]
-    iterations: int
-    converged: bool
+    extra_velocity: Array  # added to the velocity in this step's change of poses only [m/s], (n, 3)
+    extra_angular_velocity: Array  # [rad/s], (n, 3)
+    is_touched: NDArray[np.bool_]  # bodies that got an impulse, (n,) bool
+    is_held: NDArray[np.bool_]  # bodies that got one from what cannot move, (n,) bool
+    iterations: int  # sweeps of the solver
+    converged: bool  # whether it converged
 
 
 class ContactResponse:
@@ -75,16 +55,14 @@ class ContactResponse:
     Args:
         surfaces: of all bodies.
         gravity: [m/s²].
+
+    Attributes:
+        last_keys: the contacts of the last step.
     """
 
     def __init__(self, surfaces: Surfaces, gravity: Array) -> None:
         self._surfaces, self._gravity = surfaces, gravity
         self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), 1.0)
-
-    @property
-    def last_keys(self) -> frozenset[Key]:
-        """The contacts of the last step."""
-        return self._last_keys
 
     def resolve(self, contacts: Contacts, bodies: MovingBodies, dt: float) -> Outcome:
         """Change the velocities of the bodies so that contacts hold, bounce and rub over a step of dt [s].
@@ -94,18 +72,16 @@ class ContactResponse:
         n = len(bodies)
         if not len(contacts):
             self._keep(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)), dt)
-            return Outcome(
-                np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), 0, True
-            )
+            nobody = np.zeros(n, dtype=bool)
+            return Outcome(np.zeros((n, 3)), np.zeros((n, 3)), nobody, nobody, 0, True)
         system = ContactSystem.build(contacts, bodies.position, bodies.inverse_mass, bodies.inverse_inertia())
         free = system.velocities(bodies.velocity, bodies.angular_velocity)
         friction, restitution = self._surfaces.of_pairs(contacts.first, contacts.second)
         bounces = Bounces.find(
             contacts, bodies, approach=free[:, 0], restitution=restitution, gravity=self._gravity, dt=dt
         )
-        tolerance = RELATIVE_TOLERANCE * float(np.abs(free).max()) + WEIGHT_TOLERANCE * dt * float(
-            np.linalg.norm(self._gravity)
-        )
+        weight = float(np.linalg.norm(self._gravity))
+        tolerance = RELATIVE_TOLERANCE * float(np.abs(free).max()) + WEIGHT_TOLERANCE * dt * weight
         solution = solve_impacts(
             system,
             free,
@@ -150,8 +126,8 @@ class ContactResponse:
 
     def _keep(self, keys: Indices, impulses: Array, dt: float) -> None:
         self._keys, self._impulses, self._dt = keys, impulses, dt
-        self._row_of = {(first, second, feature): row for row, (first, second, feature) in enumerate(keys.tolist())}
-        self._last_keys = key_set(keys)
+        self._row_of: dict[Key, int] = {(a, b, feature): row for row, (a, b, feature) in enumerate(keys.tolist())}
+        self.last_keys = frozenset(self._row_of)
 
     def _starting_impulses(self, contacts: Contacts, system: ContactSystem, dt: float) -> Array:
         """The impulses of the same contacts in the last step, scaled to this one, along the axes, (k, 3)."""
@@ -159,8 +135,7 @@ class ContactResponse:
         if not np.any(rows >= 0):
             return np.zeros((len(contacts), 3))
         in_world = np.where((rows >= 0)[:, None], (dt / self._dt) * self._impulses[rows], 0.0)
-        impulses: Array = np.einsum("kci,ki->kc", system.axes, in_world)
-        return impulses
+        return np.einsum("kci,ki->kc", system.axes, in_world)
 
     def _separate(
         self, contacts: Contacts, system: ContactSystem, bounces: Bounces, normal_velocity: Array, dt: float

@@ -8,18 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.motion.rotation import cross
-from sim.rigid.contacts import Contacts, tangent_basis
-
-Array = NDArray[np.float64]
+from sim.rigid.contacts import Array, Contacts, tangent_basis
 
 MAX_ITERATIONS = 100
-
 MAX_FRICTION_STEPS = 12
-FRICTION_ROUNDING = 1.0 + 1.0e-12
-"""Newton's steps end when the square of the impulse is over its limit by no more than this."""
-
-RELATIVE_TOLERANCE = 1.0e-6
-"""Of the largest contact velocity: what one sweep may still change when it is the last."""
+FRICTION_ROUNDING = 1.0 + 1.0e-12  # of the square of the impulse over that of its limit, where Newton's steps end
+RELATIVE_TOLERANCE = 1.0e-6  # of the largest contact velocity: what one sweep may still change when it is the last
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,18 +22,12 @@ class ContactSystem:
 
     Contact i has three rows: the normal and two tangents. With the Jacobian J, mass matrix M and impulses λ the
     velocities at the contacts are w = A λ + b, A = J M⁻¹ Jᵀ, b = J v.
-
-    Attributes:
-        axes: normal and tangents, (k, 3, 3).
-        jacobian: of the moving bodies' velocities (v, omega), (k, 3, n, 6).
-        response: M⁻¹ Jᵀ, transposed, (k, 3, n, 6).
-        matrix: A, (3 k, 3 k).
     """
 
-    axes: Array
-    jacobian: Array
-    response: Array
-    matrix: Array
+    axes: Array  # normal and tangents, (k, 3, 3)
+    jacobian: Array  # of the moving bodies' velocities (v, omega), (k, 3, n, 6)
+    response: Array  # M⁻¹ Jᵀ, transposed, (k, 3, n, 6)
+    matrix: Array  # A, (3 k, 3 k)
 
     @classmethod
     def build(cls, contacts: Contacts, position: Array, inverse_mass: Array, inverse_inertia: Array) -> ContactSystem:
@@ -63,8 +51,7 @@ class ContactSystem:
     def velocities(self, velocity: Array, angular_velocity: Array) -> Array:
         """Velocities at the contacts, (k, 3), of the moving bodies' velocities, (n, 3) each."""
         both = np.concatenate([velocity, angular_velocity], axis=1)
-        velocities: Array = np.einsum("kcni,ni->kc", self.jacobian, both)
-        return velocities
+        return np.einsum("kcni,ni->kc", self.jacobian, both)
 
     def velocity_changes(self, impulses: Array) -> Array:
         """Changes of the velocities at the contacts, (k, 3), by impulses (k, 3) along the axes."""
@@ -79,17 +66,11 @@ class ContactSystem:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Impulses and how they were found.
+    """Impulses and how they were found."""
 
-    Attributes:
-        impulses: along the axes of the contacts [N s], (k, 3).
-        iterations: sweeps over all contacts.
-        converged: whether the last sweep changed less than the tolerance.
-    """
-
-    impulses: Array
-    iterations: int
-    converged: bool
+    impulses: Array  # along the axes of the contacts [N s], (k, 3)
+    iterations: int  # sweeps over all contacts
+    converged: bool  # whether the last sweep changed less than the tolerance
 
 
 def solve_velocities(
@@ -113,7 +94,8 @@ def solve_velocities(
     bias = free.copy()
     bias[:, 0] -= least_normal
     rows = [np.ascontiguousarray(system.matrix[3 * i : 3 * i + 3]) for i in range(k)]
-    blocks = _upper_blocks(system.matrix)
+    own = system.matrix.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
+    blocks = own[:, *np.triu_indices(3)].tolist()  # nn, n1, n2, 11, 12, 22
     biases, coefficients = bias.tolist(), friction.tolist()
     impulses = _admissible(start, friction)
     flat = impulses.reshape(-1)
@@ -157,28 +139,19 @@ def solve_positions(
     matrix = np.ascontiguousarray(system.matrix[::3, ::3])
     diagonal, targets = np.diagonal(matrix).tolist(), wanted.tolist()
     lowest = np.where(two_sided, -np.inf, 0.0).tolist()
-    normal = np.zeros(k)
     impulses = np.zeros((k, 3))
-    converged, iteration = False, 0
-    while not converged and iteration < MAX_ITERATIONS:
-        iteration += 1
+    normal = np.zeros(k)
+    for iteration in range(1, MAX_ITERATIONS + 1):
         largest_change = 0.0
         for i in range(k):
             old = float(normal[i])
             new = max(old + (targets[i] - float(matrix[i].dot(normal))) / diagonal[i], lowest[i])
             normal[i] = new
             largest_change = max(largest_change, diagonal[i] * abs(new - old))
-        converged = largest_change <= tolerance
-    impulses[:, 0] = normal
-    return Solution(impulses, iteration, converged)
-
-
-def _upper_blocks(matrix: Array) -> list[list[float]]:
-    """The upper triangles nn, n1, n2, 11, 12, 22 of the contacts' own blocks."""
-    k = len(matrix) // 3
-    own = matrix.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
-    upper: list[list[float]] = own[:, *np.triu_indices(3)].tolist()
-    return upper
+        impulses[:, 0] = normal
+        if largest_change <= tolerance:
+            return Solution(impulses, iteration, True)
+    return Solution(impulses, MAX_ITERATIONS, False)
 
 
 def _friction(a_11: float, a_12: float, a_22: float, c_1: float, c_2: float, limit: float) -> tuple[float, float]:

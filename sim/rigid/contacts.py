@@ -13,30 +13,20 @@ from sim.core.motion.poses import Poses
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-Key = tuple[int, int, int]
-"""What tells a contact from others from step to step: the two bodies, and which ball of which of them."""
-
+Key = tuple[int, int, int]  # of a contact from step to step: the two bodies, and which ball of which of them
 FEATURE_BITS = 32
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Points where bodies touch or are about to, as they are now.
+    """Points where bodies touch or are about to, as they are now."""
 
-    Attributes:
-        first, second: numbers of the two bodies, (k,).
-        keys: what tells them apart from step to step, (k, 3) int64.
-        point: [m], (k, 3).
-        normal: from the second to the first, (k, 3).
-        gap: [m], (k,), negative where they overlap.
-    """
-
-    first: Indices
+    first: Indices  # numbers of the two bodies, (k,)
     second: Indices
-    keys: Indices
-    point: Array
-    normal: Array
-    gap: Array
+    keys: Indices  # what tells them apart from step to step, (k, 3) int64
+    point: Array  # [m], (k, 3)
+    normal: Array  # from the second to the first, (k, 3)
+    gap: Array  # [m], (k,), negative where they overlap
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -49,26 +39,16 @@ class AnchoredContacts:
     The plane touches the other body's surface where it is nearest to the ball. While the bodies move by a small part
     of their size it stands for that surface, with an error of the motion squared over the radius of curvature; for
     flat surfaces and walls it is exact, and a ball that rolls is followed exactly.
-
-    Attributes:
-        owner: number of the body that the ball belongs to, (k,).
-        other: number of the body that the plane belongs to, (k,).
-        side: 0 if the owner is the first of the pair, else 1, (k,).
-        feature: number of the ball, (k,).
-        centre: of the ball [m], in the owner's frame, (k, 3).
-        radius: of the ball [m], (k,).
-        anchor: a point of the plane [m], in the other's frame, (k, 3).
-        outward: the plane's normal, in the other's frame, (k, 3).
     """
 
-    owner: Indices
-    other: Indices
-    side: Indices
-    feature: Indices
-    centre: Array
-    radius: Array
-    anchor: Array
-    outward: Array
+    owner: Indices  # number of the body that the ball belongs to, (k,)
+    other: Indices  # number of the body that the plane belongs to, (k,)
+    side: Indices  # 0 if the owner is the first of the pair, else 1, (k,)
+    feature: Indices  # number of the ball, (k,)
+    centre: Array  # of the ball [m], in the owner's frame, (k, 3)
+    radius: Array  # of the ball [m], (k,)
+    anchor: Array  # a point of the plane [m], in the other's frame, (k, 3)
+    outward: Array  # the plane's normal, in the other's frame, (k, 3)
 
     def __len__(self) -> int:
         return len(self.owner)
@@ -109,11 +89,6 @@ class AnchoredContacts:
             normal=np.where(self.side == 0, 1.0, -1.0)[:, None] * outward,
             gap=height - self.radius,
         )
-
-
-def key_set(keys: Indices) -> frozenset[Key]:
-    """Keys (k, 3) as a set to look up."""
-    return frozenset((first, second, feature) for first, second, feature in keys.tolist())
 
 
 def tangent_basis(normal: Array) -> Array:

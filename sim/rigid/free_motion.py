@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim.core.motion import rotation
 from sim.rigid.states import MovingBodies
-
-Array = NDArray[np.float64]
 
 _SEQUENCE = ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
 """Principal axes and shares of the step; the same forwards and backwards, hence second order and reversible."""
@@ -22,10 +19,9 @@ def rotate_freely(bodies: MovingBodies, dt: float) -> None:
     """Turn the free bodies by I domega/dt = -omega x (I omega) for dt [s].
 
     Strang splitting of the Euler equations into rotations about the principal axes (Dullweber, Leimkuhler & McLachlan
-    1997, "Symplectic splitting methods for rigid body molecular dynamics"; McLachlan 1993). Every part is solved
-    exactly, explicitly and as a rotation, so that |L| is exact, and, as the method is symplectic, the energy does not
-    drift: it oscillates by O((omega dt)²). An implicit gyroscopic step would damp the motion, and would have to be
-    iterated. The spin in world axes is carried over as it is; the angular velocity follows from it.
+    1997, "Symplectic splitting methods for rigid body molecular dynamics"; McLachlan 1993). Every part is solved as a
+    rotation, so that |L| is exact; as the method is symplectic, the energy oscillates by O((omega dt)²) without drift.
+    The spin in world axes is carried over as it is; the angular velocity follows from it.
     """
     spin = bodies.angular_momentum()
     q = rotation.product(bodies.orientation, bodies.principal_orientation)

@@ -6,14 +6,9 @@ import numpy as np
 
 from sim.rigid.contacts import Array, Contacts, Indices, Key, tangent_basis
 
-SAME_PATCH = 0.9
-"""Normals closer than this cosine (26°) belong to one patch of contact."""
-
-MOST_PATCHES = 4
-"""Patches of one pair that are kept, deepest first: more normals than three hold a body in any pose."""
-
-KEPT_BONUS = 2.0e-3
-"""Head start, in extents of the patch, of points of the last step: equal ones must not take turns."""
+SAME_PATCH = 0.9  # normals closer than this cosine (26°) belong to one patch of contact
+MOST_PATCHES = 4  # patches of one pair that are kept, deepest first: more normals than three hold a body in any pose
+KEPT_BONUS = 2.0e-3  # head start, in extents of the patch, of points of the last step: equal ones must not take turns
 
 _ANGLES = 2.0 * np.pi * (np.arange(8) + 0.29) / 8.0
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
@@ -57,5 +52,4 @@ def _corners(
         kept = np.array([tuple(key) in last for key in contacts.keys[patch].tolist()])
         along = along + (KEPT_BONUS * extent) * kept[:, None]
     reach = margin * along - extent * contacts.gap[patch, None]
-    corners: Indices = np.unique(np.append(patch[np.argmax(reach, axis=0)], deepest))
-    return corners
+    return np.unique(np.append(patch[np.argmax(reach, axis=0)], deepest))

@@ -4,57 +4,39 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from sim.rigid.contact_solver import ContactSystem, Solution, solve_velocities
-from sim.rigid.contacts import Contacts
+from sim.rigid.contacts import Array, Contacts
 from sim.rigid.states import MovingBodies
 
-Array = NDArray[np.float64]
-
-SLOWEST_BOUNCE = 0.02
-"""Bodies that approach more slowly do not bounce [m/s]; nor those that gravity gave that speed within two steps."""
+SLOWEST_BOUNCE = 0.02  # approach below which nothing bounces [m/s]; or two steps of gravity
 
 
 @dataclass(frozen=True, eq=False)
 class Bounces:
-    """The impacts among contacts, (k,) each.
+    """The impacts among contacts, (k,) each."""
 
-    Attributes:
-        happens: whether the contact bounces.
-        is_placed: whether it is brought to where its bounce leads to by the end of the step.
-        restitution: speed after over speed before [-]; 0 where nothing bounces.
-        impact: normal velocity right before the impact [m/s].
-        rest: time from the impact to the end of the step [s].
-        fall: normal velocity that gravity adds in that time [m/s].
-    """
-
-    happens: NDArray[np.bool_]
-    is_placed: NDArray[np.bool_]
-    restitution: Array
-    impact: Array
-    rest: Array
-    fall: Array
+    happens: NDArray[np.bool_]  # whether the contact bounces
+    is_placed: NDArray[np.bool_]  # whether it is brought to where its bounce leads to by the end of the step
+    restitution: Array  # speed after over speed before [-]; 0 where nothing bounces
+    impact: Array  # normal velocity right before the impact [m/s]
+    rest: Array  # time from the impact to the end of the step [s]
+    fall: Array  # normal velocity that gravity adds in that time [m/s]
 
     @classmethod
     def find(
-        cls,
-        contacts: Contacts,
-        bodies: MovingBodies,
-        *,
-        approach: Array,
-        restitution: Array,
-        gravity: Array,
-        dt: float,
+        cls, contacts: Contacts, bodies: MovingBodies, *, approach: Array, restitution: Array, gravity: Array, dt: float
     ) -> Bounces:
         """Contacts that close within the step fast enough to bounce.
 
-        Against what cannot move the instant of the impact counts: gravity acts before and after it, and the gap is
-        passed down and up at different speeds. Without that a ball would come back to e² h0 only to first order in
-        dt. Between free bodies gravity cancels, and an impulse at the start of the step keeps all momenta exactly.
+        Against what cannot move the instant of the impact counts, as gravity acts before and after it: else a ball
+        would come back to e² h0 only to first order in dt. Between free bodies gravity cancels, and an impulse at the
+        start of the step keeps all momenta exactly.
 
         Args:
             contacts: of the step.
@@ -90,23 +72,15 @@ class Bounces:
         )
 
     def least_velocity(self, otherwise: Array, *, share: float) -> Array:
-        """Least normal velocities at the end of the step [m/s], (k,).
+        """Least normal velocities at the end of the step [m/s], (k,), `otherwise` where contacts do not bounce.
 
-        Args:
-            otherwise: of the contacts that do not bounce [m/s], (k,).
-            share: of the restitution: 1 as it is, 0 for the state in which the bodies no longer approach.
+        `share` is that of the restitution: 1 as it is, 0 for the state in which the bodies no longer approach.
         """
         return np.where(self.happens, self.fall - share * self.restitution * self.impact, otherwise)
 
     def displacement(self, normal_velocity: Array, gap: Array) -> Array:
-        """How far contacts have moved along their normals from the start to the end of the step [m], (k,).
-
-        Args:
-            normal_velocity: at its end [m/s], (k,).
-            gap: at its start [m], (k,).
-        """
-        displacement: Array = -np.maximum(gap, 0.0) + self.rest * (normal_velocity - 0.5 * self.fall)
-        return displacement
+        """How far contacts move along their normals in the step [m], (k,); gaps are those at its start."""
+        return -np.maximum(gap, 0.0) + self.rest * (normal_velocity - 0.5 * self.fall)
 
 
 def solve_impacts(
@@ -119,7 +93,7 @@ def solve_impacts(
     start: Array,
     tolerance: float,
 ) -> Solution:
-    """Impulses with Newton's restitution, as far as energy allows; momenta are kept as by any impulses.
+    """Impulses with Newton's restitution, as far as energy allows; arguments as those of `solve_velocities`.
 
     Newton's law w_n = -e b_n is of velocities. Together with friction, or with other contacts, the impulses that it
     takes may do work on the bodies (Kane & Levinson 1985): 29 % of the energy that a cube brings, at e = 1. Stronge's
@@ -133,34 +107,15 @@ def solve_impacts(
     λ is between two solutions: it pushes only, stays within friction and lets nothing approach, which are all convex.
     Without friction E(1) is just the bound, as it is for all central impacts, so that Newton's law holds there. Each
     group of bodies that touch has its own s.
-
-    Args:
-        system: of the contacts.
-        free: velocities at the contacts without their impulses [m/s], (k, 3).
-        bounces: the impacts among them.
-        least_normal: least normal velocities of the contacts that do not bounce [m/s], (k,).
-        friction: coefficients [-], (k,).
-        start: impulses to start from [N s], (k, 3).
-        tolerance: largest change of a contact velocity in the last sweep [m/s].
     """
-    compression = solve_velocities(
-        system,
-        free,
-        least_normal=bounces.least_velocity(least_normal, share=0.0),
-        friction=friction,
-        start=start,
-        tolerance=tolerance,
-    )
+    solve = partial(solve_velocities, system, free, friction=friction, tolerance=tolerance)
+    compression = solve(least_normal=bounces.least_velocity(least_normal, share=0.0), start=start)
     if not bounces.happens.any():
         return compression
     before = compression.impulses
-    newton = solve_velocities(
-        system,
-        free,
+    newton = solve(
         least_normal=bounces.least_velocity(least_normal, share=1.0),
-        friction=friction,
         start=(1.0 + bounces.restitution)[:, None] * before,
-        tolerance=tolerance,
     )
     islands = _islands(system)
     step = newton.impulses - before
@@ -190,8 +145,7 @@ def _islands(system: ContactSystem) -> NDArray[np.int64]:
     """Numbers of the groups of contacts, (k,): impulses at one change velocities at others of its group only."""
     k = len(system.axes)
     is_linked = system.matrix.reshape(k, 3, k, 3).any(axis=(1, 3))
-    numbers: NDArray[np.int64] = connected_components(is_linked, directed=False)[1].astype(np.int64)
-    return numbers
+    return connected_components(is_linked, directed=False)[1].astype(np.int64)
 
 
 def _largest_share(room: float, linear: float, quadratic: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,40 +12,30 @@ from sim.core.domain import DomainParameters
 from sim.core.motion import rotation
 from sim.core.motion.paths import Path, path_onwards
 from sim.core.motion.poses import Poses
+from sim.core.motion.rotation import Array
 from sim.core.parameters import Vector3
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.core.walls import walls_of
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
-from sim.rigid.contacts import Contacts
 from sim.rigid.free_motion import rotate_freely
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
-from sim.rigid.states import Inertia, MovingBodies
+from sim.rigid.states import MovingBodies
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.solid import Points
-
-Array = NDArray[np.float64]
 
 LARGEST_DT = 2.0e-3
-"""Largest step [s] of dynamic bodies: a stack of boxes is held to a micrometre, and a frame at 60 fps costs nine steps.
-And of bodies with keyframes, as nothing else looks ahead to where a path sets in. Bodies that are led steadily, or by
-hand, need none."""
+"""Largest step [s] of dynamic bodies, which holds a stack of boxes to a micrometre, and of bodies with keyframes, as
+nothing else looks ahead to where a path sets in."""
 
-LARGEST_ADVANCE = 0.25
-"""How far surfaces may get in a step, in half shortest edges of the smallest dynamic body."""
-
-LARGEST_TURN = 0.1
-"""How far bodies may turn in a step [rad]: rotation errs by about a tenth of its square."""
-
-LOST_DISTANCE = 10.0
-"""A dynamic body farther from the domain's centre, in diagonals, is stopped: it fell out of sight."""
+LARGEST_ADVANCE = 0.25  # how far surfaces may get in a step, in half shortest edges of the smallest dynamic body
+LARGEST_TURN = 0.1  # how far bodies may turn in a step [rad]: rotation errs by about a tenth of its square
+LOST_DISTANCE = 10.0  # a dynamic body farther from the domain's centre, in diagonals, is stopped: it fell out of sight
 
 SOLVER_NAME = "rigid"
 
-RUNAWAY_SPEED = 1.0e4
-"""No rigid body of a film moves at thirty times the speed of sound [m/s]."""
+RUNAWAY_SPEED = 1.0e4  # no rigid body of a film moves at thirty times the speed of sound [m/s]
 
 
 class RigidSolver:
@@ -56,7 +46,7 @@ class RigidSolver:
     contacts are equal and opposite at one point, so that contacts change neither the linear nor the angular momentum
     of bodies that nothing else holds.
 
-    Approximate: shapes touch as unions of balls (`geometry.Balls`), which rounds sharp corners by 2 % of the shortest
+    Approximate: shapes touch as unions of balls (`balls.Balls`), which rounds sharp corners by 2 % of the shortest
     edge; friction has one coefficient for sticking and sliding; moving overlapping bodies apart, where they do not
     bounce, changes the angular momentum of the pair by some 1e-5 of itself. Restitution is Newton's, of normal
     velocities, where Stronge's, of energy, allows it (`restitution`): impulses never add energy. Bringing corners to
@@ -65,7 +55,9 @@ class RigidSolver:
 
     Attributes:
         bodies: state of the moving bodies.
+        solids: geometries of the moving bodies.
         all_names, all_geometries: of the moving bodies, then of the static ones.
+        surfaces: friction and restitution of all of these.
         walls: closed faces of the domain.
         paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
 
@@ -89,61 +81,36 @@ class RigidSolver:
     ) -> None:
         self.name = SOLVER_NAME
         self.gravity = np.array(gravity, dtype=np.float64)  # its own, which contacts share
-        self._geometries = _geometries_of(parameters)
+        self.solids = tuple(_geometries_of(parameters))
         self.paths: dict[int, Path] = {
             number: path_of(body) for number, body in enumerate(parameters) if body.kind == "kinematic"
         }
-        self.bodies = _starting_bodies(parameters, self._geometries)
+        self.bodies = _starting_bodies(parameters, self.solids)
         self._place_kinematic_bodies(0.0)
 
         fixed = _geometries_of(obstacles)
         self._fixed_position, self._fixed_rotation = _poses_of_obstacles(obstacles, fixed)
         everybody = [*parameters, *obstacles]
         self.all_names = tuple(body.name for body in everybody)
-        self.all_geometries = (*self._geometries, *fixed)
+        self.all_geometries = (*self.solids, *fixed)
         self.walls = tuple(walls_of(domain))
         can_move = np.concatenate([self.bodies.is_dynamic, np.zeros(len(fixed), dtype=bool)])
         self._detector = CollisionDetector(self.all_geometries, can_move, self.walls)
-        self._surfaces = Surfaces(
+        self.surfaces = Surfaces(
             friction=np.array([body.friction for body in everybody]),
             restitution=np.array([body.restitution for body in everybody]),
         )
-        self._response = ContactResponse(self._surfaces, self.gravity)
+        self._response = ContactResponse(self.surfaces, self.gravity)
         corners = np.array([domain.min, domain.max])
         self._domain_centre = corners.mean(axis=0)
         self._domain_diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
-        self._radius = np.array([geometry.radius for geometry in self._geometries])
+        self._radius = np.array([geometry.radius for geometry in self.solids])
         dynamic = np.flatnonzero(self.bodies.is_dynamic)
-        smallest = min((self._geometries[number].shortest_edge for number in dynamic), default=math.inf)
+        smallest = min((self.solids[number].shortest_edge for number in dynamic), default=math.inf)
         self._largest_advance = LARGEST_ADVANCE * 0.5 * smallest
         self._largest_dt = largest_dt(parameters)
         self.time_s = 0.0
         self.begin_frame(0.0)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What was repaired or assumed to build the moving bodies' shapes, one sentence each."""
-        return tuple(warning for geometry in self._geometries for warning in geometry.warnings)
-
-    # --- what a coupling needs of the bodies ------------------------------------------------------------------------
-
-    @property
-    def friction(self) -> Array:
-        """Coulomb's coefficients [-] of all bodies, the static ones last, (n,)."""
-        return self._surfaces.friction
-
-    @property
-    def solids(self) -> tuple[BodyGeometry, ...]:
-        """Of each moving body, its shape at rest (`solid`) and its centre of mass in that frame."""
-        return tuple(self._geometries)
-
-    def body_samples(self, index: int, spacing: float) -> Points:
-        """Evenly spread points on a body's surface, relative to its centre of mass, in its axes [m], (m, 3)."""
-        return self._geometries[index].samples(spacing)
-
-    def signed_distance_in_body_frame(self, index: int) -> Callable[[Points], NDArray[np.float64]]:
-        """The exact distance to a body's surface [m], negative inside, of points in the frame of `body_samples`."""
-        return self._geometries[index].signed_distance
 
     def poses(self) -> Poses:
         """Where all bodies are now: moving, static, and the domain."""
@@ -155,8 +122,6 @@ class RigidSolver:
     def max_surface_speed(self) -> float:
         """Upper bound of the speed of any surface point [m/s]."""
         return float(np.max(self._surface_speeds(), initial=0.0))
-
-    # --- the step ---------------------------------------------------------------------------------------------------
 
     def stable_dt(self) -> float:
         """Largest step [s] in which surfaces move and bodies turn little enough; gravity's part counts."""
@@ -180,13 +145,16 @@ class RigidSolver:
         free = bodies.is_free[:, None]
         bodies.velocity = bodies.velocity + np.where(free, dt * self.gravity, 0.0)
         self._set_mean_velocities_of_kinematic_bodies(dt)
-        contacts = self._find_contacts(dt)
+        reach = self._with_obstacles(dt * self._surface_speeds())
+        contacts = self._detector.find(self.poses(), reach, self._response.last_keys)
         outcome = self._response.resolve(contacts, bodies, dt)
-        self._count(contacts, outcome.iterations, outcome.converged)
+        self._contact_count = len(contacts)
+        self._iterations += outcome.iterations
+        self._not_converged += not outcome.converged
+        self._max_penetration = max(self._max_penetration, -float(np.min(contacts.gap, initial=0.0)))
 
         # A body in free flight moves by the mean of its velocities, which is exact; one in contact by the new one,
-        # which is the velocity that the contacts allow, and so does one that a fluid pushed: the fluid is to see the
-        # velocity by which the body moves, and a body that it carries has none.
+        # which is what the contacts allow, and so does one that a fluid pushed: the fluid is to see how it moves.
         flying = free & ~(outcome.is_touched | bodies.is_pushed)[:, None]
         bodies.is_pushed[:] = False
         velocity = bodies.velocity - np.where(flying, 0.5 * dt * self.gravity, 0.0)
@@ -223,7 +191,7 @@ class RigidSolver:
         self._place_kinematic_bodies(self.time_s)  # couplings see how it moves from now on
 
     def scale_mass(self, name: str, factor: float) -> None:
-        """Make a dynamic body so many times heavier, between frames; no checkpoint knows of it.
+        """Multiply the mass of a dynamic body by a factor, between frames; no checkpoint knows of it.
 
         Raises:
             ValueError: there is no such dynamic body, or the factor is not finite and positive.
@@ -249,18 +217,13 @@ class RigidSolver:
             raise ValueError(f'the restitution of "{name}" must lie between 0 and 1, got {restitution:g}')
         number = self.all_names.index(name)
         if friction is not None:
-            self._surfaces.friction[number] = friction
+            self.surfaces.friction[number] = friction
         if restitution is not None:
-            self._surfaces.restitution[number] = restitution
+            self.surfaces.restitution[number] = restitution
 
     def set_gravity(self, gravity: Vector3) -> None:
         """Change gravity [m/s²] between frames, for contacts as well; no checkpoint knows of it."""
         self.gravity[:] = gravity
-
-    def _find_contacts(self, dt: float) -> Contacts:
-        return self._detector.find(
-            self.poses(), self._with_obstacles(dt * self._surface_speeds()), self._response.last_keys
-        )
 
     def _with_obstacles(self, motion: Array) -> Array:
         """Motion of the moving bodies, and none of all others."""
@@ -270,18 +233,16 @@ class RigidSolver:
         """Upper bound of how far surface points got [m], (n,); a turn by an angle a moves quaternions by 2 sin(a/4)."""
         moved = np.sqrt(np.square(self.bodies.position - position).sum(axis=1))
         turned = np.sqrt(np.square(self.bodies.orientation - orientation).sum(axis=1))
-        motion: Array = moved + 2.0 * turned * self._radius
-        return motion
+        return moved + 2.0 * turned * self._radius
 
     def _surface_speeds(self) -> Array:
         spin = np.sqrt(np.square(self.bodies.angular_velocity).sum(axis=1))
-        speeds: Array = np.sqrt(np.square(self.bodies.velocity).sum(axis=1)) + spin * self._radius
-        return speeds
+        return np.sqrt(np.square(self.bodies.velocity).sum(axis=1)) + spin * self._radius
 
     def _place_kinematic_bodies(self, time_s: float) -> None:
         for number, path in self.paths.items():
             motion = path.at(time_s)
-            arm = rotation.rotated(motion.orientation, self._geometries[number].centre_of_mass)
+            arm = rotation.rotated(motion.orientation, self.solids[number].centre_of_mass)
             self.bodies.position[number] = motion.position + arm
             self.bodies.orientation[number] = motion.orientation
             self.bodies.velocity[number] = motion.velocity + rotation.cross(motion.angular_velocity, arm)
@@ -291,7 +252,7 @@ class RigidSolver:
         """Contacts see how kinematic bodies will have moved by the end of the step."""
         for number, path in self.paths.items():
             end = path.at(self.time_s + dt)
-            arm = rotation.rotated(end.orientation, self._geometries[number].centre_of_mass)
+            arm = rotation.rotated(end.orientation, self.solids[number].centre_of_mass)
             self.bodies.velocity[number] = (end.position + arm - self.bodies.position[number]) / dt
             turn = rotation.product(end.orientation, rotation.conjugate(self.bodies.orientation[number]))
             self.bodies.angular_velocity[number] = rotation.logarithm(turn) / dt
@@ -304,21 +265,13 @@ class RigidSolver:
             self.bodies.velocity[lost] = 0.0
             self.bodies.angular_velocity[lost] = 0.0
 
-    def _count(self, contacts: Contacts, iterations: int, converged: bool) -> None:
-        self._contact_count = len(contacts)
-        self._iterations += iterations
-        self._not_converged += not converged
-        self._max_penetration = max(self._max_penetration, -float(np.min(contacts.gap, initial=0.0)))
-
-    # --- what goes out ----------------------------------------------------------------------------------------------
-
     def snapshots(self) -> dict[str, Snapshot]:
         """The pose of each body's own mesh at rest, and the velocity of the mesh's origin."""
         bodies = self.bodies
         turned = bodies.rotation()
         snapshots = {}
         for number, name in enumerate(bodies.names):
-            arm = -turned[number] @ self._geometries[number].centre_of_mass
+            arm = -turned[number] @ self.solids[number].centre_of_mass
             arrays = {
                 "position": bodies.position[number] + arm,
                 "orientation": bodies.orientation[number].copy(),
@@ -337,11 +290,7 @@ class RigidSolver:
         }
 
     def restore(self, arrays: Arrays) -> None:
-        """Continue from a checkpoint.
-
-        Raises:
-            ValueError: an array is missing or has another shape.
-        """
+        """Continue from a checkpoint. Raises ValueError when an array is missing or has another shape."""
         expected = {**{name: getattr(self.bodies, name).shape for name in _STATE}, "clock": (1,)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
@@ -367,10 +316,8 @@ class RigidSolver:
         kinetic = 0.5 * (np.sum(momentum * bodies.velocity[free]) + np.sum(spin * bodies.angular_velocity[free]))
         return {
             "mass": float(mass.sum()),
-            **{f"momentum_{axis}": float(value) for axis, value in zip("xyz", momentum.sum(axis=0), strict=True)},
-            **{
-                f"angular_momentum_{axis}": float(value) for axis, value in zip("xyz", angular.sum(axis=0), strict=True)
-            },
+            **_by_axis("momentum", momentum.sum(axis=0)),
+            **_by_axis("angular_momentum", angular.sum(axis=0)),
             "kinetic_energy": float(kinetic),
             "potential_energy": -float(np.sum(mass[:, None] * self.gravity * bodies.position[free])),
             "max_speed": self.max_surface_speed(),
@@ -410,12 +357,12 @@ def largest_dt(parameters: Sequence[RigidBodyParameters]) -> float:
 _STATE = ("position", "orientation", "velocity", "angular_velocity", "is_lost")
 
 
-def _geometries_of(parameters: Sequence[RigidBodyParameters]) -> list[BodyGeometry]:
-    """The geometry of each body; bodies of one shape, scale and centre of mass share it.
+def _by_axis(name: str, vector: Array) -> dict[str, float]:
+    return {f"{name}_{axis}": float(value) for axis, value in zip("xyz", vector, strict=True)}
 
-    Raises:
-        ShapeError: a shape cannot be built.
-    """
+
+def _geometries_of(parameters: Sequence[RigidBodyParameters]) -> list[BodyGeometry]:
+    """The geometry of each body; bodies of one shape, scale and centre of mass share it."""
     known: dict[tuple[object, ...], BodyGeometry] = {}
     geometries = []
     for body in parameters:
@@ -430,23 +377,21 @@ def _geometries_of(parameters: Sequence[RigidBodyParameters]) -> list[BodyGeomet
 
 def _starting_bodies(parameters: Sequence[RigidBodyParameters], geometries: Sequence[BodyGeometry]) -> MovingBodies:
     """The bodies at time zero; kinematic ones still at their placement."""
-    inertias, positions, orientations = [], [], []
-    for body, geometry in zip(parameters, geometries, strict=True):
-        if body.density is None:
-            inertias.append(Inertia(math.inf, np.eye(3)))
-        else:
+    mass, inertia = np.full(len(parameters), np.inf), np.tile(np.eye(3), (len(parameters), 1, 1))
+    for number, (body, geometry) in enumerate(zip(parameters, geometries, strict=True)):
+        if body.density is not None:
             properties = geometry.mass_properties(body.density)
-            inertias.append(Inertia(properties.mass, properties.inertia))
-        orientation = rotation.from_degrees(body.rotation_deg)
-        positions.append(np.asarray(body.position) + rotation.rotated(orientation, geometry.centre_of_mass))
-        orientations.append(orientation)
+            mass[number], inertia[number] = properties.mass, properties.inertia
+    orientation = np.array([rotation.from_degrees(body.rotation_deg) for body in parameters])
+    arms = rotation.rotated(orientation, np.array([geometry.centre_of_mass for geometry in geometries]))
     return MovingBodies(
         [body.name for body in parameters],
-        inertias,
-        position=np.array(positions),
-        orientation=np.array(orientations),
-        velocity=np.array([body.velocity for body in parameters]),
-        angular_velocity=np.array([body.angular_velocity for body in parameters]),
+        mass,
+        inertia,
+        position=np.array([body.position for body in parameters]) + arms,
+        orientation=orientation,
+        velocity=np.array([body.velocity for body in parameters], dtype=np.float64),
+        angular_velocity=np.array([body.angular_velocity for body in parameters], dtype=np.float64),
     )
 
 

@@ -9,30 +9,19 @@ import numpy as np
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.solver import RigidSolver
 
-START_OVERLAP = 0.01
-"""Share of the smaller body's shortest edge by which bodies may overlap: positions in a job file are rounded."""
+START_OVERLAP = 0.01  # allowed, in shortest edges of the smaller body: positions in a job file are rounded
 
 
 class StartProblem(NamedTuple):
-    """Why a body cannot start where it is.
-
-    Attributes:
-        body: its name.
-        sentence: what is wrong, by how much, and what to do.
-    """
+    """Why a body cannot start where it is, by how much, and what to do."""
 
     body: str
     sentence: str
 
 
 def check_start(solver: RigidSolver) -> None:
-    """Refuse dynamic bodies that start in other bodies or behind walls; touching is fine.
-
-    Raises:
-        ValueError: every pair that overlaps, with the depth and what to do.
-    """
-    problems = start_problems(solver)
-    if problems:
+    """Raises ValueError, which tells of every dynamic body that starts in another one or behind a wall."""
+    if problems := start_problems(solver):
         raise ValueError("; ".join(problem.sentence for problem in problems))
 
 
@@ -49,7 +38,7 @@ def _overlaps(solver: RigidSolver) -> list[StartProblem]:
     detector = CollisionDetector(solver.all_geometries, is_dynamic, ())
     detector.find(poses, np.zeros(len(poses.position)), frozenset())
     deepest: dict[tuple[int, int], float] = {}
-    found = detector.found
+    found = detector.followed
     for row, (first, second, _) in enumerate(found.keys().tolist()):
         owner, other = int(found.owner[row]), int(found.other[row])
         centre = poses.position[owner] + poses.rotation[owner] @ found.centre[row]

@@ -3,27 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.motion import rotation
-
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Inertia:
-    """Mass of one body and its inertia about the centre of mass, in the body's axes.
-
-    Attributes:
-        mass: [kg]; infinite for a body that no force moves.
-        tensor: inertia tensor [kg m²], (3, 3).
-    """
-
-    mass: float
-    tensor: Array
+from sim.core.motion.rotation import Array
 
 
 class MovingBodies:
@@ -36,6 +21,7 @@ class MovingBodies:
         orientation: unit quaternion w, x, y, z, body axes to world axes, (n, 4).
         velocity: of the centre of mass [m/s], (n, 3).
         angular_velocity: about world axes [rad/s], (n, 3).
+        mass: [kg], (n,); infinite for bodies that no force moves.
         is_lost: (n,) bool: so far outside of the domain that it was stopped; no force moves it any more.
         is_pushed: (n,) bool: got an impulse since the last step; the step that takes it in resets it.
     """
@@ -43,24 +29,21 @@ class MovingBodies:
     def __init__(
         self,
         names: Sequence[str],
-        inertias: Sequence[Inertia],
+        mass: Array,
+        inertia: Array,
         *,
         position: Array,
         orientation: Array,
         velocity: Array,
         angular_velocity: Array,
     ) -> None:
+        """Bodies with inertia tensors about their centres of mass in their own axes [kg m²], (n, 3, 3)."""
         n = len(names)
-        self.names = tuple(names)
-        self.position = np.asarray(position, dtype=np.float64).reshape(n, 3)
-        self.orientation = rotation.normalized(np.asarray(orientation, dtype=np.float64).reshape(n, 4))
-        self.velocity = np.asarray(velocity, dtype=np.float64).reshape(n, 3)
-        self.angular_velocity = np.asarray(angular_velocity, dtype=np.float64).reshape(n, 3)
-        self.mass = np.array([inertia.mass for inertia in inertias])
+        self.names, self.mass, self._tensor = tuple(names), mass, inertia
+        self.position, self.orientation = position, rotation.normalized(orientation)
+        self.velocity, self.angular_velocity = velocity, angular_velocity
         self.is_dynamic = np.isfinite(self.mass)
-        self.is_lost = np.zeros(n, dtype=bool)
-        self.is_pushed = np.zeros(n, dtype=bool)
-        self._tensor = np.stack([inertia.tensor for inertia in inertias])
+        self.is_lost, self.is_pushed = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         self._inverse_tensor = np.zeros((n, 3, 3))
         self._inverse_tensor[self.is_dynamic] = np.linalg.inv(self._tensor[self.is_dynamic])
         self.principal_moments, axes = np.linalg.eigh(self._tensor)
@@ -73,13 +56,11 @@ class MovingBodies:
     @property
     def is_free(self) -> NDArray[np.bool_]:
         """Whether forces move it, (n,)."""
-        free: NDArray[np.bool_] = self.is_dynamic & ~self.is_lost
-        return free
+        return self.is_dynamic & ~self.is_lost
 
     def are_free(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether forces move the bodies of these numbers, (k,); those from n on are static, or the domain."""
-        free: NDArray[np.bool_] = np.append(self.is_free, False)[np.minimum(numbers, len(self))]
-        return free
+        return np.append(self.is_free, False)[np.minimum(numbers, len(self))]
 
     @property
     def inverse_mass(self) -> Array:
@@ -87,7 +68,7 @@ class MovingBodies:
         return np.where(self.is_free, 1.0 / self.mass, 0.0)
 
     def scale_mass(self, number: int, factor: float) -> None:
-        """Make a dynamic body so many times heavier, with the same shape and velocities."""
+        """Multiply the mass of a dynamic body by a factor; it keeps its shape and velocities."""
         self.mass[number] *= factor
         self._tensor[number] *= factor
         self._inverse_tensor[number] /= factor
@@ -109,8 +90,7 @@ class MovingBodies:
         """Spin I omega about the centres of mass in world axes [kg m²/s], (n, 3); means nothing if kinematic."""
         turned = self.rotation()
         in_body = np.einsum("nji,nj->ni", turned, self.angular_velocity)
-        momentum: Array = np.einsum("nij,nj->ni", turned, np.einsum("njk,nk->nj", self._tensor, in_body))
-        return momentum
+        return np.einsum("nij,nj->ni", turned, np.einsum("njk,nk->nj", self._tensor, in_body))
 
     def set_angular_momentum(self, momentum: Array) -> None:
         """Set the angular velocity of the free bodies to that of a spin in world axes [kg m²/s], (n, 3)."""
@@ -120,12 +100,7 @@ class MovingBodies:
         self.angular_velocity = np.where(self.is_free[:, None], angular_velocity, self.angular_velocity)
 
     def apply_impulses(self, linear: Array, angular: Array) -> None:
-        """Change the velocities of the dynamic bodies at once.
-
-        Args:
-            linear: [N s], (n, 3).
-            angular: about the centres of mass [N m s], (n, 3).
-        """
+        """Change the velocities of the dynamic bodies by linear [N s] and angular impulses [N m s], (n, 3) each."""
         if not self.is_dynamic.any():
             return
         self.is_pushed = self.is_pushed | linear.any(axis=1)

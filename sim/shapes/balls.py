@@ -13,47 +13,28 @@ from sim.shapes.placement import PlacedSolid
 from sim.shapes.primitives import Capsule, Sphere, Torus
 from sim.shapes.solid import Points, ShapeError, TriangleMesh
 
-BALL_COUNT = 1500
-"""Balls that cover a surface, about: sixteen along the edge of a cube."""
-
-BALL_DEPTH = 0.02
-"""Radius of those balls, in shortest edges of the body: what its sharp corners are rounded by in contacts."""
-
-_REFINEMENTS = 6
-"""Each leaves under a hundredth of the error at corners of more than 20°."""
-
-_HALVINGS = 5
-"""Thin walls are met by balls of half, a quarter, ... of that radius."""
-
-_SMOOTH = 0.35
-"""Normals of a smooth vertex are within this angle of their mean [rad]: 20 degrees."""
-
-_NEIGHBOURHOOD = 1.8
-"""How far neighbours on a smooth surface are looked for, in spacings of balls: beyond those across a cell."""
+BALL_COUNT = 1500  # balls that cover a surface, about: sixteen along the edge of a cube
+BALL_DEPTH = 0.02  # radius of those balls, in shortest edges of the body: how far corners are rounded
+_REFINEMENTS = 6  # each leaves under a hundredth of the error at corners of more than 20°
+_HALVINGS = 5  # thin walls are met by balls of half, a quarter, ... of that radius.
+_SMOOTH = 0.35  # normals of a smooth vertex are within this angle of their mean [rad]: 20 degrees
+_NEIGHBOURHOOD = 1.8  # distance to neighbours on a smooth surface, in spacings: beyond those across a cell
 
 
 @dataclass(frozen=True, eq=False)
 class Balls:
     """Balls inside a body whose union stands for it when it touches others.
 
-    A ball about a point at depth r has radius r, so it lies in the body and touches its surface from inside. Its
-    centre is outside of whatever the body touches, where distances are smooth and their gradient is the contact
-    normal: corners on corners and edges along edges have one, too.
-
-    Attributes:
-        centres: [m], (3, m).
-        radii: [m], (m,).
-        axes: outward normal of the surface at each ball, (3, m).
-        cones: angle about that normal within which a ball may be touched [rad], (m,). A ball under a flat face is
-            touched along the normal only: where an edge slides over the face, a slanted contact would trip it.
-        exact: whether their union is the body, as for a sphere, and no ball has a preferred side.
+    A ball about a point at depth r has radius r. Its centre is outside of whatever the body touches, where distances
+    are smooth and their gradient is the contact normal: corners on corners and edges along edges have one, too. A ball
+    under a flat face may be touched along the normal only: a slanted contact would trip an edge that slides over it.
     """
 
-    centres: Points
-    radii: NDArray[np.float64]
-    axes: Points
-    cones: NDArray[np.float64]
-    exact: bool
+    centres: Points  # [m], (3, m)
+    radii: NDArray[np.float64]  # [m], (m,)
+    axes: Points  # outward normal of the surface at each ball, (3, m)
+    cones: NDArray[np.float64]  # angle about that normal within which a ball may be touched [rad], (m,)
+    exact: bool  # whether their union is the body, as for a sphere, and no ball has a preferred side
 
 
 def exact_balls(solid: PlacedSolid) -> Balls | None:
@@ -138,12 +119,9 @@ _EXACT_BALLS: dict[type, Callable[..., tuple[Points, float]]] = {
 
 
 def _vertex_frames(mesh: TriangleMesh) -> tuple[Points, Points, NDArray[np.float64]]:
-    """Of every vertex, where it goes when all faces move in by one, its normal, and the angle its faces' normals span.
+    """Of every vertex, its offset when all faces move in by one, its normal, and the largest angle of a face's to it.
 
     The offset d solves N d = -1 for the normals N of the faces at the vertex, in the sense of least squares.
-
-    Returns:
-        Offsets [-], (n, 3), unit normals, (n, 3), and largest angles of a face's normal to them [rad], (n,).
     """
     area_vectors = mesh.area_vectors
     area = np.linalg.norm(area_vectors, axis=1)
@@ -153,8 +131,7 @@ def _vertex_frames(mesh: TriangleMesh) -> tuple[Points, Points, NDArray[np.float
 
     def averaged(values: NDArray[np.float64]) -> NDArray[np.float64]:
         total = np.maximum(np.bincount(corner, weights=weight, minlength=count), np.finfo(np.float64).tiny)
-        means: NDArray[np.float64] = np.bincount(corner, weights=weight * values, minlength=count) / total
-        return means
+        return np.bincount(corner, weights=weight * values, minlength=count) / total
 
     mean = np.stack([averaged(normal[:, i]) for i in range(3)], axis=1)
     second = np.stack([averaged(normal[:, i] * normal[:, j]) for i in range(3) for j in range(3)], axis=1)

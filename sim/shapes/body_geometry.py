@@ -14,14 +14,10 @@ from sim.shapes.mass_properties import MassProperties, mass_properties_of_mesh, 
 from sim.shapes.mesh_solid import MeshSolid
 from sim.shapes.parameters import WeightedPlacement
 from sim.shapes.placement import PlacedSolid, build_solid
-from sim.shapes.sampling import sample_surface
 from sim.shapes.solid import Points
 
-GRID_CELLS = 48
-"""Cells of a distance grid along the longest edge of a mesh."""
-
-GRID_PADDING = 0.1
-"""How far a distance grid reaches past its mesh, in longest edges."""
+GRID_CELLS = 48  # cells of a distance grid along the longest edge of a mesh
+GRID_PADDING = 0.1  # how far a distance grid reaches past its mesh, in longest edges
 
 
 class BodyGeometry:
@@ -30,22 +26,16 @@ class BodyGeometry:
     Attributes:
         solid: the scaled shape about its own origin, unturned.
         centre_of_mass: in the frame of `solid` [m], (3,).
-        warnings: what was repaired or assumed to build the shape.
     """
 
     def __init__(self, parameters: WeightedPlacement) -> None:
-        """Build the shape; where it stands and its name have no part in it, its density only if there is ballast.
-
-        Raises:
-            ShapeError: it cannot be built, or is too thin to have an inside.
-        """
+        """Build the shape; raises ShapeError where that is impossible, or it is too thin to have an inside."""
         placed = build_solid(parameters)
         self.solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
         self._of_unit_density = _mass_properties(self.solid)
         self._ballast = parameters.ballast
         # Without ballast the centre is that of the shape, and bodies without mass have one too.
         self.centre_of_mass = self.mass_properties(parameters.density or 1.0).centre_of_mass
-        self.warnings = self.solid.warnings
 
     def mass_properties(self, density: float) -> MassProperties:
         """Mass [kg], centre of mass [m] and inertia about it [kg m²], ballast included, in the frame of `solid`."""
@@ -76,7 +66,7 @@ class BodyGeometry:
 
     def samples(self, spacing: float) -> Points:
         """Evenly spread points on its surface [m], (m, 3), in the body's frame."""
-        return sample_surface(self.solid.rest_mesh(), spacing).astype(np.float64) - self.centre_of_mass
+        return self.solid.surface_samples(spacing).astype(np.float64) - self.centre_of_mass
 
     @cached_property
     def is_analytic(self) -> bool:
@@ -104,8 +94,7 @@ class BodyGeometry:
         lost = length < 1.0e-3  # on a medial axis, such as the centre of a sphere
         gradient[lost] = points[lost] + np.array([0.0, 0.0, 1.0e-9 * self.shortest_edge])
         length[lost] = np.sqrt(np.square(gradient[lost]).sum(axis=1))
-        normal: Points = gradient / length[:, None]
-        return normal
+        return gradient / length[:, None]
 
     @cached_property
     def balls(self) -> Balls:

@@ -1,22 +1,119 @@
-"""The shapes of rigid bodies on the device, as kernels ask for distances to them (`shape_distances.distance_at`)."""
+"""Shapes of rigid bodies on the device, and their distances: formulas for primitives, a grid for meshes.
 
-from __future__ import annotations
+The formulas are those of `sim.shapes.primitives`, exact on both sides of the surface.
+"""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle, func
 from sim.shapes.body_geometry import BodyGeometry
-from sim.shapes.device_distances import BOX, CAPSULE, CONE, CYLINDER, GRID, SPHERE, TORUS, Shapes
 from sim.shapes.distance_grids import sampled_distances
 from sim.shapes.level_set import LevelSet
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 
-GRADIENT_STEP = 1.0e-3
-"""Half width of the differences that give a primitive's normal, in shortest edges: float32 errs by 1e-4 then."""
+Vector3 = ti.math.vec3
+Counts = ti.types.vector(3, ti.i32)
+CountTriples = ti.types.ndarray(dtype=Counts, ndim=1)
 
+SPHERE, BOX, CYLINDER, CAPSULE, TORUS, CONE, GRID = range(7)
+
+
+@bundle
+class Shapes(NamedTuple):
+    """Shapes of bodies, (b,) each."""
+
+    kind: Integers
+    size: Vectors  # of a primitive, scaled [m]
+    grid_values: Floats  # distances of all grids [m]
+    grid_first: Integers  # place of a grid's first value
+    grid_origin: Vectors  # [m]
+    grid_spacing: Floats  # [m]
+    grid_shape: CountTriples
+
+
+@ti.func
+def slab(beyond: Vector3) -> ti.f32:
+    """Distance to where no component, each a distance across its own axis, is positive."""
+    return ti.max(beyond, 0.0).norm() + ti.min(beyond.max(), 0.0)
+
+
+@ti.func
+def rounded(x: ti.f32, y: ti.f32, radius: ti.f32) -> ti.f32:
+    """Distance of (x, y) to a circle."""
+    return ti.sqrt(x * x + y * y) - radius
+
+
+@ti.func
+def cone_distance(radial: ti.f32, z: ti.f32, radius: ti.f32, height: ti.f32) -> ti.f32:
+    """Distance to a triangle that revolves: base down, its bounding box centred on the origin."""
+    px, py = radial - radius, z + 0.5 * height
+    along = ti.math.clamp((height * py - radius * px) / (radius * radius + height * height), 0.0, 1.0)
+    to_slant = rounded(px + along * radius, py - along * height, 0.0)
+    to_base = rounded(ti.max(px, 0.0), py, 0.0)
+    inside = py > 0.0 and height * px + radius * py < 0.0
+    return ti.select(inside, -1.0, 1.0) * ti.min(to_slant, to_base)
+
+
+@func
+def grid_distance(p: Vector3, b: ti.i32, shapes: Shapes) -> ti.f32:
+    """Trilinear interpolation; outside of the grid that of the nearest point of it, plus the way there."""
+    shape, spacing = shapes.grid_shape[b], shapes.grid_spacing[b]
+    last = ti.cast(shape - 1, ti.f32)
+    place = (p - shapes.grid_origin[b]) / spacing
+    nearest = ti.math.clamp(place, 0.0, last)
+    cell = ti.min(ti.cast(nearest, ti.i32), shape - 2)
+    share = nearest - ti.cast(cell, ti.f32)
+    value = 0.0
+    for corner in ti.static(range(8)):
+        dx, dy, dz = ti.static(corner // 4, corner // 2 % 2, corner % 2)
+        wx = ti.static(1.0 - dx) + ti.static(2.0 * dx - 1.0) * share[0]
+        wy = ti.static(1.0 - dy) + ti.static(2.0 * dy - 1.0) * share[1]
+        wz = ti.static(1.0 - dz) + ti.static(2.0 * dz - 1.0) * share[2]
+        node = ((cell[0] + dx) * shape[1] + cell[1] + dy) * shape[2] + cell[2] + dz
+        value += wx * wy * wz * shapes.grid_values[shapes.grid_first[b] + node]
+    return value + spacing * (place - nearest).norm()
+
+
+@ti.func
+def primitive_distance(p: Vector3, kind: ti.i32, size: Vector3) -> ti.f32:
+    """Distance to a primitive about its own origin [m], negative inside.
+
+    `size`: half edges of a box; else radius and half height; of a torus its two radii; of a cone radius and height.
+    """
+    radial = ti.sqrt(p[0] * p[0] + p[1] * p[1])
+    distance = p.norm() - size[0]
+    if kind == BOX:
+        distance = slab(ti.abs(p) - size)
+    elif kind == CYLINDER:
+        beyond = ti.math.vec2(radial - size[0], ti.abs(p[2]) - size[1])
+        distance = ti.max(beyond, 0.0).norm() + ti.min(beyond.max(), 0.0)
+    elif kind == CAPSULE:
+        distance = rounded(radial, ti.max(ti.abs(p[2]) - size[1], 0.0), size[0])
+    elif kind == TORUS:
+        distance = rounded(radial - size[0], p[2], size[1])
+    elif kind == CONE:
+        distance = cone_distance(radial, p[2], size[0], size[1])
+    return distance
+
+
+@func
+def distance_to(y: Vector3, b: ti.i32, shapes: Shapes) -> ti.f32:
+    """Distance to body b [m], negative inside, of a point in the frame of its shape."""
+    distance = 0.0
+    if shapes.kind[b] == GRID:
+        distance = grid_distance(y, b, shapes)
+    else:
+        distance = primitive_distance(y, shapes.kind[b], shapes.size[b])
+    return distance
+
+
+GRADIENT_STEP = 1.0e-3  # half width of differences for a primitive's normal, in shortest edges
 _SIZES = {
     Sphere: (SPHERE, lambda shape: (shape.radius, 0.0, 0.0)),
     Box: (BOX, lambda shape: tuple(0.5 * edge for edge in shape.size)),
@@ -34,12 +131,10 @@ class DeviceShapes:
     Attributes:
         count: number of bodies, b.
         geometries: of the bodies, on the host.
-        kind: of the shape, (b,).
-        size: of a primitive, (b,) vec3, scaled.
+        on_device: the shapes for kernels.
         centre_of_mass: in the frame of the shape [m], (b,) vec3.
         radius: that of a sphere around the centre of mass that holds the body [m], (b,).
         step: half width of differences for normals [m], (b,).
-        grid_first, grid_origin, grid_spacing, grid_shape: where in `grid_values` a mesh's distances are.
 
     Args:
         geometries: of the bodies; those that share one share its grid.
@@ -48,37 +143,14 @@ class DeviceShapes:
     def __init__(self, geometries: Sequence[BodyGeometry]) -> None:
         self.count, self.geometries = len(geometries), tuple(geometries)
         room = max(self.count, 1)
-        self.kind, self.grid_first = (ti.ndarray(ti.i32, room) for _ in range(2))
-        self.radius, self.step, self.grid_spacing = (ti.ndarray(ti.f32, room) for _ in range(3))
-        self.size, self.centre_of_mass, self.grid_origin = (ti.Vector.ndarray(3, ti.f32, room) for _ in range(3))
-        self.grid_shape = ti.Vector.ndarray(3, ti.i32, room)
-        self.grid_values = ti.ndarray(ti.f32, 1)
-        if self.count:
-            self._describe()
-
-    @property
-    def on_device(self) -> Shapes:
-        """The shapes for kernels."""
-        return Shapes(
-            self.kind,
-            self.size,
-            self.grid_values,
-            self.grid_first,
-            self.grid_origin,
-            self.grid_spacing,
-            self.grid_shape,
-        )
-
-    def _describe(self) -> None:
-        b = self.count
-        kind, first, shape = np.empty(b, np.int32), np.zeros(b, np.int32), np.zeros((b, 3), np.int32)
-        size, origin, spacing = np.zeros((b, 3)), np.zeros((b, 3)), np.ones(b)
-        step = np.empty(b)
-        radius = np.array([geometry.radius for geometry in self.geometries])
+        kind, first, shape = np.zeros(room, np.int32), np.zeros(room, np.int32), np.zeros((room, 3), np.int32)
+        size, origin, centre = np.zeros((room, 3)), np.zeros((room, 3)), np.zeros((room, 3))
+        radius, step, spacing = np.zeros(room), np.zeros(room), np.ones(room)
         sampled: dict[int, tuple[int, LevelSet]] = {}
-        values: list[NDArray[np.float32]] = []
-        for number, geometry in enumerate(self.geometries):
+        values = [np.zeros(1, np.float32)]
+        for number, geometry in enumerate(geometries):
             solid = geometry.solid
+            centre[number], radius[number] = geometry.centre_of_mass, geometry.radius
             if type(solid.shape) in _SIZES:
                 kind[number], size_of = _SIZES[type(solid.shape)]
                 size[number] = solid.scale * np.asarray(size_of(solid.shape))
@@ -93,21 +165,21 @@ class DeviceShapes:
             first[number], level_set = sampled[id(geometry)]
             kind[number], shape[number], origin[number] = GRID, level_set.values.shape, level_set.origin
             spacing[number], step[number] = level_set.spacing, 0.5 * level_set.spacing
-        if values:
-            self.grid_values = ti.ndarray(ti.f32, sum(each.size for each in values))
-            self.grid_values.from_numpy(np.concatenate(values))
-        for integers, numbers in (
-            (self.kind, kind),
-            (self.grid_first, first),
-            (self.grid_shape, shape),
-        ):
-            integers.from_numpy(numbers.astype(np.int32))
-        for floats, numbers in (
-            (self.size, size),
-            (self.grid_origin, origin),
-            (self.grid_spacing, spacing),
-            (self.step, step),
-            (self.radius, radius),
-            (self.centre_of_mass, np.array([geometry.centre_of_mass for geometry in self.geometries])),
-        ):
-            floats.from_numpy(numbers.astype(np.float32))
+        self.centre_of_mass, self.radius, self.step = _on_device(centre), _on_device(radius), _on_device(step)
+        self.on_device = Shapes(
+            kind=_on_device(kind),
+            size=_on_device(size),
+            grid_values=_on_device(np.concatenate(values)),
+            grid_first=_on_device(first),
+            grid_origin=_on_device(origin),
+            grid_spacing=_on_device(spacing),
+            grid_shape=_on_device(shape),
+        )
+
+
+def _on_device(values: NDArray[np.generic]) -> ti.Ndarray:
+    """Numbers (n,) or vectors (n, 3) as int32 or float32."""
+    dtype, kind = (np.int32, ti.i32) if values.dtype == np.int32 else (np.float32, ti.f32)
+    array = ti.ndarray(kind, len(values)) if values.ndim == 1 else ti.Vector.ndarray(3, kind, len(values))
+    array.from_numpy(values.astype(dtype))
+    return array

@@ -1,4 +1,4 @@
-"""Grids of a mesh's distances, as cloth that touches it and smoke that flows around it read them on the device."""
+"""Grids of a mesh's distances, as cloth and smoke read them on the device, as fine as its walls need."""
 
 from __future__ import annotations
 
@@ -8,29 +8,18 @@ from numpy.typing import NDArray
 from sim.shapes.level_set import LevelSet
 from sim.shapes.mesh_solid import MeshSolid
 from sim.shapes.placement import PlacedSolid
-from sim.shapes.thickness import wall_thickness
+from sim.shapes.sampling import stratified_points
 
-CELLS = 96
-"""Along the longest edge of a mesh: 1 cm of a body of 1 m, as coarse as cloth. More where walls are thin."""
-
-CELLS_PER_WALL = 2.0
-"""A wall of one cell has one layer of nodes inside, whose distances may be next to nothing; one of two is felt."""
-
-THIN_SHARE = 0.1
-"""Share of a mesh's surface that may be thinner: what is beside its sharp edges always is."""
-
-MOST_NODES = 2**24
-"""Of one mesh: 64 MiB. That is 256 cells along each edge of a cube, and more of what is flat."""
-
-GRID_PADDING = 3.0
-"""How far the grid reaches past the mesh, in cells: distances beyond are upper bounds."""
-
-EXACT_NODES = 2**21
-"""A grid of more nodes than this, as thin walls need it, is exact near the surface only; one of `CELLS` has fewer."""
-
-EXACT_WITHIN = 2.0
-"""Distance from the surface, in cells, up to which it is. Farther off distances only say that nothing touches, or where
-out is."""
+CELLS = 96  # along the longest edge of a mesh: 1 cm of a body of 1 m, as coarse as cloth. More where walls are thin.
+CELLS_PER_WALL = 2.0  # one cell has one layer of nodes inside, whose distances may be next to nothing
+THIN_SHARE = 0.1  # share of a mesh's surface that may be thinner: what is beside its sharp edges always is
+MOST_NODES = 2**24  # of one mesh: 64 MiB. That is 256 cells along each edge of a cube, and more of what is flat.
+GRID_PADDING = 3.0  # how far the grid reaches past the mesh, in cells: distances beyond are upper bounds
+EXACT_NODES = 2**21  # a larger grid, as thin walls need it, is exact near the surface only
+EXACT_WITHIN = 2.0  # distance from the surface, in cells, up to which that one is exact
+PROBES = 1000  # points of the surface below which the thickness is measured
+TOUCHING = 0.9  # share of its radius that a ball must have around its middle: facets are nearer than their circle
+HALVINGS = 14  # of the interval of radii, which starts with half the longest edge of the bounding box
 
 
 def sampled_distances(solid: PlacedSolid) -> LevelSet:
@@ -66,3 +55,26 @@ def _finest_spacing(extent: NDArray[np.float64]) -> float:
 def _node_count(extent: NDArray[np.float64], spacing: float) -> float:
     """Nodes of a grid about a box with these edges [m], (3,)."""
     return float(np.prod(np.ceil(extent / spacing + 2.0 * GRID_PADDING) + 1.0))
+
+
+def local_thickness(solid: MeshSolid) -> NDArray[np.float64]:
+    """Diameters [m] of the largest balls in a solid that touch points of its surface, evenly spread by area, (p,).
+
+    Between parallel walls that is their distance; beside a sharp edge it is small.
+    """
+    points, face = stratified_points(solid.mesh, PROBES)
+    inwards = -solid.mesh.area_vectors[face]
+    inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
+    low = np.zeros(len(points))
+    high = np.full(len(points), 0.5 * float(np.ptp(solid.bounds, axis=0).max()))
+    for _ in range(HALVINGS):
+        radius = 0.5 * (low + high)
+        fits = -solid.signed_distance(points + radius[:, None] * inwards) > TOUCHING * radius
+        low, high = np.where(fits, radius, low), np.where(fits, high, radius)
+    # Between parallel walls a distance d apart, d - r = TOUCHING * r of the largest r.
+    return (1.0 + TOUCHING) * low
+
+
+def wall_thickness(solid: MeshSolid, share: float) -> float:
+    """Thickness [m] that all but a share [-] of a mesh's surface has at least."""
+    return float(np.quantile(local_thickness(solid), share))

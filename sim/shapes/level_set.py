@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from sim.shapes.solid import Points, ShapeError, Solid
+from sim.shapes.solid import HasSignedDistance, Points, ShapeError
 
 _QUERY_POINTS = 2**20
 _LARGEST_GRID = 2**29
-_COARSEST_CELLS = 32
-"""Grids of so few cells along their longest edge are sampled at every node."""
+_COARSEST_CELLS = 32  # grids of so few cells along their longest edge are sampled at every node
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,22 +22,17 @@ class LevelSet:
     Accuracy inside the grid: below spacing²/(4 R) where the surface has radius of curvature R and no medial axis
     crosses the cell, at most 0.87 spacings (half a cell's diagonal) beside edges and medial axes. Outside of the grid
     the distance is that of the nearest grid point plus the way to it: an upper bound.
-
-    Attributes:
-        origin: position of node (0, 0, 0) [m], (3,).
-        spacing: edge of a cell [m].
-        values: distances [m], negative inside, (nx, ny, nz), float32.
     """
 
-    origin: NDArray[np.float64]
-    spacing: float
-    values: NDArray[np.float32]
+    origin: NDArray[np.float64]  # position of node (0, 0, 0) [m], (3,)
+    spacing: float  # edge of a cell [m]
+    values: NDArray[np.float32]  # distances [m], negative inside, (nx, ny, nz), float32
 
     @classmethod
     def sample(
-        cls, solid: Solid, spacing: float, *, padding: float | None = None, exact_within: float = np.inf
+        cls, solid: HasSignedDistance, spacing: float, *, padding: float | None = None, exact_within: float = np.inf
     ) -> LevelSet:
-        """Sample a solid's exact distance.
+        """Sample a solid's exact distance in cells with edges of `spacing` [m].
 
         Args:
             solid: what to sample.
@@ -72,11 +66,10 @@ class LevelSet:
             values[start:stop] = distance.reshape(stop - start, len(y), len(z))
         return cls(origin, spacing, values)
 
-    def _refined(self, solid: Solid, points: Points, exact_within: float) -> NDArray[np.float64]:
+    def _refined(self, solid: HasSignedDistance, points: Points, exact_within: float) -> NDArray[np.float64]:
         """Distances [m] of points (n, 3): the solid's own near its surface, else those of this grid.
 
-        A distance changes by no more than the way, so that of a point differs from those at the corners of its cell by
-        its diagonal at most: no point that is `exact_within` of the surface is missed, and all signs are right.
+        Interpolation errs by a cell's diagonal at most, so no point within `exact_within` is missed, no sign is wrong.
         """
         distance = self.signed_distance(points)
         near = np.abs(distance) <= exact_within + np.sqrt(3.0) * self.spacing

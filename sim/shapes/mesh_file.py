@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from sim.shapes.mesh_solid import MeshSolid, solid_from_triangles
 from sim.shapes.obj_file import LARGEST_TEXTURE, read_obj
 from sim.shapes.parameters import MeshShape
-from sim.shapes.solid import Points, ShapeError
+from sim.shapes.solid import Points, ShapeError, TriangleMesh
 
 FORMATS = ("obj", "ply", "stl", "glb")
-"""Formats whose geometry is all in one file, so that a copy of the file is a copy of the mesh. (A .gltf or .dae spreads
-over several; the materials beside an .obj are not read.)"""
+"""Formats whose geometry is all in one file, so that a copy of the file is a copy of the mesh."""
 
+SAME_PLACE = 1.0e-5  # repairs move vertices by less than this many bounding-box diagonals
 _Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
@@ -32,24 +32,40 @@ def load_mesh_solid(shape: MeshShape) -> MeshSolid:
 
 
 def read_upright_triangles(shape: MeshShape) -> tuple[Points, NDArray[np.int64]]:
-    """Vertices [m], (n, 3), and faces (m, 3) of a mesh: upright, its bounding box centred, scaled to `size`.
-
-    Raises:
-        ShapeError: the file is missing, of an unknown kind, or unreadable.
-    """
+    """As `read_triangles`, in metres: upright, the bounding box centred, scaled to `size`."""
     vertices, faces = read_triangles(Path(shape.file))
     return _upright(vertices, faces, shape), faces
 
 
+def texture_coordinates(mesh: TriangleMesh, shape: MeshShape) -> NDArray[np.float32] | None:
+    """Texture coordinates (m, 3, 2) of every corner of the unscaled rest mesh of a file's solid; None if it has none.
+
+    From a picture's lower left corner (0, 0) to its upper right (1, 1). Caps over holes go on with what their nearest
+    corners have. Raises ShapeError where the file cannot be read.
+    """
+    from scipy.spatial import cKDTree
+
+    found = read_texture_coordinates(shape)
+    if found is None:
+        return None
+    corners, uv = found
+    own = mesh.corners
+    # Both faces at a corner of a seam are there; the triangle says which of them counts, and then the corner's place.
+    away, triangle = cKDTree(corners.mean(axis=1)).query(own.mean(axis=1))
+    offsets = np.linalg.norm(own[:, :, None] - corners[triangle][:, None], axis=3)
+    coordinates = np.take_along_axis(uv[triangle], offsets.argmin(axis=2)[:, :, None], axis=1)
+    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    of_cap = (away > SAME_PLACE * diagonal) | (offsets.min(axis=2).max(axis=1) > SAME_PLACE * diagonal)
+    if of_cap.any():
+        _, nearest = cKDTree(corners.reshape(-1, 3)).query(own[of_cap].reshape(-1, 3))
+        coordinates[of_cap] = uv.reshape(-1, 2)[nearest].reshape(-1, 3, 2)
+    return coordinates.astype(np.float32)
+
+
 def read_texture_coordinates(shape: MeshShape) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Corners of a file's triangles [m], (m, 3, 3), upright and centred as above, and their coordinates on pictures.
+    """Corners of a file's triangles [m], (m, 3, 3), upright and centred, and their texture coordinates, (m, 3, 2).
 
-    Returns:
-        The corners and, from a picture's lower left corner (0, 0) to its upper right (1, 1), their places (m, 3, 2);
-        None if the file has none. A part of the file without them has 0.
-
-    Raises:
-        ShapeError: as of `read_triangles`.
+    None if the file has none; parts of it without them have 0. Raises ShapeError as `read_triangles` does.
     """
     from trimesh import Trimesh
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.shapes.solid import Points, TriangleMesh
+from sim.shapes.solid import Points, TriangleMesh, boundary_edges
 
 Faces = NDArray[np.int64]
 
-_MERGE_DISTANCE = 1.0e-6
-"""Vertices closer than this many bounding-box diagonals are one: what float32 files can tell apart."""
-
-_CAVITY_PROBES = 256
-"""About how many vertices of a closed patch are asked whether they lie inside of the rest."""
+_MERGE_DISTANCE = 1.0e-6  # of vertices that are one, in bounding-box diagonals: what float32 can tell apart
+_CAVITY_PROBES = 256  # about how many vertices of a closed patch are asked whether they lie inside of the rest
 
 
 def merge_vertices(vertices: Points, faces: Faces) -> tuple[Points, Faces]:
@@ -33,15 +30,6 @@ def drop_collapsed_and_repeated_faces(faces: Faces) -> Faces:
     canonical = np.take_along_axis(faces, (smallest_first + np.arange(3)) % 3, axis=1)
     _, first = np.unique(canonical, axis=0, return_index=True)
     return faces[np.sort(first)]
-
-
-def boundary_edges(faces: Faces) -> NDArray[np.int64]:
-    """Directed edges (k, 2) that faces pass more often forwards than backwards; none for a closed mesh."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    undirected, edge = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
-    net = np.bincount(edge.reshape(-1), weights=np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)).astype(np.int64)
-    open_edges = np.where(net[:, None] >= 0, undirected, undirected[:, ::-1])
-    return np.repeat(open_edges, np.abs(net), axis=0)
 
 
 def boundary_loops(faces: Faces) -> list[list[int]]:

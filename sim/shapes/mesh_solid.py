@@ -9,52 +9,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim.shapes.mass_properties import integrate_moments
 from sim.shapes.mesh_repair import (
-    boundary_edges,
     boundary_loops,
     cap_holes,
     drop_collapsed_and_repeated_faces,
     merge_vertices,
     orient_outward,
 )
-from sim.shapes.moments import integrate_moments
 from sim.shapes.sampling import stratified_points
-from sim.shapes.solid import Points, ShapeError, TriangleMesh
+from sim.shapes.solid import Points, RestShape, ShapeError, TriangleMesh, boundary_edges
 from sim.shapes.tessellation import longest_edge, subdivide
 
-_DECIDED_WITHIN = 0.1
-"""A winding number is decided when this close to an integer; beside an open hemisphere it is off by 0.15 to 0.25."""
-
-_LARGEST_UNDECIDED = 0.2
-"""Largest fraction of the surface beside which the inside may be undecided."""
-
-_WORTH_A_WARNING = 0.01
-"""Undecided fraction of a mesh without holes from which on the user is told."""
+_DECIDED_WITHIN = 0.1  # of an integer a winding number is decided; beside a hemisphere it is off by 0.15 to 0.25
+_LARGEST_UNDECIDED = 0.2  # largest fraction of the surface beside which the inside may be undecided
+_WORTH_A_WARNING = 0.01  # undecided fraction of a mesh without holes from which on the user is told
 
 _PROBES = 4096
-_PROBE_OFFSET = 1.0e-4
-"""How far from the surface the probes are, in bounding-box diagonals: above float32 round-off, below any wall."""
+_PROBE_OFFSET = 1.0e-4  # of probes from the surface, in bounding-box diagonals: above round-off, below any wall
 
 
 @dataclass(frozen=True, eq=False)
-class MeshSolid:
-    """A solid bounded by a triangle mesh about its own origin; implements `sim.shapes.solid.RestShape`.
+class MeshSolid(RestShape):
+    """A solid bounded by a triangle mesh about its own origin.
 
     A point is inside where the generalized winding number of the mesh (Jacobson et al. 2013, evaluated as by Barill et
     al. 2018) exceeds 1/2: overlapping parts unite, and holes are spanned smoothly. Its distance is that to the nearest
-    triangle that is not buried in another part, caps over the holes included, exact to round-off. Two exceptions: at a
-    hole with an uneven rim the surface of the sign and the cap differ, by about the unevenness of the rim; and along
-    the seam of two overlapping parts the triangles that cross it still count with their buried ends.
-
-    Attributes:
-        mesh: outward-oriented triangles, the caps last.
-        cap_count: how many of the last faces are caps.
-        warnings: what was repaired or assumed.
+    triangle, caps included, that is not buried in another part, exact to round-off but at holes with an uneven rim, and
+    along seams of overlapping parts, where crossing triangles count with their buried ends.
     """
 
-    mesh: TriangleMesh
-    cap_count: int = 0
-    warnings: tuple[str, ...] = ()
+    mesh: TriangleMesh  # outward-oriented triangles, the caps last
+    cap_count: int = 0  # how many of the last faces are caps
+    warnings: tuple[str, ...] = ()  # what was repaired or assumed
 
     @cached_property
     def volume(self) -> float:
@@ -87,8 +74,7 @@ class MeshSolid:
         points = np.ascontiguousarray(points, dtype=np.float64)
         if not len(points):
             return np.empty(0)
-        # igl.signed_distance with the fast winding number scales the distance by 1 - 2|w|, so that it is no distance
-        # near holes: sign and distance are asked for apart. The trees are kept, too.
+        # igl.signed_distance with the fast winding number scales the distance by 1 - 2|w|, which is none near holes.
         squared, _, _ = self._distance_tree.squared_distance(self.mesh.vertices, self._bounding_faces, points)
         return np.where(self.winding_number(points) > 0.5, -1.0, 1.0) * np.sqrt(squared)
 
@@ -146,17 +132,11 @@ class MeshSolid:
 
 
 def solid_from_triangles(vertices: ArrayLike, faces: ArrayLike, *, label: str) -> MeshSolid:
-    """Repair a mesh and make sure that it has an inside.
-
-    Args:
-        vertices: (n, 3) [m].
-        faces: (m, 3) vertex indices.
-        label: what messages call it, such as "bunny.obj".
+    """Repair a mesh of vertices (n, 3) [m] and faces (m, 3), which messages call by its label.
 
     Raises:
-        ShapeError: no faces, no extent, non-finite vertices, or an inside that cannot be determined: a fifth of the
-            surface or more has a winding number that is not within 0.1 of an integer on both sides, or is not inside
-            on its inner side.
+        ShapeError: no faces, no extent, non-finite vertices, or an inside that cannot be determined: beside a fifth of
+            the surface the winding number is not within 0.1 of an integer, or the inner side is not inside.
     """
     vertices, faces = _checked_arrays(vertices, faces, label)
     warnings = []
@@ -220,13 +200,16 @@ def _undecided_fraction(solid: MeshSolid) -> float:
 
 
 def _no_inside(label: str, undecided: float, holes: int, open_edges: int) -> str:
-    share = f"beside {100.0 * undecided:.0f} % of its surface the winding number is undecided"
+    finding = (
+        f"{label} has no clear inside: beside {100.0 * undecided:.0f} % of its surface the winding number is undecided "
+        f"(at most {100.0 * _LARGEST_UNDECIDED:.0f} % may be), "
+    )
     if holes:
         return (
-            f"{label} has no clear inside: {share} (at most {100.0 * _LARGEST_UNDECIDED:.0f} % may be), {open_edges} "
-            "edges being open; close its holes, or give the sheet a thickness, in a modelling program"
+            f"{finding}{open_edges} edges being open; close its holes, or give the sheet a thickness, in a modelling "
+            "program"
         )
     return (
-        f"{label} has no clear inside: {share} (at most {100.0 * _LARGEST_UNDECIDED:.0f} % may be), although it has no "
-        "holes: it folds over or into itself; rebuild it in a modelling program (Blender: Remesh modifier)"
+        f"{finding}although it has no holes: it folds over or into itself; rebuild it in a modelling program (Blender: "
+        "Remesh modifier)"
     )

@@ -8,19 +8,22 @@ asks for; what the mesh encloses gets exact distances from `MeshSolid`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
+from functools import cache, reduce
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
+from sim.shapes.mesh_solid import MeshSolid
 from sim.shapes.solid import Points, TriangleMesh
 from sim.shapes.tessellation import cut_along
 
 Distances = NDArray[np.float64]
 DistanceFunction = Callable[[Points], Distances]
 Corner = tuple[float, float, float]
+
+_CELL = 0.026  # edge of a cell of the duck and the bunny, in units of their models
 
 _CELLS_PER_BLOCK = 4
 _RELAXATION_ROUNDS = 3
@@ -79,19 +82,15 @@ def smooth_difference(a: Distances, b: Distances, blend: float) -> Distances:
 def mesh_parts(
     parts: Callable[[Points], Mapping[str, Distances]], lower: Sequence[float], upper: Sequence[float], cell: float
 ) -> TriangleMesh:
-    """Closed mesh of the union of named parts, cut along their seams.
+    """Closed mesh of the union of named parts, cut along their seams: no triangle belongs to two parts.
 
     Marching cubes, then a few rounds in which vertices move towards the mean of their neighbours and back onto the
     surface, which evens out the triangles. Seams are filleted over a cell: smooth shading finds no crease there.
 
     Args:
         parts: the distance of every part at points (n, 3), by name.
-        lower: corner of a box around the surface, with a cell of margin.
-        upper: the opposite corner.
+        lower, upper: corners of a box around the surface, with a cell of margin.
         cell: edge of a cell.
-
-    Returns:
-        The mesh, with `part` and `part_names`; no triangle belongs to two parts.
     """
 
     def union(points: Points) -> Distances:
@@ -106,6 +105,21 @@ def mesh_parts(
         mesh = cut_along(mesh, own - np.min(list(distances.values()), axis=0))
     nearest = np.argmin(list(parts(mesh.corners.mean(axis=1)).values()), axis=0)
     return TriangleMesh(mesh.vertices, mesh.faces, nearest.astype(np.int32), names)
+
+
+def procedural_solid(
+    parts: Callable[[Points], Mapping[str, Distances]], lower: Sequence[float], upper: Sequence[float], axis: int
+) -> Callable[[float], MeshSolid]:
+    """Builder of the solid that `mesh_parts` models, by its extent along an axis [m], its bounding box centred."""
+
+    @cache
+    def unit_mesh() -> TriangleMesh:
+        mesh = mesh_parts(parts, lower, upper, _CELL)
+        low, high = mesh.bounds
+        extent = (high - low)[axis]
+        return mesh.transformed(1.0 / extent, np.eye(3), -0.5 * (low + high) / extent)
+
+    return lambda extent: MeshSolid(unit_mesh().transformed(extent, np.eye(3), np.zeros(3)))
 
 
 def _march(function: DistanceFunction, lower: Points, upper: Points, cell: float) -> TriangleMesh:

@@ -14,23 +14,18 @@ from numpy.typing import NDArray
 
 from sim.shapes.solid import Points
 
-ROUND_OFF = 1.0e-2
-"""Part of a polygon's area by which a triangle may lie over others: corners on a line, in files of few digits."""
-
-LARGEST_TEXTURE = float(np.finfo(np.float32).max)
-"""Texture coordinates beyond this are infinite in meshes, which hold float32."""
+ROUND_OFF = 1.0e-2  # part of a polygon's area by which its triangles may overlap: files of few digits
+LARGEST_TEXTURE = float(np.finfo(np.float32).max)  # beyond it coordinates are infinite in float32
 
 
 def read_obj(text: str) -> tuple[Points, NDArray[np.int64], NDArray[np.float64] | None]:
-    """Vertices and triangles of a file; polygons become fans about their first corner.
+    """Vertices (n, 3) in the order of the file, triangles (m, 3), and texture coordinates of their corners (m, 3, 2).
 
-    Returns:
-        Vertices (n, 3) in the order of the file, triangles (m, 3), and texture coordinates of their corners (m, 3, 2),
-        0 where a corner names none that is there and can be used; None for a file without any.
+    Polygons become fans about their first corner. Coordinates are 0 where a corner names none that is there and can be
+    used, and None for a file without any.
 
     Raises:
-        ValueError: a `v` or `f` line cannot be read, or has a polygon that such a fan does not fill; the message names
-            it.
+        ValueError: a `v` or `f` line cannot be read, or has a polygon that such a fan does not fill; named by line.
     """
     vertices: list[tuple[float, float, float]] = []
     triangles: list[tuple[int, int, int]] = []
@@ -70,16 +65,13 @@ def read_obj(text: str) -> tuple[Points, NDArray[np.int64], NDArray[np.float64] 
 
 
 def _refuse_overlaps(vertices: Points, triangles: NDArray[np.int64], lines: NDArray[np.int64]) -> None:
-    """Refuse polygons so concave that triangles of their fan face the other way, and so lie over others.
+    """Refuse polygons, by the line of each triangle, (m,), whose fan has triangles that face the other way.
 
-    Args:
-        vertices: (n, 3).
-        triangles: (m, 3); those of vertices that are not there are left to who knows the file.
-        lines: number of the line, and so of the polygon, that each triangle is from, ascending, (m,).
+    Vertices that are not there, or not finite, are left to who knows the file.
     """
     known = (triangles < len(vertices)).all(axis=1)
     first, second, third = np.moveaxis(vertices[triangles[known]], 1, 0)
-    with np.errstate(invalid="ignore", over="ignore"):  # vertices that are not finite are told of by who knows the file
+    with np.errstate(invalid="ignore", over="ignore"):
         normal = np.cross(second - first, third - first)
         own, polygon = np.unique(lines[known], return_inverse=True)
         total = np.stack([np.bincount(polygon, normal[:, axis], len(own)) for axis in range(3)], axis=1)
@@ -101,10 +93,7 @@ def _vertex_number(corner: str, count: int) -> int:
 
 
 def _texture_place(values: list[str]) -> tuple[float, float]:
-    """Texture coordinates in a `vt` line; 0 if they cannot be read or are not finite in the float32 of meshes.
-
-    The shape does not depend on them, so they are no reason to refuse its file; those after them keep their numbers.
-    """
+    """Texture coordinates in a `vt` line; 0 if they cannot be read or are not finite in the float32 of meshes."""
     try:
         u, v, *_ = (*(float(value) for value in values[:2]), 0.0)  # one alone is a place on a strip
     except ValueError:

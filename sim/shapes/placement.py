@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,24 +26,18 @@ from sim.shapes.parameters import (
     TorusShape,
 )
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
+from sim.shapes.sampling import sample_surface
 from sim.shapes.solid import Points, RestShape, ShapeError, TriangleMesh
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedSolid:
-    """A rest shape in the world; implements `sim.shapes.Solid`.
+    """A rest shape in the world; implements `sim.shapes.Solid`."""
 
-    Attributes:
-        shape: the shape about its own origin.
-        scale: uniform factor [-].
-        rotation: (3, 3) rotation matrix, rest axes to world axes.
-        position: (3,) world position of the shape's origin [m].
-    """
-
-    shape: RestShape
-    scale: float
-    rotation: NDArray[np.float64]
-    position: NDArray[np.float64]
+    shape: RestShape  # the shape about its own origin
+    scale: float  # uniform factor [-]
+    rotation: NDArray[np.float64]  # (3, 3) rotation matrix, rest axes to world axes
+    position: NDArray[np.float64]  # (3,) world position of the shape's origin [m]
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
@@ -78,14 +74,20 @@ class PlacedSolid:
         """The surface scaled, but neither rotated nor moved."""
         return self._mesh(max_edge).transformed(self.scale, np.eye(3), np.zeros(3))
 
+    def surface_samples(self, spacing: float) -> NDArray[np.float32]:
+        """Evenly spread points on its surface in world coordinates [m], (m, 3).
+
+        They are sampled on the mesh at rest and then placed, so that two bodies of one shape carry the same pattern.
+        """
+        samples = sample_surface(self.rest_mesh(), spacing).astype(np.float64)
+        return (samples @ self.rotation.T + self.position).astype(np.float32)
+
     def _mesh(self, max_edge: float | None) -> TriangleMesh:
         return self.shape.surface_mesh(None if max_edge is None else max_edge / self.scale)
 
 
 def build_solid(placement: Placement) -> PlacedSolid:
-    """The solid that a placement describes.
-
-    A relative mesh path counts from the working directory: whoever reads the job file resolves it against the file.
+    """The solid that a placement describes; a relative mesh path counts from the working directory.
 
     Raises:
         ShapeError: the shape cannot be built; the text gives place, rule, value and remedy.
@@ -105,22 +107,9 @@ def _build_torus(shape: TorusShape) -> Torus:
     return Torus(shape.major_radius, shape.minor_radius)
 
 
-def _build_duck(shape: DuckShape) -> RestShape:
-    from sim.shapes.duck import build_duck
-
-    return build_duck(shape.length)
-
-
-def _build_bunny(shape: BunnyShape) -> RestShape:
-    from sim.shapes.bunny import build_bunny
-
-    return build_bunny(shape.height)
-
-
-def _build_mesh(shape: MeshShape) -> RestShape:
-    from sim.shapes.mesh_file import load_mesh_solid
-
-    return load_mesh_solid(shape)
+def _module(name: str) -> Any:
+    """A module that is loaded when a job has a shape of it."""
+    return import_module(f"sim.shapes.{name}")
 
 
 _BUILDERS: Mapping[type[Parameters], Callable[..., RestShape]] = {
@@ -130,8 +119,8 @@ _BUILDERS: Mapping[type[Parameters], Callable[..., RestShape]] = {
     CapsuleShape: lambda shape: Capsule(shape.radius, shape.height),
     TorusShape: _build_torus,
     ConeShape: lambda shape: Cone(shape.radius, shape.height),
-    DuckShape: _build_duck,
-    BunnyShape: _build_bunny,
-    MeshShape: _build_mesh,
+    DuckShape: lambda shape: _module("procedural").build_duck(shape.length),
+    BunnyShape: lambda shape: _module("procedural").build_bunny(shape.height),
+    MeshShape: lambda shape: _module("mesh_file").load_mesh_solid(shape),
 }
 """How each type of shape is built: one line for a new shape."""

@@ -6,18 +6,16 @@ Distances follow the constructions of I. Quilez, "Distance functions" (2008-2023
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.shapes.solid import Points, TriangleMesh
+from sim.shapes.solid import Points, RestShape, TriangleMesh
 from sim.shapes.tessellation import grid_box, icosphere, revolve, revolve_ring, subdivide_polyline
 
 Distances = NDArray[np.float64]
 
-SMOOTH_SEGMENTS = 160
-"""Segments of a full circle when only looks count: a chord is off by 0.02 % of the radius, under a pixel at 4K."""
+SMOOTH_SEGMENTS = 160  # of a full circle when only looks count: a chord is off by 0.02 % of the radius
 
 
 def _segments(radius: float, max_edge: float | None) -> int:
@@ -42,11 +40,10 @@ def _distance_in_slab(beyond: NDArray[np.float64]) -> Distances:
 
 
 @dataclass(frozen=True)
-class Box:
+class Box(RestShape):
     """An axis-aligned box of the given edge lengths [m], centred on the origin."""
 
     size: tuple[float, float, float]
-    warnings: ClassVar[tuple[str, ...]] = ()
 
     @property
     def volume(self) -> float:
@@ -67,11 +64,10 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Sphere:
+class Sphere(RestShape):
     """A ball of the given radius [m], centred on the origin."""
 
     radius: float
-    warnings: ClassVar[tuple[str, ...]] = ()
 
     @property
     def volume(self) -> float:
@@ -92,12 +88,11 @@ class Sphere:
 
 
 @dataclass(frozen=True)
-class Cylinder:
+class Cylinder(RestShape):
     """A solid cylinder along z, centred on the origin; radius and height [m]."""
 
     radius: float
     height: float
-    warnings: ClassVar[tuple[str, ...]] = ()
 
     @property
     def volume(self) -> float:
@@ -122,12 +117,11 @@ class Cylinder:
 
 
 @dataclass(frozen=True)
-class Capsule:
+class Capsule(RestShape):
     """A cylinder along z with half-ball caps, centred on the origin; radius and cylindrical height [m]."""
 
     radius: float
     height: float
-    warnings: ClassVar[tuple[str, ...]] = ()
 
     @property
     def volume(self) -> float:
@@ -154,12 +148,11 @@ class Capsule:
 
 
 @dataclass(frozen=True)
-class Torus:
+class Torus(RestShape):
     """A ring around z, centred on the origin; major radius > minor radius [m]."""
 
     major_radius: float
     minor_radius: float
-    warnings: ClassVar[tuple[str, ...]] = ()
 
     @property
     def volume(self) -> float:
@@ -183,12 +176,11 @@ class Torus:
 
 
 @dataclass(frozen=True)
-class Cone:
+class Cone(RestShape):
     """A solid cone along z, base down, its bounding box centred on the origin; base radius and height [m]."""
 
     radius: float
     height: float
-    warnings: ClassVar[tuple[str, ...]] = ()
 
     @property
     def volume(self) -> float:

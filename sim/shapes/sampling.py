@@ -8,15 +8,9 @@ from scipy.spatial import cKDTree
 
 from sim.shapes.solid import ShapeError, Solid, TriangleMesh
 
-_ROUND_OFF = 1.0e-6
-"""Slack, in lattice spacings, that forgives decimal sizes such as 0.3 / 0.02 their binary round-off."""
-
-_MIN_DISTANCE = 0.8
-"""Least distance of two samples, in spacings: a maximal random set then holds one sample per spacing squared."""
-
-_CANDIDATES_PER_SAMPLE = 16
-"""Density of the candidates: their own gaps, a quarter of a spacing, add to the largest gap between samples."""
-
+_ROUND_OFF = 1.0e-6  # slack, in lattice spacings, that forgives decimal sizes such as 0.3 / 0.02 their binary round-off
+_MIN_DISTANCE = 0.8  # of two samples, in spacings: a maximal random set then holds one per spacing squared
+_CANDIDATES_PER_SAMPLE = 16  # their own gaps, a quarter of a spacing, add to those between samples
 _LARGEST_LATTICE = 2**31
 _LAYER_POINTS = 2**20
 _MOST_SAMPLES = 1.0e7
@@ -25,19 +19,10 @@ _MOST_SAMPLES = 1.0e7
 def fill_with_particles(
     solid: Solid, spacing: float, *, lower: ArrayLike | None = None, upper: ArrayLike | None = None
 ) -> NDArray[np.float32]:
-    """Particles on a cubic lattice in world axes, at least half a spacing inside the surface.
+    """Positions [m], (n, 3), of particles on a cubic lattice, at least half a spacing [m] inside the surface.
 
-    The lattice is centred in the solid's bounds, cut by `lower` and `upper`; a box of k spacings gets exactly k³
-    particles. The order is that of the lattice: x slowest, z fastest.
-
-    Args:
-        solid: what to fill.
-        spacing: lattice spacing [m].
-        lower: particles stay half a spacing above this corner [m], (3,).
-        upper: and half a spacing below this one [m], (3,).
-
-    Returns:
-        Positions [m], (n, 3), float32; n may be 0.
+    The lattice is centred in the solid's bounds, cut by the corners `lower` and `upper` [m], from which particles stay
+    half a spacing, too; a box of k spacings gets exactly k³ particles. In the order of the lattice, z fastest.
 
     Raises:
         ShapeError: the lattice would have more than 2³¹ points.
@@ -68,19 +53,12 @@ def fill_with_particles(
 
 
 def sample_surface(mesh: TriangleMesh, spacing: float) -> NDArray[np.float32]:
-    """Evenly spread samples of a surface, about one per spacing squared: the boundary of Akinci et al. 2012.
+    """Positions [m], (m, 3), evenly spread on a surface, about one per spacing [m] squared (Akinci et al. 2012).
 
     A maximal Poisson-disk set: no two samples are closer than 0.8 spacings, no point of the surface is farther than
     1.05 spacings from a sample. Candidates are stratified by area; rounds accept, of the first remaining candidate of
     every grid cell, those that come first among their neighbours, and drop what is then too close (after Wei 2008,
     "Parallel Poisson disk sampling"). The same mesh and spacing give the same samples.
-
-    Args:
-        mesh: surface in the frame the samples are wanted in.
-        spacing: typical distance of neighbours [m].
-
-    Returns:
-        Positions [m], (m, 3), float32.
 
     Raises:
         ShapeError: the surface has no area, or would take more than ten million samples.
@@ -108,17 +86,10 @@ def sample_surface(mesh: TriangleMesh, spacing: float) -> NDArray[np.float32]:
 
 
 def stratified_points(mesh: TriangleMesh, count: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Deterministic points on a surface, evenly by area.
+    """Deterministic points [m], (count, 3), on a surface, evenly by area, and the face of each, (count,).
 
     Equal steps along the cumulated area give every face its share; the plastic-number sequence (Roberts 2018, "The
     unreasonable effectiveness of quasirandom sequences") places the points within the faces.
-
-    Args:
-        mesh: a surface with area.
-        count: how many.
-
-    Returns:
-        Positions [m], (count, 3), and the face of each, (count,).
     """
     cumulated_area = np.cumsum(np.linalg.norm(mesh.area_vectors, axis=1))
     face = np.searchsorted(cumulated_area, (np.arange(count) + 0.5) * (cumulated_area[-1] / count), side="right")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-Points = NDArray[np.float64]
-"""(n, 3) positions or directions."""
+Points = NDArray[np.float64]  # (n, 3) positions or directions
 
 
 class ShapeError(ValueError):
@@ -18,19 +18,12 @@ class ShapeError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Triangles whose normals (counter-clockwise corners) point out of the solid.
+    """Triangles whose normals (counter-clockwise corners) point out of the solid."""
 
-    Attributes:
-        vertices: (n, 3) float64 [m].
-        faces: (m, 3) int32 vertex indices.
-        part: (m,) int32, which of `part_names` a face belongs to; None for a shape of one part.
-        part_names: names of the parts, such as "body", "bill" and "eyes".
-    """
-
-    vertices: Points
-    faces: NDArray[np.int32]
-    part: NDArray[np.int32] | None = None
-    part_names: tuple[str, ...] = ()
+    vertices: Points  # (n, 3) float64 [m]
+    faces: NDArray[np.int32]  # (m, 3) vertex indices
+    part: NDArray[np.int32] | None = None  # which of `part_names` a face belongs to, (m,); None for one part
+    part_names: tuple[str, ...] = ()  # such as "body", "bill" and "eyes"
 
     @property
     def corners(self) -> NDArray[np.float64]:
@@ -57,12 +50,7 @@ class TriangleMesh:
     @property
     def is_closed(self) -> bool:
         """Whether every edge is passed as often forwards as backwards: a surface without boundary."""
-        edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-        forwards = edges[:, 0] < edges[:, 1]
-        undirected = np.sort(edges, axis=1)
-        key = undirected[:, 0] * len(self.vertices) + undirected[:, 1]
-        _, edge = np.unique(key, return_inverse=True)
-        return bool(np.all(np.bincount(edge, weights=np.where(forwards, 1.0, -1.0)) == 0.0))
+        return not len(boundary_edges(self.faces))
 
     def transformed(self, scale: float, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> TriangleMesh:
         """The mesh scaled, then rotated by a (3, 3) matrix, then moved by `position` [m]."""
@@ -78,12 +66,30 @@ class TriangleMesh:
         return TriangleMesh(self.vertices[used], numbers.reshape(faces.shape).astype(np.int32))
 
 
-class Solid(Protocol):
-    """A closed region of the world."""
+def boundary_edges(faces: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Directed edges (k, 2) that faces pass more often forwards than backwards; none for a closed mesh."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    _, first, edge = np.unique(low * (high.max(initial=0) + 1) + high, return_index=True, return_inverse=True)
+    net = np.bincount(edge, weights=np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)).astype(np.int64)
+    undirected = np.stack([low[first], high[first]], axis=1)
+    open_edges = np.where(net[:, None] >= 0, undirected, undirected[:, ::-1])
+    return np.repeat(open_edges, np.abs(net), axis=0)
+
+
+class HasSignedDistance(Protocol):
+    """A region of space that is known by its signed distance."""
 
     @property
     def bounds(self) -> NDArray[np.float64]:
         """Lower and upper corner of its tight axis-aligned box [m], (2, 3)."""
+
+    def signed_distance(self, points: Points) -> NDArray[np.float64]:
+        """Distance to the surface [m], negative inside, (n,), of positions (n, 3)."""
+
+
+class Solid(HasSignedDistance, Protocol):
+    """A closed region of the world."""
 
     @property
     def volume(self) -> float:
@@ -93,33 +99,32 @@ class Solid(Protocol):
     def warnings(self) -> tuple[str, ...]:
         """What was repaired or assumed to build it, one sentence each, for the user."""
 
-    def signed_distance(self, points: Points) -> NDArray[np.float64]:
-        """Distance to the surface [m], negative inside, (n,), of world positions (n, 3)."""
-
     def surface_mesh(self, max_edge: float | None = None) -> TriangleMesh:
-        """Its closed, outward-oriented surface in world coordinates, fine enough to be rendered.
-
-        Args:
-            max_edge: upper bound on the length of an edge [m]; as fine as looks smooth if omitted.
-        """
+        """Closed outward-oriented surface; edges no longer than `max_edge` [m], or as fine as looks smooth."""
 
 
-class RestShape(Protocol):
-    """A shape about its own origin, before it is scaled, rotated and moved; lengths in metres."""
+class RestShape(ABC):
+    """A shape about its own origin, before it is scaled, rotated and moved; lengths in metres.
+
+    Attributes:
+        warnings: what was repaired or assumed, one sentence each.
+    """
+
+    warnings: tuple[str, ...] = ()
 
     @property
+    @abstractmethod
     def volume(self) -> float:
         """Volume [m³]."""
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What was repaired or assumed, one sentence each."""
-
+    @abstractmethod
     def support(self, directions: Points) -> NDArray[np.float64]:
         """Largest x·d over the shape [m], (k,), for unit directions d (k, 3)."""
 
+    @abstractmethod
     def signed_distance(self, points: Points) -> NDArray[np.float64]:
-        """Distance to the surface [m], negative inside, (n,)."""
+        """Distance to the surface [m], negative inside, (n,), of points (n, 3)."""
 
+    @abstractmethod
     def surface_mesh(self, max_edge: float | None) -> TriangleMesh:
         """Closed outward-oriented surface; edges no longer than `max_edge` [m] if given."""

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sim.shapes.solid import Points, TriangleMesh
 
-SMOOTH_SUBDIVISIONS = 5
-"""Subdivisions of an icosahedron that look round: 10 242 vertices, off by 0.03 % of the radius."""
+SMOOTH_SUBDIVISIONS = 5  # subdivisions of an icosahedron that look round: 10 242 vertices, off by 0.03 % of the radius
 
 
 def subdivide_polyline(points: Sequence[tuple[float, float]] | NDArray[np.float64], max_edge: float) -> Points:
@@ -35,15 +34,7 @@ def _quads_as_triangles(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArr
 def revolve(profile: Points, segments: int) -> TriangleMesh:
     """A profile (n, 2) of radius and z, from the axis at the bottom to the axis at the top, turned around z."""
     rings = profile[1:-1]
-    angle = np.arange(segments) * (2.0 * np.pi / segments)
-    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    ring_vertices = np.concatenate(
-        [
-            rings[:, None, :1] * around[None],
-            np.broadcast_to(rings[:, None, 1:], (len(rings), segments, 1)),
-        ],
-        axis=2,
-    ).reshape(-1, 3)
+    ring_vertices = _turned_around_z(rings, segments)
     bottom, top = len(ring_vertices), len(ring_vertices) + 1
     vertices = np.concatenate([ring_vertices, [(0.0, 0.0, profile[0, 1]), (0.0, 0.0, profile[-1, 1])]])
 
@@ -57,15 +48,18 @@ def revolve(profile: Points, segments: int) -> TriangleMesh:
 
 def revolve_ring(profile: Points, segments: int) -> TriangleMesh:
     """A closed counter-clockwise profile (n, 2) of radius > 0 and z, turned around z."""
-    angle = np.arange(segments) * (2.0 * np.pi / segments)
-    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    vertices = np.concatenate(
-        [profile[:, None, :1] * around[None], np.broadcast_to(profile[:, None, 1:], (len(profile), segments, 1))],
-        axis=2,
-    ).reshape(-1, 3)
+    vertices = _turned_around_z(profile, segments)
     index = np.arange(len(vertices)).reshape(len(profile), segments)
     following, above = np.roll(index, -1, axis=1), np.roll(index, -1, axis=0)
     return TriangleMesh(vertices, _quads_as_triangles(index, following, np.roll(following, -1, axis=0), above))
+
+
+def _turned_around_z(profile: Points, segments: int) -> Points:
+    """Vertices (n segments, 3) of rings through a profile (n, 2) of radius and z."""
+    angle = np.arange(segments) * (2.0 * np.pi / segments)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    heights = np.broadcast_to(profile[:, None, 1:], (len(profile), segments, 1))
+    return np.concatenate([profile[:, None, :1] * around, heights], axis=2).reshape(-1, 3)
 
 
 def icosphere(radius: float, max_edge: float) -> TriangleMesh:

@@ -13,114 +13,127 @@ of the scheme, and its order remains.
 
 import taichi as ti
 
-from sim.smoke.lanes import lane_count, lane_items, lane_place
-from sim.smoke.obstacles import Obstacles
-from sim.smoke.reductions import RowReductions
+from sim.core.arrays import Floats
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.smoke.arrays import Faces
+from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
+from sim.smoke.obstacles import Obstacles, Solids, is_solid
+from sim.smoke.reductions import Rows, new_rows, partial_place, sum_up
 
 
-@ti.data_oriented
 class CorrectionBalance:
-    """Weakens corrections of one advected cell field after another.
+    """Weakens corrections of one advected cell array after another.
 
     Exact for the total over all air cells of a closed box without moving obstacles, but for rounding and for steps in
     which no factor in [0, 1] reaches it. What leaves through open sides is balanced to second order; through the sides
     of moving solids flows what an upwind scheme has flow in the step, so their smoke is balanced to first order.
 
     Attributes:
-        reductions: what it reduces rows with.
+        rows: what it reduces rows with.
 
     Args:
-        obstacles: in the grid where the fields live.
-        velocity: the three face velocities [m/s], flat fields.
+        obstacles: in the grid where the values live.
+        velocity: of the faces [m/s].
     """
 
-    def __init__(self, obstacles: Obstacles, velocity: tuple) -> None:
-        grid = obstacles.grid
-        self._obstacles = obstacles
-        self._nx, self._ny, self._nz = grid.cells
-        self._step_x, self._step_y = grid.padded[1] * grid.padded[2], grid.padded[2]
-        self._u, self._v, self._w = velocity
-        self._lanes = lane_count()
-        self._missing, self._corrections = (RowReductions(self._nx, self._ny) for _ in range(2))
-        self.reductions = [self._missing, self._corrections]
+    def __init__(self, obstacles: Obstacles, velocity: Faces) -> None:
+        self._obstacles, self._velocity = obstacles, velocity
+        self.rows = [new_rows(obstacles.box), new_rows(obstacles.box)]
 
-    @ti.kernel
-    def restore(self, field: ti.template(), predicted: ti.template(), corrected: ti.template(), step: ti.f32):
-        """Bring the total of the corrected field to what it must be.
+    def restore(self, values: ti.Ndarray, predicted: ti.Ndarray, corrected: ti.Ndarray, step: float) -> None:
+        """Bring the total of the corrected values to what it must be.
 
         Args:
-            field: before the step, flat.
-            predicted: the semi-Lagrangian result, flat.
-            corrected: the limited result, flat; changed.
+            values: before the step.
+            predicted: the semi-Lagrangian result.
+            corrected: the limited result; changed.
             step: length of the step over the edge of a cell [s/m].
         """
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            missing, raised, lowered = 0.0, 0.0, 0.0
-            for n in range(lane_items(self._nz, lane)):
-                k = lane_place(n, lane)
-                at = row + k
-                if not self._obstacles.is_solid(at):
-                    correction = corrected[at] - predicted[at]
-                    raised += ti.max(correction, 0.0)
-                    lowered += ti.min(correction, 0.0)
-                    missing += (field[at] - corrected[at]) - self._outflow(field, i, j, k, at, step)
-            place = self._missing.place(i, j, lane)
-            self._missing.partial[place] = ti.Vector([missing, 0.0])
-            self._corrections.partial[place] = ti.Vector([raised, lowered])
-        self._missing.sum_up()
-        self._corrections.sum_up()
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            missing, both = self._missing.result[None][0], self._corrections.result[None]
-            keep_raised, keep_lowered = 1.0, 1.0
-            if missing < 0.0:
-                keep_raised = self._kept(missing, both[0])
-            else:
-                keep_lowered = self._kept(missing, both[1])
-            for n in range(lane_items(self._nz, lane)):
-                at = row + lane_place(n, lane)
+        box, solids = self._obstacles.box, self._obstacles.solids
+        _restore(box, solids, self._velocity, values, predicted, corrected, *self.rows, step)
+
+
+@kernel
+def _restore(
+    box: Grid,
+    solids: Solids,
+    velocity: Faces,
+    values: Floats,
+    predicted: Floats,
+    corrected: Floats,
+    missing_rows: Rows,
+    correction_rows: Rows,
+    step: ti.f32,
+):
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        missing, raised, lowered = 0.0, 0.0, 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            k = lane_place(box, n, lane)
+            at = row_start(box, i, j) + k
+            if not is_solid(solids, at):
                 correction = corrected[at] - predicted[at]
-                if correction > 0.0:
-                    corrected[at] = predicted[at] + keep_raised * correction
-                else:
-                    corrected[at] = predicted[at] + keep_lowered * correction
+                raised += ti.max(correction, 0.0)
+                lowered += ti.min(correction, 0.0)
+                missing += (values[at] - corrected[at]) - _outflow(box, solids, velocity, values, i, j, k, step)
+        place = partial_place(box, i, j, lane)
+        missing_rows.partial[place] = ti.Vector([missing, 0.0])
+        correction_rows.partial[place] = ti.Vector([raised, lowered])
+    sum_up(missing_rows)
+    sum_up(correction_rows)
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        missing, both = missing_rows.nodes[0][0], correction_rows.nodes[0]
+        keep_raised, keep_lowered = 1.0, 1.0
+        if missing < 0.0:
+            keep_raised = _kept(missing, both[0])
+        else:
+            keep_lowered = _kept(missing, both[1])
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            correction = corrected[at] - predicted[at]
+            if correction > 0.0:
+                corrected[at] = predicted[at] + keep_raised * correction
+            else:
+                corrected[at] = predicted[at] + keep_lowered * correction
 
-    @ti.func
-    def _kept(self, missing: ti.f32, corrections: ti.f32):
-        """Part of the corrections, of the sign opposite to what is missing, that closes the balance."""
-        part = 1.0
-        if corrections != 0.0:
-            part = ti.max(0.0, ti.min(1.0 + missing / corrections, 1.0))
-        return part
 
-    @ti.func
-    def _outflow(self, field: ti.template(), i: ti.i32, j: ti.i32, k: ti.i32, at: ti.i32, step: ti.f32):
-        """What leaves the air through the faces of a cell in the step, in cells full of it."""
-        x, y, z = ti.static(self._step_x, self._step_y, 1)
-        return (
-            self._through(field, at, -x, i == 1, -step * self._u[at])
-            + self._through(field, at, x, i == self._nx, step * self._u[at + x])
-            + self._through(field, at, -y, j == 1, -step * self._v[at])
-            + self._through(field, at, y, j == self._ny, step * self._v[at + y])
-            + self._through(field, at, -z, k == 1, -step * self._w[at])
-            + self._through(field, at, z, k == self._nz, step * self._w[at + z])
-        )
+@func
+def _kept(missing: ti.f32, corrections: ti.f32):
+    """Part of the corrections, of the sign opposite to what is missing, that closes the balance."""
+    part = 1.0
+    if corrections != 0.0:
+        part = ti.max(0.0, ti.min(1.0 + missing / corrections, 1.0))
+    return part
 
-    @ti.func
-    def _through(self, field: ti.template(), at: ti.i32, beside: ti.i32, is_side: ti.i32, crossed: ti.f32):
-        """Flux out of the air through a face, of air that crosses so many cells in the step.
 
-        Clean air comes in from outside, and what was continued into solids from them. What leaves through a side is
-        what a straight line through the last two cells has within the way to it; between nothing and twice as much
-        as the last one holds, as beyond its foot such a line goes below zero.
-        """
-        flux = 0.0
-        if is_side or self._obstacles.is_solid(at + beside):
-            inside, beyond = field[at], field[at + beside]
-            if is_side:
-                leaving = inside + 0.5 * (1.0 - crossed) * (inside - field[at - beside])
-                twice = 2.0 * inside
-                inside, beyond = ti.max(ti.min(leaving, ti.max(twice, 0.0)), ti.min(twice, 0.0)), 0.0
-            flux = ti.max(crossed, 0.0) * inside + ti.min(crossed, 0.0) * beyond
-        return flux
+@func
+def _outflow(box: Grid, solids: Solids, velocity: Faces, values: Floats, i: ti.i32, j: ti.i32, k: ti.i32, step: ti.f32):
+    """What leaves the air through the faces of a cell in the step, in cells full of it."""
+    at, x, y = row_start(box, i, j) + k, box.step_x, box.step_y
+    return (
+        _through(solids, values, at, -x, i == 1, -step * velocity.x[at])
+        + _through(solids, values, at, x, i == box.nx, step * velocity.x[at + x])
+        + _through(solids, values, at, -y, j == 1, -step * velocity.y[at])
+        + _through(solids, values, at, y, j == box.ny, step * velocity.y[at + y])
+        + _through(solids, values, at, -1, k == 1, -step * velocity.z[at])
+        + _through(solids, values, at, 1, k == box.nz, step * velocity.z[at + 1])
+    )
+
+
+@func
+def _through(solids: Solids, values: Floats, at: ti.i32, beside: ti.i32, is_side: ti.i32, crossed: ti.f32):
+    """Flux out of the air through a face, of air that crosses so many cells in the step.
+
+    Clean air comes in from outside, and what was continued into solids from them. What leaves through a side is
+    what a straight line through the last two cells has within the way to it; between nothing and twice as much
+    as the last one holds, as beyond its foot such a line goes below zero.
+    """
+    flux = 0.0
+    if is_side or is_solid(solids, at + beside):
+        inside, beyond = values[at], values[at + beside]
+        if is_side:
+            leaving = inside + 0.5 * (1.0 - crossed) * (inside - values[at - beside])
+            twice = 2.0 * inside
+            inside, beyond = ti.max(ti.min(leaving, ti.max(twice, 0.0)), ti.min(twice, 0.0)), 0.0
+        flux = ti.max(crossed, 0.0) * inside + ti.min(crossed, 0.0) * beyond
+    return flux

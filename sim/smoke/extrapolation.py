@@ -10,8 +10,12 @@ import math
 import numpy as np
 import taichi as ti
 
-from sim.smoke.lanes import lane_count, lane_items, lane_place
-from sim.smoke.obstacles import Obstacles
+from sim.core.arrays import Floats, Integers
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.smoke.arrays import State
+from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
+from sim.smoke.obstacles import Obstacles, Solids, is_solid
 
 KNOWN = 0
 """Layer of what has a value of its own: cells of air, and faces with air on at least one side."""
@@ -23,126 +27,119 @@ FACES_X, FACES_Y, FACES_Z, CELLS = range(4)
 """The byte of a place's word that holds the layer of its three faces and of its cell."""
 
 
-@ti.data_oriented
 class Extrapolation:
-    """Fills the solid cells next to air in the cell and face fields of one grid.
+    """Fills the solid cells next to air in the values of one grid.
 
     Attributes:
-        fields: what it has allocated, four bytes a value.
+        words: the layers of each place, int32; None without solids, where there is nothing to fill.
 
     Args:
-        obstacles: in the grid where the fields live.
-        velocity: the three face velocities, flat fields.
-        cell_fields: density and temperature excess, flat fields.
+        obstacles: in the grid where the values live.
+        state: what is continued into them.
         reach: how many cells into a solid a look-up may come.
     """
 
-    def __init__(self, obstacles: Obstacles, *, velocity: tuple, cell_fields: tuple, reach: float) -> None:
-        grid = obstacles.grid
-        self._obstacles = obstacles
-        self._lanes = lane_count()
-        self._nx, self._ny, self._nz = grid.cells
-        self._size = grid.size
-        self._steps = (grid.padded[1] * grid.padded[2], grid.padded[2], 1)
-        self._u, self._v, self._w = velocity
-        self._density, self._excess = cell_fields
-        self._layers = math.ceil(reach) + 1
-        # Without solids there is nothing to fill, and no field to allocate.
-        self._has_solids = obstacles.moving or bool(grid.solid.any())
-        self.fields: list[ti.Field] = []
-        if self._has_solids:
-            self._words = ti.field(ti.i32, shape=grid.size)
-            self.fields.append(self._words)
-            self._words.from_numpy(np.full(grid.size, NOWHERE * 0x01010101, np.uint32).view(np.int32))
+    def __init__(self, obstacles: Obstacles, state: State, *, reach: float) -> None:
+        self._obstacles, self._state = obstacles, state
+        self._layers = range(1, math.ceil(reach) + 2)
+        self.words: ti.Ndarray | None = None
+        if obstacles.moving or obstacles.grid.solid.any():
+            self.words = ti.ndarray(ti.i32, obstacles.grid.size)
+            self.words.from_numpy(np.full(obstacles.grid.size, NOWHERE * 0x01010101, np.uint32).view(np.int32))
             self.update()
 
     def update(self) -> None:
         """Follow the obstacles."""
-        if self._has_solids:
-            self._find_known()
-            for layer in range(1, self._layers + 1):
-                self._grow(layer)
+        if self.words is not None:
+            _find_known(self._obstacles.box, self._obstacles.solids, self.words)
+            for layer in self._layers:
+                _grow(self._obstacles.box, self.words, layer)
 
     def fill(self) -> None:
         """Set the solid cells and faces near air."""
-        if self._has_solids:
-            for layer in range(1, self._layers + 1):
-                self._fill_layer(layer)
-            self._clear_depths()
+        if self.words is not None:
+            for layer in self._layers:
+                _fill_layer(self._obstacles.box, self.words, self._state, layer)
+            _clear_depths(self.words, self._state)
 
-    @ti.func
-    def _layer(self, at: ti.i32, kind: ti.template()):
-        return (self._words[at] >> ti.static(8 * kind)) & 255
 
-    @ti.func
-    def _is_air(self, i: ti.i32, j: ti.i32, k: ti.i32):
-        inside = 0 < i <= self._nx and 0 < j <= self._ny and 0 < k <= self._nz
-        at = i * self._steps[0] + j * self._steps[1] + k
-        return int(inside and not self._obstacles.is_solid(at))
+@kernel
+def _find_known(box: Grid, solids: Solids, words: Integers):
+    for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
+        for n in range(lane_items(box, box.nz + 1, lane)):
+            k = lane_place(box, n, lane)
+            in_x, in_y, in_z = int(i <= box.nx), int(j <= box.ny), int(k <= box.nz)
+            exists = ti.Vector([in_y * in_z, in_x * in_z, in_x * in_y, in_x * in_y * in_z])
+            here = _is_air(box, solids, i, j, k)
+            known = ti.Vector([here, here, here, here])
+            known[0] += _is_air(box, solids, i - 1, j, k)
+            known[1] += _is_air(box, solids, i, j - 1, k)
+            known[2] += _is_air(box, solids, i, j, k - 1)
+            word = 0
+            for kind in ti.static(range(4)):
+                layer = ti.select(exists[kind] == 0, NOWHERE, ti.select(known[kind] > 0, KNOWN, DEEP))
+                word |= layer << ti.static(8 * kind)
+            words[row_start(box, i, j) + k] = word
 
-    @ti.kernel
-    def _find_known(self):
-        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
-            for n in range(lane_items(self._nz + 1, lane)):
-                k = lane_place(n, lane)
-                in_x, in_y, in_z = int(i <= self._nx), int(j <= self._ny), int(k <= self._nz)
-                exists = ti.Vector([in_y * in_z, in_x * in_z, in_x * in_y, in_x * in_y * in_z])
-                here = self._is_air(i, j, k)
-                known = ti.Vector([here, here, here, here])
-                known[0] += self._is_air(i - 1, j, k)
-                known[1] += self._is_air(i, j - 1, k)
-                known[2] += self._is_air(i, j, k - 1)
-                word = 0
-                for kind in ti.static(range(4)):
-                    layer = ti.select(exists[kind] == 0, NOWHERE, ti.select(known[kind] > 0, KNOWN, DEEP))
-                    word |= layer << ti.static(8 * kind)
-                self._words[i * self._steps[0] + j * self._steps[1] + k] = word
 
-    @ti.kernel
-    def _grow(self, layer: ti.i32):
-        """Deep places beside those of the layers before become this layer.
+@kernel
+def _grow(box: Grid, words: Integers, layer: ti.i32):
+    """Deep places beside those of the layers before become this layer.
 
-        Other threads may see a word before or after its change: neither is in a layer before.
-        """
-        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
-            for n in range(lane_items(self._nz + 1, lane)):
-                k = lane_place(n, lane)
-                at = i * self._steps[0] + j * self._steps[1] + k
-                word = self._words[at]
-                for kind in ti.static(range(4)):
-                    if self._layer(at, kind) == DEEP:
-                        beside = DEEP
-                        for step in ti.static(self._steps):
-                            beside = ti.min(beside, self._layer(at - step, kind), self._layer(at + step, kind))
-                        if beside < layer:
-                            word += (layer - DEEP) << ti.static(8 * kind)
-                self._words[at] = word
+    Other threads may see a word before or after its change: neither is in a layer before.
+    """
+    for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
+        for n in range(lane_items(box, box.nz + 1, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            word = words[at]
+            for kind in ti.static(range(4)):
+                if _layer(words, at, kind) == DEEP:
+                    beside = DEEP
+                    for step in ti.static((box.step_x, box.step_y, 1)):
+                        beside = ti.min(beside, _layer(words, at - step, kind), _layer(words, at + step, kind))
+                    if beside < layer:
+                        word += (layer - DEEP) << ti.static(8 * kind)
+            words[at] = word
 
-    @ti.kernel
-    def _fill_layer(self, layer: ti.i32):
-        for at in range(self._steps[0], self._size - self._steps[0]):
-            if self._words[at] != KNOWN:
-                self._fill_place(self._u, FACES_X, at, layer)
-                self._fill_place(self._v, FACES_Y, at, layer)
-                self._fill_place(self._w, FACES_Z, at, layer)
-                self._fill_place(self._density, CELLS, at, layer)
-                self._fill_place(self._excess, CELLS, at, layer)
 
-    @ti.func
-    def _fill_place(self, field: ti.template(), kind: ti.template(), at: ti.i32, layer: ti.i32):
-        if self._layer(at, kind) == layer:
-            total = 0.0
-            count = 0.0
-            for step in ti.static(self._steps):
-                for neighbour in ti.static((-step, step)):
-                    if self._layer(at + neighbour, kind) < layer:
-                        total += field[at + neighbour]
-                        count += 1.0
-            field[at] = total / count
+@kernel
+def _fill_layer(box: Grid, words: Integers, state: State, layer: ti.i32):
+    for at in range(box.step_x, words.shape[0] - box.step_x):
+        if words[at] != KNOWN:
+            _fill_place(box, words, state.velocity.x, FACES_X, at, layer)
+            _fill_place(box, words, state.velocity.y, FACES_Y, at, layer)
+            _fill_place(box, words, state.velocity.z, FACES_Z, at, layer)
+            _fill_place(box, words, state.density, CELLS, at, layer)
+            _fill_place(box, words, state.excess, CELLS, at, layer)
 
-    @ti.kernel
-    def _clear_depths(self):
-        for at in range(self._size):
-            if self._layer(at, CELLS) == DEEP:
-                self._density[at] = 0.0
-                self._excess[at] = 0.0
+
+@kernel
+def _clear_depths(words: Integers, state: State):
+    for at in range(words.shape[0]):
+        if _layer(words, at, CELLS) == DEEP:
+            state.density[at] = 0.0
+            state.excess[at] = 0.0
+
+
+@func
+def _layer(words: Integers, at: ti.i32, kind: ti.template()):
+    return (words[at] >> ti.static(8 * kind)) & 255
+
+
+@func
+def _is_air(box: Grid, solids: Solids, i: ti.i32, j: ti.i32, k: ti.i32):
+    inside = 0 < i <= box.nx and 0 < j <= box.ny and 0 < k <= box.nz
+    return int(inside and not is_solid(solids, row_start(box, i, j) + k))
+
+
+@func
+def _fill_place(box: Grid, words: Integers, values: Floats, kind: ti.template(), at: ti.i32, layer: ti.i32):
+    if _layer(words, at, kind) == layer:
+        total = 0.0
+        count = 0.0
+        for step in ti.static((box.step_x, box.step_y, 1)):
+            for neighbour in ti.static((-step, step)):
+                if _layer(words, at + neighbour, kind) < layer:
+                    total += values[at + neighbour]
+                    count += 1.0
+        values[at] = total / count

@@ -4,103 +4,144 @@ Rows run along z, where neighbours in memory are neighbours in space. A thread o
 compiler turns into vector instructions; on a GPU `GPU_LANES` threads walk along it together, so that neighbouring
 threads read neighbouring places. One form of loop serves both, as a CPU has one lane:
 
-    for i, j, lane in ti.ndrange((1, nx + 1), (1, ny + 1), lane_count()):
-        for n in range(lane_items(nz, lane)):
-            at = row_of_i_j + lane_place(n, lane)
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
 
 The first loop must be the outermost of its kernel.
 
-Loops that store are not vectorized in that form: to the compiler each value that is stored may be the address of a
-field, which it then loads anew for the next cell. In a large grid a thread of a CPU therefore computes a *run* of
-cells, keeps the results with itself, where they are no address, and stores them when all are there; what is left of the
-row it stores one by one, as all of it in a small grid and on a GPU. `in_runs` is known when the kernel is compiled:
-
-    if ti.static(in_runs):
-        for run in range(lane_runs(nz)):
-            first = row_of_i_j + run_start(run)
-            values = new_run()
-            for m in range(RUN):
-                values[m] = compute(first + m)
-            for m in range(RUN):
-                field[first + m] = values[m]
-    for n in range(rest_items(nz, lane, in_runs)):
-        at = row_of_i_j + rest_place(nz, n, lane, in_runs)
-        field[at] = compute(at)
-
-Nothing that is computed may depend on what the same run stores.
+Loops that store are not vectorized in that form: to the compiler each value that is stored may be the address of an
+array, which it then loads anew for the next cell. Where a row has one lane, `fill_row` and `fill_row_pair` therefore
+compute a *run* of cells, keep the results in a local array, which is no address, and store them when all are there.
 """
 
-import math
+from typing import NamedTuple
 
 import taichi as ti
 
+from sim.core.arrays import Floats
+from sim.core.bundles import bundle, func
 from sim.core.reductions import runs_on_gpu
 
 GPU_LANES = 32
 """As many as the threads of a GPU that run in step: together they read whole lines of memory."""
 
 RUN = 16
-"""Cells of a run: two vectors of eight, few enough that short rows have some, and so many that the compiler makes a
-loop of vectors of it and does not unroll it cell by cell."""
-
-LEAST_CELLS_IN_RUNS = 48**3
-"""Of smaller grids the kernels are compiled without runs, as that takes half as long again with them: 3.6 s of
-processor time more when they are new, 1.5 s when they were kept, which a grid of 48^3 saves in some hundred steps."""
+"""Cells of a run: two vectors of eight, few enough that short rows have some."""
 
 
-def lane_count() -> int:
-    """How many threads share a row on the device that Taichi runs on."""
-    return GPU_LANES if runs_on_gpu() else 1
+@bundle
+class Grid(NamedTuple):
+    """A grid of cells as kernels take it; cells count from 1, and have a layer of ghosts around them."""
+
+    offset: ti.i32  # where it begins in flat arrays
+    nx: ti.i32  # cells along x, y, z
+    ny: ti.i32
+    nz: ti.i32
+    step_x: ti.i32  # to the next cell along x in flat arrays
+    step_y: ti.i32
+    lanes: ti.template()  # threads that share a row
 
 
-@ti.func
-def lane_items(length: ti.i32, lane: ti.i32) -> ti.i32:
+def device_grid(cells: tuple[int, int, int], *, offset: int = 0) -> Grid:
+    """A grid of cells, counted along x, y, z, as the device shares out its rows."""
+    nx, ny, nz = cells
+    return Grid(offset, nx, ny, nz, (ny + 2) * (nz + 2), nz + 2, GPU_LANES if runs_on_gpu() else 1)
+
+
+@func
+def row_start(box: Grid, i: ti.i32, j: ti.i32) -> ti.i32:
+    """Flat index of the ghost before the first cell of a row."""
+    return box.offset + i * box.step_x + j * box.step_y
+
+
+@func
+def cell_counts(box: Grid):
+    """Cells along x, y, z."""
+    return ti.Vector([box.nx, box.ny, box.nz])
+
+
+@func
+def steps(box: Grid):
+    """To the next cell along x, y, z in flat arrays."""
+    return ti.Vector([box.step_x, box.step_y, 1])
+
+
+@func
+def lane_items(box: Grid, length: ti.i32, lane: ti.i32) -> ti.i32:
     """How many of the places 1 .. length belong to a lane."""
     items = length
-    if ti.static(lane_count() > 1):
-        items = (length + ti.static(lane_count() - 1) - lane) // ti.static(lane_count())
+    if ti.static(box.lanes > 1):
+        items = (length + ti.static(box.lanes - 1) - lane) // ti.static(box.lanes)
     return items
 
 
-@ti.func
-def lane_place(item: ti.i32, lane: ti.i32) -> ti.i32:
+@func
+def lane_place(box: Grid, item: ti.i32, lane: ti.i32) -> ti.i32:
     """The place, counted from 1, of an item of a lane."""
     place = item + 1
-    if ti.static(lane_count() > 1):
-        place += lane + item * ti.static(lane_count() - 1)
+    if ti.static(box.lanes > 1):
+        place += lane + item * ti.static(box.lanes - 1)
     return place
 
 
-def has_runs(cells: tuple[int, int, int]) -> bool:
-    """Whether the kernels of a grid of so many cells take its rows in runs."""
-    return not runs_on_gpu() and math.prod(cells) >= LEAST_CELLS_IN_RUNS
-
-
-@ti.func
-def lane_runs(length: ti.i32) -> ti.i32:
-    """How many whole runs there are in a row."""
-    return length // RUN
-
-
-@ti.func
-def run_start(run: ti.i32) -> ti.i32:
-    """The place, counted from 1, of the first cell of a run."""
-    return run * RUN + 1
-
-
-@ti.func
+@func
 def new_run():
     """Room for the values of a run."""
     return ti.Vector.zero(ti.f32, RUN)
 
 
-@ti.func
-def rest_items(length: ti.i32, lane: ti.i32, in_runs: ti.template()) -> ti.i32:
+@func
+def rest_items(box: Grid, length: ti.i32, lane: ti.i32) -> ti.i32:
     """How many of the places 1 .. length belong to a lane and to no run."""
-    return length % RUN if ti.static(in_runs) else lane_items(length, lane)
+    return length % RUN if ti.static(box.lanes == 1) else lane_items(box, length, lane)
 
 
-@ti.func
-def rest_place(length: ti.i32, item: ti.i32, lane: ti.i32, in_runs: ti.template()) -> ti.i32:
+@func
+def rest_place(box: Grid, length: ti.i32, item: ti.i32, lane: ti.i32) -> ti.i32:
     """The place, counted from 1, of such an item of a lane."""
-    return (length // RUN * RUN if ti.static(in_runs) else 0) + lane_place(item, lane)
+    return (length // RUN * RUN if ti.static(box.lanes == 1) else 0) + lane_place(box, item, lane)
+
+
+@func
+def fill_row(
+    box: Grid, out: Floats, row: ti.i32, length: ti.i32, lane: ti.i32, compute: ti.template(), given: ti.template()
+):
+    """out[row + k] = compute(k, *given) at a lane's places k; nothing computed may depend on what the row stores."""
+    if ti.static(box.lanes == 1):
+        for run in range(length // RUN):
+            first = run * RUN + 1
+            values = new_run()
+            for m in range(RUN):
+                values[m] = compute(first + m, *given)
+            for m in range(RUN):
+                out[row + first + m] = values[m]
+    for n in range(rest_items(box, length, lane)):
+        k = rest_place(box, length, n, lane)
+        out[row + k] = compute(k, *given)
+
+
+@func
+def fill_row_pair(
+    box: Grid,
+    pair: ti.template(),
+    row: ti.i32,
+    length: ti.i32,
+    lane: ti.i32,
+    compute: ti.template(),
+    given: ti.template(),
+):
+    """As `fill_row`, of two values at a time, for a pair of arrays."""
+    first_out, second_out = ti.static(pair[0], pair[1])
+    if ti.static(box.lanes == 1):
+        for run in range(length // RUN):
+            first = run * RUN + 1
+            values, others = new_run(), new_run()
+            for m in range(RUN):
+                values[m], others[m] = compute(first + m, *given)
+            for m in range(RUN):
+                first_out[row + first + m] = values[m]
+                second_out[row + first + m] = others[m]
+    for n in range(rest_items(box, length, lane)):
+        k = rest_place(box, length, n, lane)
+        first_out[row + k], second_out[row + k] = compute(k, *given)

@@ -9,15 +9,19 @@ stay open on coarse grids.
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
 from sim.core.arrays import Floats
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
+from sim.smoke.arrays import Faces, new_faces, new_floats
 from sim.smoke.grid import Index3, SmokeGrid
-from sim.smoke.lanes import lane_count, lane_items, lane_place
-from sim.smoke.obstacles import Obstacles
+from sim.smoke.lanes import Grid, cell_counts, device_grid, lane_items, lane_place, row_start, steps
+from sim.smoke.obstacles import Obstacles, Solids, is_solid
 
 COARSEST_CELLS = 64
 """At most this many cells are solved directly, by a dense inverse."""
@@ -31,7 +35,7 @@ DIRICHLET_GHOST = -1.0
 
 @dataclass(frozen=True)
 class Level:
-    """One of the grids; the arrays of all levels stand one after another in one flat field.
+    """One of the grids; the arrays of all levels stand one after another in one flat array.
 
     Attributes:
         cells: how many cells along x, y, z.
@@ -115,143 +119,121 @@ def operator_matrix(conductance: tuple[NDArray[np.float32], ...]) -> NDArray[np.
     return matrix
 
 
-@ti.data_oriented
+@bundle
+class Operator(NamedTuple):
+    """Coefficients of the pressure equation on all levels, one after another."""
+
+    faces: Faces  # conductance of each face
+    inverse_diagonal: Floats
+
+
 class Coefficients:
     """Coefficients of the operator on all levels, for the obstacles as they are.
 
     Attributes:
         levels: the grids, finest first.
-        conductance_x, conductance_y, conductance_z: open area over distance of each face, flat, float32, in units of
-            the finest cell; 0 where closed, and 2 on an open side of the box, where pressure is 0 half a cell away,
-            or less on the finest level where air comes in (`OpenSides`).
-        inverse_diagonal: flat, float32; 0 in cells without an open face, `DIRICHLET_GHOST` beyond open sides.
+        boxes: the same for kernels.
+        operator: `faces` has open area over distance of each face, in units of the finest cell; 0 where closed, and 2
+            on an open side of the box, where pressure is 0 half a cell away, or less on the finest level where air
+            comes in (`OpenSides`). `inverse_diagonal` is 0 in cells without an open face, `DIRICHLET_GHOST` beyond open
+            sides.
     """
 
     def __init__(self, obstacles: Obstacles) -> None:
-        self.levels = plan_levels(obstacles.grid.cells)
+        cells = obstacles.grid.cells
+        self.levels = plan_levels(cells)
+        self.boxes = [device_grid(level.cells, offset=level.offset) for level in self.levels]
         self._obstacles = obstacles
-        self._lanes = lane_count()
         total = sum(level.size for level in self.levels)
-        self.conductance_x, self.conductance_y, self.conductance_z, self.inverse_diagonal = (
-            ti.field(ti.f32, shape=total) for _ in range(4)
-        )
+        self.operator = Operator(new_faces(total), new_floats(total))
         distances = np.concatenate([each for level in self.levels for each in level.centre_distances])
-        self._distance = ti.field(ti.f32, shape=len(distances))
+        self._distance = new_floats(len(distances))
         self._distance.from_numpy(distances.astype(np.float32))
         marks = [_marks_of_open_sides(obstacles.grid, level) for level in self.levels]
-        self.inverse_diagonal.from_numpy(np.concatenate(marks))
-        coarsest = self.levels[-1]
-        self._coarsest_faces = ti.ndarray(ti.f32, 3 * coarsest.size)
+        self.operator.inverse_diagonal.from_numpy(np.concatenate(marks))
+        self._coarsest_faces = new_floats(3 * self.levels[-1].size)
         self.update()
-
-    @property
-    def fields(self) -> tuple[ti.Field, ti.Field, ti.Field]:
-        """The conductances by axis."""
-        return self.conductance_x, self.conductance_y, self.conductance_z
 
     def update(self) -> None:
         """Follow the obstacles."""
-        for axis, field in enumerate(self.fields):
-            self._open_faces(axis, field, *self.levels[0].cells, self.levels[0].distance_offsets[axis])
-            for fine, coarse in pairwise(self.levels):
-                self._coarsen(
-                    axis,
-                    field,
-                    fine.offset,
-                    *fine.cells,
-                    fine.distance_offsets[axis],
-                    coarse.offset,
-                    *coarse.cells,
-                    coarse.distance_offsets[axis],
-                )
-        for level in self.levels:
-            self._invert_diagonal(level.offset, *level.cells)
+        begins = [level.distance_offsets for level in self.levels]
+        for axis, faces in enumerate(self.operator.faces):
+            _open_faces(axis, self.boxes[0], self._obstacles.solids, self._distance, begins[0][axis], faces)
+            for (fine, fine_begins), (coarse, coarse_begins) in pairwise(zip(self.boxes, begins, strict=True)):
+                _coarsen(axis, faces, self._distance, fine, fine_begins[axis], coarse, coarse_begins[axis])
+        for box in self.boxes:
+            _invert_diagonal(box, self.operator)
 
     def coarsest_conductance(self) -> NDArray[np.float32]:
         """Conductances on the coarsest level by axis, (3, nx + 2, ny + 2, nz + 2)."""
         coarsest = self.levels[-1]
-        self._copy_faces(coarsest.offset, coarsest.size, self._coarsest_faces)
+        _copy_faces(self.operator.faces, coarsest.offset, coarsest.size, self._coarsest_faces)
         faces: NDArray[np.float32] = self._coarsest_faces.to_numpy().reshape(3, *coarsest.padded)
         return faces
 
-    @ti.kernel
-    def _open_faces(
-        self, axis: ti.template(), conductance: ti.template(), nx: ti.i32, ny: ti.i32, nz: ti.i32, distances: ti.i32
-    ):
-        for i, j, lane in ti.ndrange((1, nx + 1 + (axis == 0)), (1, ny + 1 + (axis == 1)), self._lanes):
-            step_x, step_y = (ny + 2) * (nz + 2), nz + 2
-            step = ti.static(axis == 0) * step_x + ti.static(axis == 1) * step_y + ti.static(axis == 2)
-            for n in range(lane_items(nz + (axis == 2), lane)):
-                k = lane_place(n, lane)
-                at = i * step_x + j * step_y + k
-                distance = self._distance[distances + ti.Vector([i, j, k])[axis]]
-                is_closed = self._obstacles.is_solid(at - step) or self._obstacles.is_solid(at)
-                conductance[at] = ti.select(is_closed, 0.0, 1.0 / distance)
 
-    @ti.kernel
-    def _coarsen(
-        self,
-        axis: ti.template(),
-        conductance: ti.template(),
-        fine_offset: ti.i32,
-        fine_nx: ti.i32,
-        fine_ny: ti.i32,
-        fine_nz: ti.i32,
-        fine_distances: ti.i32,
-        offset: ti.i32,
-        nx: ti.i32,
-        ny: ti.i32,
-        nz: ti.i32,
-        distances: ti.i32,
-    ):
-        """A coarse face takes the open area of its four fine ones; those beyond an odd end are ghosts, and closed."""
-        for i, j, lane in ti.ndrange((1, nx + 1 + (axis == 0)), (1, ny + 1 + (axis == 1)), self._lanes):
-            fine_step_x, fine_step_y = (fine_ny + 2) * (fine_nz + 2), fine_nz + 2
-            for n in range(lane_items(nz + (axis == 2), lane)):
-                k = lane_place(n, lane)
-                fine_i, fine_j, fine_k = 2 * i - 1, 2 * j - 1, 2 * k - 1
-                fine_face, face = 0, 0
-                first, second = fine_step_x, fine_step_y
-                if ti.static(axis == 0):
-                    fine_i = ti.min(fine_i, fine_nx + 1)
-                    fine_face, face = fine_i, i
-                    first, second = fine_step_y, 1
-                elif ti.static(axis == 1):
-                    fine_j = ti.min(fine_j, fine_ny + 1)
-                    fine_face, face = fine_j, j
-                    first, second = fine_step_x, 1
-                else:
-                    fine_k = ti.min(fine_k, fine_nz + 1)
-                    fine_face, face = fine_k, k
-                child = fine_offset + fine_i * fine_step_x + fine_j * fine_step_y + fine_k
-                total = conductance[child] + conductance[child + first]
-                total += conductance[child + second] + conductance[child + first + second]
-                area = self._distance[fine_distances + fine_face] * total
-                at = offset + (i * (ny + 2) + j) * (nz + 2) + k
-                conductance[at] = area / self._distance[distances + face]
+@func
+def invert_diagonal_at(operator: Operator, at: ti.i32, step_x: ti.i32, step_y: ti.i32):
+    """Follow the conductances of a cell's faces; the steps lead to the next cell along x and y."""
+    diagonal = operator.faces.x[at] + operator.faces.x[at + step_x]
+    diagonal += operator.faces.y[at] + operator.faces.y[at + step_y]
+    diagonal += operator.faces.z[at] + operator.faces.z[at + 1]
+    operator.inverse_diagonal[at] = ti.select(diagonal > 0.0, 1.0 / diagonal, 0.0)
 
-    @ti.kernel
-    def _invert_diagonal(self, offset: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
-        for i, j, lane in ti.ndrange((1, nx + 1), (1, ny + 1), self._lanes):
-            step_x, step_y = (ny + 2) * (nz + 2), nz + 2
-            for n in range(lane_items(nz, lane)):
-                k = lane_place(n, lane)
-                self.invert_diagonal_at(offset + i * step_x + j * step_y + k, step_x, step_y)
 
-    @ti.func
-    def invert_diagonal_at(self, at: ti.i32, step_x: ti.i32, step_y: ti.i32):
-        """Follow the conductances of a cell's faces; the steps lead to the next cell along x and y."""
-        diagonal = self.conductance_x[at] + self.conductance_x[at + step_x]
-        diagonal += self.conductance_y[at] + self.conductance_y[at + step_y]
-        diagonal += self.conductance_z[at] + self.conductance_z[at + 1]
-        self.inverse_diagonal[at] = ti.select(diagonal > 0.0, 1.0 / diagonal, 0.0)
+@kernel
+def _open_faces(
+    axis: ti.template(), box: Grid, solids: Solids, distance: Floats, distance_begin: ti.i32, conductance: Floats
+):
+    extra_x, extra_y, extra_z = ti.static(int(axis == 0), int(axis == 1), int(axis == 2))
+    for i, j, lane in ti.ndrange((1, box.nx + 1 + extra_x), (1, box.ny + 1 + extra_y), box.lanes):
+        for n in range(lane_items(box, box.nz + extra_z, lane)):
+            k = lane_place(box, n, lane)
+            at = row_start(box, i, j) + k
+            is_closed = is_solid(solids, at - steps(box)[axis]) or is_solid(solids, at)
+            conductance[at] = ti.select(is_closed, 0.0, 1.0 / distance[distance_begin + ti.Vector([i, j, k])[axis]])
 
-    @ti.kernel
-    def _copy_faces(self, offset: ti.i32, size: ti.i32, faces: Floats):
-        for at in range(size):
-            faces[at] = self.conductance_x[offset + at]
-            faces[size + at] = self.conductance_y[offset + at]
-            faces[2 * size + at] = self.conductance_z[offset + at]
+
+@kernel
+def _coarsen(
+    axis: ti.template(),
+    conductance: Floats,
+    distance: Floats,
+    fine: Grid,
+    fine_begin: ti.i32,
+    coarse: Grid,
+    coarse_begin: ti.i32,
+):
+    """A coarse face takes the open area of its four fine ones; those beyond an odd end are ghosts, and closed."""
+    extra_x, extra_y, extra_z = ti.static(int(axis == 0), int(axis == 1), int(axis == 2))
+    for i, j, lane in ti.ndrange((1, coarse.nx + 1 + extra_x), (1, coarse.ny + 1 + extra_y), coarse.lanes):
+        first, second = ti.static(((1, 2), (0, 2), (0, 1))[axis])
+        along, across = steps(fine)[first], steps(fine)[second]
+        for n in range(lane_items(coarse, coarse.nz + extra_z, lane)):
+            k = lane_place(coarse, n, lane)
+            face = ti.Vector([i, j, k])
+            fine_face = 2 * face - 1
+            fine_face[axis] = ti.min(fine_face[axis], cell_counts(fine)[axis] + 1)
+            child = row_start(fine, fine_face[0], fine_face[1]) + fine_face[2]
+            total = conductance[child] + conductance[child + along]
+            total += conductance[child + across] + conductance[child + along + across]
+            area = distance[fine_begin + fine_face[axis]] * total
+            conductance[row_start(coarse, i, j) + k] = area / distance[coarse_begin + face[axis]]
+
+
+@kernel
+def _invert_diagonal(box: Grid, operator: Operator):
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        for n in range(lane_items(box, box.nz, lane)):
+            invert_diagonal_at(operator, row_start(box, i, j) + lane_place(box, n, lane), box.step_x, box.step_y)
+
+
+@kernel
+def _copy_faces(conductance: Faces, offset: ti.i32, size: ti.i32, faces: Floats):
+    for at in range(size):
+        faces[at] = conductance.x[offset + at]
+        faces[size + at] = conductance.y[offset + at]
+        faces[2 * size + at] = conductance.z[offset + at]
 
 
 def _marks_of_open_sides(grid: SmokeGrid, level: Level) -> NDArray[np.float32]:

@@ -3,13 +3,14 @@
 Who has something in the box marks its cells before each step of the smoke, with the velocity that the solid has at
 their centres:
 
-    obstacles = smoke.obstacles
-    @ti.kernel
-    def _mark(self):
-        for i, j in ti.ndrange((1, nx + 1), (1, ny + 1)):
-            for k in range(1, nz + 1):
-                if <the centre obstacles.centre(i, j, k) lies inside>:
-                    obstacles.mark(i, j, k, velocity)
+    @kernel
+    def _mark(box: Grid, marks: Marks, ...):
+        for i, j in ti.ndrange((1, box.nx + 1), (1, box.ny + 1)):
+            for k in range(1, box.nz + 1):
+                if <the centre of the cell lies inside>:
+                    mark(marks, row_start(box, i, j) + k, velocity)
+
+    _mark(smoke.obstacles.box, smoke.obstacles.marks, ...)
 
 The step itself then commits them: from there on they are the obstacles, and all marks are taken off. Where two mark the
 same cell the later one's velocity counts; static solids are never overridden.
@@ -17,15 +18,19 @@ same cell the later one's velocity counts; static solids are never overridden.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.core.arrays import Floats, Integers
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
+from sim.smoke.arrays import Faces, new_faces
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.lanes import lane_count, lane_items, lane_place
-from sim.smoke.reductions import Pair, RowReductions
+from sim.smoke.lanes import Grid, device_grid, lane_items, lane_place, row_start, steps
+from sim.smoke.reductions import Pair, Rows, new_rows, partial_place, sum_up
 
 AIR, MOVING, STATIC = range(3)
 """What a cell is. Beyond closed sides of the box all is static, beyond open ones air."""
@@ -67,46 +72,52 @@ def time_of_travel(distance: float, speed: float, acceleration: float) -> float:
     return 2.0 * distance / (speed + math.sqrt(speed * speed + 4.0 * acceleration * distance))
 
 
-@ti.data_oriented
+@bundle
+class Solids(NamedTuple):
+    """The solid cells as kernels take them."""
+
+    state: Integers  # AIR, MOVING or STATIC
+    velocity: Faces  # components at the centres of MOVING cells [m/s]; of no meaning elsewhere
+    moving: ti.template()  # whether there may be MOVING cells
+
+
+@bundle
+class Marks(NamedTuple):
+    """The solid cells of the next commit, as kernels mark them."""
+
+    state: Integers
+    velocity: Faces
+
+
 class Obstacles:
     """The solid cells of one grid: static ones, and those that others mark step by step.
 
     Attributes:
         grid: the cells; its `solid` are the static ones.
+        box: the same for kernels.
         moving: whether anybody marks cells; without, nothing ever changes.
         movers: who does; steps are cut to follow them.
-        state: AIR, MOVING or STATIC of each cell now, flat with ghosts, int32.
-        marked: likewise, of the next commit.
-        velocity_x, velocity_y, velocity_z: of the solid at the centres of MOVING cells [m/s], flat, float32; without
-            a meaning elsewhere. Only there if `moving`.
+        solids: the cells now; their velocities are there only if `moving`.
+        marks: likewise, of the next commit.
+        rows: what it reduces rows with.
     """
 
     def __init__(self, grid: SmokeGrid, *, moving: bool = False) -> None:
-        self.grid, self.moving = grid, moving
-        self._nx, self._ny, self._nz = grid.cells
-        self._steps = (grid.padded[1] * grid.padded[2], grid.padded[2], 1)
-        self._low, self._cell_size = grid.origin, grid.cell_size
+        self.grid, self.box, self.moving = grid, device_grid(grid.cells), moving
         self._static = _static_state(grid)
-        self._lanes = lane_count()
         self.movers: list[Mover] = []
-        self.state = ti.field(ti.i32, shape=grid.size)
+        velocity = new_faces(grid.size if moving else 1)
+        self.solids = Solids(ti.ndarray(ti.i32, grid.size), velocity, moving)
+        self.marks = Marks(ti.ndarray(ti.i32, grid.size if moving else 1), velocity)
+        self.rows = [new_rows(self.box)] if moving else []
+        self.solids.state.from_numpy(self._static)
         if moving:
-            self.marked = ti.field(ti.i32, shape=grid.size)
-            self.velocity_x, self.velocity_y, self.velocity_z = (ti.field(ti.f32, shape=grid.size) for _ in range(3))
-            self._rows = RowReductions(self._nx, self._ny)
-            self.marked.from_numpy(self._static)
-        self.state.from_numpy(self._static)
+            self.marks.state.from_numpy(self._static)
 
     @property
-    def fields(self) -> list[ti.Field]:
-        """All fields, four bytes a value."""
-        moving = [self.marked, self.velocity_x, self.velocity_y, self.velocity_z] if self.moving else []
-        return [self.state, *moving]
-
-    @property
-    def reductions(self) -> list[RowReductions]:
-        """What it reduces rows with."""
-        return [self._rows] if self.moving else []
+    def arrays(self) -> list[ti.Ndarray]:
+        """All arrays over cells, four bytes a value."""
+        return [self.solids.state, *((self.marks.state, *self.marks.velocity) if self.moving else ())]
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no solid crosses more than a cell, so that none leaps over the smoke in its way.
@@ -117,10 +128,10 @@ class Obstacles:
 
     def is_air(self) -> NDArray[np.bool_]:
         """Which cells are air now, (nx, ny, nz)."""
-        air: NDArray[np.bool_] = self.grid.trim(self.state.to_numpy(), self.grid.cells) == AIR
+        air: NDArray[np.bool_] = self.grid.trim(self.solids.state.to_numpy(), self.grid.cells) == AIR
         return air
 
-    def commit(self, density: ti.Field) -> Change:
+    def commit(self, density: ti.Ndarray) -> Change:
         """Take the marked cells for the obstacles from now on, and clear the marks.
 
         Args:
@@ -128,89 +139,82 @@ class Obstacles:
         """
         if not self.moving:
             return NO_CHANGE
-        cells = self._swap(density)
-        return Change(cells, *map(float, self._sum_changes())) if cells else NO_CHANGE
+        cells = int(_swap(self.box, self.solids.state, self.marks.state, density, *self.rows))
+        return Change(cells, *map(float, _sum_changes(*self.rows))) if cells else NO_CHANGE
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Which cells are moving solids, if any may be; their velocities have gone into the faces."""
         if not self.moving:
             return {}
-        return {"obstacles": (self.state.to_numpy() == MOVING).reshape(self.grid.padded)}
+        return {"obstacles": (self.solids.state.to_numpy() == MOVING).reshape(self.grid.padded)}
 
     def restore(self, is_moving: NDArray[np.generic]) -> None:
         """Continue from the cells of a checkpoint, `padded`."""
         state = np.where(np.asarray(is_moving, bool).ravel(), np.int32(MOVING), self._static)
-        self.state.from_numpy(state)
-        self.marked.from_numpy(self._static)
+        self.solids.state.from_numpy(state)
+        self.marks.state.from_numpy(self._static)
 
-    @ti.func
-    def centre(self, i: ti.i32, j: ti.i32, k: ti.i32):
-        """Centre of a cell [m]; cells count from 1."""
-        return ti.Vector([self._low[0], self._low[1], self._low[2]]) + self._cell_size * (
-            ti.Vector([float(i), float(j), float(k)]) - 0.5
-        )
 
-    @ti.func
-    def mark(self, i: ti.i32, j: ti.i32, k: ti.i32, velocity):
-        """A cell of the box, counted from 1, is solid in the coming step and moves there with a velocity [m/s]."""
-        at = i * self._steps[0] + j * self._steps[1] + k
-        if self.marked[at] != STATIC:
-            self.marked[at] = MOVING
-            self.velocity_x[at] = velocity[0]
-            self.velocity_y[at] = velocity[1]
-            self.velocity_z[at] = velocity[2]
+@func
+def mark(marks: Marks, at: ti.i32, velocity):
+    """The cell at a flat index is solid in the coming step and moves there with a velocity [m/s]."""
+    if marks.state[at] != STATIC:
+        marks.state[at] = MOVING
+        marks.velocity.x[at] = velocity[0]
+        marks.velocity.y[at] = velocity[1]
+        marks.velocity.z[at] = velocity[2]
 
-    @ti.func
-    def is_solid(self, at: ti.i32):
-        """Whether the cell at a flat index is solid now."""
-        return self.state[at] != AIR
 
-    @ti.func
-    def face_velocity(self, axis: ti.template(), at: ti.i32):
-        """Velocity [m/s] of the solid across a closed face: of its solid cell, or the mean of both.
+@func
+def is_solid(solids: Solids, at: ti.i32):
+    """Whether the cell at a flat index is solid now."""
+    return solids.state[at] != AIR
 
-        For a rigid motion that of the cell is exact: v + omega x r does not change along its own direction.
-        """
-        velocity = 0.0
-        if ti.static(self.moving):
-            below = at - ti.static(self._steps[axis])
-            solids = int(self.state[below] != AIR) + int(self.state[at] != AIR)
-            total = self._speed(axis, below) + self._speed(axis, at)
-            velocity = total / ti.max(1.0, float(solids))
-        return velocity
 
-    @ti.func
-    def _speed(self, axis: ti.template(), at: ti.i32):
-        component = ti.static((self.velocity_x, self.velocity_y, self.velocity_z)[axis])
-        return ti.select(self.state[at] == MOVING, component[at], 0.0)
+@func
+def face_velocity(box: Grid, solids: Solids, axis: ti.template(), at: ti.i32):
+    """Velocity [m/s] of the solid across a closed face: of its solid cell, or the mean of both.
 
-    @ti.kernel
-    def _swap(self, density: ti.template()) -> ti.i32:
-        changed = 0
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._steps[0] + j * self._steps[1]
-            covered, uncovered = 0.0, 0.0
-            in_row = 0
-            for n in range(lane_items(self._nz, lane)):
-                at = row + lane_place(n, lane)
-                before, after = self.state[at], self.marked[at]
-                if before != after:
-                    in_row += 1
-                    self.state[at] = after
-                    if after == AIR:
-                        uncovered += density[at]
-                    else:
-                        covered += density[at]
-                if after == MOVING:
-                    self.marked[at] = AIR
-            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([covered, uncovered])
-            changed += in_row
-        return changed
+    For a rigid motion that of the cell is exact: v + omega x r does not change along its own direction.
+    """
+    velocity = 0.0
+    if ti.static(solids.moving):
+        component = ti.static((solids.velocity.x, solids.velocity.y, solids.velocity.z)[axis])
+        below = at - steps(box)[axis]
+        count = int(solids.state[below] != AIR) + int(solids.state[at] != AIR)
+        total = ti.select(solids.state[below] == MOVING, component[below], 0.0)
+        total += ti.select(solids.state[at] == MOVING, component[at], 0.0)
+        velocity = total / ti.max(1.0, float(count))
+    return velocity
 
-    @ti.kernel
-    def _sum_changes(self) -> Pair:
-        self._rows.sum_up()
-        return self._rows.result[None]
+
+@kernel
+def _swap(box: Grid, state: Integers, marked: Integers, density: Floats, rows: Rows) -> ti.i32:
+    changed = 0
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        covered, uncovered = 0.0, 0.0
+        in_row = 0
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            before, after = state[at], marked[at]
+            if before != after:
+                in_row += 1
+                state[at] = after
+                if after == AIR:
+                    uncovered += density[at]
+                else:
+                    covered += density[at]
+            if after == MOVING:
+                marked[at] = AIR
+        rows.partial[partial_place(box, i, j, lane)] = ti.Vector([covered, uncovered])
+        changed += in_row
+    return changed
+
+
+@kernel
+def _sum_changes(rows: Rows) -> Pair:
+    sum_up(rows)
+    return rows.nodes[0]
 
 
 def _static_state(grid: SmokeGrid) -> NDArray[np.int32]:

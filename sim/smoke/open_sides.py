@@ -18,11 +18,14 @@ and in a steady flow exactly Bernoulli's pressure.
 
 import taichi as ti
 
-from sim.smoke.multigrid_levels import Coefficients
-from sim.smoke.obstacles import Obstacles
+from sim.core.bundles import func
+from sim.core.launch import kernel
+from sim.smoke.arrays import Faces
+from sim.smoke.lanes import Grid, cell_counts, steps
+from sim.smoke.multigrid_levels import Coefficients, Operator, invert_diagonal_at
+from sim.smoke.obstacles import Obstacles, Solids, is_solid
 
 
-@ti.data_oriented
 class OpenSides:
     """Lets air in through open sides with the total pressure of air at rest.
 
@@ -30,53 +33,60 @@ class OpenSides:
 
     Args:
         obstacles: in the grid where the faces are; what they cover stays closed.
-        velocity: the three face velocities [m/s], flat fields.
+        velocity: of the faces [m/s].
         coefficients: of the pressure equation; those of the finest level follow the inflow, at the faces of open sides
             and the cells behind them. The coarser ones only precondition, and stay those of p = 0.
     """
 
-    def __init__(self, obstacles: Obstacles, velocity: tuple, coefficients: Coefficients) -> None:
-        grid = obstacles.grid
-        self._obstacles = obstacles
-        self._cells = grid.cells
-        self._cell_size = grid.cell_size
-        self._steps = (grid.padded[1] * grid.padded[2], grid.padded[2], 1)
-        self._velocity, self._coefficients = velocity, coefficients
-        nx, ny, nz = grid.cells
+    def __init__(self, obstacles: Obstacles, velocity: Faces, coefficients: Coefficients) -> None:
+        self._obstacles, self._velocity, self._operator = obstacles, velocity, coefficients.operator
+        nx, ny, nz = obstacles.grid.cells
         self._places = max(ny * nz, nx * nz, nx * ny)
-        self._sides = tuple((axis, side) for axis in range(3) for side in (0, 1) if grid.is_open(axis, side))
+        self._sides = tuple((axis, side) for axis in range(3) for side in (0, 1) if obstacles.grid.is_open(axis, side))
 
     def brake_inflow(self, dt: float) -> None:
         """Prepare the projection of a step of dt [s]; velocities and conductances of inflow become smaller."""
         if self._sides:
-            self._brake(dt / self._cell_size)
+            obstacles, step = self._obstacles, dt / self._obstacles.grid.cell_size
+            _brake(self._sides, self._places, obstacles.box, obstacles.solids, self._velocity, self._operator, step)
 
-    @ti.kernel
-    def _brake(self, step: ti.f32):
-        # All sides in one loop, a place of each a turn: starting a loop takes longer than running it.
-        for n in range(self._places):
-            for axis, side in ti.static(self._sides):
-                cell = self._cell(axis, side, n)
-                if cell > 0 and not self._obstacles.is_solid(cell):
-                    normal = ti.static(self._velocity[axis])
-                    conductance = ti.static(self._coefficients.fields[axis])
-                    face = cell + ti.static(side * self._steps[axis])
-                    inward = normal[face] if ti.static(side == 0) else -normal[face]
-                    drag = 1.0 + step * ti.max(inward, 0.0)
-                    normal[face] /= drag
-                    conductance[face] = 2.0 / drag
-        # Cells behind two sides are found twice, with the same result.
-        for n in range(self._places):
-            for axis, side in ti.static(self._sides):
-                cell = self._cell(axis, side, n)
-                if cell > 0:
-                    self._coefficients.invert_diagonal_at(cell, self._steps[0], self._steps[1])
 
-    @ti.func
-    def _cell(self, axis: ti.template(), side: ti.template(), place: ti.i32):
-        """The cell behind a side at one of its places, row by row; 0 beyond the last."""
-        first, second = ti.static(((1, 2), (0, 2), (0, 1))[axis])
-        row = place // self._cells[second]
-        first_cell = ti.static((1, self._cells[axis])[side] * self._steps[axis])
-        along = (row + 1) * self._steps[first] + (place % self._cells[second] + 1) * self._steps[second]
-        return ti.select(row < self._cells[first], first_cell + along, 0)
+@kernel
+def _brake(
+    sides: ti.template(),
+    places: ti.i32,
+    box: Grid,
+    solids: Solids,
+    velocity: Faces,
+    operator: Operator,
+    step: ti.f32,
+):
+    # All sides in one loop, a place of each a turn: starting a loop takes longer than running it.
+    for n in range(places):
+        for axis, side in ti.static(sides):
+            cell = _cell_behind(box, axis, side, n)
+            if cell > 0 and not is_solid(solids, cell):
+                normal = ti.static((velocity.x, velocity.y, velocity.z)[axis])
+                conductance = ti.static((operator.faces.x, operator.faces.y, operator.faces.z)[axis])
+                face = cell + side * steps(box)[axis]
+                inward = normal[face] if ti.static(side == 0) else -normal[face]
+                drag = 1.0 + step * ti.max(inward, 0.0)
+                normal[face] /= drag
+                conductance[face] = 2.0 / drag
+    # Cells behind two sides are found twice, with the same result.
+    for n in range(places):
+        for axis, side in ti.static(sides):
+            cell = _cell_behind(box, axis, side, n)
+            if cell > 0:
+                invert_diagonal_at(operator, cell, box.step_x, box.step_y)
+
+
+@func
+def _cell_behind(box: Grid, axis: ti.template(), side: ti.template(), place: ti.i32):
+    """The cell behind a side at one of its places, row by row; 0 beyond the last."""
+    cells, step = cell_counts(box), steps(box)
+    first, second = ti.static(((1, 2), (0, 2), (0, 1))[axis])
+    row = place // cells[second]
+    behind = cells[axis] if ti.static(side == 1) else 1
+    at = behind * step[axis] + (row + 1) * step[first] + (place % cells[second] + 1) * step[second]
+    return ti.select(row < cells[first], at, 0)

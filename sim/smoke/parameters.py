@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from sim.core.domain import DomainParameters, Face
+from sim.core.domain import DomainParameters, Face, Faces
 from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyframe, require_ascending_times
 from sim.core.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
@@ -153,7 +153,7 @@ class SmokeParameters(Parameters):
         default=0.02,
         description="Edge of a cubic cell [m]; air passes through walls of bodies that are thinner than one.",
     )
-    open_faces: tuple[Face, ...] = Field(
+    open_faces: Faces = Field(
         default=("x-", "x+", "y-", "y+", "z+"), description="Sides through which air and smoke may pass."
     )
     ambient_temperature: Positive = Field(default=293.0, description="Temperature of the air [K].")

@@ -14,14 +14,18 @@ starts from there.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import taichi as ti
 
-from sim.core.launch import fast_launch
-from sim.smoke.lanes import lane_count, lane_items, lane_place
-from sim.smoke.multigrid import MultigridVCycle
-from sim.smoke.obstacles import Obstacles
-from sim.smoke.reductions import Pair, RowReductions
+from sim.core.arrays import Floats
+from sim.core.bundles import bundle, func
+from sim.core.launch import kernel
+from sim.smoke.arrays import Faces, new_floats
+from sim.smoke.lanes import Grid, fill_row, lane_items, lane_place, row_start
+from sim.smoke.multigrid import Equation, MultigridVCycle, laplacian
+from sim.smoke.obstacles import Obstacles, Solids, is_solid
+from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place, sum_up
 from sim.smoke.regions import ClosedRegions
 
 SAFETY = 0.7
@@ -47,43 +51,43 @@ class ProjectionReport:
     converged: bool
 
 
-@ti.data_oriented
+ALPHA, BETA, R_Z = range(3)
+"""Numbers of the conjugate gradients that stay on the device."""
+
+
+@bundle
+class Search(NamedTuple):
+    """Arrays of the conjugate gradients."""
+
+    equation: Equation
+    correction: Floats  # q
+    direction: Floats  # p
+    image: Floats  # A p
+    numbers: Floats  # by ALPHA, BETA, R_Z
+    rows: Rows
+
+
 class PressureProjection:
     """Projects face velocities onto the divergence-free ones, in place.
 
     Attributes:
         multigrid: the preconditioner; its coefficients say which faces are open.
         regions: the closed regions of air.
-        work_fields: six flat float32 fields of at least the grid's size, free between two projections.
-        reductions: what it reduces rows with.
+        work: six float32 arrays of at least the grid's size, free between two projections.
+        rows: what it reduces rows with.
     """
 
-    def __init__(self, obstacles: Obstacles, velocity: tuple, *, tolerance: float, max_iterations: int) -> None:
-        grid = obstacles.grid
-        self._tolerance, self._max_iterations, self._cell_size = tolerance, max_iterations, grid.cell_size
-        self._nx, self._ny, self._nz = grid.cells
-        self._step_x, self._step_y = grid.padded[1] * grid.padded[2], grid.padded[2]
-        self._size = grid.size
-        self._u, self._v, self._w = velocity
-        self._obstacles = obstacles
-        # Before the multigrid, which uses its fields: what is made in between shares a group (`sim.core.runtime`).
-        self._correction = ti.field(ti.f32, shape=grid.size)
-        self._search = ti.field(ti.f32, shape=grid.size)
-        self._search_image = ti.field(ti.f32, shape=grid.size)
-        self._alpha, self._beta, self._r_z = (ti.field(ti.f32, shape=()) for _ in range(3))
-        self._rows = RowReductions(self._nx, self._ny)
+    def __init__(self, obstacles: Obstacles, velocity: Faces, *, tolerance: float, max_iterations: int) -> None:
+        self._tolerance, self._max_iterations = tolerance, max_iterations
+        self._cell_size = obstacles.grid.cell_size
+        self._box, self._obstacles, self._velocity = obstacles.box, obstacles, velocity
         self.multigrid = MultigridVCycle(obstacles)
         self.regions = ClosedRegions(obstacles)
-        self.work_fields = (
-            self._correction,
-            self._search,
-            self._search_image,
-            self.multigrid.right_hand_side,
-            self.multigrid.solution,
-            self.multigrid.spare,
-        )
-        self._lanes = lane_count()
-        self.reductions = [self._rows]
+        equation, size = self.multigrid.equation, obstacles.grid.size
+        correction, direction, image = (new_floats(size) for _ in range(3))
+        self._search = Search(equation, correction, direction, image, new_floats(3), new_rows(self._box))
+        self.rows = [self._search.rows]
+        self.work = (correction, direction, image, equation.right_hand_side, equation.solution, equation.spare)
 
     def update(self) -> None:
         """Follow the obstacles."""
@@ -97,7 +101,9 @@ class PressureProjection:
         iterations = 0
         while divergence > self._tolerance * speed and iterations < self._max_iterations:
             iterations += self._solve(SAFETY * self._tolerance * speed, self._max_iterations - iterations)
-            self._subtract_gradient()
+            _subtract_gradient(
+                self._box, self._search.correction, self.multigrid.coefficients.operator.faces, self._velocity
+            )
             divergence, speed, _ = self._measure()
         return ProjectionReport(
             iterations=iterations,
@@ -113,14 +119,14 @@ class PressureProjection:
         The host waits once an iteration, for that norm; all other numbers stay on the device.
         """
         self.multigrid.apply()
-        self._start_search()
+        _start_search(self._box, self._search)
         for iteration in range(1, max_iterations):
-            residual, advanced = map(float, self._advance())
+            residual, advanced = _advance(self._box, self._search)
             if residual <= goal or advanced == 0.0:
                 return iteration
             self.multigrid.apply()
-            self._turn_search()
-        self._advance()
+            _turn_search(self._box, self._search)
+        _advance(self._box, self._search)
         return max_iterations
 
     def _measure(self) -> tuple[float, float, float]:
@@ -129,140 +135,147 @@ class PressureProjection:
         Returns:
             Its largest magnitude, the largest face velocity, and the largest magnitude of a mean.
         """
-        largest, speed = map(float, self._compute_residual())
-        mean = self.regions.subtract_means(self.multigrid.right_hand_side, largest)
+        largest, speed = _compute_residual(self._box, self._obstacles.solids, self._velocity, self._search)
+        mean = self.regions.subtract_means(self._search.equation.right_hand_side, largest)
         if mean > 0.0:
-            largest = self._find_largest_residual()
+            largest = float(_find_largest_residual(self._box, self._search))
         return largest, speed, mean
 
-    @ti.kernel
-    def _clear_work(self):
+    def _clear_work(self) -> None:
         """Ghosts must hold 0, whatever others kept in these arrays."""
-        for at in range(self._size):
-            self._correction[at] = 0.0
-            self._search[at] = 0.0
-            self.multigrid.solution[at] = 0.0
-            self.multigrid.spare[at] = 0.0
-            self.multigrid.right_hand_side[at] = 0.0
+        for array in self.work:
+            if array is not self._search.image:
+                array.fill(0.0)
 
-    @ti.kernel
-    def _compute_residual(self) -> Pair:
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            largest = 0.0
-            speed = 0.0
-            for n in range(lane_items(self._nz, lane)):
-                at = row + lane_place(n, lane)
-                u, v, w = self._u[at], self._v[at], self._w[at]
-                u_next, v_next, w_next = self._u[at + self._step_x], self._v[at + self._step_y], self._w[at + 1]
-                residual = (u - u_next) + (v - v_next) + (w - w_next)
-                if self._obstacles.is_solid(at):
-                    residual = 0.0
-                self.multigrid.right_hand_side[at] = residual
-                largest = ti.max(largest, ti.abs(residual))
-                lower = ti.max(ti.abs(u), ti.abs(v), ti.abs(w))
-                upper = ti.max(ti.abs(u_next), ti.abs(v_next), ti.abs(w_next))
-                speed = ti.max(speed, lower, upper)
-            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([largest, speed])
-        self._rows.find_maxima()
-        return self._rows.result[None]
 
-    @ti.kernel
-    def _find_largest_residual(self) -> ti.f32:
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            largest = 0.0
-            for n in range(lane_items(self._nz, lane)):
-                largest = ti.max(largest, ti.abs(self.multigrid.right_hand_side[row + lane_place(n, lane)]))
-            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([largest, 0.0])
-        self._rows.find_maxima()
-        return self._rows.result[None][0]
+@kernel
+def _compute_residual(box: Grid, solids: Solids, velocity: Faces, search: Search) -> Pair:
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        largest = 0.0
+        speed = 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            u, v, w = velocity.x[at], velocity.y[at], velocity.z[at]
+            u_next, v_next, w_next = velocity.x[at + box.step_x], velocity.y[at + box.step_y], velocity.z[at + 1]
+            residual = (u - u_next) + (v - v_next) + (w - w_next)
+            if is_solid(solids, at):
+                residual = 0.0
+            search.equation.right_hand_side[at] = residual
+            largest = ti.max(largest, ti.abs(residual))
+            lower = ti.max(ti.abs(u), ti.abs(v), ti.abs(w))
+            upper = ti.max(ti.abs(u_next), ti.abs(v_next), ti.abs(w_next))
+            speed = ti.max(speed, lower, upper)
+        search.rows.partial[partial_place(box, i, j, lane)] = ti.Vector([largest, speed])
+    find_maxima(search.rows)
+    return search.rows.nodes[0]
 
-    @ti.kernel
-    def _start_search(self):
-        """p = z, and r.z."""
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            r_z = 0.0
-            for n in range(lane_items(self._nz, lane)):
-                at = row + lane_place(n, lane)
-                z = self.multigrid.solution[at]
-                self._search[at] = z
-                self._correction[at] = 0.0
-                r_z += z * self.multigrid.right_hand_side[at]
-            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([r_z, 0.0])
-        self._rows.sum_up()
-        self._r_z[None] = self._rows.result[None][0]
 
-    @fast_launch
-    @ti.kernel
-    def _advance(self) -> Pair:
-        """Go along p to the smallest error: alpha = r.z / p.Ap, q += alpha p, r -= alpha Ap.
+@kernel
+def _find_largest_residual(box: Grid, search: Search) -> ti.f32:
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        largest = 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            largest = ti.max(largest, ti.abs(search.equation.right_hand_side[at]))
+        search.rows.partial[partial_place(box, i, j, lane)] = ti.Vector([largest, 0.0])
+    find_maxima(search.rows)
+    return search.rows.nodes[0][0]
 
-        Returns:
-            max|r|, and 1, or 0 where there was no way to go: p.Ap and r.z vanish together once the residual does.
-        """
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            p_Ap = 0.0
-            for n in range(lane_items(self._nz, lane)):
-                at = row + lane_place(n, lane)
-                image = self.multigrid.laplacian(self._search, at, self._step_x, self._step_y)
-                self._search_image[at] = image
-                p_Ap += image * self._search[at]
-            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([p_Ap, 0.0])
-        self._rows.sum_up()
-        self._alpha[None] = 0.0
-        # Written so that NaN ends the solve as well.
-        if self._rows.result[None][0] > 0.0 and self._r_z[None] > 0.0:
-            self._alpha[None] = self._r_z[None] / self._rows.result[None][0]
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            alpha = self._alpha[None]
-            largest = 0.0
-            for n in range(lane_items(self._nz, lane)):
-                at = row + lane_place(n, lane)
-                self._correction[at] += alpha * self._search[at]
-                residual = self.multigrid.right_hand_side[at] - alpha * self._search_image[at]
-                self.multigrid.right_hand_side[at] = residual
-                largest = ti.max(largest, ti.abs(residual))
-            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([largest, 0.0])
-        self._rows.find_maxima()
-        return Pair(self._rows.result[None][0], ti.select(self._alpha[None] > 0.0, 1.0, 0.0))
 
-    @fast_launch
-    @ti.kernel
-    def _turn_search(self):
-        """p = z + beta p with beta = -alpha z.Ap / r.z of the last direction, and the new r.z (Notay 2000)."""
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            r_z = 0.0
-            z_Ap = 0.0
-            for n in range(lane_items(self._nz, lane)):
-                at = row + lane_place(n, lane)
-                z = self.multigrid.solution[at]
-                r_z += z * self.multigrid.right_hand_side[at]
-                z_Ap += z * self._search_image[at]
-            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([r_z, z_Ap])
-        self._rows.sum_up()
-        self._beta[None] = -self._alpha[None] * self._rows.result[None][1] / self._r_z[None]
-        self._r_z[None] = self._rows.result[None][0]
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            beta = self._beta[None]
-            for n in range(lane_items(self._nz, lane)):
-                at = row + lane_place(n, lane)
-                self._search[at] = self.multigrid.solution[at] + beta * self._search[at]
+@kernel
+def _start_search(box: Grid, search: Search):
+    """p = z, and r.z."""
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        r_z = 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            z = search.equation.solution[at]
+            search.direction[at] = z
+            search.correction[at] = 0.0
+            r_z += z * search.equation.right_hand_side[at]
+        search.rows.partial[partial_place(box, i, j, lane)] = ti.Vector([r_z, 0.0])
+    sum_up(search.rows)
+    search.numbers[R_Z] = search.rows.nodes[0][0]
 
-    @ti.kernel
-    def _subtract_gradient(self):
-        open_x, open_y, open_z = ti.static(self.multigrid.coefficients.fields)
-        # The last planes of faces belong to ghost cells, whose pressure is 0 and whose other faces are closed.
-        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            for n in range(lane_items(self._nz + 1, lane)):
-                at = row + lane_place(n, lane)
-                here = self._correction[at]
-                self._u[at] -= open_x[at] * (here - self._correction[at - self._step_x])
-                self._v[at] -= open_y[at] * (here - self._correction[at - self._step_y])
-                self._w[at] -= open_z[at] * (here - self._correction[at - 1])
+
+@kernel
+def _advance(box: Grid, search: Search) -> Pair:
+    """Go along p to the smallest error: alpha = r.z / p.Ap, q += alpha p, r -= alpha Ap.
+
+    Returns:
+        max|r|, and 1, or 0 where there was no way to go: p.Ap and r.z vanish together once the residual does.
+    """
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        row = row_start(box, i, j)
+        fill_row(box, search.image, row, box.nz, lane, _image, ti.static((row, box, search)))
+        p_Ap = 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row + lane_place(box, n, lane)
+            p_Ap += search.image[at] * search.direction[at]
+        search.rows.partial[partial_place(box, i, j, lane)] = ti.Vector([p_Ap, 0.0])
+    sum_up(search.rows)
+    search.numbers[ALPHA] = 0.0
+    # Written so that NaN ends the solve as well.
+    if search.rows.nodes[0][0] > 0.0 and search.numbers[R_Z] > 0.0:
+        search.numbers[ALPHA] = search.numbers[R_Z] / search.rows.nodes[0][0]
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        row, alpha = row_start(box, i, j), search.numbers[ALPHA]
+        given = ti.static((row, search.correction, alpha, search.direction))
+        fill_row(box, search.correction, row, box.nz, lane, _plus, given)
+        residual = ti.static(search.equation.right_hand_side)
+        fill_row(box, residual, row, box.nz, lane, _plus, ti.static((row, residual, -alpha, search.image)))
+        largest = 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            largest = ti.max(largest, ti.abs(residual[row + lane_place(box, n, lane)]))
+        search.rows.partial[partial_place(box, i, j, lane)] = ti.Vector([largest, 0.0])
+    find_maxima(search.rows)
+    return Pair(search.rows.nodes[0][0], ti.select(search.numbers[ALPHA] > 0.0, 1.0, 0.0))
+
+
+@kernel
+def _turn_search(box: Grid, search: Search):
+    """p = z + beta p with beta = -alpha z.Ap / r.z of the last direction, and the new r.z (Notay 2000)."""
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        r_z = 0.0
+        z_Ap = 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            z = search.equation.solution[at]
+            r_z += z * search.equation.right_hand_side[at]
+            z_Ap += z * search.image[at]
+        search.rows.partial[partial_place(box, i, j, lane)] = ti.Vector([r_z, z_Ap])
+    sum_up(search.rows)
+    search.numbers[BETA] = -search.numbers[ALPHA] * search.rows.nodes[0][1] / search.numbers[R_Z]
+    search.numbers[R_Z] = search.rows.nodes[0][0]
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        row = row_start(box, i, j)
+        given = ti.static((row, search.equation.solution, search.numbers[BETA], search.direction))
+        fill_row(box, search.direction, row, box.nz, lane, _plus, given)
+
+
+@func
+def _image(k: ti.i32, row: ti.i32, box: Grid, search: Search):
+    return laplacian(search.equation.operator, search.direction, row + k, box.step_x, box.step_y)
+
+
+@func
+def _plus(k: ti.i32, row: ti.i32, first: Floats, factor: ti.f32, second: Floats):
+    return first[row + k] + factor * second[row + k]
+
+
+@kernel
+def _subtract_gradient(box: Grid, correction: Floats, openness: Faces, velocity: Faces):
+    # The last planes of faces belong to ghost cells, whose pressure is 0 and whose other faces are closed.
+    for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
+        row = row_start(box, i, j)
+        for face, is_open, step in ti.static(
+            ((velocity.x, openness.x, box.step_x), (velocity.y, openness.y, box.step_y), (velocity.z, openness.z, 1))
+        ):
+            given = ti.static((row, face, is_open, step, correction))
+            fill_row(box, face, row, box.nz + 1, lane, _less_gradient, given)
+
+
+@func
+def _less_gradient(k: ti.i32, row: ti.i32, face: Floats, openness: Floats, step: ti.i32, correction: Floats):
+    at = row + k
+    return face[at] - openness[at] * (correction[at] - correction[at - step])

@@ -1,31 +1,32 @@
 """Hot smoke on a staggered grid (Fedkiw, Stam & Jensen 2001)."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.core.arrays import Floats
 from sim.core.domain import DomainParameters
+from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
-from sim.core.runtime import require_room_for_fields
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.smoke.advection import Advection
 from sim.smoke.air_force import AirForce
+from sim.smoke.arrays import Faces, State, new_state
 from sim.smoke.balance import CorrectionBalance
-from sim.smoke.cooling import Cooling
+from sim.smoke.cooling import cool
 from sim.smoke.extrapolation import Extrapolation
 from sim.smoke.forces import Forces, upward
 from sim.smoke.grid import SmokeGrid, SolidRegion
-from sim.smoke.lanes import lane_count, lane_items, lane_place
+from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
 from sim.smoke.obstacles import Obstacles, time_of_travel
 from sim.smoke.open_sides import OpenSides
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.projection import PressureProjection
-from sim.smoke.reductions import Pair, RowReductions
+from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
 from sim.smoke.sources import build_sources
 from sim.smoke.turbulence import Turbulence
 from sim.smoke.wind import Wind
@@ -34,7 +35,6 @@ RUNAWAY_SPEED = 1.0e4
 """No smoke of this kind moves at thirty times the speed of sound [m/s]."""
 
 
-@ti.data_oriented
 class SmokeSolver:
     """Density, temperature and velocity of smoke in a box of cells, with solids in it that stand still or move.
 
@@ -84,69 +84,47 @@ class SmokeSolver:
         solids: Sequence[SolidRegion] = (),
         moving: bool = False,
     ) -> None:
-        require_room_for_fields()
         self.name = parameters.name
         self.parameters = parameters
         self.grid = SmokeGrid.build(parameters, domain, solids)
         self.obstacles = Obstacles(self.grid, moving=moving)
-        self._nx, self._ny, self._nz = self.grid.cells
-        self._size = self.grid.size
-        self._step_x, self._step_y = self.grid.padded[1] * self.grid.padded[2], self.grid.padded[2]
-        self.u_face_x, self.v_face_y, self.w_face_z, self.density, self.excess_temperature = (
-            ti.field(ti.f32, shape=self._size) for _ in range(5)
-        )
-        velocity = (self.u_face_x, self.v_face_y, self.w_face_z)
-        cell_fields = (self.density, self.excess_temperature)
-        self._state = {
-            "u_face_x": self.u_face_x,
-            "v_face_y": self.v_face_y,
-            "w_face_z": self.w_face_z,
-            "density": self.density,
-            "excess_temperature": self.excess_temperature,
-        }
+        self.state = new_state(self.grid.size)
         self._projection = PressureProjection(
             self.obstacles,
-            velocity,
+            self.state.velocity,
             tolerance=parameters.projection_tolerance,
             max_iterations=parameters.projection_max_iterations,
         )
-        self._open_sides = OpenSides(self.obstacles, velocity, self._projection.multigrid.coefficients)
-        work = self._projection.work_fields
-        self._balance = CorrectionBalance(self.obstacles, velocity)
+        coefficients, work = self._projection.multigrid.coefficients, self._projection.work
+        self.openness: Faces = coefficients.operator.faces
+        self._open_sides = OpenSides(self.obstacles, self.state.velocity, coefficients)
+        self._balance = CorrectionBalance(self.obstacles, self.state.velocity)
         self._advection = Advection(
             self.grid,
-            velocity=velocity,
-            cell_fields=cell_fields,
-            work=work,
+            self.state,
+            work,
             maccormack=parameters.advection == "maccormack",
             wind=parameters.wind,
             balance=self._balance,
         )
+        self._has_gravity = any(upward(gravity))
         self._lift = parameters.lift_per_kelvin(gravity)
         self._forces = Forces(
             self.obstacles,
-            openness=self.openness,
-            velocity=velocity,
-            cell_fields=cell_fields,
-            work=work[:4],
+            self.openness,
+            self.state,
+            work[:4],
             gravity=gravity,
             buoyancy_density=parameters.buoyancy_density,
             buoyancy_temperature=self._lift,
             confinement=parameters.vorticity_confinement,
         )
-        self._extrapolation = Extrapolation(
-            self.obstacles, velocity=velocity, cell_fields=cell_fields, reach=parameters.cfl
-        )
-        self._cooling = Cooling(self.grid, parameters, density=self.density, excess_temperature=self.excess_temperature)
-        self._lanes = lane_count()
-        self._rows = RowReductions(self._nx, self._ny)
-        self.sources = build_sources(
-            parameters, self.obstacles, openness=self.openness, velocity=velocity, cell_fields=cell_fields
-        )
-        self._turbulence = self._build_turbulence(velocity)
-        self._wind = self._build_wind(velocity)
+        self._extrapolation = Extrapolation(self.obstacles, self.state, reach=parameters.cfl)
+        self._rows = new_rows(self.obstacles.box)
+        self.sources = build_sources(parameters, self.obstacles, self.openness, self.state)
+        self._turbulence = self._build_turbulence()
+        self._wind = self._build_wind()
         self.air_forces: list[AirForce] = []
-        self._has_gravity = any(upward(gravity))
         self._time_s = 0.0
         self._emitted_mass = self._covered_mass = self._uncovered_mass = 0.0
         self.begin_frame(0.0)
@@ -162,27 +140,26 @@ class SmokeSolver:
         return self._time_s
 
     @property
-    def openness(self) -> tuple[ti.Field, ti.Field, ti.Field]:
-        """By axis, positive on faces that air passes, flat."""
-        return self._projection.multigrid.coefficients.fields
-
-    @property
     def device_bytes(self) -> int:
         """Memory of the state, the work arrays, the coefficients, the obstacles and the reductions [bytes]."""
-        coefficients = self._projection.multigrid.coefficients
         arrays = [
-            *self._state.values(),
-            *self._projection.work_fields,
-            *coefficients.fields,
-            coefficients.inverse_diagonal,
-            *self.obstacles.fields,
-            *self._projection.regions.fields,
-            *self._extrapolation.fields,
+            *self._arrays.values(),
+            *self._projection.work,
+            *self.openness,
+            self._projection.multigrid.coefficients.operator.inverse_diagonal,
+            *self.obstacles.arrays,
+            *filter(None, (self._projection.regions.number, self._extrapolation.words)),
         ]
-        parts = [self._rows, *self._projection.reductions, *self._balance.reductions, *self.obstacles.reductions]
-        if self._turbulence is not None:
-            parts.append(self._turbulence)
-        return 4 * sum(math.prod(field.shape) for field in arrays) + sum(part.device_bytes for part in parts)
+        for rows in (self._rows, *self._projection.rows, *self._balance.rows, *self.obstacles.rows):
+            arrays += [rows.partial, rows.nodes]
+        gusts = 0 if self._turbulence is None else self._turbulence.device_bytes
+        return gusts + sum(array.arr.nelement() * array.arr.element_size() for array in arrays)
+
+    @property
+    def _arrays(self) -> dict[str, ti.Ndarray]:
+        """The state by the names of a checkpoint."""
+        names = ("u_face_x", "v_face_y", "w_face_z", "density", "excess_temperature")
+        return dict(zip(names, (*self.state.velocity, self.state.density, self.state.excess), strict=True))
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no air crosses more than `cfl` cells, and no obstacle more than one.
@@ -190,7 +167,7 @@ class SmokeSolver:
         The speed at the end of the step counts, v + a dt with the largest buoyant acceleration a, so that a start
         from rest is bounded as well: dt solves (v + a dt) dt = cfl h.
         """
-        speed, acceleration = map(float, self._find_speed_and_acceleration())
+        speed, acceleration = self._find_speed_and_acceleration()
         gusts = 0.0 if self._turbulence is None else self._turbulence.acceleration
         without_sources = self._largest_step(speed, acceleration + gusts)
         for source in self.sources:
@@ -218,13 +195,13 @@ class SmokeSolver:
         self._emit(dt)
         self._open_sides.brake_inflow(dt)
         self._project()
-        self._cooling.advance(dt)
+        cool(self.obstacles.box, self.state, self.parameters, dt)
         self._extrapolation.fill()
         self._time_s += dt
 
     def move_obstacles(self) -> None:
         """Take the marked cells for the obstacles from now on; each step does so."""
-        change = self.obstacles.commit(self.density)
+        change = self.obstacles.commit(self.state.density)
         cell_volume = self.grid.cell_size**3
         self._covered_mass += change.covered * cell_volume
         self._uncovered_mass += change.uncovered * cell_volume
@@ -259,7 +236,7 @@ class SmokeSolver:
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The state with its ghosts, the obstacles that move, the time and the counted masses."""
-        arrays = {name: field.to_numpy().reshape(self.grid.padded) for name, field in self._state.items()}
+        arrays = {name: values.to_numpy().reshape(self.grid.padded) for name, values in self._arrays.items()}
         clock = np.array([self._time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass])
         return {**arrays, **self.obstacles.checkpoint(), "clock": clock}
 
@@ -270,13 +247,13 @@ class SmokeSolver:
             ValueError: an array is missing or has another shape.
         """
         moving = ["obstacles"] if self.obstacles.moving else []
-        expected = {**dict.fromkeys([*self._state, *moving], self.grid.padded), "clock": (4,)}
+        expected = {**dict.fromkeys([*self._arrays, *moving], self.grid.padded), "clock": (4,)}
         for name, shape in expected.items():
             if name not in arrays or arrays[name].shape != shape:
                 found = f"shape {arrays[name].shape}" if name in arrays else "nothing"
                 raise ValueError(f'checkpoint of smoke "{self.name}": {name} must have shape {shape}, got {found}')
-        for name, field in self._state.items():
-            field.from_numpy(np.ascontiguousarray(arrays[name], np.float32).ravel())
+        for name, values in self._arrays.items():
+            values.from_numpy(np.ascontiguousarray(arrays[name], np.float32).ravel())
         if moving:
             self.obstacles.restore(arrays["obstacles"])
             self._follow_obstacles()
@@ -292,7 +269,7 @@ class SmokeSolver:
         there are also `covered_mass` and `uncovered_mass` [m³], of the cells that they entered and left since the
         start, and `compression` [1/s], the worst of the frame (`ProjectionReport`).
         """
-        speed, _ = map(float, self._find_speed_and_acceleration())
+        speed, _ = self._find_speed_and_acceleration()
         air = self.obstacles.is_air()
         excess = self._cells("excess_temperature")[air]
         numbers = {
@@ -320,11 +297,11 @@ class SmokeSolver:
 
     def first_bad_quantity(self) -> str | None:
         """The first field with a value that is no number, or a velocity beyond all reason."""
-        for name, field in self._state.items():
-            count = self._count_not_finite(field)
+        for name, values in self._arrays.items():
+            count = _count_not_finite(values)
             if count:
                 return f"{name} is not finite at {count} places"
-        speed, _ = map(float, self._find_speed_and_acceleration())
+        speed, _ = self._find_speed_and_acceleration()
         return f"max_speed is {speed:.3g} m/s" if speed > RUNAWAY_SPEED else None
 
     def _emit(self, dt: float) -> None:
@@ -345,58 +322,60 @@ class SmokeSolver:
         self._extrapolation.update()
 
     def _cells(self, name: str) -> NDArray[np.float32]:
-        return self.grid.trim(self._state[name].to_numpy(), self.grid.cells)
+        return self.grid.trim(self._arrays[name].to_numpy(), self.grid.cells)
 
     def _faces(self, name: str, axis: int) -> NDArray[np.float32]:
-        return self.grid.trim(self._state[name].to_numpy(), self.grid.face_shape(axis))
+        return self.grid.trim(self._arrays[name].to_numpy(), self.grid.face_shape(axis))
 
     def _buoyancy_bound(self, excess: float, density: float) -> float:
         if not self._has_gravity:
             return 0.0
         return self._lift * abs(excess) + self.parameters.buoyancy_density * density
 
-    def _build_turbulence(self, velocity: tuple) -> Turbulence | None:
+    def _build_turbulence(self) -> Turbulence | None:
         parameters = self.parameters.turbulence
         if parameters.strength == 0.0:
             return None
-        return Turbulence(self.grid, parameters, wind=self.parameters.wind, openness=self.openness, velocity=velocity)
+        return Turbulence(self.grid, parameters, self.parameters.wind, self.openness, self.state.velocity)
 
-    def _build_wind(self, velocity: tuple) -> Wind | None:
+    def _build_wind(self) -> Wind | None:
         if not any(self.parameters.wind):
             return None
         windward = self.parameters.windward_faces
         if cut_off := self.grid.cut_off_faces():
             raise ValueError(f'smoke "{self.name}": wind {self.parameters.cut_off_problem(cut_off)}')
-        return Wind(self.obstacles, self.parameters.wind, windward, openness=self.openness, velocity=velocity)
+        return Wind(self.obstacles, self.parameters.wind, windward, self.openness, self.state.velocity)
 
-    @ti.kernel
-    def _find_speed_and_acceleration(self) -> Pair:
+    def _find_speed_and_acceleration(self) -> tuple[float, float]:
         """Largest face velocity [m/s] and a bound of the largest buoyant acceleration [m/s²]."""
-        alpha = ti.static(self.parameters.buoyancy_density if self._has_gravity else 0.0)
-        beta = ti.static(self._lift if self._has_gravity else 0.0)
-        for i, j, lane in ti.ndrange((1, self._nx + 1), (1, self._ny + 1), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            speed = 0.0
-            acceleration = 0.0
-            for n in range(lane_items(self._nz, lane)):
-                k = lane_place(n, lane)
-                at = row + k
-                lower = ti.max(ti.abs(self.u_face_x[at]), ti.abs(self.v_face_y[at]), ti.abs(self.w_face_z[at]))
-                upper = ti.max(
-                    ti.abs(self.u_face_x[at + self._step_x]),
-                    ti.abs(self.v_face_y[at + self._step_y]),
-                    ti.abs(self.w_face_z[at + 1]),
-                )
-                speed = ti.max(speed, lower, upper)
-                buoyancy = alpha * self.density[at] + beta * ti.abs(self.excess_temperature[at])
-                acceleration = ti.max(acceleration, buoyancy)
-            self._rows.partial[self._rows.place(i, j, lane)] = ti.Vector([speed, acceleration])
-        self._rows.find_maxima()
-        return self._rows.result[None]
+        alpha = self.parameters.buoyancy_density if self._has_gravity else 0.0
+        beta = self._lift if self._has_gravity else 0.0
+        speed, acceleration = _find_speed_and_acceleration(self.obstacles.box, self.state, alpha, beta, self._rows)
+        return speed, acceleration
 
-    @ti.kernel
-    def _count_not_finite(self, field: ti.template()) -> ti.i32:
-        count = 0
-        for at in range(self._size):
-            count += 1 - is_finite(field[at])
-        return count
+
+@kernel
+def _find_speed_and_acceleration(box: Grid, state: State, alpha: ti.f32, beta: ti.f32, rows: Rows) -> Pair:
+    for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
+        speed = 0.0
+        acceleration = 0.0
+        for n in range(lane_items(box, box.nz, lane)):
+            at = row_start(box, i, j) + lane_place(box, n, lane)
+            u, v, w = state.velocity.x[at], state.velocity.y[at], state.velocity.z[at]
+            u_next, v_next = state.velocity.x[at + box.step_x], state.velocity.y[at + box.step_y]
+            w_next = state.velocity.z[at + 1]
+            lower = ti.max(ti.abs(u), ti.abs(v), ti.abs(w))
+            upper = ti.max(ti.abs(u_next), ti.abs(v_next), ti.abs(w_next))
+            speed = ti.max(speed, lower, upper)
+            acceleration = ti.max(acceleration, alpha * state.density[at] + beta * ti.abs(state.excess[at]))
+        rows.partial[partial_place(box, i, j, lane)] = ti.Vector([speed, acceleration])
+    find_maxima(rows)
+    return rows.nodes[0]
+
+
+@kernel
+def _count_not_finite(values: Floats) -> ti.i32:
+    count = 0
+    for at in range(values.shape[0]):
+        count += 1 - is_finite(values[at])
+    return count

@@ -8,11 +8,15 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Integers
+from sim.core.bundles import func
 from sim.core.hashed_numbers import hash_to_unit, smooth_noise, spread
+from sim.core.launch import kernel
 from sim.core.motion import rotation
-from sim.shapes import build_solid
+from sim.shapes.placement import build_solid
+from sim.smoke.arrays import Faces, State
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.obstacles import Obstacles
+from sim.smoke.lanes import Grid
+from sim.smoke.obstacles import Obstacles, Solids, is_solid
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 from sim.smoke.source_motion import SourceMotion, motion_of
 from sim.smoke.sweep import CELLS, SweptShape
@@ -51,7 +55,6 @@ class _Places:
         self.values.from_numpy(padded[1])
 
 
-@ti.data_oriented
 class Source:
     """One source on one grid: the open cells and faces whose centres lie inside it.
 
@@ -74,26 +77,19 @@ class Source:
         obstacles: Obstacles,
         *,
         ambient_temperature: float,
-        openness: tuple,
-        velocity: tuple,
-        cell_fields: tuple,
+        openness: Faces,
+        state: State,
     ) -> None:
         self.parameters = parameters
         self.target_density = parameters.density
         self.target_excess = parameters.temperature - ambient_temperature
         grid = obstacles.grid
         self._grid, self._obstacles = grid, obstacles
-        self._step_x, self._step_y, self._padded_y = (
-            grid.padded[1] * grid.padded[2],
-            grid.padded[2],
-            grid.padded[1],
-        )
-        self._density, self._excess = cell_fields
-        self._openness, self._velocity = openness, velocity
+        self._openness, self._state = openness, state
         self._cells, self._faces = _Places(), [_Places() for _ in range(3)]
         self._emitted = ti.ndarray(ti.f32, 1)
         # Random numbers of other seeds are others; seed 0 leaves the key of a patch as it is.
-        self._salt = spread(parameters.seed)
+        self._salt = int(np.uint32(spread(parameters.seed)).view(np.int32))
         self.motion: SourceMotion | None = None
         if parameters.moves:
             self._shape = SweptShape(parameters, grid)
@@ -135,13 +131,24 @@ class Source:
         if self._emitted.shape[0] < blocks:
             self._emitted = ti.ndarray(ti.f32, blocks)
         tick = int(time_s * FLUCTUATION_RATE_HZ)
-        self._raise_cells(
-            self._cells.indices, self._cells.count, blocks, tick, self._salt,
-            strength * self.target_density, strength * self.target_excess, self._emitted,
-        )  # fmt: skip
+        targets = ti.math.vec2(strength * self.target_density, strength * self.target_excess)
+        _raise_cells(
+            self._obstacles.box,
+            self._obstacles.solids,
+            self._state,
+            self._cells.indices,
+            self._cells.count,
+            tick,
+            self._salt,
+            self.parameters.fluctuation,
+            targets,
+            self.target_excess >= 0.0,
+            blocks,
+            self._emitted,
+        )
         if self.parameters.velocity is not None:
-            for axis, faces in enumerate(self._faces):
-                self._set_faces(faces.indices, faces.values, self._openness[axis], self._velocity[axis], faces.count)
+            for faces, openness, velocity in zip(self._faces, self._openness, self._state.velocity, strict=True):
+                _set_faces(faces.indices, faces.values, openness, velocity, faces.count)
         return float(self._emitted.to_numpy()[:blocks].sum(dtype=np.float64))
 
     def _stay(self, grid: SmokeGrid) -> None:
@@ -170,71 +177,72 @@ class Source:
         flicker = self.parameters.flicker
         return 1.0 - flicker * smooth_noise(time_s * self.parameters.flicker_rate, self.parameters.seed)
 
-    @ti.kernel
-    def _raise_cells(
-        self, cells: Integers, count: ti.i32, blocks: ti.i32, tick: ti.i32, salt: ti.u32,
-        target_density: ti.f32, target_excess: ti.f32, added: Floats,
-    ):  # fmt: skip
-        for block in range(blocks):
-            emitted = 0.0
-            for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, count)):
-                at = cells[n]
-                if not self._obstacles.is_solid(at):
-                    before = self._density[at]
-                    after = ti.max(before, target_density)
-                    self._density[at] = after
-                    emitted += after - before
-                    shortfall = self.parameters.fluctuation * self._fluctuate(at, tick, salt)
-                    target = (1.0 - shortfall) * target_excess
-                    # Heat is raised to the target, and cold lowered.
-                    excess = self._excess[at]
-                    self._excess[at] = (
-                        ti.max(excess, target) if ti.static(self.target_excess >= 0.0) else ti.min(excess, target)
-                    )
-            added[block] = emitted
 
-    @ti.func
-    def _fluctuate(self, at: ti.i32, tick: ti.i32, salt: ti.u32):
-        """A number in [0, 1) that a few neighbouring cells share."""
-        patch_i = at // self._step_x // FLUCTUATION_CELLS
-        patch_j = at // self._step_y % self._padded_y // FLUCTUATION_CELLS
-        patch_k = at % self._step_y // FLUCTUATION_CELLS
-        patch = (patch_i * 1024 + patch_j) * 1024 + patch_k
-        # The odd factor (Knuth's) spreads ticks over all bits, so that they do not shift the pattern.
-        return hash_to_unit(ti.cast(patch, ti.u32) ^ (ti.cast(tick, ti.u32) * ti.u32(2654435769)) ^ salt)
-
-    @ti.kernel
-    def _set_faces(self, faces: Integers, speeds: Floats, openness: ti.template(), field: ti.template(), count: ti.i32):
-        for n in range(count):
-            if openness[faces[n]] > 0.0:
-                field[faces[n]] = speeds[n]
+@kernel
+def _raise_cells(
+    box: Grid,
+    solids: Solids,
+    state: State,
+    cells: Integers,
+    count: ti.i32,
+    tick: ti.i32,
+    salt: ti.i32,
+    fluctuation: ti.f32,
+    targets: ti.math.vec2,
+    is_hot: ti.template(),
+    blocks: ti.i32,
+    added: Floats,
+):
+    """Raise density and heat to their targets, and lower the excess of what is colder than the air."""
+    for block in range(blocks):
+        emitted = 0.0
+        for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, count)):
+            at = cells[n]
+            if not is_solid(solids, at):
+                before = state.density[at]
+                after = ti.max(before, targets[0])
+                state.density[at] = after
+                emitted += after - before
+                target = (1.0 - fluctuation * _fluctuate(box, at, tick, salt)) * targets[1]
+                excess = state.excess[at]
+                state.excess[at] = ti.max(excess, target) if ti.static(is_hot) else ti.min(excess, target)
+        added[block] = emitted
 
 
-def build_sources(
-    parameters: SmokeParameters, obstacles: Obstacles, *, openness: tuple, velocity: tuple, cell_fields: tuple
-) -> Sequence[Source]:
+@func
+def _fluctuate(box: Grid, at: ti.i32, tick: ti.i32, salt: ti.i32):
+    """A number in [0, 1) that a few neighbouring cells share."""
+    patch_i = at // box.step_x // FLUCTUATION_CELLS
+    patch_j = at // box.step_y % (box.ny + 2) // FLUCTUATION_CELLS
+    patch_k = at % box.step_y // FLUCTUATION_CELLS
+    patch = (patch_i * 1024 + patch_j) * 1024 + patch_k
+    # The odd factor (Knuth's) spreads ticks over all bits, so that they do not shift the pattern.
+    key = ti.cast(patch, ti.u32) ^ (ti.cast(tick, ti.u32) * ti.u32(2654435769))
+    return hash_to_unit(key ^ ti.cast(salt, ti.u32))
+
+
+@kernel
+def _set_faces(faces: Integers, speeds: Floats, openness: Floats, velocity: Floats, count: ti.i32):
+    for n in range(count):
+        if openness[faces[n]] > 0.0:
+            velocity[faces[n]] = speeds[n]
+
+
+def build_sources(parameters: SmokeParameters, obstacles: Obstacles, openness: Faces, state: State) -> Sequence[Source]:
     """The sources of a smoke.
 
     Args:
         parameters: of the smoke.
         obstacles: in its grid.
-        openness: by axis, positive on faces that air passes, flat fields.
-        velocity: the three face velocities [m/s], flat fields.
-        cell_fields: density and temperature excess, flat fields.
+        openness: positive on faces that air passes.
+        state: of the smoke.
 
     Raises:
         ValueError: a source that stays contains no open cell: it lies outside the box, in a solid, or is smaller than
             a cell.
     """
     sources = [
-        Source(
-            source,
-            obstacles,
-            ambient_temperature=parameters.ambient_temperature,
-            openness=openness,
-            velocity=velocity,
-            cell_fields=cell_fields,
-        )
+        Source(source, obstacles, ambient_temperature=parameters.ambient_temperature, openness=openness, state=state)
         for source in parameters.source
     ]
     grid = obstacles.grid

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.core.domain import DomainParameters
-from sim.shapes import Solid
 from sim.shapes.sampling import stratified_points
+from sim.shapes.solid import Solid
 from sim.smoke.parameters import WHOLE, SmokeParameters
 
 Points = NDArray[np.float64]

@@ -1,15 +1,20 @@
 """Gusts: a random acceleration of the air that has no divergence (curl noise; Bridson, Hourihan & Nordenstam 2007)."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.bundles import bundle
 from sim.core.hashed_numbers import hash_bits, hash_to_unit, spread
+from sim.core.launch import kernel
 from sim.core.parameters import Vector3
+from sim.smoke.arrays import Faces
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.lanes import lane_count, lane_items, lane_place
+from sim.smoke.lanes import Grid, device_grid, lane_items, lane_place, row_start
 from sim.smoke.parameters import CELLS_PER_EDDY, TurbulenceParameters
 
 REACH = 4
@@ -18,11 +23,30 @@ REACH = 4
 PEAK = 3.0
 """Largest acceleration that steps are cut for, over the root mean square: a bell curve exceeds it by chance only."""
 
+SUMS = 5
+"""Numbers that a face along z needs of a row of the lattice."""
+
 FACE, CENTRE, SLOPE = range(3)
 """Weights of the lattice's nodes: at a lower face, at a cell's centre, and their difference across the cell."""
 
 
-@ti.data_oriented
+@bundle
+class Lattice(NamedTuple):
+    """Nodes of random vectors around a box, and the weights by which cells and faces depend on them."""
+
+    nodes_x: ti.i32
+    nodes_y: ti.i32
+    nodes_z: ti.i32
+    potential: Vectors  # at the nodes, in C order
+    sums: Floats  # over x and y of what each face along z needs: two of a_x, two of a_y, one of a_z
+    firsts_x: Integers  # first node of a cell and its lower face
+    firsts_y: Integers
+    firsts_z: Integers
+    weights_x: Vectors  # `REACH` of each cell, by FACE, CENTRE, SLOPE
+    weights_y: Vectors
+    weights_z: Vectors
+
+
 class Turbulence:
     """a = curl psi, with a vector potential psi of random values on a lattice between which it is smooth.
 
@@ -38,15 +62,15 @@ class Turbulence:
         grid: where the faces are.
         parameters: strength, size, rate, seed.
         wind: [m/s].
-        openness: by axis, positive on faces that air passes, flat fields.
-        velocity: the three face velocities [m/s], flat fields.
+        openness: positive on faces that air passes.
+        velocity: of the faces [m/s].
 
     Raises:
         ValueError: the eddies are smaller than cells can carry.
     """
 
     def __init__(
-        self, grid: SmokeGrid, parameters: TurbulenceParameters, *, wind: Vector3, openness: tuple, velocity: tuple
+        self, grid: SmokeGrid, parameters: TurbulenceParameters, wind: Vector3, openness: Faces, velocity: Faces
     ) -> None:
         if parameters.size < CELLS_PER_EDDY * grid.cell_size * (1.0 - 1.0e-9):
             raise ValueError(
@@ -54,18 +78,16 @@ class Turbulence:
                 "no such eddies; enlarge it or use a smaller cell_size"
             )
         self._grid, self._parameters, self._wind = grid, parameters, wind
-        self._nx, self._ny, self._nz = grid.cells
-        self._step_x, self._step_y = grid.padded[1] * grid.padded[2], grid.padded[2]
-        self._open_x, self._open_y, self._open_z = openness
-        self._u, self._v, self._w = velocity
-        self._lanes = lane_count()
+        self._openness, self._velocity, self._box = openness, velocity, device_grid(grid.cells)
         # Nodes that a box can reach, wherever it lies on the lattice.
-        self._nodes = tuple(math.ceil(n * grid.cell_size / parameters.size) + REACH for n in grid.cells)
-        self._potential = ti.Vector.field(3, ti.f32, shape=self._nodes)
-        # Sums over x and y of what each face along z needs: two of a_x, two of a_y, one of a_z.
-        self._rows = ti.Vector.field(5, ti.f32, shape=(self._nx + 1, self._ny + 1, self._nodes[2]))
-        self._weights = tuple(ti.Vector.field(3, ti.f32, shape=(n + 1, REACH)) for n in grid.cells)
-        self._firsts = tuple(ti.field(ti.i32, shape=n + 1) for n in grid.cells)
+        nodes = [math.ceil(n * grid.cell_size / parameters.size) + REACH for n in grid.cells]
+        self._lattice = Lattice(
+            *nodes,
+            ti.Vector.ndarray(3, ti.f32, math.prod(nodes)),
+            ti.ndarray(ti.f32, SUMS * (grid.cells[0] + 1) * (grid.cells[1] + 1) * nodes[2]),
+            *(ti.ndarray(ti.i32, n + 1) for n in grid.cells),
+            *(ti.Vector.ndarray(3, ti.f32, REACH * (n + 1)) for n in grid.cells),
+        )
         self._origin = self._place(0.0)
         # Uniform numbers from -1 to 1 have a variance of 1/3.
         self._amplitude = parameters.strength * parameters.size / math.sqrt(6.0 * 0.55**2) * math.sqrt(3.0)
@@ -73,8 +95,7 @@ class Turbulence:
     @property
     def device_bytes(self) -> int:
         """Memory that it has allocated [bytes]; the sums of rows are nearly all of it."""
-        sizes = [(self._potential, 12), (self._rows, 20), *((field, 12) for field in self._weights)]
-        return sum(size * math.prod(field.shape) for field, size in sizes)
+        return sum(array.arr.nelement() * array.arr.element_size() for array in self._lattice[3:])
 
     @property
     def acceleration(self) -> float:
@@ -88,12 +109,11 @@ class Turbulence:
         phase = time_s * self._parameters.rate
         tick = math.floor(phase)
         turn = 0.5 * math.pi * (phase - tick)
-        self._draw(
-            ti.Vector(self._origin), tick, spread(self._parameters.seed),
-            self._amplitude * math.cos(turn), self._amplitude * math.sin(turn),
-        )  # fmt: skip
-        self._sum_rows()
-        self._apply(dt)
+        now, later = self._amplitude * math.cos(turn), self._amplitude * math.sin(turn)
+        salt = int(np.uint32(spread(self._parameters.seed)).view(np.int32))
+        _draw(self._lattice, ti.math.ivec3(self._origin), tick, salt, now, later)
+        _sum_rows(self._box, self._lattice)
+        _apply(self._box, self._lattice, self._openness, self._velocity, dt)
 
     def _place(self, time_s: float) -> list[int]:
         """Set the weights of all faces and cells for a lattice that has drifted so long [s]; returns its first node."""
@@ -110,64 +130,71 @@ class Turbulence:
                 weights[:, node, SLOPE] = (_spline(faces[1:] - at) - _spline(faces[:-1] - at)) / grid.cell_size
             first = int(nearest[0]) - 1
             origin.append(first)
-            self._weights[axis].from_numpy(weights.astype(np.float32))
-            self._firsts[axis].from_numpy((nearest[:-1] - 1 - first).astype(np.int32))
+            all_firsts = self._lattice.firsts_x, self._lattice.firsts_y, self._lattice.firsts_z
+            all_weights = self._lattice.weights_x, self._lattice.weights_y, self._lattice.weights_z
+            all_firsts[axis].from_numpy((nearest[:-1] - 1 - first).astype(np.int32))
+            all_weights[axis].from_numpy(weights.reshape(-1, 3).astype(np.float32))
         return origin
 
-    @ti.kernel
-    def _draw(self, origin: ti.math.ivec3, tick: ti.i32, salt: ti.u32, now: ti.f32, later: ti.f32):
-        """Random vectors at the nodes, between those of two ticks."""
-        for i, j, k in self._potential:
-            place = origin + ti.Vector([i, j, k])
-            key = salt
-            for axis in ti.static(range(3)):
-                key = hash_bits(key ^ ti.cast(place[axis], ti.u32))
-            for axis in ti.static(range(3)):
-                numbers = ti.Vector([0.0, 0.0])
-                for step in ti.static(range(2)):
-                    moment = ti.cast(3 * (tick + step) + axis, ti.u32)
-                    numbers[step] = 2.0 * hash_to_unit(hash_bits(key ^ moment)) - 1.0
-                self._potential[i, j, k][axis] = now * numbers[0] + later * numbers[1]
 
-    @ti.kernel
-    def _sum_rows(self):
-        for i, j, k in self._rows:
-            total = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
-            first_x, first_y = self._firsts[0][i], self._firsts[1][j]
-            for a in range(REACH):
-                x = self._weights[0][i, a]
-                for b in range(REACH):
-                    y = self._weights[1][j, b]
-                    psi = self._potential[first_x + a, first_y + b, k]
-                    total += ti.Vector(
-                        [
-                            x[FACE] * y[SLOPE] * psi[2],
-                            x[FACE] * y[CENTRE] * psi[1],
-                            x[CENTRE] * y[FACE] * psi[0],
-                            x[SLOPE] * y[FACE] * psi[2],
-                            x[SLOPE] * y[CENTRE] * psi[1] - x[CENTRE] * y[SLOPE] * psi[0],
-                        ]
-                    )
-            self._rows[i, j, k] = total
+@kernel
+def _draw(lattice: Lattice, origin: ti.math.ivec3, tick: ti.i32, salt: ti.i32, now: ti.f32, later: ti.f32):
+    """Random vectors at the nodes, between those of two ticks."""
+    for i, j, k in ti.ndrange(lattice.nodes_x, lattice.nodes_y, lattice.nodes_z):
+        place = origin + ti.Vector([i, j, k])
+        key = ti.cast(salt, ti.u32)
+        for axis in ti.static(range(3)):
+            key = hash_bits(key ^ ti.cast(place[axis], ti.u32))
+        value = ti.math.vec3(0.0)
+        for axis in ti.static(range(3)):
+            numbers = ti.Vector([0.0, 0.0])
+            for step in ti.static(range(2)):
+                moment = ti.cast(3 * (tick + step) + axis, ti.u32)
+                numbers[step] = 2.0 * hash_to_unit(hash_bits(key ^ moment)) - 1.0
+            value[axis] = now * numbers[0] + later * numbers[1]
+        lattice.potential[(i * lattice.nodes_y + j) * lattice.nodes_z + k] = value
 
-    @ti.kernel
-    def _apply(self, dt: ti.f32):
-        for i, j, lane in ti.ndrange((1, self._nx + 2), (1, self._ny + 2), self._lanes):
-            row = i * self._step_x + j * self._step_y
-            for n in range(lane_items(self._nz + 1, lane)):
-                k = lane_place(n, lane)
-                at = row + k
-                first = self._firsts[2][k - 1]
-                a_x, a_y, a_z = 0.0, 0.0, 0.0
-                for c in range(REACH):
-                    z = self._weights[2][k - 1, c]
-                    sums = self._rows[i - 1, j - 1, first + c]
-                    a_x += z[CENTRE] * sums[0] - z[SLOPE] * sums[1]
-                    a_y += z[SLOPE] * sums[2] - z[CENTRE] * sums[3]
-                    a_z += z[FACE] * sums[4]
-                self._u[at] += ti.select(self._open_x[at] > 0.0, dt * a_x, 0.0)
-                self._v[at] += ti.select(self._open_y[at] > 0.0, dt * a_y, 0.0)
-                self._w[at] += ti.select(self._open_z[at] > 0.0, dt * a_z, 0.0)
+
+@kernel
+def _sum_rows(box: Grid, lattice: Lattice):
+    for i, j, k in ti.ndrange(box.nx + 1, box.ny + 1, lattice.nodes_z):
+        total = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0])
+        for a in range(REACH):
+            x = lattice.weights_x[REACH * i + a]
+            plane = (lattice.firsts_x[i] + a) * lattice.nodes_y
+            for b in range(REACH):
+                y = lattice.weights_y[REACH * j + b]
+                psi = lattice.potential[(plane + lattice.firsts_y[j] + b) * lattice.nodes_z + k]
+                total += ti.Vector(
+                    [
+                        x[FACE] * y[SLOPE] * psi[2],
+                        x[FACE] * y[CENTRE] * psi[1],
+                        x[CENTRE] * y[FACE] * psi[0],
+                        x[SLOPE] * y[FACE] * psi[2],
+                        x[SLOPE] * y[CENTRE] * psi[1] - x[CENTRE] * y[SLOPE] * psi[0],
+                    ]
+                )
+        for n in ti.static(range(SUMS)):
+            lattice.sums[SUMS * ((i * (box.ny + 1) + j) * lattice.nodes_z + k) + n] = total[n]
+
+
+@kernel
+def _apply(box: Grid, lattice: Lattice, openness: Faces, velocity: Faces, dt: ti.f32):
+    for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
+        first_sum = ((i - 1) * (box.ny + 1) + j - 1) * lattice.nodes_z
+        for n in range(lane_items(box, box.nz + 1, lane)):
+            k = lane_place(box, n, lane)
+            at = row_start(box, i, j) + k
+            a_x, a_y, a_z = 0.0, 0.0, 0.0
+            for c in range(REACH):
+                z = lattice.weights_z[REACH * (k - 1) + c]
+                sums = SUMS * (first_sum + lattice.firsts_z[k - 1] + c)
+                a_x += z[CENTRE] * lattice.sums[sums] - z[SLOPE] * lattice.sums[sums + 1]
+                a_y += z[SLOPE] * lattice.sums[sums + 2] - z[CENTRE] * lattice.sums[sums + 3]
+                a_z += z[FACE] * lattice.sums[sums + 4]
+            velocity.x[at] += ti.select(openness.x[at] > 0.0, dt * a_x, 0.0)
+            velocity.y[at] += ti.select(openness.y[at] > 0.0, dt * a_y, 0.0)
+            velocity.z[at] += ti.select(openness.z[at] > 0.0, dt * a_z, 0.0)
 
 
 def _spline(distance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -52,7 +52,3 @@ class WhitewaterCloud:
         """These particles, then those."""
         pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
         return WhitewaterCloud(*(np.concatenate(pair) for pair in pairs))
-
-    def count(self, kind: WhitewaterKind) -> int:
-        """How many particles are of a kind."""
-        return int(np.count_nonzero(self.kind == kind))

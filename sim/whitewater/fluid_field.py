@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from sim.core.arrays import on_device
 from sim.core.cells import CellGrid, CellSort
 from sim.whitewater.kernels import Fluid, compute_normals, compute_potentials, sample_flow
 from sim.whitewater.motion import FluidState
@@ -20,7 +21,7 @@ FULL_NEIGHBORHOOD = 4.0 / 3.0 * math.pi * SUPPORT_IN_SPACINGS**3
 _FULL_WEIGHT = FULL_NEIGHBORHOOD / 4.0
 _FULL_SURFACE_WEIGHT = math.pi * SUPPORT_IN_SPACINGS**2 / 3.0
 
-_ANYWHERE = (3.0e38, 3.0e38, 3.0e38)
+_ANYWHERE = (-3.0e38,) * 3, (3.0e38,) * 3
 
 
 class FluidField:
@@ -31,13 +32,7 @@ class FluidField:
     """
 
     def __init__(self, bounds: NDArray[np.floating], particle_radius: float, capacity: int) -> None:
-        """Make room.
-
-        Args:
-            bounds: lower and upper corner of a box about the fluid [m], (2, 3); particles may leave it a little.
-            particle_radius: of the fluid [m].
-            capacity: most fluid particles.
-        """
+        """Make room for particles of this radius [m] in a box [m], (2, 3), which they may leave a little."""
         self.support_radius = SUPPORT_IN_SPACINGS * 2.0 * particle_radius
         self._grid = CellGrid.covering(bounds[0], bounds[1], self.support_radius)
         self._cells = CellSort(self._grid, capacity)
@@ -50,12 +45,11 @@ class FluidField:
         self._order, self._fluid = np.zeros(0, np.int32), None
         if not count:
             return
-        nowhere = (-_ANYWHERE[0], -_ANYWHERE[1], -_ANYWHERE[2])
-        self._cells.sort(_device(state.position), _device(state.particle_id), count, nowhere, _ANYWHERE)
+        self._cells.sort(on_device(state.position), on_device(state.particle_id), count, *_ANYWHERE)
         self._order = self._cells.order.to_numpy()[:count]
         self._fluid = Fluid(
-            _device(state.position[self._order]),
-            _device(state.velocity[self._order]),
+            on_device(state.position[self._order]),
+            on_device(state.velocity[self._order]),
             count,
             self._cells.cell_start,
             self._grid.on_device,
@@ -84,12 +78,5 @@ class FluidField:
         if not count or self._fluid is None:
             return np.zeros((count, 3), np.float32), np.zeros(count, np.int32)
         flow, neighbors = ti.Vector.ndarray(3, ti.f32, count), ti.ndarray(ti.i32, count)
-        sample_flow(_device(points.astype(np.float32, copy=False)), count, self._fluid, flow, neighbors)
+        sample_flow(on_device(points), count, self._fluid, flow, neighbors)
         return flow.to_numpy(), neighbors.to_numpy()
-
-
-def _device(values: np.ndarray) -> ti.Ndarray:
-    vectors = values.ndim == 2
-    array = ti.Vector.ndarray(3, ti.f32, len(values)) if vectors else ti.ndarray(ti.i32, len(values))
-    array.from_numpy(np.ascontiguousarray(values))
-    return array

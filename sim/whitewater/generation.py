@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +18,8 @@ _COUNTS, _PLACES, _FATES = 0, 1, 2
 Float64Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Moment:
-    """What random numbers are keyed by besides the particle.
-
-    Attributes:
-        frame: that is being computed.
-        substep: of that frame.
-    """
-
-    frame: int
-    substep: int
+Moment = tuple[int, int]
+"""Frame and its substep, which random numbers are keyed by besides the particle."""
 
 
 def clamp_potential(values: NDArray[np.floating], low: float, high: float) -> Float64Array:
@@ -47,12 +37,7 @@ def generation_rate(
     """Whitewater particles that each fluid particle makes [1/s], (n,): I_k (k_ta I_ta + k_wc I_wc) (eq. 9).
 
     The kinetic energy of eq. 7 is taken per unit mass, from speeds, so that it does not depend on the particle radius.
-
-    Args:
-        velocity: of the fluid [m/s], (n, 3).
-        trapped_air: [m/s], (n,).
-        wave_crest: [-], (n,).
-        parameters: rates and ranges.
+    Velocities are (n, 3) [m/s], trapped air [m/s] and wave crest [-] (n,).
     """
     p = parameters
     energy = np.einsum("ij,ij->i", velocity, velocity, dtype=np.float64)
@@ -82,12 +67,9 @@ def generate(
         rate: of each fluid particle [1/s], (n,).
         dt: length of the substep [s].
         particle_radius: of the fluid [m].
-        room: most particles to make.
+        room: most particles to make; says how many were not.
         moment: which substep this is.
         parameters: sizes, lifetimes and the seed.
-
-    Returns:
-        The new particles, as spray, and how many were not made for lack of room.
     """
     source, sample = _sources(state, rate * dt, moment, parameters.seed)
     wanted = len(source)
@@ -103,14 +85,13 @@ def generate(
     outwards = share[:, None] * _direction_across(velocity, 2.0 * math.pi * angle)
     position = state.position[source] + particle_radius * outwards + (dt * along)[:, None] * velocity
     smallest, largest = parameters.radius_min_in_radii, parameters.radius_max_in_radii
+    shortest, longest = parameters.lifetime_min, parameters.lifetime_max
     born = WhitewaterCloud(
         position=position.astype(np.float32),
         velocity=(velocity + (parameters.spread * speed)[:, None] * outwards).astype(np.float32),
         # Squared, for there are more small bubbles than large ones.
         radius=(particle_radius * (smallest + (largest - smallest) * size**2)).astype(np.float32),
-        lifetime=(parameters.lifetime_min + (parameters.lifetime_max - parameters.lifetime_min) * life).astype(
-            np.float32
-        ),
+        lifetime=(shortest + (longest - shortest) * life).astype(np.float32),
         kind=np.full(len(source), WhitewaterKind.SPRAY, np.uint8),
     )
     return born, wanted - len(source)
@@ -132,7 +113,7 @@ def _numbers(
     particle_id: NDArray[np.integer], sample: NDArray[np.integer], moment: Moment, key: tuple[int, int]
 ) -> Float64Array:
     """Four numbers in [0, 1) for each particle and sample, (4, n)."""
-    return uniforms((particle_id, sample, moment.frame, moment.substep), key)
+    return uniforms((particle_id, sample, *moment), key)
 
 
 def _direction_across(velocity: Float64Array, angle: Float64Array) -> Float64Array:

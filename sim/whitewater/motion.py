@@ -61,23 +61,15 @@ class FluidMotion:
 
     def max_speed(self) -> float:
         """Largest speed at both frames [m/s]."""
-        if len(self.particle_id) == 0:
-            return 0.0
-        largest = max(
-            float(np.einsum("ij,ij->i", v, v).max(initial=0.0)) for v in (self._begin_velocity, self._end_velocity)
-        )
-        return float(np.sqrt(largest))
+        both = (self._begin_velocity, self._end_velocity)
+        return float(np.sqrt(max(float(np.einsum("ij,ij->i", v, v).max(initial=0.0)) for v in both)))
 
     def bounds(self) -> NDArray[np.float64]:
         """Lower and upper corner of a box about the particles at both frames [m], (2, 3)."""
         if len(self.particle_id) == 0:
             return np.zeros((2, 3))
-        both = (self._begin_position, self._end_position)
-        low, high = (
-            np.min([each.min(axis=0) for each in both], axis=0),
-            np.max([each.max(axis=0) for each in both], axis=0),
-        )
-        return np.array([low, high], np.float64)
+        both = np.concatenate([self._begin_position, self._end_position])
+        return np.array([both.min(axis=0), both.max(axis=0)], np.float64)
 
     def at(self, share: float) -> FluidState:
         """The particles when a share of the time between the frames has passed (cubic Hermite interpolation)."""

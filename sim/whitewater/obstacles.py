@@ -17,11 +17,11 @@ from sim.shapes.placement import build_solid
 
 Float64Array = NDArray[np.float64]
 
+# Most cells of a body's distance grid along its longest edge, 2 million in all: it is sampled in every process.
 _FINEST_GRID = 128
-"""Most cells of a body's distance grid along its longest edge, 2 million in all: it is sampled in every process."""
 
+# Rounds of pushing points out of bodies and walls: corners between two need two, a third settles most of the rest.
 _PUSHES = 3
-"""Rounds of pushing points out of bodies and walls: corners between two need two, a third settles most of the rest."""
 
 
 @dataclass(frozen=True)
@@ -105,10 +105,7 @@ class Obstacles:
     ) -> tuple[Float64Array, Float64Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Move points out of walls and bodies, and take away the velocity that leads into them.
 
-        Args:
-            position: [m], (n, 3).
-            velocity: [m/s], (n, 3).
-            share: of the time between the frames that has passed [-].
+        Positions [m] and velocities [m/s] are (n, 3); `share` of the time between the frames has passed [-].
 
         Returns:
             Position, velocity, which points touched something, and which are to stay: those neither beyond an open
@@ -135,11 +132,6 @@ class Obstacles:
         """Share of the ball about each point that is in front of walls and bodies, taken as flat [-], (n,).
 
         Of a ball of radius h, a plane at distance a h from its centre cuts off (1 - a)² (2 + a) / 4.
-
-        Args:
-            position: [m], (n, 3).
-            radius: of the ball [m].
-            share: of the time between the frames that has passed [-].
         """
         free = np.ones(len(position))
         for distance in (position - self._wall_low, self._wall_high - position):

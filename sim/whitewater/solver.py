@@ -13,16 +13,13 @@ from sim.core.domain import DomainParameters
 from sim.core.parameters import Vector3
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.fluid_field import FluidField
-from sim.whitewater.generation import Moment, generate, generation_rate
+from sim.whitewater.generation import generate, generation_rate
 from sim.whitewater.motion import FluidMotion, FluidState
 from sim.whitewater.obstacles import MovingObstacle, Obstacles
 from sim.whitewater.parameters import WhitewaterParameters
 
-TRAVEL_IN_SUPPORTS = 1.0
-"""How far the fastest fluid goes in a substep, in support radii."""
-
+# A frame has as many substeps as support radii that the fastest fluid goes, up to this.
 MAX_SUBSTEPS = 64
-"""So many are a speed of 64 support radii a frame; what is faster than that is a splash of a few particles."""
 
 Float64Array = NDArray[np.float64]
 
@@ -49,15 +46,9 @@ class WhitewaterSolver:
     """
 
     def __init__(
-        self,
-        parameters: WhitewaterParameters,
-        *,
-        domain: DomainParameters,
-        gravity: Vector3,
-        frames_per_second: float,
+        self, parameters: WhitewaterParameters, *, domain: DomainParameters, gravity: Vector3, frames_per_second: float
     ) -> None:
-        self._parameters = parameters
-        self._domain = domain
+        self._parameters, self._domain = parameters, domain
         self._gravity = np.asarray(gravity, np.float64)
         self._frame_dt = 1.0 / frames_per_second
 
@@ -104,7 +95,7 @@ class WhitewaterSolver:
                 dt,
                 particle_radius=particle_radius,
                 room=room,
-                moment=Moment(frame, substep),
+                moment=(frame, substep),
                 parameters=self._parameters,
             )
             cloud = cloud.joined(self._settled(born, field, obstacles, share))
@@ -112,8 +103,7 @@ class WhitewaterSolver:
         return cloud, WhitewaterReport(substeps, generated, not_generated)
 
     def _substep_count(self, max_speed: float, support_radius: float) -> int:
-        travel = max_speed * self._frame_dt / (TRAVEL_IN_SUPPORTS * support_radius)
-        return min(max(1, math.ceil(travel)), MAX_SUBSTEPS)
+        return min(max(1, math.ceil(max_speed * self._frame_dt / support_radius)), MAX_SUBSTEPS)
 
     def _move(
         self, cloud: WhitewaterCloud, field: FluidField, obstacles: Obstacles, share: float, dt: float

@@ -61,7 +61,7 @@ def test_a_finished_job_can_be_looked_at_from_all_sides(finished: Studio) -> Non
     checked = json.loads(finished.run("verify", "tiny", "--deep", "--json").assert_code(0).out)
     assert checked == {"checked": FILES, "deep": True, "flaws": {}, "texts": []}
     story = finished.run("explain", "tiny", "render/000002").assert_code(0).out
-    assert story.startswith("render/000002: succeeded, up to date\n")
+    assert story.startswith("render/000002: done, up to date\n")
     assert "frames/000002.png" in story
     assert "attempt 1 on " in story
     assert "starting at frame 0" in finished.run("explain", "tiny", "simulate", "--log").assert_code(0).out

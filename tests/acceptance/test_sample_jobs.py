@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import av
 import pytest
+from command_line import pipeline
 from places import PROJECT
 
 JOBS = sorted((PROJECT / "jobs").glob("*.toml"))
@@ -40,13 +42,24 @@ def test_every_sample_job_has_a_tiny_version():
     assert [path.stem for path in JOBS] == sorted(TINY)
 
 
+def submit(*arguments: object) -> tuple[int, str]:
+    ended = pipeline("submit", *arguments)
+    return ended.exit_code, ended.output
+
+
+@pytest.fixture(scope="module")
+def child() -> Iterator[ProcessPoolExecutor]:
+    """One process for all jobs, which compiles kernels and imports Blender once."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
+        yield executor
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", JOBS, ids=lambda path: path.stem)
-def test_a_sample_job_becomes_a_film(path, tmp_path):
+def test_a_sample_job_becomes_a_film(child, path, tmp_path):
     changes = {"frames": 2, "render.resolution": [64, 36], "render.samples": 1, "device": "cpu", **TINY[path.stem]}
     options = [part for key, value in changes.items() for part in ("--set", f"{key}={value}")]
-    command = [sys.executable, "-m", "pipeline", "submit", str(path), "--output", str(tmp_path), *options]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert ended.returncode == 0, ended.stderr
+    code, told = child.submit(submit, path, "--output", tmp_path, "--executor", "inline", *options).result(timeout=300)
+    assert code == 0, told
     with av.open(str(tmp_path / path.stem / "movie.mp4")) as film:
         assert sum(1 for _ in film.decode(video=0)) == 2

@@ -28,7 +28,7 @@ def test_ply_of_the_projects_writer_reads_back_and_fills_a_blender_mesh(tmp_path
         source = read_ply(path)
         for count in (30, 7):
             # A second, smaller filling leaves nothing of the first.
-            part = type(source)(source.positions, source.triangles[:count], source.normals, source.velocities)
+            part = type(source)(source.vertices, source.faces[:count], source.normals, source.velocities)
             mesh = bpy.data.meshes.get("m") or bpy.data.meshes.new("m")
             fill_mesh(mesh, part)
             assert not mesh.validate(), "Blender had to repair the mesh"
@@ -46,10 +46,9 @@ def test_ply_of_the_projects_writer_reads_back_and_fills_a_blender_mesh(tmp_path
 
 
 UNFIT_MESHES = {
-    "is not a PLY mesh": b"solid stl",
-    "binary_little_endian is needed": b"ply\nformat ascii 1.0\nend_header\n",
-    "needs exactly the elements": b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n",
-    "refers to vertices that it does not have": (
+    "0.ply: has no PLY header": b"solid stl",
+    "1.ply: is not a PLY of the expected layout": b"ply\nformat ascii 1.0\nend_header\n",
+    "2.ply: a face names vertex 5, but there are 1": (
         b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
         b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
         + bytes(12)

@@ -71,7 +71,7 @@ class Family:
 
     def blenders(self) -> list[psutil.Process]:
         """Blender executables that serve frames."""
-        return self._called(lambda command: "--serve" in command)
+        return self._called(lambda command: "render_frames.py" in command)
 
     def left_over(self, within_s: float) -> list[str]:
         """What still lives after so long [s] when nothing should; it is ended then, so that it troubles no others."""

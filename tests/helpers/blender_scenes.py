@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from warm_python import run_python
 
 from render.camera_path import CameraPath
+from render.meshes import write_ply
 from render.parameters import CameraParameters, RenderParameters, SetParameters
 from render.spec import Camera, RenderSpec
 
@@ -45,23 +48,9 @@ def sphere(center: tuple[float, float, float], radius: float, *, rings: int = 24
 
 
 def write_mesh(path: Path, positions: np.ndarray, triangles: np.ndarray, velocity=None) -> None:
-    columns = [positions] if velocity is None else [positions, np.broadcast_to(velocity, positions.shape)]
-    names = ["x", "y", "z"] if velocity is None else ["x", "y", "z", "vx", "vy", "vz"]
-    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("index", "<i4", (3,))])
-    faces["count"], faces["index"] = 3, triangles
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(positions)}",
-        *(f"property float {name}" for name in names),
-        f"element face {len(triangles)}",
-        "property list uchar int vertex_indices",
-        "end_header\n",
-    ]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(
-        "\n".join(header).encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes() + faces.tobytes()
-    )
+    velocities = None if velocity is None else np.broadcast_to(velocity, positions.shape)
+    write_ply(path, positions, triangles, velocities=velocities)
 
 
 def still_camera(parameters: CameraParameters) -> Camera:
@@ -99,6 +88,13 @@ RENDER_FRAMES = """
             print("REFUSED", error)
     renderer.close()
 """
+
+
+def draw_all(folder: Path, spec: RenderSpec, frames: Iterable[int] = (0,)) -> list[np.ndarray]:
+    """Display values of frames from 0 to 255, (rows, columns, 3), drawn one after the other in the warm Python."""
+    spec.write(folder / "spec.json")
+    run_python(RENDER_FRAMES, str(folder), "{frame}.png", ",".join(map(str, frames)), "2")
+    return [read(folder / f"{frame}.png") for frame in frames]
 
 
 def read(path: Path) -> np.ndarray:

@@ -1,5 +1,6 @@
 """What `check` tells of the text of a job."""
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,35 @@ shape = { type = "sphere", radius = 0.1 }
 position = [0.0, 0.0, 0.2]
 """
 """Smoke in a box of a metre, without bodies: its lines are 2 to 14."""
+
+
+BALL = """
+[[rigid]]
+name = "ball"
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.1]
+"""
+WATER = """
+[[fluid]]
+name = "water"
+particle_radius = 0.02
+[[fluid.block]]
+shape = { type = "box", size = [0.4, 0.4, 0.4] }
+position = [0.0, 0.0, 0.5]
+"""
+PLUME = """
+[[smoke]]
+name = "plume"
+cell_size = 0.05
+[[smoke.source]]
+shape = { type = "sphere", radius = 0.1 }
+position = [0.0, 0.0, 0.2]
+"""
+
+
+def says(line: str, expected: str) -> bool:
+    """Whether a line begins with the first of the parts that "..." separates, and has the others after it in order."""
+    return re.match(".*".join(map(re.escape, expected.split(" ... "))), line) is not None
 
 
 class Checked(NamedTuple):

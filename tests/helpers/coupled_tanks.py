@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from coupled_steps import CoupledSteps
 from numpy.typing import NDArray
+from small_fluids import EARTH, lattice
 
 from sim.core.domain import DomainParameters
 from sim.core.world import World
@@ -20,9 +21,7 @@ from sim.rigid.solver import RigidSolver
 from sim.shapes.placement import build_solid
 
 SPACING = 0.02
-EARTH = (0.0, 0.0, -9.81)
 WEIGHTLESS = (0.0, 0.0, 0.0)
-EVERY_FACE = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
 class Tank(CoupledSteps):
@@ -83,9 +82,3 @@ class Tank(CoupledSteps):
         linear = [bodies[f"momentum_{axis}"] for axis in "xyz"]
         angular = [bodies[f"angular_momentum_{axis}"] for axis in "xyz"]
         return m * v.sum(axis=0) + linear, m * np.cross(x, v).sum(axis=0) + angular
-
-
-def lattice(low: tuple[float, ...], high: tuple[float, ...], spacing: float) -> NDArray[np.float32]:
-    """Cubic lattice that fills a box, half a spacing from its faces."""
-    axes = [np.arange(a + spacing / 2, b - spacing / 4, spacing) for a, b in zip(low, high, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)

@@ -2,7 +2,7 @@
 
 from sim.core.arrays import Floats, Vectors
 from sim.core.launch import kernel
-from sim.shapes.device_distances import Shapes, distance_to
+from sim.shapes.device_shapes import Shapes, distance_to
 
 
 @kernel

@@ -93,11 +93,11 @@ class HalfFullRoom:
     def is_water(self) -> NDArray[np.bool_]:
         """Of the cells."""
         grid = self.smoke.grid
-        return grid.trim(self.smoke.obstacles.state.to_numpy(), grid.cells) == MOVING
+        return grid.trim(self.smoke.obstacles.solids.state.to_numpy(), grid.cells) == MOVING
 
     def faces(self, axis: int) -> NDArray[np.float64]:
         """Velocity of the faces across an axis [m/s]."""
-        field = (self.smoke.u_face_x, self.smoke.v_face_y, self.smoke.w_face_z)[axis]
+        field = self.smoke.state.velocity[axis]
         return self.smoke.grid.trim(field.to_numpy(), self.smoke.grid.face_shape(axis)).astype(np.float64)
 
 

@@ -5,13 +5,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import viser
+from click.testing import Result
+from command_line import pipeline
 
 from pipeline.job.loading import LoadedJob, read_job
 from pipeline.web.live.admission import live_job
-from pipeline.web.live.frame_timer import LONGEST_FRAME_S
 from pipeline.web.live.page import LivePage
 from pipeline.web.live.recording import Recorder
 from pipeline.web.live.session import Session
+from pipeline.web.live.soundness import LONGEST_FRAME_S
 from pipeline.web.serving import page_server
 
 BALL_OVER_SHEET = """\
@@ -50,6 +52,11 @@ def loaded(folder: Path, text: str = BALL_OVER_SHEET) -> LoadedJob:
     path = folder / "drape.toml"
     path.write_text(text)
     return read_job(path)
+
+
+def live(folder: Path, *options: object) -> Result:
+    """What `pipeline live` of the ball over a sheet printed, and its exit code."""
+    return pipeline("live", loaded(folder).path, "--port", 0, "--output", folder, *options)
 
 
 def session_of(folder: Path, text: str = BALL_OVER_SHEET) -> Session:

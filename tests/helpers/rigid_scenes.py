@@ -50,6 +50,11 @@ def advance(solver: RigidSolver, duration_s: float, dt: float | None = None) -> 
     return count
 
 
+def energy(solver: RigidSolver) -> float:
+    """Kinetic and potential energy [J]."""
+    return sum(solver.diagnostics()[kind] for kind in ("kinetic_energy", "potential_energy"))
+
+
 def totals(solver: RigidSolver, quantity: str) -> np.ndarray:
     """A vector among the diagnostics, (3,)."""
     diagnostics = solver.diagnostics()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from synthetic_jobs import job_text, run_synthetic
 
-from pipeline.base.policy import Policy
+from pipeline.base.task import Policy
 from pipeline.run.events import Notice, RunEvent
 from pipeline.run.executors.processes import ProcessExecutor
 
@@ -23,4 +23,6 @@ if __name__ == "__main__":
         text = job_text(frames=int(sys.argv[2]))
         # Whoever kills at random may hit the same task many times.
         policy = Policy(attempts=100, backoff_s=0.01)
-        sys.exit(run_synthetic(Path(sys.argv[1]), executor, text, observer=Printer(), policy=policy).exit_code)
+        sys.exit(
+            run_synthetic(Path(sys.argv[1]), executor, text, observers=[Printer().notify], policy=policy).exit_code
+        )

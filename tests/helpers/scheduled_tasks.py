@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, TaskId
 from pipeline.run.events import Committed, Failed, Finish, Finished, Instruction, JobOutcome, Start, Tick
@@ -42,6 +44,13 @@ def film(frames: int, *, simulation: Resources | None = None) -> list[Task]:
         *(task(f"render/{k}", (f"surface/{k}.out",), frame=k) for k in range(frames)),
         task("movie", tuple(f"render/{k}.out" for k in range(frames))),
     ]
+
+
+def begun(tasks: list[Task], **options: Any) -> Scheduler:
+    """A scheduler of two cores, which has given its first instructions."""
+    scheduler = Scheduler(tasks, capacity=TWO_CORES, **options)
+    scheduler.start()
+    return scheduler
 
 
 def started(instructions: list[Instruction]) -> list[str]:

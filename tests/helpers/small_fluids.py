@@ -45,3 +45,19 @@ def make_fluid(
         capacity=capacity,
     )
     return SOLVERS[material.solver](start)
+
+
+def steps(fluid: SPHFluid, count: int) -> None:
+    """Advance by stable steps, of a frame at the most."""
+    for _ in range(count):
+        fluid.substep(min(fluid.stable_dt(), 1.0 / 60.0))
+
+
+def run(fluid: SPHFluid, seconds: float) -> None:
+    """Advance by stable steps until a duration has passed [s]; nothing may go wrong."""
+    time = 0.0
+    while time < seconds:
+        dt = fluid.stable_dt()
+        fluid.substep(dt)
+        time += dt
+        assert fluid.first_bad_quantity() is None

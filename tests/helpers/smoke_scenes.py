@@ -1,10 +1,12 @@
 """Small scenes that several smoke tests share."""
 
 import numpy as np
+import taichi as ti
 
 from sim.core.domain import Face
-from sim.shapes import build_solid
 from sim.shapes.parameters import Placement, SphereShape
+from sim.shapes.placement import build_solid
+from sim.smoke.arrays import Faces, new_faces
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.obstacles import MOVING, Obstacles
 
@@ -23,14 +25,38 @@ def unit_grid(cells: tuple[int, int, int], open_faces: tuple[Face, ...], *, obst
     return SmokeGrid(empty.origin, cell_size, cells, empty.open_faces, empty.cells_inside(ball))
 
 
-def set_faces(grid: SmokeGrid, fields, values) -> None:
+def set_faces(grid: SmokeGrid, faces: Faces, values) -> None:
     """Upload face velocities, each in the shape of its faces; closed faces get 0."""
-    for axis, (field, value) in enumerate(zip(fields, values, strict=True)):
-        field.from_numpy(grid.pad((value * (grid.open_area[axis] > 0.0)).astype(np.float32)).ravel())
+    for axis, (array, value) in enumerate(zip(faces, values, strict=True)):
+        array.from_numpy(grid.pad((value * (grid.open_area[axis] > 0.0)).astype(np.float32)).ravel())
 
 
-def get_faces(grid: SmokeGrid, fields) -> list[np.ndarray]:
-    return [grid.trim(field.to_numpy(), grid.face_shape(axis)) for axis, field in enumerate(fields)]
+def get_faces(grid: SmokeGrid, faces: Faces) -> list[np.ndarray]:
+    return [grid.trim(array.to_numpy(), grid.face_shape(axis)) for axis, array in enumerate(faces)]
+
+
+def openness_of(grid: SmokeGrid) -> Faces:
+    """1 on open faces, 0 on closed ones."""
+    openness = new_faces(grid.size)
+    set_faces(grid, openness, (1.0, 1.0, 1.0))
+    return openness
+
+
+class Bytes:
+    """Counts what the arrays that are made from now on take; of at least so many values each."""
+
+    def __init__(self, monkeypatch, *, least_values: int = 0) -> None:
+        self.total = 0
+        make, make_vectors = ti.ndarray, ti.Vector.ndarray
+
+        def note(array):
+            size = array.arr.nelement() * array.arr.element_size()
+            if size >= 4 * least_values:
+                self.total += size
+            return array
+
+        monkeypatch.setattr(ti, "ndarray", lambda *args, **keywords: note(make(*args, **keywords)))
+        monkeypatch.setattr(ti.Vector, "ndarray", lambda *args, **keywords: note(make_vectors(*args, **keywords)))
 
 
 def rough_velocity(grid: SmokeGrid) -> list[np.ndarray]:
@@ -47,9 +73,8 @@ def rough_velocity(grid: SmokeGrid) -> list[np.ndarray]:
 
 def mark(obstacles: Obstacles, solid: np.ndarray, velocity: tuple[float, float, float]) -> None:
     """Mark cells, (nx, ny, nz) bool, as solid in the coming step, all with one velocity [m/s]; no solid is static."""
-    state = obstacles.marked.to_numpy()
+    state = obstacles.marks.state.to_numpy()
     state[obstacles.grid.pad(solid).ravel()] = MOVING
-    obstacles.marked.from_numpy(state)
-    fields = (obstacles.velocity_x, obstacles.velocity_y, obstacles.velocity_z)
-    for field, value in zip(fields, velocity, strict=True):
-        field.from_numpy(np.full(obstacles.grid.size, value, np.float32))
+    obstacles.marks.state.from_numpy(state)
+    for array, value in zip(obstacles.marks.velocity, velocity, strict=True):
+        array.fill(value)

@@ -8,8 +8,7 @@ from typing import Any
 import synthetic_stages
 
 from pipeline.base.layout import JobLayout
-from pipeline.base.policy import Policy
-from pipeline.base.task import Resources, TaskId, TaskState
+from pipeline.base.task import Policy, Resources, TaskId, TaskState
 from pipeline.job.loading import load_job
 from pipeline.run.events import Outcome, RunEvent, StateChanged
 from pipeline.run.executors.base import Executor
@@ -64,7 +63,7 @@ def run_recorded(root: Path, text: str | None = None, **options: Any) -> tuple[O
     """Run the synthetic job in this process; returns how it ended, and all that it told."""
     recorder = Recorder()
     with InlineExecutor() as executor:
-        return run_synthetic(root, executor, text, observer=recorder, **options), recorder
+        return run_synthetic(root, executor, text, observers=[recorder.notify], **options), recorder
 
 
 def contents(root: Path) -> dict[str, bytes]:

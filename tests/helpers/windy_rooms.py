@@ -76,7 +76,7 @@ class WindyRoom:
 
     @property
     def faces(self) -> tuple[Any, Any, Any]:
-        return self.smoke.u_face_x, self.smoke.v_face_y, self.smoke.w_face_z
+        return self.smoke.state.velocity
 
     def velocity(self, axis: int) -> NDArray[np.float64]:
         """Of the faces across an axis [m/s]."""

@@ -25,11 +25,11 @@ from blender_scenes import (
     write_mesh,
 )
 from blender_stand_in import write_blender_stand_in
-from fresh_python import run_python
+from fresh_python import run_python as run_fresh_python
 from inline_tasks import run_task
 from needed_blender import needs_bpy
 from refused_removal import refuse_removal
-from warm_python import run_python as run_warm_python
+from warm_python import run_python
 
 from blender_scripts.look_table import looks_for
 from pipeline.base.layout import JobLayout
@@ -41,13 +41,14 @@ from pipeline.stages.render import RenderStage
 from render.blender import (
     BlenderDiedError,
     BlenderUnavailableError,
-    ExecutableRenderer,
+    ChildRenderer,
     FrameRenderError,
     build_argv,
     open_renderer,
     parse_blender_version,
     require_supported_executable,
     run_script,
+    script_argv,
 )
 from render.gpus import find_gpus
 from render.parameters import CameraParameters, MaterialParameters, SetParameters
@@ -140,25 +141,18 @@ def test_broken_input_is_refused_with_frame_and_file(ball_pictures):
     folder, printed = ball_pictures
     refused = [line for line in printed.splitlines() if line.startswith("REFUSED")]
     assert len(refused) == 3
-    assert "frame 4:" in refused[0] and "1 vertices whose positions are not finite" in refused[0]
+    assert "frame 4:" in refused[0] and "vertices of vertex 7 are not finite" in refused[0]
     assert "frame 5:" in refused[1] and "truncated" in refused[1]
     assert "frame 6:" in refused[2] and "000006.ply" in refused[2] and "No such file" in refused[2]
     assert not (folder / ".000004.png.part#1").exists()
-
-
-def test_another_process_draws_the_same_bytes(ball_pictures, tmp_path):
-    folder, printed = ball_pictures
-    assert "DEVICE CPU" in printed
-    run_python(RENDER_FRAMES, str(folder), "again-{frame}.png", "0")
-    assert (folder / "again-0.png").read_bytes() == (folder / ".000000.png.part#1").read_bytes()
 
 
 @pytest.mark.parametrize("quality", ["draft", "preview"])
 def test_a_denoised_frame_does_not_depend_on_the_process_or_its_threads(quality, tmp_path):
     write_ball_frames(tmp_path)
     spec_of(BALL, denoise=True, quality=quality, motion_blur=True).write(tmp_path / "spec.json")
-    for threads in ("1", "2"):
-        run_python(RENDER_FRAMES, str(tmp_path), f"{threads}-{{frame}}.png", "2", threads)
+    for run, threads in ((run_python, "1"), (run_fresh_python, "2")):
+        run(RENDER_FRAMES, str(tmp_path), f"{threads}-{{frame}}.png", "2", threads)
     assert (tmp_path / "1-2.png").read_bytes() == (tmp_path / "2-2.png").read_bytes()
 
 
@@ -168,7 +162,8 @@ def blender_stand_in(tmp_path) -> Path:
 
 
 def test_external_executable_draws_the_same_bytes_as_the_module(ball_pictures, blender_stand_in):
-    folder, _ = ball_pictures
+    folder, printed = ball_pictures
+    assert "DEVICE CPU" in printed
     renderer = open_renderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
     try:
         assert renderer.device == "CPU"
@@ -181,13 +176,13 @@ def test_external_executable_draws_the_same_bytes_as_the_module(ball_pictures, b
     for frame in (0, 1):
         expected = (folder / f".{frame:06d}.png.part#1").read_bytes()
         assert (folder / f"external {frame}.png").read_bytes() == expected
-    assert isinstance(renderer, ExecutableRenderer)
+    assert isinstance(renderer, ChildRenderer)
     assert renderer._process.poll() is not None
 
 
 def test_a_killed_executable_is_reported_with_its_last_lines(ball_pictures, blender_stand_in):
     folder, _ = ball_pictures
-    renderer = ExecutableRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
+    renderer = ChildRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
     renderer._process.kill()
     renderer._process.wait()
     with pytest.raises(BlenderDiedError, match=r"(?s)exit code -9; .*noise that Blender prints") as death:
@@ -204,7 +199,7 @@ def test_an_executable_leaves_no_temporary_files(ball_pictures, blender_stand_in
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    renderer = ExecutableRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
+    renderer = ChildRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
     (own,) = temporary.iterdir()
     assert list(own.glob("blender_*"))  # Blender's own folder lies there
     if is_killed:
@@ -258,7 +253,7 @@ def test_an_executable_killed_between_frames_or_while_it_draws_costs_an_attempt(
     def attempt(frame: int, number: int) -> TaskEvent:
         return run_task(tasks[frame], layout, attempt=number)
 
-    def kill_blender(renderer: ExecutableRenderer) -> None:
+    def kill_blender(renderer: ChildRenderer) -> None:
         renderer._process.kill()
         renderer._process.wait()
 
@@ -327,7 +322,7 @@ def test_every_look_and_set_builds_and_draws(tmp_path):
     for stage in (SetParameters(name="studio", tank=True), SetParameters(name="outdoor"), night, window):
         spec = spec_of(*objects, samples=2).model_copy(update={"set": stage, "camera": camera})
         spec.write(tmp_path / "spec.json")
-        run_warm_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")
+        run_python(RENDER_FRAMES, str(tmp_path), f"{stage.name}.png", "0")
         assert 10 < read(tmp_path / f"{stage.name}.png").mean() < 245
 
 
@@ -343,7 +338,12 @@ def test_argv_starts_blender_without_the_users_settings():
     start = ["/opt/blender", "--background", "--factory-startup", "--disable-autoexec", "--threads", "3", "--python"]
     assert argv[: len(start)] == start
     assert Path(script).is_file()
-    assert argv[argv.index("--") + 1 :] == ["/job/spec.json", "--serve", "--threads", "3", "--gpu", "none"]
+    assert argv[argv.index("--") + 1 :] == ["/job/spec.json", "--threads", "3", "--gpu", "none"]
+    assert script_argv(None, "gpus.py", ["a word"]) == [
+        sys.executable,
+        str(Path(script).with_name("gpus.py")),
+        "a word",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,10 @@ from render.bounds import (
     read_bounds,
     write_bounds,
 )
-from render.camera_path import CameraPath, View
+from render.camera_path import CameraPath
 from render.errors import InvalidFileError
 from render.parameters import CameraParameters
+from render.visibility import screen_positions
 
 DOMAIN = np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]])
 LOW_AND_WIDE = np.array([[-0.4, -0.1, 0.0], [0.4, 0.3, 0.2]])
@@ -40,8 +41,7 @@ def block(count: int, low: tuple[float, float, float], high: tuple[float, float,
 
 
 POOL = (-0.4, -0.4, 0.0), (0.4, 0.4, 0.2)
-POOL_RADIUS = 0.5 * (0.8 * 0.8 * 0.2 / 20_000) ** (1 / 3)
-"""Of each of 20,000 particles that fill the pool [m]."""
+POOL_RADIUS = 0.5 * (0.8 * 0.8 * 0.2 / 20_000) ** (1 / 3)  # of each of 20,000 particles that fill the pool [m]
 
 
 def test_every_direction_has_its_opposite_and_no_two_are_the_same():
@@ -152,35 +152,18 @@ def test_bounds_survive_the_file_and_nonsense_is_refused(tmp_path):
     reach = reach_of_points(block(100, *POOL))
     write_bounds(path, {"water": reach})
     assert (read_bounds(path)["water"] == reach).all()
-    for text in (
-        "",
-        "[]",
-        '{"version": 3, "reaches": {}}',
-        '{"version": 2, "reaches": {"water": [0, 0, 0]}}',
-        f'{{"version": 2, "reaches": {{"water": {[-1.0] * 50}}}}}',
-        '{"version": 2, "boxes": {}}',
+    for text, reason in (
+        ("", "holds no bounds"),
+        ("[]", "holds no bounds"),
+        ('{"version": 1, "boxes": {"action": [[0, 0, 0], [1, 1, 1]]}}', "is of version 1, this program reads 2"),
+        ('{"version": 3, "reaches": {}}', "is of version 3, this program reads 2"),
+        ('{"version": 2, "reaches": {"water": [0, 0, 0]}}', '"water" bounds nothing'),
+        (f'{{"version": 2, "reaches": {{"water": {[-1.0] * 50}}}}}', '"water" bounds nothing'),
+        ('{"version": 2, "boxes": {}}', "holds no bounds"),
     ):
         path.write_text(text)
-        with pytest.raises(InvalidFileError):
+        with pytest.raises(InvalidFileError, match=reason):
             read_bounds(path)
-
-
-def test_boxes_of_an_earlier_version_are_told_from_what_is_read_now(tmp_path):
-    path = tmp_path / "bounds.json"
-    path.write_text('{"version": 1, "boxes": {"action": [[0, 0, 0], [1, 1, 1]]}}')
-    with pytest.raises(InvalidFileError, match="is of version 1, this program reads 2"):
-        read_bounds(path)
-
-
-def seen_from(view: View, points: NDArray[np.float64], aspect: float) -> NDArray[np.float64]:
-    """Where points are in the picture, (n, 2): -1 and 1 are its edges."""
-    forward = np.subtract(view.look_at, view.position)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0, 0, 1))
-    right /= np.linalg.norm(right)
-    offset = points - view.position
-    plane = np.stack([offset @ right, offset @ np.cross(right, forward)], axis=1) / (offset @ forward)[:, None]
-    return plane * view.focal_length_mm / 18.0 * [1.0, aspect]
 
 
 @pytest.mark.parametrize("orbit_deg_per_s", [0.0, 30.0])
@@ -189,7 +172,9 @@ def test_a_camera_that_frames_a_box_keeps_all_of_it_in_every_picture(orbit_deg_p
     camera = CameraParameters(framing="action", orbit_deg_per_s=orbit_deg_per_s)
     points = corners(LOW_AND_WIDE)
     path = CameraPath(camera, *DOMAIN, aspect=aspect, starts={}, framed=points)
-    extents = [abs(seen_from(path.view(time, {}), points, aspect)).max() for time in np.linspace(0.0, 12.0, 25)]
+    extents = [
+        abs(screen_positions(path.view(time, {}), points, aspect=aspect)).max() for time in np.linspace(0.0, 12.0, 25)
+    ]
     assert max(extents) <= 0.9 + 1e-9
     assert max(extents) > 0.85  # and no smaller than it has to be
     first, middle = path.first(), LOW_AND_WIDE.mean(axis=0)

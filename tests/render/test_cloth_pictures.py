@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, read, redness, spec_of, still_camera
+from blender_scenes import draw_all, redness, spec_of, still_camera
 from needed_blender import needs_bpy
-from warm_python import run_python
 
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters
@@ -16,8 +15,7 @@ from render.spec import MeshSequenceObject
 
 pytestmark = [needs_bpy, pytest.mark.slow]
 
-THREADS = 12
-"""A side of the sheet, three periods of twill; a thread is two pixels wide."""
+THREADS = 12  # a side of the sheet, three periods of twill; a thread is two pixels wide
 
 
 def write_sheet(path: Path, *, turned: bool) -> None:
@@ -41,10 +39,9 @@ def draw_denim(folder: Path, *, threads: int, samples: int) -> list[np.ndarray]:
     sheet = MeshSequenceObject(name="sheet", file="sheet/{frame}.ply", material=material)
     for frame, turned in enumerate((False, True)):
         write_sheet(folder / f"sheet/{frame:06d}.ply", turned=turned)
-    spec_of(sheet, resolution=(128, 72), samples=samples).write(folder / "spec.json")
-    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0,1")
+    pictures = draw_all(folder, spec_of(sheet, resolution=(128, 72), samples=samples), (0, 1))
     # 0.8 m of the 1.8 m that the picture shows in width, at half its height.
-    return [read(folder / f"{frame}.png")[22:50, 42:86] for frame in (0, 1)]
+    return [picture[22:50, 42:86] for picture in pictures]
 
 
 @pytest.fixture(scope="module")
@@ -101,10 +98,9 @@ def brightness_lying(folder: Path, look: str, color: tuple[float, float, float])
     sheet = MeshSequenceObject(name="sheet", file="sheet.ply", material=MaterialParameters(look=look, color=color))
     camera = still_camera(CameraParameters(position=(0.0, -3.0, 1.16), look_at=(0.0, 0.0, 0.3)))
     spec = spec_of(sheet, samples=16, motion_blur=False).model_copy(update={"camera": camera})
-    spec.write(folder / "spec.json")
-    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
+    (picture,) = draw_all(folder, spec)
     # A band across the sheet, which begins 8 pixels beside the middle of the picture and is 6 high.
-    return float((read(folder / "0.png")[16:20, 27:37] @ [0.2126, 0.7152, 0.0722]).mean())
+    return float((picture[16:20, 27:37] @ [0.2126, 0.7152, 0.0722]).mean())
 
 
 @pytest.mark.parametrize(("look", "darkest", "brightest"), [("cotton", 75, 125), ("denim", 127, 155)])

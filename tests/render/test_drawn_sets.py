@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, spec_of, sphere, still_camera, write_mesh
+from blender_scenes import draw_all, spec_of, sphere, still_camera, write_mesh
 from needed_blender import needs_bpy
 from radiance_pictures import write_hdr
-from warm_python import run_python
 
 from render.parameters import CameraParameters, LightParameters, MaterialParameters, SetParameters
 from render.pictures import read_picture
@@ -20,8 +19,8 @@ pytestmark = needs_bpy
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 WHITE = MaterialParameters(look="plastic", color=(0.8, 0.8, 0.8), roughness=1.0)
 MIDDLE_ROW, MIDDLE_COLUMN = 18, 32
-RADIUS_PIXELS = 10
-"""Of a ball of 0.3 m, and two pixels less."""
+BALL = np.s_[MIDDLE_ROW - 5 : MIDDLE_ROW + 5, MIDDLE_COLUMN - 5 : MIDDLE_COLUMN + 5]
+RADIUS_PIXELS = 10  # of a ball of 0.3 m, and two pixels less
 
 
 def draw(
@@ -39,10 +38,10 @@ def draw(
     changes = {
         "set": SetParameters.model_validate(keys),
         "camera": still_camera(camera or CameraParameters(position=(0.0, -2.5, 0.3), look_at=(0.0, 0.0, 0.3))),
+        "lights": lights,
+        "open_faces": open_faces,
     }
-    changes |= {"lights": lights, "open_faces": open_faces}
-    spec_of(*objects, samples=16, motion_blur=False).model_copy(update=changes).write(folder / "spec.json")
-    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
+    draw_all(folder, spec_of(*objects, samples=16, motion_blur=False).model_copy(update=changes))
     return read_picture(folder / "0.png").astype(float)
 
 
@@ -95,9 +94,7 @@ def test_a_low_sun_throws_a_longer_shadow(tmp_path):
 
 def test_what_a_low_sun_lights_is_redder(tmp_path):
     usual, low = (
-        draw(tmp_path, name="outdoor", sun_elevation_deg=e, sun_azimuth_deg=-90.0)[
-            MIDDLE_ROW - 5 : MIDDLE_ROW + 5, MIDDLE_COLUMN - 5 : MIDDLE_COLUMN + 5
-        ].mean(axis=(0, 1))
+        draw(tmp_path, name="outdoor", sun_elevation_deg=e, sun_azimuth_deg=-90.0)[BALL].mean(axis=(0, 1))
         for e in (38.0, 8.0)
     )
     assert low[0] / low[2] > 1.1 * usual[0] / usual[2]
@@ -126,7 +123,7 @@ def test_a_plain_background_has_exactly_the_colour_of_the_set_and_shadows_on_it(
     assert picture.shape[2] == 3
     color = np.array([srgb(0.2), srgb(0.5), srgb(0.8)])
     assert (picture[:5] == color).all()
-    ball = picture[MIDDLE_ROW - 5 : MIDDLE_ROW + 5, MIDDLE_COLUMN - 5 : MIDDLE_COLUMN + 5]
+    ball = picture[BALL]
     assert np.ptp(ball.mean(axis=(0, 1))) < 60  # white, and not the background's 122
     below = picture[-4:, MIDDLE_COLUMN - 4 : MIDDLE_COLUMN + 4]
     assert (below.mean(axis=(0, 1)) < 0.9 * color).all()
@@ -137,11 +134,11 @@ def test_a_transparent_background_leaves_the_ball_and_its_shadow(tmp_path):
     assert picture.shape[2] == 4
     alpha = picture[..., 3]
     assert (alpha[:5] == 0).all()
-    assert (alpha[MIDDLE_ROW - 5 : MIDDLE_ROW + 5, MIDDLE_COLUMN - 5 : MIDDLE_COLUMN + 5] == 255).all()
+    assert (alpha[BALL] == 255).all()
     shadow = alpha[-4:, MIDDLE_COLUMN - 4 : MIDDLE_COLUMN + 4].mean()
     assert 20 < shadow < 235
     # The set still lights what stands on it, though it is not seen.
-    assert (picture[MIDDLE_ROW - 5 : MIDDLE_ROW + 5, MIDDLE_COLUMN - 5 : MIDDLE_COLUMN + 5, :3]).mean() > 60
+    assert picture[BALL][..., :3].mean() > 60
 
 
 @pytest.mark.parametrize("name", ["studio", "outdoor", "window"])

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, read, redness, spec_of, sphere, spread, still_camera, write_mesh
+from blender_scenes import draw_all, redness, spec_of, sphere, spread, still_camera, write_mesh
 from drawn_jobs import BALL, RED, pose
 from needed_blender import needs_bpy
-from warm_python import run_python
 
 from render.parameters import CameraParameters
 from render.poses import write_poses
@@ -16,8 +15,7 @@ from render.spec import MeshObject
 pytestmark = needs_bpy
 
 
-LENGTH_M = 0.4
-"""How far the ball flies while the shutter is open; it is half as wide."""
+LENGTH_M = 0.4  # how far the ball flies while the shutter is open; it is half as wide
 
 
 @pytest.mark.parametrize("shutter", [0.25, 1.0])
@@ -26,8 +24,7 @@ def test_a_body_smears_as_long_as_it_flies_while_the_shutter_is_open(shutter, tm
     (tmp_path / "poses").mkdir()
     for frame, speed in enumerate((0.0, LENGTH_M * 60.0 / shutter)):
         write_poses(tmp_path / f"poses/{frame:06d}.json", frame, pose(velocity=(speed, 0.0, 0.0)))
-    spec_of(BALL, samples=32, shutter=shutter).write(tmp_path / "spec.json")
-    run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0,1")
+    draw_all(tmp_path, spec_of(BALL, samples=32, shutter=shutter), (0, 1))
     still, flying = spread(tmp_path, 0), spread(tmp_path, 1)
     # Even smearing over a length L adds L²/12 to the variance. Open for half a frame, it would be twice or half of it.
     assert np.sqrt(flying[0] ** 2 - still[0] ** 2) == pytest.approx(LENGTH_M / np.sqrt(12.0), rel=0.2)
@@ -41,10 +38,9 @@ def test_a_ball_out_of_focus_has_a_wider_rim_than_the_one_in_focus(tmp_path):
         for name, place in (("near", (-0.4, 0.0, 0.5)), ("far", (0.7, 1.5, 0.5)))
     )
     camera = still_camera(CameraParameters(position=(0.0, -2.5, 0.5), look_at=(0.0, 0.0, 0.5), f_stop=0.1))
-    spec = spec_of(*balls, samples=64, motion_blur=False, resolution=(width, height))
-    spec.model_copy(update={"camera": camera}).write(tmp_path / "spec.json")
-    run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0")
-    red = redness(read(tmp_path / "0.png"))[height // 2 - 8 : height // 2 + 8].mean(axis=0)
+    spec = spec_of(*balls, samples=32, motion_blur=False, resolution=(width, height))
+    (picture,) = draw_all(tmp_path, spec.model_copy(update={"camera": camera}))
+    red = redness(picture)[height // 2 - 8 : height // 2 + 8].mean(axis=0)
     # Between the stage's 0.27 to 0.30 and the ball's 0.5 and more.
     near, far = (((half > 0.32) & (half < 0.48)).sum() for half in (red[: width // 2], red[width // 2 :]))
     # A lens of 50 mm at f/0.1 is 0.5 m wide: focused at 2.5 m, it smears a point at 4 m over 0.3 m there, 27 pixels,

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, RESOLUTION, read, spec_of, sphere, still_camera, write_mesh
+from blender_scenes import RESOLUTION, draw_all, spec_of, sphere, still_camera, write_mesh
 from needed_blender import needs_bpy
-from warm_python import run_python
 
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters, SetParameters
@@ -18,15 +17,13 @@ from render.spec import MeshObject, MeshSequenceObject, SceneObject
 pytestmark = needs_bpy
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-QUARTER_TURN = (sqrt(0.5), 0.0, sqrt(0.5), 0.0)
-"""About the y axis, along which the camera looks."""
+QUARTER_TURN = (sqrt(0.5), 0.0, sqrt(0.5), 0.0)  # about the y axis, along which the camera looks
 
 
 def draw(folder: Path, *objects: SceneObject, **render: object) -> np.ndarray:
     """Display values of frame 0 from 0 to 255, (rows, columns, 3)."""
-    spec_of(*objects, **{"samples": 24, "motion_blur": False, **render}).write(folder / "spec.json")
-    run_python(RENDER_FRAMES, str(folder), "{frame}.png", "0", "2")
-    return read(folder / "0.png")
+    (picture,) = draw_all(folder, spec_of(*objects, **{"samples": 24, "motion_blur": False, **render}))
+    return picture
 
 
 def patch(picture: np.ndarray, x: float, z: float, half: float) -> np.ndarray:
@@ -81,12 +78,12 @@ def test_density_decides_how_far_light_gets_inside(look, tmp_path):
             tmp_path,
             MeshObject(name=look, file="ball.ply", material=MaterialParameters(look=look, density=density)),
             resolution=(128, 72),
-            samples=64,
+            samples=16,
         )
         for density in (0.02, 0.5)
     )
     # The backdrop shows through thin honey. In thin milk, light that entered far away fills the shadow below; 500
-    # pixels of 64 samples are good to a fraction of a per cent.
+    # pixels of 16 samples are good to a per cent.
     z, half, factor = (0.5, 0.2, 1.3) if look == "honey" else (0.3, 0.06, 1.05)
     lighter, darker = ((patch(each, 0.0, z, half) @ LUMINANCE).mean() for each in (thin, dense))
     assert lighter > factor * darker
@@ -153,14 +150,19 @@ def test_the_grain_of_a_sheet_hangs_on_its_coordinates_at_rest(tmp_path):
     assert stripes(pictures[1]) < 0.8
 
 
+@pytest.fixture(scope="module")
+def empty_set(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    return draw(tmp_path_factory.mktemp("empty"), samples=8)
+
+
 @pytest.mark.parametrize("look", ["glass", "metal", "stone", "ceramic", "plastic", "rubber"])
-def test_solid_looks_are_lit_and_differ_from_the_set_behind_them(look, tmp_path):
+def test_solid_looks_are_lit_and_differ_from_the_set_behind_them(look, tmp_path, empty_set):
     write_mesh(tmp_path / "ball.ply", *sphere((0.0, 0.0, 0.5), 0.3))
     ball = MeshObject(name=look, file="ball.ply", material=MaterialParameters(look=look))
-    with_ball, without = draw(tmp_path, ball, samples=8), draw(tmp_path, samples=8)
+    with_ball = draw(tmp_path, ball, samples=8)
     seen = patch(with_ball, 0.0, 0.5, 0.2) @ LUMINANCE
     assert 25 < seen.mean() < 245
-    changed = np.abs(with_ball - without).max(axis=2) > 12.0
+    changed = np.abs(with_ball - empty_set).max(axis=2) > 12.0
     # A disc of 0.3 m at 2.5 m, seen by 1.39 tangents a picture's width; glass hides least of what is behind it.
     disc = np.pi * (RESOLUTION[0] * 50.0 / 36.0 * 0.3 / sqrt(2.5**2 - 0.3**2)) ** 2
     assert changed.sum() > (0.3 if look == "glass" else 0.6) * disc
@@ -175,10 +177,8 @@ def test_caustics_bend_the_sun_s_light_and_leave_the_rest_of_the_ground_as_it_is
         glass = MaterialParameters(look="glass", caustics=caustics)
         ball = MeshObject(name="ball", file="ball.ply", material=glass)
         scene = {"set": SetParameters(name="outdoor", strength=0.5), "camera": above}
-        spec = spec_of(ball, samples=64, motion_blur=False).model_copy(update=scene)
-        spec.write(tmp_path / "spec.json")
-        run_python(RENDER_FRAMES, str(tmp_path), "{frame}.png", "0", "2")
-        pictures.append(read(tmp_path / "0.png") @ LUMINANCE)
+        (picture,) = draw_all(tmp_path, spec_of(ball, samples=64, motion_blur=False).model_copy(update=scene))
+        pictures.append(picture @ LUMINANCE)
     straight, bent = pictures
     ground = straight[:, :8].mean()
     # A far disc stands for the sun: the same light to a hundredth, and noise of 64 samples over 288 pixels.

@@ -133,7 +133,7 @@ def test_numbers_that_are_not_finite_are_refused_by_name(tmp_path, tetrahedron, 
     columns[column][2, 1] = value
     path = tmp_path / "mesh.ply"
     write_ply(path, faces=faces, **columns)
-    with pytest.raises(InvalidFileError, match=r"of vertex 2 is not finite"):
+    with pytest.raises(InvalidFileError, match=rf"{column} of vertex 2 are not finite"):
         validate_ply(path)
 
 
@@ -157,7 +157,7 @@ def test_a_face_that_is_not_a_triangle_is_refused(file):
 
 def test_arrays_that_do_not_fit_together_are_refused(tmp_path, tetrahedron):
     vertices, faces = tetrahedron
-    with pytest.raises(ValueError, match="'velocity': 3"):
+    with pytest.raises(ValueError, match="'velocities': 3"):
         write_ply(tmp_path / "mesh.ply", vertices, faces, velocities=vertices[:3])
     with pytest.raises(ValueError, match=r"faces must have the shape \(n, 3\), got \(4, 2\)"):
         write_ply(tmp_path / "mesh.ply", vertices, faces[:, :2])

@@ -16,7 +16,6 @@ from blender_scenes import (
     spread,
     write_mesh,
 )
-from blender_stand_in import write_blender_stand_in
 from drawn_jobs import BALL, draw_frame, job_of_the_ball, pose
 from needed_blender import needs_bpy
 from warm_python import run_python
@@ -25,7 +24,6 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import Task
 from pipeline.model.job import Job
 from pipeline.stages.render import RenderStage
-from render.blender import open_renderer
 from render.poses import write_poses
 from sim.core.snapshots import Snapshot
 
@@ -41,8 +39,7 @@ POSES = [
     pose(orientation=ABOUT_Y_90),
     pose(angular_velocity=(0.0, -2.0 * np.pi * 20.0, 0.0)),  # a third of a turn in a frame
 ]
-OFF_CENTRE = np.array([0.25, 0.0, 0.0])
-"""Where the mesh is from its own origin [m], so that turning the body moves it."""
+OFF_CENTRE = np.array([0.25, 0.0, 0.0])  # where the mesh is from its own origin [m], so that turning the body moves it
 
 
 @pytest.fixture(scope="module")
@@ -101,16 +98,6 @@ def test_poses_that_are_missing_or_unfit_are_refused_with_their_frame(pictures):
     assert "frame 6: cannot read the poses" in refused[0] and "000006.json" in refused[0]
     assert "frame 7:" in refused[1] and 'none of "ball"' in refused[1]
     assert "frame 8:" in refused[2] and 'position of "ball" must be 3 finite numbers' in refused[2]
-
-
-def test_an_external_blender_draws_the_same_poses(pictures, tmp_path):
-    folder, _ = pictures
-    renderer = open_renderer(folder / "spec.json", threads=1, blender=str(write_blender_stand_in(tmp_path)))
-    try:
-        renderer.render(5, tmp_path / "external.png")
-    finally:
-        renderer.close()
-    assert (tmp_path / "external.png").read_bytes() == (folder / "5.png").read_bytes()
 
 
 def test_poses_that_are_not_finite_are_not_written(tmp_path):

@@ -32,8 +32,7 @@ pytestmark = needs_bpy
 
 BALL = MeshObject(name="ball", file="ball.ply", position=(0.0, 0.25, 0.5), material=RED)
 FRONT = View((0.0, -2.25, 0.5), (0.0, 0.25, 0.5), 50.0, 2.5)
-WAY_M = 0.2
-"""How far the camera flies while the shutter is open: half of a frame."""
+WAY_M = 0.2  # how far the camera flies while the shutter is open: half of a frame
 
 
 def flying(frame_part: float) -> View:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from blender_scenes import read, spec_of, sphere, still_camera, write_mesh
 from drawn_jobs import RED, job_of_the_ball, pose
-from fresh_python import run_python
 from inline_tasks import run_task
 from needed_blender import needs_bpy
 from PIL import Image
 from places import PROJECT
+from warm_python import run_python
 
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job

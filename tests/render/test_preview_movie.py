@@ -15,8 +15,7 @@ from render.preview_movie import LARGEST_WIDTH, write_preview_movie
 SIZE = (96, 64)
 FRAMES = 12
 WHITE, AMBER = (245, 245, 245), (255, 176, 48)
-NEAR = 12
-"""Levels: a lossy codec, twice, of plain areas."""
+NEAR = 12  # levels: a lossy codec, twice, of plain areas
 
 
 def draw(folder: Path, frames: list[int], *, size: tuple[int, int] = SIZE) -> dict[int, Path]:

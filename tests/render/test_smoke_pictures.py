@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from bare_volumes import PICTURE_WIDTH_M, draw_bare, smoke_object, write_frame
 from blender_scenes import RENDER_FRAMES, read, spec_of
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
 from blender_scripts.black_body import black_body_color, relative_luminance
 from render.parameters import MaterialParameters
@@ -96,7 +96,7 @@ def test_smoke_that_flies_is_blurred_by_its_way_while_the_shutter_is_open(tmp_pa
         velocity[..., 0] = speed
         write_frame(tmp_path, frame, ball, velocity=velocity)
     smoke = smoke_object(MaterialParameters(look="smoke", color=BLACK, density=30.0))
-    pictures = draw_bare(tmp_path, smoke, 3, quality=quality, motion_blur=True, shutter=0.5, samples=64)
+    pictures = draw_bare(tmp_path, smoke, 3, quality=quality, motion_blur=True, shutter=0.5, samples=24)
     place = PICTURE_WIDTH_M * ((np.arange(64) + 0.5) / 64 - 0.5)
     centres_of, variances = [], []
     for picture in pictures:

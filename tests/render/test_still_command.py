@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from click.testing import Result
 from command_line import pipeline
 from exr_channels import exr_channels
 from half_simulated_jobs import half_simulated_job
@@ -20,6 +21,13 @@ def job(tmp_path) -> JobLayout:
     return half_simulated_job(tmp_path)
 
 
+def draw(job: JobLayout, frame: int, quality: str, *arguments: object) -> Result:
+    result = pipeline("still", job.root, "--frame", frame, "--quality", quality, *arguments)
+    render_drawing.close_renderers()
+    assert result.exit_code == 0, result.output
+    return result
+
+
 def contents(layout: JobLayout) -> dict[str, bytes]:
     return {
         path.relative_to(layout.root).as_posix(): path.read_bytes()
@@ -31,11 +39,7 @@ def contents(layout: JobLayout) -> dict[str, bytes]:
 @needs_bpy
 def test_a_still_is_drawn_beside_the_jobs_frames_and_touches_nothing_else(job):
     before = contents(job)
-    result = pipeline(
-        "still", job.root, "--frame", 1, "--quality", "preview", "--resolution", 48, 32, "--set", "render.samples=2"
-    )
-    render_drawing.close_renderers()
-    assert result.exit_code == 0, result.output
+    result = draw(job, 1, "preview", "--resolution", 48, 32, "--set", "render.samples=2")
     (drawn,) = job.stills.iterdir()
     assert result.stdout == f"{drawn}\n"
     assert drawn.name.startswith("000001-preview-48x32-"), "and what tells it from one without that --set"
@@ -62,9 +66,7 @@ position = [1.0, -2.0, 0.5]
         (tmp_path / name).mkdir()
         job = half_simulated_job(tmp_path / name, camera)
         arguments = ("--set", "camera.position=[0, -3, 1]", "--set", "render.samples=1")
-        result = pipeline("still", job.root, "--frame", 1, "--quality", "draft", *arguments)
-        render_drawing.close_renderers()
-        assert result.exit_code == 0, result.output
+        draw(job, 1, "draft", *arguments)
         (drawn,) = job.stills.iterdir()
         pictures.append(drawn.read_bytes())
     assert pictures[0] == pictures[1]
@@ -76,9 +78,7 @@ def test_a_still_goes_where_it_is_wanted_and_replaces_what_is_there(job, tmp_pat
     target.parent.mkdir()
     target.write_bytes(b"an older poster")
     arguments = ("--set", "render.samples=1", "--set", "set.color=[0.5, 0.1, 0.1]", "-o", target)
-    result = pipeline("still", job.root, "--frame", 0, "--quality", "draft", *arguments)
-    render_drawing.close_renderers()
-    assert result.exit_code == 0, result.output
+    draw(job, 0, "draft", *arguments)
     with Image.open(target) as picture:
         assert picture.size == (64, 36)
     assert [path.name for path in target.parent.iterdir()] == ["poster.png"]
@@ -88,9 +88,7 @@ def test_a_still_goes_where_it_is_wanted_and_replaces_what_is_there(job, tmp_pat
 @needs_bpy
 def test_a_still_with_a_master_has_both_files(job, tmp_path):
     arguments = ("--set", 'render.format="exr"', "--set", "render.samples=1", "-o", tmp_path / "poster.png")
-    result = pipeline("still", job.root, "--frame", 0, "--quality", "draft", *arguments)
-    render_drawing.close_renderers()
-    assert result.exit_code == 0, result.output
+    draw(job, 0, "draft", *arguments)
     validate_exr(tmp_path / "poster.exr", (64, 36))
     validate_picture(tmp_path / "poster.png", (64, 36))
 
@@ -105,9 +103,7 @@ def test_vectors_of_a_rigid_body_and_of_a_camera_reach_to_the_next_frame(job, tm
     for name, more in {"still": [], "following": ['camera.follow="ball"']}.items():
         overrides = [word for key in (*keys, *more) for word in ("--set", key)]
         target = tmp_path / f"{name}.png"
-        result = pipeline("still", job.root, "--frame", 1, "--quality", "draft", *overrides, "-o", target)
-        render_drawing.close_renderers()
-        assert result.exit_code == 0, result.output
+        draw(job, 1, "draft", *overrides, "-o", target)
         vectors[name] = exr_channels(target.with_suffix(".exr"), tmp_path)["ViewLayer.Vector.X"]
     # 12 m/s at 60 fps are 0.2 m a frame; 64 pixels x 50 mm / 36 mm / 2.4 m = 37.0 pixels a metre on the ball's front.
     # Vectors point to where things were in the frame before.

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from places import HELPERS, PROJECT
+from fresh_python import run_python
+from places import HELPERS
 
 from render.meshes import SurfaceMesh
 from render.parameters import SurfaceParameters
@@ -17,6 +16,12 @@ from render.surface import SurfaceReconstructionError, reconstruct_surface, with
 
 RADIUS = 0.005
 BALL_RADIUS = 0.1
+HERE = f"""
+import sys
+sys.path[:0] = [{str(HELPERS)!r}, {str(Path(__file__).parent)!r}]
+from test_surface import *
+"""
+"""Begins code for another process with what this module has."""
 PARAMETERS = SurfaceParameters()
 
 
@@ -132,15 +137,9 @@ def test_no_particles_give_a_mesh_without_vertices():
 
 def test_the_same_particles_give_the_same_bytes_in_every_process():
     positions = splash()
-    script = f"""
-import sys
-sys.path[:0] = [{str(HELPERS)!r}, {str(Path(__file__).parent)!r}]
-from test_surface import digest, mesh_of, splash
-print(digest(mesh_of(splash(), splash())))
-"""
-    done = subprocess.run([sys.executable, "-c", script], check=True, cwd=PROJECT, capture_output=True, text=True)
+    told = run_python(HERE + "print(digest(mesh_of(splash(), splash())))")
     digests = {digest(mesh_of(positions, positions)) for _ in range(4)}
-    assert digests == {done.stdout.strip()}
+    assert digests == {told.strip()}
 
 
 def test_a_process_keeps_its_number_of_threads():
@@ -150,15 +149,11 @@ def test_a_process_keeps_its_number_of_threads():
 
 
 def test_several_threads_give_the_same_surface_up_to_order_and_rounding():
-    script = f"""
-import sys
-sys.path[:0] = [{str(HELPERS)!r}, {str(Path(__file__).parent)!r}]
-from test_surface import *
+    script = """
 mesh = reconstruct_surface(splash(), splash(), particle_radius=RADIUS, parameters=PARAMETERS, threads=2)
 print(enclosed_volume(mesh), is_closed_manifold(mesh), len(mesh.vertices))
 """
-    done = subprocess.run([sys.executable, "-c", script], check=True, cwd=PROJECT, capture_output=True, text=True)
-    volume, closed, vertex_count = done.stdout.split()
+    volume, closed, vertex_count = run_python(HERE + script).split()
     mesh = mesh_of(splash())
     assert float(volume) == pytest.approx(enclosed_volume(mesh), rel=1e-4)  # order of summation and of collapses
     assert closed == "True"

@@ -9,8 +9,7 @@ from blender_scenes import sphere
 from render.camera_path import View
 from render.visibility import in_picture, is_inside, screen_positions
 
-FRONT = View((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), 36.0, 2.0)
-"""Sees a metre to each side at the origin."""
+FRONT = View((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), 36.0, 2.0)  # sees a metre to each side at the origin
 
 
 def test_edges_of_the_picture_are_where_the_lens_puts_them():

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
 from render.parameters import VolumeParameters
 from render.volume import write_volume

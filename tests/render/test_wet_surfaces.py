@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, read, redness, spec_of, sphere, still_camera, write_mesh
+from blender_scenes import RENDER_FRAMES, draw_all, redness, spec_of, sphere, still_camera, write_mesh
 from needed_blender import needs_bpy
 from warm_python import run_python
 
@@ -18,19 +18,15 @@ from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, SceneO
 pytestmark = needs_bpy
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-REACH = 0.012
-"""Of particles with a radius of 8 mm [m]."""
-GAP = 0.002
-"""Between the water and what it lies on, a quarter of a radius [m]."""
-NO_REACH = 0.1 * GAP
-"""Too short to reach across the gap [m]."""
+REACH = 0.012  # of particles with a radius of 8 mm [m]
+GAP = 0.002  # between the water and what it lies on, a quarter of a radius [m]
+NO_REACH = 0.1 * GAP  # too short to reach across the gap [m]
 WATER_TOP = 0.5
 RED = MaterialParameters(look="plastic", color=(0.7, 0.02, 0.02), roughness=0.5)
 CAMERA = still_camera(CameraParameters(position=(0.0, -3.0, 0.62), look_at=(0.0, 0.0, 0.3), focal_length_mm=70.0))
 
 
-Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Positions, triangles and normals."""
+Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]  # positions, triangles and normals
 
 
 def box(low: tuple[float, ...], high: tuple[float, ...]) -> Mesh:
@@ -89,42 +85,46 @@ def draw(folder: Path, *objects: SceneObject) -> np.ndarray:
 
 def draw_frames(folder: Path, count: int, *objects: SceneObject) -> list[np.ndarray]:
     """Display values of the first frames, all drawn in one process."""
-    spec = spec_of(*objects, samples=16, motion_blur=False, resolution=(128, 72), quality="preview")
-    spec.model_copy(update={"camera": CAMERA}).write(folder / "spec.json")
-    run_python(RENDER_FRAMES, str(folder), "{frame}.png", ",".join(map(str, range(count))), "2")
-    return [read(folder / f"{frame}.png") for frame in range(count)]
+    spec = spec_of(*objects, samples=8, motion_blur=False, resolution=(128, 72), quality="preview")
+    return draw_all(folder, spec.model_copy(update={"camera": CAMERA}), range(count))
 
 
 FLOOR = np.s_[58:62, 44:84]
 """Pixels of the floor through the water's front, which meet its lower side at some 80 degrees."""
 
 
-def brightness_of_the_floor(folder: Path, *objects: SceneObject) -> float:
-    return float((draw(folder, *objects)[FLOOR] @ LUMINANCE).mean())
+def brightness(picture: np.ndarray, where: tuple[slice, slice]) -> float:
+    return float((picture[where] @ LUMINANCE).mean())
 
 
-def test_the_floor_under_water_is_seen_and_mirrors_nothing(tmp_path):
+@pytest.fixture(scope="module")
+def block(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    """A block of water that wets the floor."""
+    folder = tmp_path_factory.mktemp("block")
+    write_water(folder)
+    return draw(folder, water(REACH))
+
+
+def test_the_floor_under_water_is_seen_and_mirrors_nothing(tmp_path, block):
     write_water(tmp_path)
-    bare, wet = brightness_of_the_floor(tmp_path), brightness_of_the_floor(tmp_path, water(REACH))
-    # What the water's surfaces keep back comes to 0.1 % in display values, noise of 16 samples to less.
+    bare, wet = brightness(draw(tmp_path), FLOOR), brightness(block, FLOOR)
+    # What the water's surfaces keep back comes to 0.1 % in display values, noise of 8 samples to less.
     assert wet == pytest.approx(bare, rel=0.05)
     # What does not wet is a mirror, of the dark upper half of the room.
-    assert brightness_of_the_floor(tmp_path, water(NO_REACH)) < 0.5 * wet
+    assert brightness(draw(tmp_path, water(NO_REACH)), FLOOR) < 0.5 * wet
 
 
-def test_light_that_caustics_bend_reaches_a_floor_under_water(tmp_path):
+def test_light_that_caustics_bend_reaches_a_floor_under_water(tmp_path, block):
     """Cycles finds no way through two parallel surfaces, and a floor under a block of water was a quarter as bright."""
     write_water(tmp_path)
-    straight, bent = (brightness_of_the_floor(tmp_path, water(REACH, caustics=on)) for on in (False, True))
+    bent = draw(tmp_path, water(REACH, caustics=True))
     # The light of the room's dome is not followed.
-    assert bent > 0.7 * straight
+    assert brightness(bent, FLOOR) > 0.7 * brightness(block, FLOOR)
 
 
 BALL = ((0.0, -0.1, 0.2), 0.12)
-IN_FRONT = np.s_[36:66, 40:88]
-"""Pixels of the ball as it is seen through the water's front."""
-IN_FRONT_OF_ALL = np.s_[36:66, :]
-"""The same rows, wherever the ball is."""
+IN_FRONT = np.s_[36:66, 40:88]  # pixels of the ball as it is seen through the water's front
+IN_FRONT_OF_ALL = np.s_[36:66, :]  # the same rows, wherever the ball is
 EVERYWHERE = np.s_[:, :]
 
 
@@ -193,22 +193,19 @@ def test_cloth_that_lies_in_water_is_seen_wherever_it_is(tmp_path):
 
 BETWEEN = np.s_[39:42, 40:88]
 """Pixels of where two blocks of water meet at a height of 0.26 m, through the front of the upper one."""
+UPPER = {"name": "upper", "file": "upper{frame}.ply"}
 
 
-def test_two_clear_fluids_that_meet_mirror_nothing(tmp_path):
-    write_water(tmp_path)
-    one = draw(tmp_path, water(REACH))
-    below, above = layers(0.26)
-    for name, (positions, triangles, normals) in (("water", below), ("upper", above)):
+def test_two_clear_fluids_that_meet_mirror_nothing(tmp_path, block):
+    for name, (positions, triangles, normals) in zip(("water", "upper"), layers(0.26), strict=True):
         write_ply(tmp_path / f"{name}000000.ply", positions, triangles, normals=normals, velocities=0 * positions)
-
-    def brightness(reach: float) -> float:
-        upper = water(reach).model_copy(update={"name": "upper", "file": "upper{frame}.ply"})
-        return float((draw(tmp_path, water(reach), upper)[BETWEEN] @ LUMINANCE).mean())
-
+    met, apart = (
+        brightness(draw(tmp_path, water(reach), water(reach).model_copy(update=UPPER)), BETWEEN)
+        for reach in (REACH, NO_REACH)
+    )
     # 156 where one block has 155; the sliver between them mirrors the dark upper half of the room, 69.
-    assert brightness(REACH) == pytest.approx(float((one[BETWEEN] @ LUMINANCE).mean()), rel=0.05)
-    assert brightness(NO_REACH) < 0.6 * brightness(REACH)
+    assert met == pytest.approx(brightness(block, BETWEEN), rel=0.05)
+    assert apart < 0.6 * met
 
 
 def test_water_keeps_its_surface_around_a_body_of_glass(tmp_path):

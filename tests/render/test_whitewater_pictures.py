@@ -20,8 +20,7 @@ pytestmark = needs_bpy
 SPRAY, FOAM, BUBBLES = range(3)
 GROUND_ROW = 29
 DARK = MaterialParameters(look="plastic", color=(0.02, 0.02, 0.02), roughness=1.0)
-PIXELS_PER_M = RESOLUTION[0] * 50.0 / 36.0 / 2.5
-"""In the plane y = 0, which the camera of `spec_of` sees from 2.5 m."""
+PIXELS_PER_M = RESOLUTION[0] * 50.0 / 36.0 / 2.5  # in the plane y = 0, which the camera of `spec_of` sees from 2.5 m
 
 
 def objects() -> list:
@@ -153,4 +152,4 @@ def test_broken_files_are_refused_with_frame_and_file(pictures):
     assert len(refused) == 3
     assert f"frame {len(FRAMES)}:" in refused[0] and "1 values that are not finite" in refused[0]
     assert "truncated" in refused[1]
-    assert "is not a PLY of whitewater points" in refused[2]
+    assert "is not a point cloud of the expected layout" in refused[2]

@@ -15,19 +15,26 @@ CLOTH = {"shape": {"type": "rectangle", "size": (0.4, 0.4), "counts": (5, 5)}, "
 BODIES = {
     "fluid": {"block": [{"shape": {"type": "box", "size": (0.2, 0.2, 0.2)}, "position": (0.0, 0.0, 0.3)}]},
     "smoke": {"cell_size": 0.2, "source": [{"shape": {"type": "sphere", "radius": 0.2}, "position": (0.0, 0.0, 0.5)}]},
-    "rigid": {"kind": "dynamic", "density": 500.0, "shape": {"type": "sphere", "radius": 0.1},
-              "position": (0.0, 0.0, 0.3)},
+    "rigid": {
+        "kind": "dynamic",
+        "density": 500.0,
+        "shape": {"type": "sphere", "radius": 0.1},
+        "position": (0.0, 0.0, 0.3),
+    },
     "cloth": CLOTH,
-}  # fmt: skip
+}
 KEYS = {
-    "fluid": FluidParameters.model_fields, "smoke": SmokeParameters.model_fields,
-    "rigid": RigidBodyParameters.model_fields, "cloth": ClothParameters.model_fields,
-}  # fmt: skip
+    "fluid": FluidParameters.model_fields,
+    "smoke": SmokeParameters.model_fields,
+    "rigid": RigidBodyParameters.model_fields,
+    "cloth": ClothParameters.model_fields,
+}
 
 
 def world_of(kind: str, **keys):
-    return build_world(SceneParameters.model_validate({kind: [{"name": "body", **BODIES[kind], **keys}]}),
-                       frames_per_second=60)  # fmt: skip
+    return build_world(
+        SceneParameters.model_validate({kind: [{"name": "body", **BODIES[kind], **keys}]}), frames_per_second=60
+    )
 
 
 @pytest.mark.usefixtures("taichi_cpu")
@@ -38,11 +45,14 @@ def world_of(kind: str, **keys):
         ("smoke", {}, {"cfl", "cell_size"}),
         ("rigid", {}, {"velocity", "angular_velocity"}),
         ("cloth", {}, {"substeps", "stretch_stiffness", "wind"}),
-        ("cloth", {"integrator": "explicit", "stretch_stiffness": 10.0},
-         {"substeps", "stretch_stiffness", "integrator"}),
+        (
+            "cloth",
+            {"integrator": "explicit", "stretch_stiffness": 10.0},
+            {"substeps", "stretch_stiffness", "integrator"},
+        ),
     ],
     ids=["fluid", "smoke", "rigid", "cloth", "explicit cloth"],
-)  # fmt: skip
+)
 def test_remedies_name_keys_of_the_body(kind, keys, named):
     (solver,) = world_of(kind, **keys).solvers.values()
     remedies = solver.remedies()

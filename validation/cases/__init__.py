@@ -27,19 +27,12 @@ Found = tuple[Sequence[Check], Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Case:
-    """One case, of the name of its module.
+    """One case, of the name of its module; sizes are those of the full case, and of the one that a test can afford."""
 
-    Attributes:
-        find: computes it, given the solver's name and the sizes.
-        draw: its figure, given the results of all solvers; None where it is all numbers.
-        solvers: which it is computed with.
-        sizes: resolutions, durations and what else differs: of the full case, and of the one that a test can afford.
-    """
-
-    find: Callable[..., Found]
-    draw: Callable[[Sequence[CaseResult]], Figure] | None = None
-    solvers: tuple[str, ...] = ("wcsph", "dfsph", "pcisph")
-    sizes: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
+    find: Callable[..., Found]  # computes it, given the solver's name and the sizes
+    draw: Callable[[Sequence[CaseResult]], Figure] | None = None  # its figure, given the results of all solvers
+    solvers: tuple[str, ...] = ("wcsph", "dfsph", "pcisph")  # which it is computed with
+    sizes: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)  # resolutions, durations and what else differs
 
     @property
     def name(self) -> str:
@@ -62,8 +55,7 @@ class Case:
 
 def load_case(name: str) -> Case:
     """The case of this name. Raises ModuleNotFoundError for an unknown one."""
-    case: Case = import_module(f"validation.cases.{name.replace('-', '_')}").CASE
-    return case
+    return import_module(f"validation.cases.{name.replace('-', '_')}").CASE
 
 
 def _is_number(value: Any) -> bool:

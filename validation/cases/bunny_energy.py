@@ -13,13 +13,11 @@ from validation.cases import Case, Found
 from validation.checks import CaseResult, Check
 from validation.figures import COLOURS, label_axes, make_panels, style_of
 
-BALL_RADIUS, BALL_HEIGHT, BUNNY_HEIGHT = 0.25, 0.95, 0.5
-"""Of the ball of water and of its centre above the floor, and of the bunny [m]."""
+BALL_RADIUS, BALL_HEIGHT, BUNNY_HEIGHT = 0.25, 0.95, 0.5  # of the water and its centre; the bunny [m]
 
 DURATION = 1.0
 FRAMES_PER_SECOND = 60.0
-IMPACT_FRAME = 10
-"""The last frame before the water touches the bunny, 0.2 m below it: 0.2 s after the start."""
+IMPACT_FRAME = 10  # the last frame before the water touches the bunny, 0.2 m below it: 0.2 s after the start
 
 ARTIFICIAL_VISCOSITY, EQUAL_VISCOSITY = 0.05, 0.005
 """The default, and with which WCSPH is as viscous as the others: it multiplies the speed of sound there, and a tenth of
@@ -30,10 +28,12 @@ def scene(solver: str, spacing: float, artificial_viscosity: float = ARTIFICIAL_
     """The bunny in the middle of a walled square metre, the ball above it."""
     bunny = {"type": "bunny", "height": BUNNY_HEIGHT}
     water = {
-        "name": "water", "solver": solver, "particle_radius": spacing / 2.0,
+        "name": "water",
+        "solver": solver,
+        "particle_radius": spacing / 2.0,
         "artificial_viscosity": artificial_viscosity,
         "block": [{"shape": {"type": "sphere", "radius": BALL_RADIUS}, "position": (0, 0, BALL_HEIGHT)}],
-    }  # fmt: skip
+    }
     return SceneParameters.model_validate(
         {
             "domain": {"min": (-0.5, -0.5, 0.0), "max": (0.5, 0.5, 1.5), "open_faces": ()},

@@ -12,26 +12,15 @@ from sim.core.domain import DomainParameters
 from validation.cases import Case, Found
 from validation.checks import CaseResult, Check
 from validation.figures import COLOURS, THEORY, label_axes, make_panels, style_of
-from validation.scenes import SPACING, WATER, Tank, advance, body, submerged_sphere
+from validation.scenes import SPACING, WATER, Tank, body, recorded, submerged_sphere
 
-NEUTRAL_RADIUS = 3 * SPACING
-"""Of the neutral sphere [m]."""
-
-DUCK_TANK = (1.6, 1.4, 1.6)
-"""Length, width and depth of its water over its length."""
-
-BOX = (0.16, 0.16, 0.12)
-"""Edges of what floats [m]; it is lower than wide, so that it floats upright."""
+NEUTRAL_RADIUS = 3 * SPACING  # of the neutral sphere [m]
+DUCK_TANK = (1.6, 1.4, 1.6)  # length, width and depth of its water over its length
+BOX = (0.16, 0.16, 0.12)  # edges of what floats [m]; it is lower than wide, so that it floats upright
 
 
 def find(solver: str, duck_length: float, densities: Sequence[float]) -> Found:
-    """The neutral bodies and the floating boxes.
-
-    Args:
-        solver: of the fluid.
-        duck_length: of the neutral duck, whose bill and tail are thinner than two spacings [m].
-        densities: of the boxes [kg/m³].
-    """
+    """A neutral sphere and duck, whose bill and tail are thinner than two spacings, and boxes of densities [kg/m³]."""
     neutral = {
         "sphere": _neutral(submerged_sphere(solver, WATER, NEUTRAL_RADIUS)),
         "duck": _neutral(_submerged_duck(solver, duck_length)),
@@ -39,7 +28,7 @@ def find(solver: str, duck_length: float, densities: Sequence[float]) -> Found:
     afloat = {density: _afloat(solver, density) for density in densities}
     checks = [
         *(
-            Check(f"farthest way of a neutral {name} in 2 s", each["way"], 0.0, SPACING,
+            Check(f"largest displacement of a neutral {name} in 2 s", each["displacement"], 0.0, SPACING,
                   "the required one spacing", "m")
             for name, each in neutral.items()
         ),
@@ -53,7 +42,7 @@ def find(solver: str, duck_length: float, densities: Sequence[float]) -> Found:
     ]  # fmt: skip
     series: dict[str, Any] = {}
     for name, each in neutral.items():
-        series |= {f"ways_{name}": each["ways"], "neutral_times": each["times"]}
+        series |= {f"displacements_{name}": each["displacements"], "neutral_times": each["times"]}
     for density, each in afloat.items():
         series |= {f"afloat_{density:g}": each["draughts"], "afloat_times": each["times"]}
     return checks, series
@@ -71,11 +60,10 @@ def _submerged_duck(solver: str, length: float) -> Tank:
 
 def _neutral(tank: Tank) -> dict[str, Any]:
     start = tank.rigid.bodies.position[0].copy()
-    times, ways = [0.0], [0.0]
-    for time in advance(tank, 2.0, cuts=100):
-        times.append(time)
-        ways.append(float(np.linalg.norm(tank.rigid.bodies.position[0] - start)))
-    return {"times": times, "ways": ways, "way": max(ways), "astray": tank.astray()}
+    found: dict[str, Any] = recorded(
+        tank, 2.0, cuts=100, start=True, displacements=lambda: np.linalg.norm(tank.rigid.bodies.position[0] - start)
+    )
+    return {**found, "displacement": max(found["displacements"]), "astray": tank.astray()}
 
 
 def _afloat(solver: str, density: float) -> dict[str, Any]:
@@ -90,18 +78,16 @@ def _afloat(solver: str, density: float) -> dict[str, Any]:
     )
     domain = DomainParameters(min=(-side / 2.0, -side / 2.0, 0.0), max=(side / 2.0, side / 2.0, 0.6))
     tank = Tank(solver, [box], domain=domain, depth=round(surface / SPACING) * SPACING)
-    volume = tank.fluid.particle_count * tank.fluid.particle_volume
-    times, draughts = [], []
-    for time in advance(tank, 2.0, cuts=50):
+    volume, area = tank.fluid.particle_count * tank.fluid.particle_volume, BOX[0] * BOX[1]
+
+    def draught() -> float:
+        """The surface lies where water and the part of the box below it fill the tank: H A = V + (H - bottom) a."""
         bottom = float(tank.rigid.bodies.position[0, 2]) - BOX[2] / 2.0
-        # The surface lies where water and the part of the box below it fill the tank: H A = V + (H - bottom) a.
-        area = BOX[0] * BOX[1]
-        level = (volume - bottom * area) / (side**2 - area)
-        times.append(time)
-        draughts.append(level - bottom)
-    settled = [draught for time, draught in zip(times, draughts, strict=True) if time > 1.0]
-    found = {"times": times, "draughts": draughts, "draught": float(np.mean(settled))}
-    return {**found, "exact": exact, "astray": tank.astray()}
+        return (volume - bottom * area) / (side**2 - area) - bottom
+
+    found: dict[str, Any] = recorded(tank, 2.0, cuts=50, draughts=draught)
+    settled = [each for time, each in zip(found["times"], found["draughts"], strict=True) if time > 1.0]
+    return {**found, "draught": float(np.mean(settled)), "exact": exact, "astray": tank.astray()}
 
 
 def draw(results: Sequence[CaseResult]) -> Figure:
@@ -111,13 +97,15 @@ def draw(results: Sequence[CaseResult]) -> Figure:
     for result in results:
         series, colour = result.series, COLOURS[result.solver]
         for name, dash in (("sphere", "-"), ("duck", "--")):
-            neutral.plot(series["neutral_times"], [1e3 * way for way in series[f"ways_{name}"]], dash, color=colour)
+            neutral.plot(
+                series["neutral_times"], [1e3 * each for each in series[f"displacements_{name}"]], dash, color=colour
+            )
         neutral.plot([], [], **style_of(result))
         for density, dash in zip(densities, ("-", "--", ":"), strict=False):
             draughts = [1e3 * draught for draught in series[f"afloat_{density:g}"]]
             afloat.plot(series["afloat_times"], draughts, dash, color=colour, linewidth=1.0)
     neutral.axhline(1e3 * SPACING, color=THEORY, linewidth=1.0, label="one spacing")
-    label_axes(neutral, "time [s]", "way [mm]", "neutral sphere (solid) and duck (dashed)")
+    label_axes(neutral, "time [s]", "displacement [mm]", "neutral sphere (solid) and duck (dashed)")
     for density in densities:
         afloat.axhline(1e3 * density / WATER * BOX[2], color=THEORY, linewidth=1.0)
     title = f"floating box, {', '.join(f'{density:g}' for density in densities)} kg/m³"

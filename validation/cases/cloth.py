@@ -28,26 +28,15 @@ THREADS_ALONE: dict[str, Any] = {"shear_stiffness": 0.0, "bend_stiffness": 0.0, 
 SOFT: dict[str, Any] = {"mass_per_area": 0.2, "stretch_stiffness": 100.0}
 """Mass per area [kg/m²] and stretch stiffness [N/m] of what explicit springs compute."""
 
-COLUMN_ROWS, COLUMN_MASS, COLUMN_WIDTH = 21, 0.15, 0.05
-"""Rows, mass per area [kg/m²] and width [m] of the hanging column, 1 m long."""
+SUPPLE: dict[str, Any] = {"shear_stiffness": 20.0, "bend_stiffness": 1e-5, "air_density": 0.0, **SOFT}
 
-COTTON = 4000.0
-"""Stretch stiffness of cotton [N/m]."""
-
-SPAN, BAND_WIDTH = 0.5, 0.1
-"""Length between the bars and width of the band [m]."""
-
-SHEET, SHEET_NODES = 0.2, 6
-"""Side [m] and nodes along it of the swinging sheet."""
-
-MESH_ROWS, MESH_COLUMNS = 28, 24
-"""Rows and columns of cells of the hanging mesh, of equal triangles, 1 m high."""
-
-BALL_DENSITIES = (1000.0, 30.0)
-"""Of the ball that hits a free sheet of 18 g [kg/m³]: 524 g and 16 g."""
-
-FOLDED, FOLDED_THICKNESS = 0.5, 3e-3
-"""Side and thickness of the sheet that falls on its edge [m]."""
+COLUMN_ROWS, COLUMN_MASS, COLUMN_WIDTH = 21, 0.15, 0.05  # [-], [kg/m²], [m]; the hanging column is 1 m long
+COTTON = 4000.0  # stretch stiffness of cotton [N/m]
+SPAN, BAND_WIDTH = 0.5, 0.1  # length between the bars and width of the band [m]
+SHEET, SHEET_NODES = 0.2, 6  # side [m] and nodes along it of the swinging sheet
+MESH_ROWS, MESH_COLUMNS = 28, 24  # rows and columns of cells of the hanging mesh, of equal triangles, 1 m high
+BALL_DENSITIES = (1000.0, 30.0)  # of the ball that hits a free sheet of 18 g [kg/m³]: 524 g and 16 g
+FOLDED, FOLDED_THICKNESS = 0.5, 3e-3  # side and thickness of the sheet that falls on its edge [m]
 
 
 def find(
@@ -139,10 +128,9 @@ def _settle(solver: ClothSolver, spans: tuple[float, ...]) -> None:
 def _column(integrator: str, stiffness: float) -> dict[str, NDArray[np.float64]]:
     """Stretch of each row of a strip of two threads under the weight below it, from the upper row on."""
     spacing = 1.0 / (COLUMN_ROWS - 1)
-    solver = _solver(
-        shape=_rectangle((COLUMN_WIDTH, 1.0), (2, COLUMN_ROWS)), rotation_deg=(90, 0, 0), pin=[{"edge": "y+"}],
-        mass_per_area=COLUMN_MASS, stretch_stiffness=stiffness, damping=2e-3, integrator=integrator, **THREADS_ALONE,
-    )  # fmt: skip
+    hung = {"rotation_deg": (90, 0, 0), "pin": [{"edge": "y+"}], "integrator": integrator}
+    stuff = {"mass_per_area": COLUMN_MASS, "stretch_stiffness": stiffness, "damping": 2e-3, **THREADS_ALONE}
+    solver = _solver(shape=_rectangle((COLUMN_WIDTH, 1.0), (2, COLUMN_ROWS)), **hung, **stuff)
     # A quarter of its period is sqrt(m / E): 6 ms and 50 ms; 16 ms are twenty steps of XPBD.
     _settle(solver, (0.016,) * 40 if integrator == "xpbd" else (0.05, 0.033) * 8)
     heights = solver.state.positions()[:, 2].reshape(COLUMN_ROWS, 2)[::-1].mean(axis=1)
@@ -167,10 +155,9 @@ def _hanging_mesh() -> float:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "sheet.stl"
         trimesh.Trimesh(vertices, triangles, process=False).export(path)
-        solver = _solver(
-            shape={"type": "mesh", "file": str(path)}, pin=[{"region": upper_edge}], mass_per_area=COLUMN_MASS,
-            stretch_stiffness=COTTON, bend_stiffness=0.0, damping=2e-3, air_density=0.0,
-        )  # fmt: skip
+        stuff = {"mass_per_area": COLUMN_MASS, "stretch_stiffness": COTTON, "damping": 2e-3}
+        free = {"bend_stiffness": 0.0, "air_density": 0.0}
+        solver = _solver(shape={"type": "mesh", "file": str(path)}, pin=[{"region": upper_edge}], **stuff, **free)
     start = solver.state.positions()
     _settle(solver, (0.033,) * 12)
     lower_edge = (start[:, 2] < -0.499) & (np.abs(start[:, 0]) < 0.25)
@@ -196,10 +183,8 @@ def _catenary_sag() -> float:
 
 
 def _band_sag(cells: int) -> float:
-    solver = _solver(
-        shape=_rectangle((SPAN, BAND_WIDTH), (cells + 1, 2)), pin=[{"edge": "x-"}, {"edge": "x+"}], damping=2e-3,
-        integrator="explicit", **SOFT, **THREADS_ALONE,
-    )  # fmt: skip
+    held = {"shape": _rectangle((SPAN, BAND_WIDTH), (cells + 1, 2)), "pin": [{"edge": "x-"}, {"edge": "x+"}]}
+    solver = _solver(**held, damping=2e-3, integrator="explicit", **SOFT, **THREADS_ALONE)
     _settle(solver, (0.05, 0.033) * 14)  # a quarter of its swing, and another that stops what the first does not
     return -float(solver.state.positions()[:, 2].min())
 
@@ -207,10 +192,9 @@ def _band_sag(cells: int) -> float:
 def _pendulum(integrator: str) -> float:
     """Period of two nodes on a short strip over 2 pi (L/g)^(1/2) (1 + a²/16), its length stretched by its weight."""
     stiffness, length, angle = 200.0, 0.25, math.radians(5.0)
-    solver = _solver(
-        shape=_rectangle((0.1, length), (2, 2)), rotation_deg=(85, 0, 0), pin=[{"edge": "y+"}], mass_per_area=0.2,
-        stretch_stiffness=stiffness, integrator=integrator, bend_damping=0.0, **THREADS_ALONE,
-    )  # fmt: skip
+    hung = {"rotation_deg": (85, 0, 0), "pin": [{"edge": "y+"}], "integrator": integrator}
+    stuff = {"mass_per_area": 0.2, "stretch_stiffness": stiffness, "bend_damping": 0.0, **THREADS_ALONE}
+    solver = _solver(shape=_rectangle((0.1, length), (2, 2)), **hung, **stuff)
     dt, times = solver.stable_dt(), []
     start = solver.state.positions()
     anchor, side = start[2, 1], start[0, 1] - start[2, 1]
@@ -227,10 +211,9 @@ def _pendulum(integrator: str) -> float:
 
 def _swinging_sheet(duration: float) -> dict[str, Any]:
     """Energy of an undamped sheet that falls from flat, held at two corners, over m g L / 2."""
-    solver = _solver(
-        shape=_rectangle((SHEET, SHEET), (SHEET_NODES, SHEET_NODES)), pin=[{"corner": "x-y-"}, {"corner": "x+y-"}],
-        shear_stiffness=20.0, bend_stiffness=1e-5, bend_damping=0.0, air_density=0.0, integrator="explicit", **SOFT,
-    )  # fmt: skip
+    sheet = _rectangle((SHEET, SHEET), (SHEET_NODES, SHEET_NODES))
+    held = {"pin": [{"corner": "x-y-"}, {"corner": "x+y-"}], "integrator": "explicit"}
+    solver = _solver(shape=sheet, **held, bend_damping=0.0, **SUPPLE)
     dt, times, energies, kinetic = solver.stable_dt(), [], [], []
     mass = solver.state.mass.to_numpy().astype(np.float64)
     scale = mass.sum() * GRAVITY * 0.5 * SHEET
@@ -268,10 +251,8 @@ def _folded_drop(*, nodes: int, frames: int) -> dict[str, list[float]]:
     from sim.build import build_world
     from sim.cloth.solver import ClothSolver
 
-    sheet = {
-        "name": "sheet", "shape": _rectangle((FOLDED, FOLDED), (nodes, nodes)), "thickness": FOLDED_THICKNESS,
-        "position": (0.0, 0.0, 0.55 * FOLDED), "rotation_deg": (85.0, 7.0, 0.0), "air_density": 0.0,
-    }  # fmt: skip
+    sheet = {"name": "sheet", "shape": _rectangle((FOLDED, FOLDED), (nodes, nodes)), "thickness": FOLDED_THICKNESS}
+    sheet |= {"position": (0.0, 0.0, 0.55 * FOLDED), "rotation_deg": (85.0, 7.0, 0.0), "air_density": 0.0}
     room = {"min": (-1.0, -1.0, 0.0), "max": (1.0, 1.0, 2.0)}
     scene = SceneParameters.model_validate({"gravity": (0, 0, -GRAVITY), "domain": room, "cloth": [sheet]})
     world = build_world(scene, frames_per_second=60.0)
@@ -296,14 +277,10 @@ def _ball_and_sheet(integrator: str, density: float, *, frames: int) -> tuple[fl
     from sim.cloth.solver import ClothSolver
     from sim.rigid.solver import RigidSolver
 
-    ball = {
-        "name": "ball", "kind": "dynamic", "density": density, "shape": {"type": "sphere", "radius": 0.05},
-        "position": (0.03, 0.01, 0.06), "velocity": (0.3, 0.0, -3.0), "angular_velocity": (0.0, 20.0, 5.0),
-    }  # fmt: skip
-    sheet = {
-        "name": "sheet", "shape": _rectangle((0.3, 0.3), (11, 11)), "thickness": 2e-3, "self_collision": False,
-        "shear_stiffness": 20.0, "bend_stiffness": 1e-5, "air_density": 0.0, "integrator": integrator, **SOFT,
-    }  # fmt: skip
+    ball = {"name": "ball", "kind": "dynamic", "density": density, "shape": {"type": "sphere", "radius": 0.05}}
+    ball |= {"position": (0.03, 0.01, 0.06), "velocity": (0.3, 0.0, -3.0), "angular_velocity": (0.0, 20.0, 5.0)}
+    sheet = {"name": "sheet", "shape": _rectangle((0.3, 0.3), (11, 11)), "thickness": 2e-3}
+    sheet |= {"self_collision": False, "integrator": integrator, **SUPPLE}
     space = {"min": (-1.0,) * 3, "max": (1.0,) * 3, "open_faces": EVERY_FACE}
     scene = SceneParameters.model_validate({"gravity": (0, 0, 0), "domain": space, "cloth": [sheet], "rigid": [ball]})
     world = build_world(scene, frames_per_second=60.0)

@@ -15,8 +15,7 @@ from validation.checks import CaseResult, Check
 from validation.scenes import EVERY_FACE, WATER, WEIGHTLESS, Curve, Tank, body, momentum_drifts, momentum_of
 
 LOW, HIGH = (-0.2, -0.06, -0.06), (-0.08, 0.06, 0.06)
-SPEED = 2.0
-"""Corners of the drop [m], and its speed along x [m/s]."""
+SPEED = 2.0  # corners of the drop [m], and its speed along x [m/s]
 
 BOX, AT = (0.1, 0.14, 0.08), (0.0, 0.05, 0.0)
 SPIN = (3.0, 0.0, 5.0)
@@ -31,10 +30,8 @@ def find(solver: str, densities: Sequence[float], duration: float) -> Found:
     series: dict[str, Any] = {}
     for density in densities:
         box = body("box", {"type": "box", "size": BOX}, density=density, position=AT, angular_velocity=SPIN)
-        tank = Tank(
-            solver, [box], domain=SPACE, gravity=WEIGHTLESS, block=(LOW, HIGH), velocity=(SPEED, 0.0, 0.0),
-            wall_friction=5.0, viscosity=1.0e-3,
-        )  # fmt: skip
+        drop = {"block": (LOW, HIGH), "velocity": (SPEED, 0.0, 0.0)}
+        tank = Tank(solver, [box], domain=SPACE, gravity=WEIGHTLESS, **drop, wall_friction=5.0, viscosity=1.0e-3)
         count, bodies = tank.fluid.particle_count, tank.rigid.bodies
         linear, angular = _totals(tank)
         scales = float(np.linalg.norm(linear)), float(np.linalg.norm(linear) * HIGH[1] + np.linalg.norm(angular))

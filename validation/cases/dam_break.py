@@ -14,20 +14,13 @@ from sim.core.domain import DomainParameters
 from validation.cases import Case, Found
 from validation.checks import CaseResult, Check
 from validation.figures import THEORY, TITLES, label_axes, make_panels, style_of
-from validation.scenes import GRAVITY, advance, lattice, make_fluid, state_of
+from validation.scenes import GRAVITY, lattice, make_fluid, recorded, state_of
 
 REFERENCE = Path(__file__).resolve().parents[2] / "tests" / "reference" / "dam_break_front.csv"
-WIDTH = 0.2
-"""Of the column [m]; it is twice as high, and the channel is long enough for the front never to reach its end."""
-
-LAYERS_ACROSS = 6
-"""The channel's width in particles; its walls are smooth, so that the flow is plane."""
-
-COMPARED = (0.5, 3.0)
-"""Span of T in which the deviations are taken: later the front is a film thinner than a particle."""
-
-AHEAD = 0.0025
-"""Part of the water that is ahead of what counts as the front: the same at every resolution, unlike the first drop."""
+WIDTH = 0.2  # of the column [m], which is twice as high; the front never reaches the end of the channel
+LAYERS_ACROSS = 6  # the channel's width in particles; its walls are smooth, so that the flow is plane
+COMPARED = (0.5, 3.0)  # span of T in which the deviations are taken: later the front is a film thinner than a particle
+AHEAD = 0.0025  # share of the water that is ahead of what counts as the front, at every resolution
 
 
 def collapse(solver: str, columns: int, longest: float) -> dict[str, Any]:
@@ -38,14 +31,15 @@ def collapse(solver: str, columns: int, longest: float) -> dict[str, Any]:
     column = lattice((0.0, 0.0, 0.0), (WIDTH, depth, 2.0 * WIDTH), spacing)
     fluid = make_fluid(solver, domain, column, spacing=spacing)
     scale = np.sqrt(2.0 * GRAVITY / WIDTH)
-    times, fronts = [0.0], [1.0]
-    for time in advance(fluid, longest / scale, cuts=round(20 * longest)):
-        position, _ = state_of(fluid)
-        times.append(time * scale)
-        fronts.append(float(np.quantile(position[:, 0], 1.0 - AHEAD) + spacing / 2.0) / WIDTH)
+    found = recorded(
+        fluid,
+        longest / scale,
+        cuts=round(20 * longest),
+        fronts=lambda: (np.quantile(state_of(fluid)[0][:, 0], 1.0 - AHEAD) + spacing / 2.0) / WIDTH,
+    )
     return {
-        "times": times,
-        "fronts": fronts,
+        "times": [0.0, *(time * scale for time in found["times"])],
+        "fronts": [1.0, *found["fronts"]],
         "wall_contacts": fluid.diagnostics()["wall_contacts"],
     }
 
@@ -64,21 +58,16 @@ def experiments() -> dict[str, np.ndarray]:
 def deviations(times: list[float], fronts: list[float], *, shift: float = 0.0) -> np.ndarray:
     """Computed over measured front, less 1, at every measured point in the compared span.
 
-    Args:
-        times: computed T.
-        fronts: computed Z.
-        shift: how much later in T the experiments are taken to have begun.
+    The experiments are taken to have begun later in T by a shift.
     """
     measured = _measured(*COMPARED)
-    computed: np.ndarray = np.interp(measured[0] - shift, times, fronts) / measured[1] - 1.0
-    return computed
+    return np.interp(measured[0] - shift, times, fronts) / measured[1] - 1.0
 
 
 def _measured(first: float, last: float) -> np.ndarray:
     """All measured points between two T, (2, n)."""
     points = np.concatenate(list(experiments().values()), axis=1)
-    chosen: np.ndarray = points[:, (points[0] > first) & (points[0] < last)]
-    return chosen
+    return points[:, (points[0] > first) & (points[0] < last)]
 
 
 def _best_shift(times: list[float], fronts: list[float]) -> float:

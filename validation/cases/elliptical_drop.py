@@ -19,18 +19,14 @@ from validation.checks import CaseResult, Check
 from validation.figures import COLOURS, THEORY, draw_refinement, label_axes, make_panels, refinement_of, style_of
 from validation.scenes import WEIGHTLESS, advance, lattice, make_fluid, state_of, turn_about_y
 
-RADIUS, STRAIN_RATE, DURATION = 1.0, 100.0, 0.0076
-"""R [m], A0 [1/s] and the time of the comparison [s]."""
+RADIUS, STRAIN_RATE, DURATION = 1.0, 100.0, 0.0076  # R [m], A0 [1/s] and the time of the comparison [s]
 
 TILT_DEG = 22.5
 """Of the particles' lattice against the axes of strain. One that is aligned with them is pulled apart into rows, two
 spacings from each other when the drop is twice as long: out of reach of the kernel, so that the area grows."""
 
-LAYERS_ACROSS = 6
-"""Thickness of the slab in particles; smooth walls on both sides keep the flow plane."""
-
-ARTIFICIAL_VISCOSITY = 0.01
-"""Far below the default: the exact solution has none."""
+LAYERS_ACROSS = 6  # thickness of the slab in particles; smooth walls on both sides keep the flow plane
+ARTIFICIAL_VISCOSITY = 0.01  # far below the default: the exact solution has none
 
 
 @cache
@@ -56,10 +52,8 @@ def stretch(solver: str, resolution: int) -> dict[str, Any]:
     drop = lattice((-side, 0.0, -side), (side, depth, side), spacing) @ turn_about_y(TILT_DEG).astype(np.float32)
     drop = drop[np.hypot(drop[:, 0], drop[:, 2]) < RADIUS]
     velocity = STRAIN_RATE * drop * np.float32([-1.0, 0.0, 1.0])
-    fluid = make_fluid(
-        solver, domain, drop, spacing=spacing, velocities=velocity, gravity=WEIGHTLESS,
-        artificial_viscosity=ARTIFICIAL_VISCOSITY,
-    )  # fmt: skip
+    material = {"artificial_viscosity": ARTIFICIAL_VISCOSITY}
+    fluid = make_fluid(solver, domain, drop, spacing=spacing, velocities=velocity, gravity=WEIGHTLESS, **material)
     start = fluid.diagnostics()
     times, axes, energies = [0.0], [_axes(drop)], [1.0]
     for time in advance(fluid, DURATION, cuts=38):

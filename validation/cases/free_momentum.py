@@ -14,8 +14,7 @@ from validation.figures import THEORY, label_axes, make_panels, style_of
 from validation.scenes import EVERY_FACE, SPACING, WEIGHTLESS, lattice, make_fluid, momentum_drifts, momentum_of
 
 HALF_SIDE = 0.1
-SPIN, STIRRING = 4.0, 0.3
-"""Angular velocity [rad/s] and the standard deviation of what is added to each component [m/s]."""
+SPIN, STIRRING = 4.0, 0.3  # angular velocity [rad/s]; standard deviation of what is added to each component [m/s]
 
 
 def find(solver: str, duration: float) -> Found:
@@ -24,10 +23,8 @@ def find(solver: str, duration: float) -> Found:
     particles = lattice((-HALF_SIDE,) * 3, (HALF_SIDE,) * 3, SPACING)
     velocity = np.cross([0.0, 0.0, SPIN], particles)
     velocity += np.random.default_rng(5).normal(0.0, STIRRING, particles.shape)
-    fluid = make_fluid(
-        solver, domain, particles, spacing=SPACING, velocities=velocity, gravity=WEIGHTLESS, viscosity=1e-3,
-        surface_tension=1e-4,
-    )  # fmt: skip
+    material = {"viscosity": 1e-3, "surface_tension": 1e-4}
+    fluid = make_fluid(solver, domain, particles, spacing=SPACING, velocities=velocity, gravity=WEIGHTLESS, **material)
     mass = fluid.diagnostics()["mass"] / len(particles)
     speed = float(np.sqrt((velocity**2).sum(axis=1).mean()))
     arm = float(np.sqrt((particles.astype(float) ** 2).sum(axis=1).mean()))

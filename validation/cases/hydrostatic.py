@@ -15,14 +15,9 @@ from validation.checks import CaseResult, Check, fitted_order
 from validation.figures import THEORY, draw_refinement, label_axes, make_panels, refinement_of, style_of
 from validation.scenes import GRAVITY, WATER, advance, lattice, make_fluid, state_of
 
-HEIGHT, SIDE, DURATION = 0.2, 0.1, 2.0
-"""Of the column [m], and how long it stands [s]."""
-
-SETTLED = 1.0
-"""From here on the sound of the start is averaged away [s]."""
-
-MEAN_OF = 20
-"""Samples of the running mean of the force that is drawn."""
+HEIGHT, SIDE, DURATION = 0.2, 0.1, 2.0  # of the column [m], and how long it stands [s]
+SETTLED = 1.0  # from here on the sound of the start is averaged away [s]
+MEAN_OF = 20  # samples of the running mean of the force that is drawn
 
 
 def stand(solver: str, layers: int) -> dict[str, Any]:
@@ -42,7 +37,7 @@ def stand(solver: str, layers: int) -> dict[str, Any]:
         forces.append(-float(fluid.boundary_forces()[floor, 2].sum()) / weight)
         if time > SETTLED:
             heights.append(position[:, 2])
-            pressures.append(fluid.pressures())
+            pressures.append(fluid.snapshots()[fluid.name].arrays["pressure"])
     height, pressure = np.mean(heights, axis=0), np.mean(pressures, axis=0)
     after = fluid.diagnostics()
     scale = WATER * GRAVITY * surface

@@ -15,8 +15,7 @@ from validation.figures import COLOURS, draw_refinement, label_axes, make_panels
 from validation.scenes import EVERY_FACE, WATER, WEIGHTLESS, lattice, make_fluid
 
 SPACING = 0.02
-REFINEMENTS = (8, 16, 32)
-"""Spacings to the wavelength of a sine that the kernel smooths."""
+REFINEMENTS = (8, 16, 32)  # spacings to the wavelength of a sine that the kernel smooths
 
 
 def find(solver: str) -> Found:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,20 +13,11 @@ from validation.checks import CaseResult, Check, fitted_order
 from validation.figures import COLOURS, draw_refinement, label_axes, make_panels
 from validation.scenes import GRAVITY, WEIGHTLESS, advance, body, make_bodies
 
-SIZE = (0.1, 0.2, 0.3)
-"""Edges of the box [m]; its moments of inertia are all different."""
-
-SPIN = (4.0, 5.0, 3.0)
-"""Angular velocity at the start [rad/s]."""
-
-DURATION = 10.0
-"""Of the rotation without torque [s]."""
-
-STEPS = (8e-3, 4e-3, 2e-3)
-"""Time steps of the convergence [s]."""
-
-RACKET_SPIN, NUDGE, RACKET_DURATION = 10.0, 0.1, 4.0
-"""Spin about one axis and the disturbance about both others [rad/s], and how long [s]."""
+SIZE = (0.1, 0.2, 0.3)  # edges of the box [m]; its moments of inertia are all different
+SPIN = (4.0, 5.0, 3.0)  # angular velocity at the start [rad/s]
+DURATION = 10.0  # of the rotation without torque [s]
+STEPS = (8e-3, 4e-3, 2e-3)  # time steps of the convergence [s]
+RACKET_SPIN, NUDGE, RACKET_DURATION = 10.0, 0.1, 4.0  # spin, disturbance about the other axes [rad/s]; [s]
 
 
 def find(_: str) -> Found:
@@ -36,7 +27,8 @@ def find(_: str) -> Found:
     errors = [_rotation_error(step) for step in STEPS]
     racket = _racket()
     checks = [
-        Check("way of 1 s of free fall over g t²/2", fall["way"], 1.0, 1e-9, "exact for constant gravity; float64"),
+        Check("distance of 1 s of free fall over g t²/2", fall["distance"], 1.0, 1e-9,
+              "exact for constant gravity; float64"),
         Check("speed over g t", fall["speed"], 1.0, 1e-9, "likewise"),
         Check("drift of |L| in 10 s", rotation["momentum_drift"], 0.0, 1e-9,
               "5e-3 is required; a splitting into rotations keeps it to round-off"),
@@ -62,8 +54,8 @@ def _free_fall() -> dict[str, float]:
     solver = make_bodies(body("ball", {"type": "sphere", "radius": 0.1}, position=(0.0, 0.0, 8.0)))
     for _ in advance(solver, 1.0, cuts=60):
         pass
-    way, speed = 8.0 - solver.bodies.position[0, 2], -solver.bodies.velocity[0, 2]
-    return {"way": float(way) / (0.5 * GRAVITY), "speed": float(speed) / GRAVITY}
+    distance, speed = 8.0 - solver.bodies.position[0, 2], -solver.bodies.velocity[0, 2]
+    return {"distance": float(distance) / (0.5 * GRAVITY), "speed": float(speed) / GRAVITY}
 
 
 def _torque_free() -> dict[str, Any]:
@@ -80,7 +72,7 @@ def _torque_free() -> dict[str, Any]:
         sizes.append(float(np.linalg.norm(now) / np.linalg.norm(start)) - 1.0)
         angles.append(float(np.linalg.norm(np.cross(now, start)) / np.linalg.norm(start) ** 2))
         energies.append(spin_energy() / energy - 1.0)
-        spins.append(solver.bodies.rotation()[0].T @ solver.bodies.angular_velocity[0])
+        spins.append(_spin_in_body(solver))
     return {
         "momentum_drift": float(np.abs(sizes).max()),
         "direction_drift": max(angles),
@@ -89,23 +81,26 @@ def _torque_free() -> dict[str, Any]:
     }
 
 
+def _spin_in_body(solver: Any) -> np.ndarray:
+    return solver.bodies.rotation()[0].T @ solver.bodies.angular_velocity[0]
+
+
+def _euler(solver: Any) -> Callable[[float, np.ndarray], np.ndarray]:
+    """Rates of a spin in body axes by Euler's equations."""
+    inertia = solver.solids[0].mass_properties(700.0).inertia
+    inverse = np.linalg.inv(inertia)
+    return lambda _, spin: inverse @ -np.cross(spin, inertia @ spin)
+
+
 def _rotation_error(step: float) -> float:
     """Error of the angular velocity in body axes after 2 s against an integration to 1e-12 [rad/s]."""
     from scipy.integrate import solve_ivp
 
     solver = _box(SPIN)
-    inertia = solver.solids[0].mass_properties(700.0).inertia
-    inverse = np.linalg.inv(inertia)
-
-    def euler(_: float, spin: np.ndarray) -> np.ndarray:
-        rates: np.ndarray = inverse @ -np.cross(spin, inertia @ spin)
-        return rates
-
-    exact = solve_ivp(euler, (0.0, 2.0), SPIN, rtol=1e-12, atol=1e-12).y[:, -1]
+    exact = solve_ivp(_euler(solver), (0.0, 2.0), SPIN, rtol=1e-12, atol=1e-12).y[:, -1]
     for _ in range(round(2.0 / step)):
         solver.substep(step)
-    found = solver.bodies.rotation()[0].T @ solver.bodies.angular_velocity[0]
-    return float(np.linalg.norm(found - exact))
+    return float(np.linalg.norm(_spin_in_body(solver) - exact))
 
 
 def _racket() -> dict[str, Any]:
@@ -121,24 +116,19 @@ def _racket() -> dict[str, Any]:
         times, along = [0.0], [1.0]
         for time in advance(solver, RACKET_DURATION, cuts=800):
             times.append(time)
-            in_body = solver.bodies.rotation()[0].T @ solver.bodies.angular_velocity[0]
-            along.append(float(in_body[axis]) / RACKET_SPIN)
+            along.append(float(_spin_in_body(solver)[axis]) / RACKET_SPIN)
         changes = np.flatnonzero(np.diff(np.sign(along)))
         flips.append(len(changes))
         if axis == order[1]:
             middle, crossings = axis, np.array(times)[changes]
             series = {"racket_times": times[::2], "racket_spin": along[::2]}
-    inertia = solver.solids[0].mass_properties(700.0).inertia
-
-    def euler(_: float, rates: np.ndarray) -> np.ndarray:
-        return np.linalg.inv(inertia) @ -np.cross(rates, inertia @ rates)  # type: ignore[no-any-return]
 
     def crossing(_: float, rates: np.ndarray) -> float:
         return float(rates[middle])
 
     spin = np.full(3, NUDGE)
     spin[middle] = RACKET_SPIN
-    exact = solve_ivp(euler, (0.0, RACKET_DURATION), spin, rtol=1e-12, atol=1e-14, events=crossing).t_events[0]
+    exact = solve_ivp(_euler(solver), (0.0, RACKET_DURATION), spin, rtol=1e-12, atol=1e-14, events=crossing).t_events[0]
     return {
         "period": float(np.diff(crossings).mean()),
         "exact": float(np.diff(exact).mean()),

@@ -17,14 +17,9 @@ from validation.smoke_boxes import Advection, Array, set_flow, warm_box
 if TYPE_CHECKING:
     from sim.smoke.solver import SmokeSolver
 
-RADIUS, HEIGHT = 0.1, 0.25
-"""Where the source has fallen to 1/e, and how high above the floor its middle is [m]."""
-
-SMOKE_RATE, HEAT_RATE = 2.0, 200.0
-"""Of the source's middle [1/s, K/s]."""
-
-DURATION, SAMPLES, STEPS_PER_CELL = 1.0, 8, 4
-"""How long it rises [s], how often it is looked at, and steps in which air at 1 m/s crosses a cell."""
+RADIUS, HEIGHT = 0.1, 0.25  # where the source has fallen to 1/e, and how high above the floor its middle is [m]
+SMOKE_RATE, HEAT_RATE = 2.0, 200.0  # of the source's middle [1/s, K/s]
+DURATION, SAMPLES, STEPS_PER_CELL = 1.0, 8, 4  # rise [s]; looks at it; steps in which air at 1 m/s crosses a cell
 
 
 def find(solver: Advection, cells: Sequence[int]) -> Found:
@@ -32,16 +27,12 @@ def find(solver: Advection, cells: Sequence[int]) -> Found:
     times = [DURATION * sample / SAMPLES for sample in range(1, SAMPLES + 1)]
     fronts = {n: _fronts(n, solver) for n in cells}
     ends = [fronts[n][-1] for n in cells]
-    checks = [
-        Check("rise of the front at half the resolution, over that at the finest",
-              (ends[-2] - HEIGHT) / (ends[-1] - HEIGHT), 1.0, 0.1,
-              "measured, from the middle of the source; at this order the finest is off by about half as much")
-    ]  # fmt: skip
+    rise = (ends[-2] - HEIGHT) / (ends[-1] - HEIGHT)
+    reason = "measured, from the middle of the source; at this order the finest is off by about half as much"
+    checks = [Check("rise of the front at half the resolution, over that at the finest", rise, 1.0, 0.1, reason)]
     if len(cells) > 2:
-        checks.append(
-            Check("order of the front's height", order_of_differences(*ends), 1.5, 0.5,
-                  "steps are refined with cells: first order in time and second in space, of which neither prevails")
-        )  # fmt: skip
+        reason = "steps are refined with cells: first order in time and second in space, of which neither prevails"
+        checks.append(Check("order of the front's height", order_of_differences(*ends), 1.5, 0.5, reason))
     series: dict[str, Any] = {"cells": list(cells), "times": times, **{f"front_{n}": fronts[n] for n in cells}}
     return checks, series
 

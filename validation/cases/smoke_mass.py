@@ -18,23 +18,12 @@ from validation.smoke_boxes import Advection, ball_source, build_box, faces_of, 
 if TYPE_CHECKING:
     from sim.smoke.solver import SmokeSolver
 
-EXCESS = 100.0
-"""Temperature of the source above the air's [K]."""
-
-OPEN = ("x-", "x+", "y-", "y+", "z+")
-"""All sides but the floor."""
-
-CELLS, BLOB_CELLS = 20, (20, 40)
-"""Across the boxes of a metre, and of those that wind blows through."""
-
-BLOB, WIND, WIND_DURATION = 0.15, 1.0, 1.2
-"""Radius where the smoke in the wind has fallen to 1/e [m], speed of the wind [m/s], and how long it blows [s]."""
-
-LEAVING_DURATION, STIRRED_DURATION = 2.5, 2.0
-"""How long a plume leaves through the top, and a ball goes through smoke [s]."""
-
-BALL_SPEED = 0.3
-"""[m/s]; it crosses a bit more than half of the box."""
+EXCESS = 100.0  # temperature of the source above the air's [K]
+OPEN = ("x-", "x+", "y-", "y+", "z+")  # all sides but the floor
+CELLS, BLOB_CELLS = 20, (20, 40)  # across the boxes of a metre, and of those that wind blows through
+BLOB, WIND, WIND_DURATION = 0.15, 1.0, 1.2  # radius where the smoke has fallen to 1/e [m]; [m/s]; [s]
+LEAVING_DURATION, STIRRED_DURATION = 2.5, 2.0  # of a plume through the top, of a ball in smoke [s]
+BALL_SPEED = 0.3  # [m/s]; it crosses a bit more than half of the box
 
 
 def find(solver: Advection) -> Found:
@@ -70,8 +59,8 @@ def find(solver: Advection) -> Found:
 def _blown(solver: SmokeSolver, *, cells_a_step: float = 0.5) -> dict[str, list[float]]:
     """A blob in even wind in a box: its smoke over that of the start, by advection alone."""
     distance = ((solver.grid.cell_centres() - 0.5) ** 2).sum(axis=1)
-    set_flow(solver, lambda positions: np.tile([WIND, 0.0, 0.0], (len(positions), 1)),
-             density=np.exp(-distance / BLOB**2))  # fmt: skip
+    blob = np.exp(-distance / BLOB**2)
+    set_flow(solver, lambda positions: np.tile([WIND, 0.0, 0.0], (len(positions), 1)), density=blob)
     start, dt = solver.diagnostics()["mass"], cells_a_step * solver.grid.cell_size / WIND
     blown: dict[str, list[float]] = {"times": [], "kept": [], "exact": []}
     scale = math.erf(0.5 / BLOB)
@@ -80,8 +69,8 @@ def _blown(solver: SmokeSolver, *, cells_a_step: float = 0.5) -> dict[str, list[
         blown["times"].append(step * dt)
         blown["kept"].append(solver.diagnostics()["mass"] / start)
         # The blob is cut off at the walls at first, and what was beyond the windward side does not come in.
-        way = WIND * step * dt
-        blown["exact"].append(max(0.0, math.erf((0.5 - way) / BLOB) + scale) / (2.0 * scale))
+        gone = WIND * step * dt
+        blown["exact"].append(max(0.0, math.erf((0.5 - gone) / BLOB) + scale) / (2.0 * scale))
     return blown
 
 
@@ -130,8 +119,8 @@ def _stirred() -> dict[str, list[float]]:
     from sim.build import build_world
 
     source = {"shape": {"type": "sphere", "radius": 0.25}, "position": (0.5,) * 3, "fluctuation": 0.0, "end_s": 0.3}
-    ball = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.12},
-            "position": (0.2, 0.5, 0.5), "velocity": (BALL_SPEED, 0.0, 0.0)}  # fmt: skip
+    ball = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.12}}
+    ball |= {"position": (0.2, 0.5, 0.5), "velocity": (BALL_SPEED, 0.0, 0.0)}
     smoke = {"name": "air", "cell_size": 1.0 / CELLS, "open_faces": (), "source": [source], "cooling": 0.0}
     scene = {"domain": {"min": (0.0, 0.0, 0.0), "max": (1.0, 1.0, 1.0)}, "rigid": [ball], "smoke": [smoke]}
     world = build_world(SceneParameters.model_validate(scene), frames_per_second=30.0)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from sim.shapes import build_solid
 from sim.shapes.parameters import Placement, SphereShape
+from sim.shapes.placement import build_solid
 from validation.cases import Case, Found
 from validation.checks import CaseResult, Check, order_of_differences
 from validation.figures import label_axes, make_panels, plot_each
@@ -20,23 +20,12 @@ from validation.smoke_boxes import AMBIENT, Advection, ball_source, set_flow, ta
 if TYPE_CHECKING:
     from sim.smoke.solver import SmokeSolver
 
-EXCESS = 60.0
-"""Temperature of the source and of the ball above the air's [K]."""
-
-RADIUS = 0.1
-"""Of the ball in the middle of the closed box of 1 m, and of the source [m]."""
-
-THERMAL_RADIUS, THERMAL_HEIGHT = 0.15, 0.4
-"""Where the heat of a thermal in that box has fallen to 1/e, and how high it begins [m]."""
-
-THERMAL_DURATION, THERMAL_SAMPLES, THERMAL_STEPS_PER_CELL = 0.5, 5, 4
-"""How long it rises [s], how often it is looked at, and steps in which air at 1 m/s crosses a cell."""
-
-AROUND_CELLS, HEIGHT = 24, 1.5
-"""Cells a metre of the plume past a ball, and height of the plumes' boxes [m]."""
-
-DURATION, SAMPLES = 1.4, 14
-"""How long a plume rises [s], and how often its smoke is summed up."""
+EXCESS = 60.0  # temperature of the source and of the ball above the air's [K]
+RADIUS = 0.1  # of the ball in the middle of the closed box of 1 m, and of the source [m]
+THERMAL_RADIUS, THERMAL_HEIGHT = 0.15, 0.4  # where its heat has fallen to 1/e, and how high it begins [m]
+THERMAL_DURATION, THERMAL_SAMPLES, THERMAL_STEPS_PER_CELL = 0.5, 5, 4  # [s]; looks at it; steps a cell at 1 m/s
+AROUND_CELLS, HEIGHT = 24, 1.5  # cells a metre of the plume past a ball, and height of the plumes' boxes [m]
+DURATION, SAMPLES = 1.4, 14  # how long a plume rises [s], and how often its smoke is summed up
 
 OBSTACLE = Placement(shape=SphereShape(type="sphere", radius=0.15), position=(0.5, 0.5, 0.7))
 
@@ -52,24 +41,21 @@ def find(solver: Advection, cells: Sequence[int], ball_cells: int, closed_cells:
     checks = [
         Check("acceleration in the middle of a warm ball over 2/3 of its buoyancy", _warm_ball(ball_box), 1.0, 0.02,
               "it drives half its volume of air around it; cubes for a ball, and walls five radii away"),
-        Check("order of the way of a thermal", _order(thermals, "rises"), 1.5, 0.5,
+        Check("order of the rise of a thermal", _order(thermals, "rises"), 1.5, 0.5,
               "steps are refined with cells: first order in time and second in space, of which neither prevails"),
         Check("order of its largest speed", _order(thermals, "speeds"), 1.75, 0.45,
               "likewise"),
-        Check("way of the thermal at half the resolution, over that at the finest", _halved(thermals), 1.0, 0.04,
+        Check("rise of the thermal at half the resolution, over that at the finest", _halved(thermals), 1.0, 0.04,
               "converged: at first order the finest is as far from the limit"),
     ]  # fmt: skip
     checks += [
         Check(f"smoke {name} over what was emitted", plume["kept"][-1], 1.0, 0.01, "required: corrections are balanced")
         for name, plume in (("in a closed box", closed), ("past a ball in an open box", around))
     ]
-    checks.append(
-        Check("projections that did not converge", sum(plume["failed"] for plume in (closed, around)), 0.0, 0.0,
-              "a count")
-    )  # fmt: skip
-    series: dict[str, Any] = {"cells": list(cells), "times": closed["times"], "kept_closed": closed["kept"],
-                              "kept_around": around["kept"],
-                              "thermal_times": thermals[cells[0]]["times"]}  # fmt: skip
+    failed = sum(plume["failed"] for plume in (closed, around))
+    checks.append(Check("projections that did not converge", failed, 0.0, 0.0, "a count"))
+    series: dict[str, Any] = {"cells": list(cells), "thermal_times": thermals[cells[0]]["times"]}
+    series |= {"times": closed["times"], "kept_closed": closed["kept"], "kept_around": around["kept"]}
     series |= {f"rises_{n}": thermal["rises"] for n, thermal in thermals.items()}
     return checks, series
 

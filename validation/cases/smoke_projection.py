@@ -10,19 +10,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sim.core.domain import Face
-from sim.shapes import build_solid
 from sim.shapes.parameters import Placement, SphereShape
+from sim.shapes.placement import build_solid
 from sim.smoke.grid import SmokeGrid
 from validation.cases import Case, Found
 from validation.checks import CaseResult, Check, fitted_order
 from validation.figures import SHADES, THEORY, draw_refinement, label_axes, make_panels
 from validation.smoke_boxes import Array
 
-TOLERANCE, MAX_ITERATIONS = 1e-5, 50
-"""Largest max|div u| h / max|u|, as of a job's smoke by default, and where a projection gives up."""
-
-EXACT_TOLERANCE = 3e-6
-"""Of the latter: far below the error of the differences at 64 cells across."""
+TOLERANCE, MAX_ITERATIONS = 1e-5, 50  # of max|div u| h / max|u|, as of a job's smoke; where it gives up
+EXACT_TOLERANCE = 3e-6  # of the latter: far below the error of the differences at 64 cells across
 
 OPEN: tuple[Face, ...] = ("x-", "x+", "y-", "y+", "z+")
 ALL_OPEN: tuple[Face, ...] = (*OPEN, "z-")
@@ -41,24 +38,20 @@ def find(
         for ball in bodies:
             name = f"{sides} with a ball" if ball else sides
             histories = [_project_rough(n, sides, ball=ball) for n in rough_cells]
-            checks.append(
-                Check(f"max|div u| h / max|u|, {name}", max(each[-1] for each in histories),
-                      0.0, TOLERANCE, "required, and the solver stops there; summed anew in double precision")
-            )  # fmt: skip
+            left = max(each[-1] for each in histories)
+            reason = "required, and the solver stops there; summed anew in double precision"
+            checks.append(Check(f"max|div u| h / max|u|, {name}", left, 0.0, TOLERANCE, reason))
             series |= {f"left, {name}, {n}": each for n, each in zip(rough_cells, histories, strict=True)}
             most = max(most, *(len(each) - 1 for each in histories))
-    checks.append(
-        Check("most iterations of a projection", most, 5.0, 1.0,
-              "measured, at every resolution; conjugate gradients alone take twice as many with each refinement")
-    )  # fmt: skip
+    reason = "measured, at every resolution; conjugate gradients alone take twice as many with each refinement"
+    checks.append(Check("most iterations of a projection", most, 5.0, 1.0, reason))
+    reason = "central differences; rms, in which the half cells at open sides count little"
     spacings = [1.0 / n for n in exact_cells]
     for name in bounds:
         errors = [_projection_error(n, closed=name == "walls") for n in exact_cells]
         series[f"errors, {name}"] = errors
-        checks.append(
-            Check(f"order of the projected velocity between {name}", fitted_order(spacings, errors), 2.0, 0.1,
-                  "central differences; rms, in which the half cells at open sides count little")
-        )  # fmt: skip
+        order = fitted_order(spacings, errors)
+        checks.append(Check(f"order of the projected velocity between {name}", order, 2.0, 0.1, reason))
     return checks, series
 
 
@@ -115,8 +108,7 @@ def _slope(positions: Array, axis: int, *, closed: bool) -> Array:
     phase = positions * wave
     parts = np.cos(phase) if closed else np.sin(phase)
     parts[:, axis] = wave[axis] * (-np.sin(phase[:, axis]) if closed else np.cos(phase[:, axis]))
-    product: Array = parts.prod(axis=1)
-    return product
+    return parts.prod(axis=1)
 
 
 def _grid(n: int, open_faces: tuple[Face, ...], *, ball: bool) -> SmokeGrid:
@@ -131,23 +123,22 @@ class _Bench:
     """A projection and the velocity that it works on."""
 
     def __init__(self, grid: SmokeGrid, tolerance: float) -> None:
-        import taichi as ti
-
+        from sim.smoke.arrays import new_faces
         from sim.smoke.obstacles import Obstacles
         from sim.smoke.projection import PressureProjection
 
         self._grid = grid
-        self._fields = tuple(ti.field(ti.f32, shape=grid.size) for _ in range(3))
+        self._faces = new_faces(grid.size)
         self._projection = PressureProjection(
-            Obstacles(grid), self._fields, tolerance=tolerance, max_iterations=MAX_ITERATIONS
+            Obstacles(grid), self._faces, tolerance=tolerance, max_iterations=MAX_ITERATIONS
         )
 
     def project(self, flow: list[Array], iterations: int) -> float:
         """Project a flow, given at the middles of faces, in so many iterations at most: max|div u| h / max|u| left."""
         grid = self._grid
-        for axis, (field, values) in enumerate(zip(self._fields, flow, strict=True)):
+        for axis, (array, values) in enumerate(zip(self._faces, flow, strict=True)):
             open_values = values.reshape(grid.face_shape(axis)) * (grid.open_area[axis] > 0.0)
-            field.from_numpy(grid.pad(open_values.astype(np.float32)).ravel())
+            array.from_numpy(grid.pad(open_values.astype(np.float32)).ravel())
         self._projection._max_iterations = iterations
         self._projection.project()
         faces = self.faces()
@@ -159,8 +150,8 @@ class _Bench:
         grid = self._grid
         shapes = [grid.face_shape(axis) for axis in range(3)]
         return [
-            grid.trim(field.to_numpy(), shape).astype(np.float64)
-            for field, shape in zip(self._fields, shapes, strict=True)
+            grid.trim(array.to_numpy(), shape).astype(np.float64)
+            for array, shape in zip(self._faces, shapes, strict=True)
         ]
 
 

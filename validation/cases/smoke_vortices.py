@@ -14,7 +14,6 @@ from validation.cases import Case, Found
 from validation.checks import CaseResult, Check, fitted_order, order_of_differences
 from validation.figures import COLOURS, TITLES, draw_refinement, label_axes, make_panels, plot_each, style_of
 from validation.smoke_boxes import (
-    FACES,
     Advection,
     Array,
     build_box,
@@ -28,20 +27,11 @@ from validation.smoke_boxes import (
 if TYPE_CHECKING:
     from sim.smoke.solver import SmokeSolver
 
-STEPS_PER_CELL = 2
-"""Steps in which the fastest air crosses a cell: time and space are refined together."""
-
-PLANE_DURATION, TIMED_DURATION, SPACE_DURATION = 1.0, 0.5, 1.0
-"""How long a plane vortex turns, one by which orders in time and in space are told apart, and the one in space [s]."""
-
-LONE_CELLS, LONE_LAYERS, CORE = 32, 12, 0.1
-"""Across and along the box of 1 m with the lone vortex, and the radius of its core [m]."""
-
-BLOB_OFFSET, BLOB_RADIUS = 0.15, 0.02**0.5
-"""Of the blob that goes round: from the middle [m], and where it has fallen to 1/e [m]: 4.5 cells at least."""
-
-SPAN, SHOWN = 0.01, 0.5
-"""How long it is spun up to measure the rate, a radian of its core, and for the figure [s]."""
+STEPS_PER_CELL = 2  # steps in which the fastest air crosses a cell: time and space are refined together
+PLANE_DURATION, TIMED_DURATION, SPACE_DURATION = 1.0, 0.5, 1.0  # in the plane, to tell the orders apart, in space [s]
+LONE_CELLS, LONE_LAYERS, CORE = 32, 12, 0.1  # across and along its box of 1 m; radius of the core [m]
+BLOB_OFFSET, BLOB_RADIUS = 0.15, 0.02**0.5  # from the middle, and where it has fallen to 1/e [m]
+SPAN, SHOWN = 0.01, 0.5  # how long it is spun up to measure the rate, a radian of its core, and for the figure [s]
 
 
 EXPECTED = {
@@ -104,12 +94,10 @@ def find(
             if strength > 0.0
         ],
     ]  # fmt: skip
-    series = {
-        "plane_cells": list(plane_cells), "rotation_errors": rotation_errors, "plane_errors": plane_errors,
-        "plane_losses": plane_losses, "space_cells": list(space_cells), "space_errors": space_errors,
-        "space_losses": space_losses,
-        **{f"energy_{strength:g}": found["energies"] for strength, found in spun.items()},
-    }  # fmt: skip
+    series: dict[str, Any] = {"plane_cells": list(plane_cells), "rotation_errors": rotation_errors}
+    series |= {"plane_errors": plane_errors, "plane_losses": plane_losses}
+    series |= {"space_cells": list(space_cells), "space_errors": space_errors, "space_losses": space_losses}
+    series |= {f"energy_{strength:g}": found["energies"] for strength, found in spun.items()}
     if spun:
         series["times"] = spun[0.0]["times"]
     return checks, series
@@ -181,7 +169,7 @@ def _in_the_plane(solver: SmokeSolver) -> tuple[float, float, float, float]:
         its mean; error of the velocity of Taylor and Green's vortex over its rms; part of the kinetic energy that this
         loses.
     """
-    grid, fields = solver.grid, [getattr(solver, name) for name in FACES]
+    grid, fields = solver.grid, solver.state.velocity
     n = grid.cells[0]
     x, y, _ = (grid.cell_centres() - 0.5).T
     change = _change_at_rest(solver)
@@ -295,8 +283,7 @@ class SpectralEuler:
         omega_k = 1j * np.cross(self._k, u_k, axis=0)
         u, omega = np.fft.irfftn(u_k, shape, axes), np.fft.irfftn(omega_k, shape, axes)
         force = np.fft.rfftn(np.cross(u, omega, axis=0), axes=axes) * self._kept
-        projected: NDArray[np.complex128] = force - self._k * (self._k * force).sum(axis=0) / self._k_squared
-        return projected
+        return force - self._k * (self._k * force).sum(axis=0) / self._k_squared
 
     def velocity(self, positions: Array) -> Array:
         """The series at positions that form a lattice, (n, 3), in C order."""
@@ -307,8 +294,7 @@ class SpectralEuler:
         weights = np.where((half == 0) | (half == self._n // 2), 1.0, 2.0)
         waves = [np.exp(1j * np.outer(x, k)) for x, k in zip(axes, (frequency, frequency, half), strict=True)]
         values = np.einsum("xa,yb,zc,dabc->xyzd", *waves[:2], waves[2] * weights, self.coefficients, optimize=True)
-        found: Array = values.real.reshape(-1, 3) / self._n**3
-        return found
+        return values.real.reshape(-1, 3) / self._n**3
 
 
 def draw(results: Sequence[CaseResult]) -> Figure:

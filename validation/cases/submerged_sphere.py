@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,23 +12,17 @@ from numpy.typing import NDArray
 from validation.cases import Case, Found
 from validation.checks import CaseResult, Check
 from validation.figures import COLOURS, THEORY, label_axes, make_panels, style_of
-from validation.scenes import GRAVITY, SPACING, WATER, Curve, Tank, advance, steps, submerged_sphere
+from validation.scenes import GRAVITY, SPACING, WATER, Curve, advance, steps, submerged_sphere
 
-DENSITIES = (500.0, 2000.0)
-"""Of the sphere that is let go [kg/m³]."""
-
-SETTLING, INTERVAL = 0.6, 0.1
-"""Time for which the sphere is held until the water has come to rest, and between two moments of a release [s]."""
+DENSITIES = (500.0, 2000.0)  # of the sphere that is let go [kg/m³]
+SETTLING, INTERVAL = 0.6, 0.1  # the sphere is held until the water rests; between two releases [s]
 
 SOLVE_TOLERANCE = 1.0e-5
 """Compression that implicit solves may leave here, a tenth of the default one: what is measured is to be the method.
 At the default one, push and added mass at five spacings have standard errors of 0.01 and 0.03 after 16 releases."""
 
-FOLLOWED = 0.03
-"""How long it is followed [s]: it goes a tenth of a spacing, and sound crosses the tank twice at least."""
-
-POINTS = 30
-"""Points in time at which the motions of all releases are averaged."""
+FOLLOWED = 0.03  # how long it is followed [s]: it goes a tenth of a spacing, and sound crosses the tank twice at least
+POINTS = 30  # points in time at which the motions of all releases are averaged
 
 ADDED_MASS = 0.531
 """Added over displaced mass of a sphere that is let go in the middle of this tank.
@@ -38,57 +31,27 @@ Half in water without end (Lamb 1932, §92), and 3/8 (R/L)³ of that more at a w
 at one along it, as the mirrored dipole adds; here the sum over all mirror images in floor, sides and free surface.
 """
 
-LARGEST_SHIFT, LARGEST_MASS_ERROR = 0.05, 0.1
-"""By how much the radius of what a sphere displaces may be off [spacings], and its added over its displaced mass."""
+LARGEST_SHIFT, LARGEST_MASS_ERROR = 0.05, 0.1  # of the radius of what is displaced [spacings]; of the mass ratio
 
 
-@dataclass(frozen=True)
-class Release:
-    """One moment: what held the sphere from there on, and how it would have moved.
+class Experiment(NamedTuple):
+    """A sphere of one size with one solver, held, and let go at many moments."""
 
-    Attributes:
-        held: impulse of the water on the held sphere over rho_f V [m/s], by point in time.
-        speeds: upward velocity of the released sphere of each density [m/s], by point in time.
-    """
-
-    held: Curve
-    speeds: dict[float, Curve]
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """A sphere of one size with one solver.
-
-    Attributes:
-        times: points in time after a release [s].
-        releases: one for each moment.
-        forces: mean vertical force on the held sphere between two moments over rho_f g V.
-        sideways: size of the mean horizontal force on it, likewise.
-        sound_delay: time until the water around the sphere has answered [s].
-        astray: particles in the sphere or out of the tank at the end.
-    """
-
-    times: Curve
-    releases: list[Release]
-    forces: Curve
-    sideways: float
-    sound_delay: float
-    astray: int
+    times: Curve  # points in time after a release [s], (p,)
+    held: Curve  # impulse of the water on the held sphere over rho_f V [m/s], of each moment on, (releases, p)
+    speeds: dict[float, Curve]  # upward velocity of the released sphere [m/s], by density, (releases, p) each
+    forces: Curve  # mean vertical force on the held sphere between two moments over rho_f g V, (releases,)
+    sideways: float  # size of the mean horizontal force on it, likewise
+    sound_delay: float  # time until the water around the sphere has answered [s]
+    astray: int  # particles in the sphere or out of the tank at the end
 
 
-@dataclass(frozen=True)
-class Answer:
-    """Coefficients of the equation of motion, or their standard errors.
+class Answer(NamedTuple):
+    """Coefficients of the equation of motion, or their standard errors."""
 
-    Attributes:
-        push: force of the water on the sphere before it moves, over that on the held one.
-        added_mass: over the displaced mass.
-        stiffness: of the water at rest over the displaced mass [1/s²].
-    """
-
-    push: float
-    added_mass: float
-    stiffness: float
+    push: float  # force of the water on the sphere before it moves, over that on the held one
+    added_mass: float  # over the displaced mass
+    stiffness: float  # of the water at rest over the displaced mass [1/s²]
 
 
 def find(solver: str, sizes: Sequence[int], releases: int) -> Found:
@@ -124,7 +87,8 @@ def release_often(solver: str, radius: float, moments: int) -> Experiment:
     times = np.linspace(0.0, FOLLOWED, POINTS + 1)
     for _ in advance(held, SETTLING):
         pass
-    releases, forces = [], []
+    pushes, forces = [], []
+    speeds: dict[float, list[Curve]] = {density: [] for density in DENSITIES}
     for _ in range(moments):
         state, dt = held.fluid.checkpoint(), held.stable_dt()
         count = int(np.ceil(FOLLOWED / dt * (1.0 - 1.0e-9)))
@@ -134,15 +98,17 @@ def release_often(solver: str, radius: float, moments: int) -> Experiment:
         for _ in range(count):
             held.substep(dt)
             impulses.append(impulse := impulse + dt * held.coupling.force)
-        speeds = {}
         for density, tank in free.items():
-            _let_go(tank, state, starts[density])
+            # The water of the other tank around the sphere, which is at rest where it began.
+            tank.rigid.restore(starts[density])
+            tank.fluid.restore(state)
+            tank.coupling.resume()
             motion = [0.0]
             for _ in range(count):
                 tank.substep(dt)
                 motion.append(float(tank.rigid.bodies.velocity[0, 2]))
-            speeds[density] = np.interp(times, at, motion)
-        releases.append(Release(np.interp(times, at, np.array(impulses)[:, 0, 2] / mass), speeds))
+            speeds[density].append(np.interp(times, at, motion))
+        pushes.append(np.interp(times, at, np.array(impulses)[:, 0, 2] / mass))
         for step in steps(held, INTERVAL - count * dt):
             impulse = impulse + step * held.coupling.force
         forces.append(impulse[0] / (INTERVAL * mass * GRAVITY))
@@ -151,7 +117,8 @@ def release_often(solver: str, radius: float, moments: int) -> Experiment:
     sound_delay = 2.0 * radius / held.fluid.sound_speed if solver == "wcsph" else 0.0
     return Experiment(
         times=times,
-        releases=releases,
+        held=np.array(pushes),
+        speeds={density: np.array(each) for density, each in speeds.items()},
         forces=np.array(forces)[:, 2],
         sideways=float(np.linalg.norm(mean[:2])),
         sound_delay=sound_delay,
@@ -163,12 +130,10 @@ def equation_of_motion(experiment: Experiment) -> tuple[Answer, Answer]:
     """Coefficients of rho_s (v + g t) = push J(t) - added mass rho_f v - stiffness rho_f (integral of the way).
 
     J is what the held sphere got from the same moment on, so that what the water does anyway cancels. Fitted to the
-    mean motions of both densities together, as the water is the same for both.
-
-    Returns:
-        The coefficients, and their standard errors by leaving out one release after the other (jackknife).
+    mean motions of both densities together, as the water is the same for both. Also returns the standard errors, by
+    leaving out one release after the other (jackknife).
     """
-    count = len(experiment.releases)
+    count = len(experiment.held)
     everything = np.arange(count)
     left_out = np.array([_fit(experiment, everything[everything != number]) for number in everything])
     errors = np.sqrt((count - 1) / count * ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0))
@@ -178,16 +143,15 @@ def equation_of_motion(experiment: Experiment) -> tuple[Answer, Answer]:
 def _fit(experiment: Experiment, chosen: NDArray[np.integer]) -> Curve:
     times = experiment.times
     first = int(np.searchsorted(times, experiment.sound_delay))
-    held = np.mean([experiment.releases[number].held for number in chosen], axis=0)
+    held = experiment.held[chosen].mean(axis=0)
     rows, sides = [], []
     for density in DENSITIES:
-        speed = np.mean([experiment.releases[number].speeds[density] for number in chosen], axis=0)
+        speed = experiment.speeds[density][chosen].mean(axis=0)
         terms = np.stack([held, -speed, -_integral(_integral(speed, times), times)], axis=1)
         side = density / WATER * (speed + GRAVITY * times)
         rows.append(terms[first + 1 :] - terms[first])
         sides.append(side[first + 1 :] - side[first])
-    fitted: Curve = np.linalg.lstsq(np.concatenate(rows), np.concatenate(sides), rcond=None)[0]
-    return fitted
+    return np.linalg.lstsq(np.concatenate(rows), np.concatenate(sides), rcond=None)[0]
 
 
 def _checks(size: int, experiment: Experiment, answer: Answer) -> list[Check]:
@@ -208,12 +172,12 @@ def _checks(size: int, experiment: Experiment, answer: Answer) -> list[Check]:
         ratio = (force * answer.push * WATER - density) / (WATER - density)
         ratio *= mass / (density + answer.added_mass * WATER)
         tolerance = WATER / abs(WATER - density) * volume_error + WATER / mass * mass_error
+        reason = "the tolerances of force and added mass, as they count in it"
         checks.append(
-            Check(f"first acceleration at {density:g} kg/m³ over theory, {at}", ratio, 1.0, tolerance,
-                  "the tolerances of force and added mass, as they count in it")
-        )  # fmt: skip
-    return [*checks, Check(f"particles in the sphere or out of the tank, {at}", float(experiment.astray), 0.0, 0.0,
-                           "a count")]  # fmt: skip
+            Check(f"first acceleration at {density:g} kg/m³ over theory, {at}", ratio, 1.0, tolerance, reason)
+        )
+    astray = float(experiment.astray)
+    return [*checks, Check(f"particles in the sphere or out of the tank, {at}", astray, 0.0, 0.0, "a count")]
 
 
 def _series(experiment: Experiment) -> dict[str, Any]:
@@ -221,16 +185,8 @@ def _series(experiment: Experiment) -> dict[str, Any]:
     series: dict[str, Any] = {"times": experiment.times}
     for density in DENSITIES:
         theory = GRAVITY * (WATER - density) / (density + ADDED_MASS * WATER)
-        speeds = [release.speeds[density] for release in experiment.releases]
-        series[f"released_{density:g}"] = np.mean(speeds, axis=0) / theory
+        series[f"released_{density:g}"] = experiment.speeds[density].mean(axis=0) / theory
     return series
-
-
-def _let_go(tank: Tank, state: dict[str, NDArray[np.generic]], start: dict[str, NDArray[np.generic]]) -> None:
-    """Put the water of another tank around the sphere, which is at rest where it began."""
-    tank.rigid.restore(start)
-    tank.fluid.restore(state)
-    tank.coupling.resume()
 
 
 def _integral(values: Curve, times: Curve) -> Curve:

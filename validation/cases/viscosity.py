@@ -20,23 +20,12 @@ from validation.checks import CaseResult, Check, fitted_order
 from validation.figures import COLOURS, THEORY, draw_refinement, label_axes, make_panels, refinement_of, style_of
 from validation.scenes import EVERY_FACE, WEIGHTLESS, advance, lattice, make_fluid, state_of, turn_about_y
 
-WAVELENGTH, AMPLITUDE, VISCOSITY = 0.2, 1.0e-3, 1.0e-3
-"""Of v_x = U cos(2 pi z / wavelength) [m], U [m/s], and nu [m²/s]: a Reynolds number of 0.2."""
-
-SOUND_SPEED = 0.1
-"""A hundred times the amplitude [m/s]: what the solver would choose for so slow a flow asks for ten times the steps."""
-
-DECAY = 0.06
-"""Part of a decay time 1/(nu k²) that is computed: what the free sides do has not come to the middle by then."""
-
-CORE = 0.25
-"""Half side of the middle that is measured, in wavelengths."""
-
-IMPLICIT_RESOLUTION = 12
-"""At which the implicit solve is compared."""
-
-TILTS_DEG = {"axis": 0.0, "diagonal": 45.0}
-"""Of the lattice about y, and with it the direction of the wave in the lattice."""
+WAVELENGTH, AMPLITUDE, VISCOSITY = 0.2, 1.0e-3, 1.0e-3  # [m], [m/s], [m²/s]: a Reynolds number of 0.2
+SOUND_SPEED = 0.1  # a hundred times the amplitude [m/s]; the solver's own choice takes ten times the steps
+DECAY = 0.06  # share of a decay time 1/(nu k²): the free sides have not come to the middle by then
+CORE = 0.25  # half side of the middle that is measured, in wavelengths
+IMPLICIT_RESOLUTION = 12  # at which the implicit solve is compared
+TILTS_DEG = {"axis": 0.0, "diagonal": 45.0}  # of the lattice about y
 
 
 def decay(solver: str, resolution: int, tilt_deg: float, viscosity_solver: str = "explicit") -> dict[str, Any]:
@@ -50,11 +39,10 @@ def decay(solver: str, resolution: int, tilt_deg: float, viscosity_solver: str =
     velocity = np.zeros(particles.shape)
     velocity[:, 0] = AMPLITUDE * wave
     space = DomainParameters(min=(-1.0,) * 3, max=(1.0,) * 3, open_faces=EVERY_FACE)
-    fluid = make_fluid(
-        solver, space, particles, spacing=spacing, velocities=velocity, gravity=WEIGHTLESS, viscosity=VISCOSITY,
-        viscosity_solver=viscosity_solver, artificial_viscosity=0.0,
-        **({"sound_speed": SOUND_SPEED} if solver == "wcsph" else {}),
-    )  # fmt: skip
+    material = {"viscosity": VISCOSITY, "viscosity_solver": viscosity_solver, "artificial_viscosity": 0.0}
+    if solver == "wcsph":
+        material["sound_speed"] = SOUND_SPEED
+    fluid = make_fluid(solver, space, particles, spacing=spacing, velocities=velocity, gravity=WEIGHTLESS, **material)
     core = (np.abs(particles[:, :2]) < CORE * WAVELENGTH).all(axis=1) & (np.abs(particles[:, 2]) < 0.5 * WAVELENGTH)
     weight = wave[core] / (wave[core] ** 2).sum()
     duration = DECAY / (VISCOSITY * k**2)

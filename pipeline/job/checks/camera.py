@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kinds.table import bodies
 from pipeline.model.boxes import Box, domain_box, smoke_box, touch
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
@@ -95,7 +96,7 @@ def _check_sight(job: Job, solids: Mapping[KeyPath, Solid], views: Mapping[float
         ]
     )
     at_start = [points_of_box(*solid.bounds) for solid in solids.values()]
-    at_start += [np.array([cloth.position]) for cloth in job.cloth]
+    at_start += [np.array([body.position]) for _, _, body in bodies(job) if hasattr(body, "position")]
     times = sorted(views)
     if not _sees(views[times[0]], np.concatenate(at_start) if at_start else everywhere, aspect):
         findings.warn(CAMERA, "looks away from everything at the start: no body is in the picture")

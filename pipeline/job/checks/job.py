@@ -11,21 +11,18 @@ from pipeline.job.checks.set import check_blend, check_keys_beside_blend, check_
 from pipeline.job.magnitudes import check_magnitudes
 from pipeline.kinds.base import Kind
 from pipeline.kinds.checks.memory_budget import MemoryBudget, memory_budget
+from pipeline.kinds.checks.shapes import build_solids
 from pipeline.kinds.rigid import RIGID
-from pipeline.kinds.solids import build_solids
-from pipeline.kinds.table import KINDS, bodies, described_material
+from pipeline.kinds.table import KINDS, bodies, described_material, placements
 from pipeline.model.job import Job
-from pipeline.model.looks import (
-    BODY,
-    GLOWING_K,
-    WHITEWATER,
-    parts_of,
-)
+from pipeline.model.looks import BODY, WHITEWATER
 from pipeline.model.positions import KeyPath
-from pipeline.model.problems import Findings, format_path, suggestion
+from pipeline.model.problems import Findings, format_path, quoted_list, unknown_name
 from render.parameters import HIGHEST_FPS, MaterialParameters
 
 MANY_FRAMES = 100_000
+GLOWING_K = 900.0
+"""From here on the glow of smoke shows beside other light; by day it takes 1200 K and more [K]."""
 BURNING_SUN = 20.0
 """Irradiance, times that of the exposure, from which a grey ground is nearly white in a picture [W/m²]."""
 
@@ -41,25 +38,18 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
     """
     findings = Findings()
     _check_bodies(job, findings)
-    _check_wind(job, findings)
     _check_whitewater(job, findings)
     _check_materials(job, findings)
-    _check_faces(job, findings)
     _check_time(job, findings)
     _check_pictures(job, findings)
     check_set(job, findings)
     if check_magnitudes(job, findings):
-        _check_scene(job, findings, memory_bytes)
+        solids = build_solids(placements(job), findings)
+        budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
+        check_camera(job, solids, findings)
+        for kind in KINDS.values():
+            findings.elements[kind.name] = kind.check(job, solids, budget, findings)
     return findings
-
-
-def _check_scene(job: Job, findings: Findings, memory_bytes: int | None) -> None:
-    """Shapes, places and sizes, kind by kind, and how large it all is."""
-    solids = build_solids(job, findings)
-    budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
-    check_camera(job, solids, findings)
-    for kind in KINDS.values():
-        findings.elements[kind.name] = kind.check(job, solids, budget, findings)
 
 
 def _check_bodies(job: Job, findings: Findings) -> None:
@@ -70,14 +60,14 @@ def _check_bodies(job: Job, findings: Findings) -> None:
     elif not (job.moving_bodies or job.placed_camera.moves or any(kind is not RIGID for _, kind, _ in found)):
         others = [name for name in KINDS if name != RIGID.name]
         findings.warn((), f"has neither {' nor '.join(others)}, so nothing will move")
-    for kind, solver in (("rigid", "moving bodies"), ("cloth", "cloths")):
-        moves = job.cloth if kind == "cloth" else [body for body in job.rigid if body.kind != "static"]
-        for path, of_kind, body in found:
-            if moves and of_kind.name in ("fluid", "smoke") and body.name == kind:
-                findings.error((*path, "name"), f'"{kind}" is what all {solver} are called together; take another')
     # Names become file names, and some file systems do not tell upper from lower case.
     taken: dict[str, KeyPath] = {}
-    for path, _, body in found:
+    for path, kind, body in found:
+        other_kind = KINDS.get(body.name)
+        if kind.shares_solver is None and other_kind is not None and other_kind.has_shared_solver(job):
+            findings.error(
+                (*path, "name"), f'"{body.name}" is what the solver of all [[{body.name}]] is called; take another'
+            )
         if other := taken.get(body.name.casefold()):
             findings.error(
                 (*path, "name"), f'"{body.name}" is taken by {format_path(other)}; names are unique in a job'
@@ -85,57 +75,41 @@ def _check_bodies(job: Job, findings: Findings) -> None:
         taken.setdefault(body.name.casefold(), path)
 
 
-def _check_wind(job: Job, findings: Findings) -> None:
-    for index, cloth in enumerate(job.cloth):
-        for smoke in job.smoke:
-            lower, upper = smoke.corners(job.domain)
-            starts_inside = all(a <= x <= b for a, x, b in zip(lower, cloth.position, upper, strict=True))
-            if any(cloth.wind) and cloth.wind != smoke.wind and starts_inside:
-                findings.warn(
-                    ("cloth", index, "wind"),
-                    f'does not blow in the box of smoke "{smoke.name}", where the cloth starts: the air of the smoke '
-                    "moves it there; give the smoke that wind, or another box",
-                )
-
-
 def _check_whitewater(job: Job, findings: Findings) -> None:
     fluids = [fluid.name for fluid in job.fluid]
     for name in job.whitewater:
         if name not in fluids:
-            hint = suggestion(name, fluids) or (f"; fluids are {', '.join(fluids)}" if fluids else "; add [[fluid]]")
-            findings.error(("whitewater", name), f'no fluid is named "{name}"{hint}')
+            findings.error(("whitewater", name), unknown_name(name, fluids, "fluid", none="; add [[fluid]]"))
 
 
 def _check_materials(job: Job, findings: Findings) -> None:
     kinds = {body.name: kind for _, kind, body in bodies(job)}
-    for body in job.rigid:
-        kinds |= {f"{body.name}.{part}": KINDS["rigid"] for part in parts_of(body.shape.type) if part != BODY}
-    kinds |= {f"{fluid}.{part}": KINDS["fluid"] for fluid in job.whitewater for part in WHITEWATER}
+    for _, kind, body in bodies(job):
+        unused = {BODY} if body.name in job.whitewater else {BODY, *WHITEWATER}
+        kinds |= {f"{body.name}.{part}": kind for part in kind.material(body) if part not in unused}
     for name, said in job.material.items():
         path: KeyPath = ("material", name)
         owner, _, part = name.partition(".")
         material = described_material(job, owner, part or BODY) if name in kinds else said
         if said.blend is not None:
-            check_blend(said, path, kinds[name].name if name in kinds else None, findings)
+            check_blend(said, path, kinds.get(name), findings)
         elif material.blend is not None:
             check_keys_beside_blend(said, path, findings)
         if name not in kinds:
-            hint = suggestion(name, kinds) or (f"; bodies are {', '.join(kinds)}" if kinds else "")
-            findings.error(path, f'no body is named "{name}"{hint}')
+            findings.error(path, unknown_name(name, kinds, "body", plural="bodies"))
         elif material.look is not None:
             _check_wearer(material.look, kinds[name], name, findings)
         if material.look is not None:
             _check_keys(material, path, findings)
             if LOOK_TABLE[material.look].glows:
-                _check_glow(job, name, findings)
+                _check_glow(job, name, material.look, findings)
 
 
 def _check_wearer(look: str, kind: Kind, name: str, findings: Findings) -> None:
     """Note a look that a kind of body cannot have, or whose texture has nothing there to hang on."""
     path, row = ("material", name, "look"), LOOK_TABLE[look]
     if kind.wears not in row.bodies and kind.wears == "smoke":
-        fitting = " or ".join(f'"{each}"' for each in looks_for(kind.wears))
-        findings.error(path, f'smoke can only look like {fitting}, got "{look}"')
+        findings.error(path, f'{kind.name} can only look like {quoted_list(looks_for(kind.wears))}, got "{look}"')
     elif kind.wears not in row.bodies:
         findings.error(path, f'"{look}" is a look for [[{row.bodies[0]}]]; "{name}" is in [[{kind.name}]]')
     elif kind.wears in row.swims_on:
@@ -151,40 +125,24 @@ def _check_keys(material: MaterialParameters, path: KeyPath, findings: Findings)
             findings.warn((*path, key), f'has no effect on the look "{material.look}"')
 
 
-def _check_glow(job: Job, name: str, findings: Findings) -> None:
+def _check_glow(job: Job, name: str, look: str, findings: Findings) -> None:
     hottest = [source.temperature for smoke in job.smoke if smoke.name == name for source in smoke.source]
     if hottest and max(hottest) < GLOWING_K:
         findings.warn(
             ("material", name, "look"),
-            f'is "fire", but the hottest source has {max(hottest):g} K, and nothing glows below some {GLOWING_K:g} K; '
-            "flames have 1300 K and more",
+            f'is "{look}", but the hottest source has {max(hottest):g} K, and nothing glows below some '
+            f"{GLOWING_K:g} K; flames have 1300 K and more",
         )
 
 
-def _check_faces(job: Job, findings: Findings) -> None:
-    lists: list[tuple[KeyPath, tuple[str, ...]]] = [(("domain", "open_faces"), job.domain.open_faces)]
-    lists += [(("smoke", index, "open_faces"), smoke.open_faces) for index, smoke in enumerate(job.smoke)]
-    for path, faces in lists:
-        for face in dict.fromkeys(face for face in faces if faces.count(face) > 1):
-            findings.error(path, f'names "{face}" more than once')
-
-
 def _check_time(job: Job, findings: Findings) -> None:
-    length = job.frame_count / job.fps
     if job.duration is not None and job.duration * job.fps < 0.5:
         findings.warn(("duration",), f"{job.duration:g} s are less than a frame at {job.fps} fps; the film has one")
     if job.frame_count > MANY_FRAMES:
         findings.warn(
             ("frames",) if job.frames else ("duration",),
-            f"{job.frame_count} frames are {length / 60:.0f} minutes of film; is the number meant?",
+            f"{job.frame_count} frames are {job.film_s / 60:.0f} minutes of film; is the number meant?",
         )
-    for index, smoke in enumerate(job.smoke):
-        for number, source in enumerate(smoke.source):
-            if source.start_s >= length:
-                findings.warn(
-                    ("smoke", index, "source", number, "start_s"),
-                    f"starts at {source.start_s:g} s, after the film's end at {length:g} s",
-                )
 
 
 def _check_pictures(job: Job, findings: Findings) -> None:
@@ -211,10 +169,10 @@ def _check_pictures(job: Job, findings: Findings) -> None:
             findings.error(
                 ("camera", "keyframe", number, "look_at"), "is where the camera is; it must be somewhere else"
             )
-        if key.time_s > job.frame_count / job.fps:
+        if key.time_s > job.film_s:
             findings.warn(
                 ("camera", "keyframe", number, "time_s"),
-                f"is after the film's end at {job.frame_count / job.fps:g} s; the camera does not get there",
+                f"is after the film's end at {job.film_s:g} s; the camera does not get there",
             )
     for index, light in enumerate(job.light):
         if light.position == light.look_at and light.type != "point":

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from blender_scripts.look_table import looks_for
 from pipeline.job.input_files import split_blend
-from pipeline.kinds.checks.meshes import file_exists
+from pipeline.kinds.base import Kind
+from pipeline.kinds.checks.shapes import file_exists
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
-from pipeline.model.problems import Findings
+from pipeline.model.problems import Findings, quoted_list
 from render.parameters import MaterialParameters
 
+# A picture of the whole sphere is 360 degrees wide and 180 high.
 _SPHERE_ASPECT = 2.0
-"""A picture of the whole sphere is 360 degrees wide and 180 high."""
 
 
 def check_set(job: Job, findings: Findings) -> None:
@@ -44,19 +46,13 @@ def check_set(job: Job, findings: Findings) -> None:
         )
 
 
-def check_blend(material: MaterialParameters, path: KeyPath, kind: str | None, findings: Findings) -> None:
-    """Note what is wrong with a material that comes from a .blend file.
-
-    Args:
-        material: the material.
-        path: of its table.
-        kind: of the body that has it: "rigid"; None where there is none.
-        findings: where problems go.
-    """
+def check_blend(material: MaterialParameters, path: KeyPath, kind: Kind | None, findings: Findings) -> None:
+    """Note what is wrong with a material that comes from a .blend file, on a body of a kind, if there is one."""
     assert material.blend is not None
     file_exists(split_blend(material.blend)[0], ".blend file", (*path, "blend"), findings)
-    if kind == "smoke":
-        findings.error((*path, "blend"), 'is for surfaces; smoke can only look like "smoke" or "fire"')
+    if kind is not None and kind.wears == "smoke":
+        looks = quoted_list(looks_for(kind.wears))
+        findings.error((*path, "blend"), f"is for surfaces; {kind.name} can only look like {looks}")
     check_keys_beside_blend(material, path, findings)
 
 

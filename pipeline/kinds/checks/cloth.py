@@ -1,22 +1,20 @@
-"""Checks of cloths: sheets, pins, and the places where they start."""
+"""Checks of cloths: sheets, and the places where they start."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.kinds.checks.cloth_bodies import ClothAtStart, check_bodies_for_cloth
+from pipeline.kinds.checks.cloth_bodies import check_bodies_for_cloth
 from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over
+from pipeline.kinds.checks.cloth_start import ClothStart, start_cloths
 from pipeline.kinds.checks.memory_budget import MemoryBudget
-from pipeline.kinds.checks.meshes import mesh_exists
-from pipeline.kinds.checks.pins import check_pin_load, check_pin_speed, check_pin_times
-from pipeline.model.amounts import count, gigabytes
+from pipeline.kinds.checks.pins import check_pin_load, check_pin_speeds, check_pin_times
+from pipeline.model.amounts import count
 from pipeline.model.boxes import Box, domain_box, span, touch
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
@@ -24,215 +22,47 @@ from sim.cloth.parameters import RUNAWAY_SPEED, RectangleSheet, shared_conflicts
 from sim.shapes.parameters import MeshShape
 
 if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
     from pipeline.model.job import Job
     from sim.cloth.parameters import ClothParameters
-    from sim.cloth.sheet import RestSheet
     from sim.core.domain import DomainParameters
-    from sim.shapes import Solid
+    from sim.shapes.solid import Solid
 
-BYTES_PER_NODE = 6000
-"""What the solver takes: 2.7 kB for six springs, two triangles, what building them takes for a moment, and snapshots
-(measured with 62,500 nodes in a flat sheet), and room for some forty contacts a node in a bundle."""
+# A mesh so many times as large as the domain is in other units, most likely.
 VAST = 20.0
-"""A mesh that is so many times as large as the domain is in other units, most likely."""
+# Depth in a body of cloth that is laid onto it, in decimal numbers [m].
 ROUND_OFF = 1.0e-6
-"""Cloth that is laid onto a body, in decimal numbers, may be so deep in it [m]."""
-
+# Substeps of explicit springs in a frame: 150 times as many as XPBD takes.
 MANY_SUBSTEPS = 3000
-"""Of explicit springs in a frame: 150 times as many as XPBD takes."""
 
 
-@dataclass(frozen=True)
-class _Room:
-    """Memory for one more cloth.
-
-    Attributes:
-        budget: of all cloths.
-        nodes_before: of the cloths that have their place.
-    """
-
-    budget: MemoryBudget
-    nodes_before: int
-
-    def refusal(self, nodes: int) -> str | None:
-        """Reason why a cloth of so many nodes does not fit; None if it does."""
-        need = (self.nodes_before + nodes) * BYTES_PER_NODE
-        if need <= self.budget.bytes:
-            return None
-        together = f" and {count(self.nodes_before)} of the cloths before it" if self.nodes_before else ""
-        possible = max(0, self.budget.bytes // BYTES_PER_NODE - self.nodes_before)
-        return (
-            f"{count(nodes)} nodes{together} need {gigabytes(need)}, {self.budget.owner} has "
-            f"{gigabytes(self.budget.bytes)}; at most {count(possible)} fit"
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Start:
-    """A cloth where it starts.
-
-    Attributes:
-        path: of its table.
-        cloth: its parameters.
-        sheet: at rest.
-        position: of its nodes [m], (n, 3).
-        edges: (e, 2) node numbers.
-        pinned: nodes of each pin, by its number.
-    """
-
-    path: KeyPath
-    cloth: ClothParameters
-    sheet: RestSheet
-    position: NDArray[np.float64]
-    edges: NDArray[np.int32]
-    pinned: Mapping[int, NDArray[np.int64]]
-
-    @cached_property
-    def held(self) -> NDArray[np.bool_]:
-        """Nodes that a pin holds at the start, (n,) bool."""
-        held = np.zeros(len(self.position), dtype=bool)
-        for nodes in self.pinned.values():
-            held[nodes] = True
-        return held
-
-    @property
-    def kept(self) -> NDArray[np.bool_]:
-        """Nodes that a pin holds for ever, (n,) bool."""
-        kept = np.zeros(len(self.position), dtype=bool)
-        for number, nodes in self.pinned.items():
-            kept[nodes] |= self.cloth.pin[number].release_s is None
-        return kept
-
-    @cached_property
-    def longest_edge(self) -> float:
-        """Longest distance of neighbouring nodes [m]."""
-        ends = self.position[self.edges]
-        return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max())
-
-    @cached_property
-    def shortest_edge(self) -> float:
-        """Shortest distance of neighbouring nodes at rest [m]."""
-        rest = self.sheet.vertices[self.edges]
-        return float(np.linalg.norm(rest[:, 1] - rest[:, 0], axis=1).min())
-
-    @property
-    def mass(self) -> float:
-        """Of the cloth [kg]."""
-        return float(self.sheet.node_area.sum()) * self.cloth.mass_per_area
-
-    @property
-    def box(self) -> Box:
-        """Its bounds."""
-        return np.array([self.position.min(axis=0), self.position.max(axis=0)])
-
-
-def check_cloths(job: Job, solids: Mapping[KeyPath, Solid], budget: MemoryBudget, findings: Findings) -> int:
-    """Note what is wrong with the cloths.
-
-    Args:
-        job: the job.
-        solids: its solid shapes as far as they can be built, by path.
-        budget: memory that the simulation may take.
-        findings: where errors and warnings go.
-
-    Returns:
-        Number of nodes of all cloths, as far as they can be built.
-    """
+def check_cloths(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
+    """Note what is wrong with the cloths; returns the nodes of all that can be built."""
     for number, key, message in shared_conflicts(job.cloth):
         findings.error(("cloth", number, key), message)
-    check_pin_times(job, findings)
     for number, cloth in enumerate(job.cloth):
+        check_pin_times(("cloth", number), cloth, job.film_s, findings)
         _check_speeds(("cloth", number), cloth, findings)
-    starts: list[_Start] = []
-    for index in range(len(job.cloth)):
-        before = sum(len(start.position) for start in starts)
-        if (start := _start(job, index, _Room(budget, before), findings)) is not None:
-            starts.append(start)
+        _check_wind_in_smoke(job, ("cloth", number), cloth, findings)
+    starts = start_cloths(job, budget, findings)
     for number, start in enumerate(starts):
         _check_place(start, job.domain, findings)
         _check_size(start, job.domain, findings)
         _check_spacing(start, findings)
-        _check_pin_speeds(start, job.fps, findings)
-        check_pin_load(
-            start.path, start.cloth, nodes=len(start.position), pinned=int(start.kept.sum()), edge=start.shortest_edge,
-            fluid_share=fluid_over(job, solids, start.box) / start.mass,
-            gravity=float(np.linalg.norm(job.gravity)), fps=job.fps, findings=findings,
-        )  # fmt: skip
+        check_pin_speeds(start, job.fps, findings)
+        check_pin_load(start, job, fluid_over(job, solids, start.box), findings)
         check_buoyancy(job, start.path, start.cloth, findings)
         _check_substeps(start, job.fps, findings)
         for path, solid in solids.items():
             if path[0] == "rigid":
                 _check_inside(start, job.rigid[int(path[1])].name, solid, findings)
         _check_crossings(start, starts[:number], findings)
-    at_start = {
-        int(start.path[1]): ClothAtStart(
-            start.longest_edge, {number: start.position[nodes] for number, nodes in start.pinned.items()}
-        )
-        for start in starts
-    }
-    check_bodies_for_cloth(job, solids, at_start, findings)
+    if starts:
+        check_bodies_for_cloth(job, solids, starts, findings)
     return sum(len(start.position) for start in starts)
 
 
-def _start(job: Job, index: int, room: _Room, findings: Findings) -> _Start | None:
-    """The cloth as the simulation will start it; None if it cannot be built."""
-    from sim.cloth.sheet import build_sheet
-    from sim.cloth.springs import edges_of
-    from sim.cloth.start import start_positions
-    from sim.shapes import ShapeError
-
-    path: KeyPath = ("cloth", index)
-    cloth = job.cloth[index]
-    if not mesh_exists(cloth.shape, path, findings):
-        return None
-    if isinstance(cloth.shape, RectangleSheet):
-        key = "counts" if cloth.shape.counts is not None else "resolution"
-        if refusal := room.refusal(math.prod(cloth.shape.node_counts)):
-            findings.error((*path, "shape", key), f"{refusal}: divide it less finely")
-            return None
-    try:
-        sheet = build_sheet(cloth.shape)
-    except ShapeError as error:
-        findings.error((*path, "shape"), str(error))
-        return None
-    # How many nodes a mesh has is known only now.
-    if isinstance(cloth.shape, MeshShape) and (refusal := room.refusal(len(sheet.vertices))):
-        findings.error((*path, "shape", "file"), f"{refusal}: take a coarser mesh")
-        return None
-    for warning in sheet.warnings:
-        findings.warn((*path, "shape"), warning)
-    position = start_positions(cloth, sheet)
-    pinned = _pinned(path, cloth, sheet, position, findings)
-    return _Start(path, cloth, sheet, position, edges_of(sheet.triangles).nodes, pinned)
-
-
-def _pinned(
-    path: KeyPath, cloth: ClothParameters, sheet: RestSheet, position: NDArray[np.float64], findings: Findings
-) -> dict[int, NDArray[np.int64]]:
-    """The nodes of each pin, by its number.
-
-    Notes pins that hold none, which are left out, and moving ones that share a node.
-    """
-    from sim.cloth.start import pinned_nodes
-
-    holders, pinned = np.full(len(position), -1), {}
-    for number, pin in enumerate(cloth.pin):
-        place = (*path, "pin", number)
-        try:
-            nodes = pinned_nodes(pin, sheet, position)
-        except ValueError as error:
-            findings.error(place, str(error))
-            continue
-        others = [int(other) for other in np.unique(holders[nodes]) if other >= 0]
-        moving = [other for other in others if pin.keyframe or cloth.pin[other].keyframe]
-        if moving:
-            findings.error(place, f"shares a node with pin[{moving[0]}], and one of them moves; pin each node once")
-        holders[nodes] = number
-        pinned[number] = nodes
-    return pinned
-
-
-def _check_place(start: _Start, domain: DomainParameters, findings: Findings) -> None:
+def _check_place(start: ClothStart, domain: DomainParameters, findings: Findings) -> None:
     """Refuse cloth out of sight, and cloth on both sides of a wall."""
     box = domain_box(domain)
     if not touch(start.box, box, margin=0.0):
@@ -259,8 +89,20 @@ def _check_speeds(path: KeyPath, cloth: ClothParameters, findings: Findings) -> 
         findings.warn((*path, "wind"), f"has no effect without {none}; give that a value, or remove the wind")
 
 
-def _check_size(start: _Start, domain: DomainParameters, findings: Findings) -> None:
-    """A mesh in millimetres is a thousand times too large; nothing else would tell, if faces are open."""
+def _check_wind_in_smoke(job: Job, path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:
+    for smoke in job.smoke:
+        lower, upper = smoke.corners(job.domain)
+        starts_inside = all(a <= x <= b for a, x, b in zip(lower, cloth.position, upper, strict=True))
+        if any(cloth.wind) and cloth.wind != smoke.wind and starts_inside:
+            findings.warn(
+                (*path, "wind"),
+                f'does not blow in the box of smoke "{smoke.name}", where the cloth starts: the air of the smoke moves '
+                "it there; give the smoke that wind, or another box",
+            )
+
+
+def _check_size(start: ClothStart, domain: DomainParameters, findings: Findings) -> None:
+    """A mesh in millimetres is a thousand times too large; with open faces no other check would find it."""
     largest, room = float(np.ptp(start.box, axis=0).max()), float(np.ptp(domain_box(domain), axis=0).max())
     if isinstance(start.cloth.shape, MeshShape) and largest > VAST * room:
         findings.warn(
@@ -270,7 +112,7 @@ def _check_size(start: _Start, domain: DomainParameters, findings: Findings) -> 
         )
 
 
-def _check_spacing(start: _Start, findings: Findings) -> None:
+def _check_spacing(start: ClothStart, findings: Findings) -> None:
     """Layers keep the thickness where the sheet is folded; it cannot fold more sharply than its nodes allow."""
     shortest = start.shortest_edge
     if start.cloth.self_collision and start.cloth.thickness > shortest:
@@ -281,21 +123,7 @@ def _check_spacing(start: _Start, findings: Findings) -> None:
         )
 
 
-def _check_pin_speeds(start: _Start, fps: int, findings: Findings) -> None:
-    """Nodes follow a pin by their springs, from substep to substep."""
-    for number, nodes in start.pinned.items():
-        position = start.position[nodes]
-        check_pin_speed(
-            (*start.path, "pin", number),
-            start.cloth,
-            reach=float(np.linalg.norm(position - position.mean(axis=0), axis=1).max()),
-            longest_edge=start.longest_edge,
-            fps=fps,
-            findings=findings,
-        )
-
-
-def _check_substeps(start: _Start, fps: int, findings: Findings) -> None:
+def _check_substeps(start: ClothStart, fps: int, findings: Findings) -> None:
     """Explicit springs are unstable beyond their step, and without a number of substeps dictate theirs."""
     from sim.cloth.springs import springs_of
     from sim.cloth.stable_step import ACCURATE_SHARE, longest_explicit_step, too_few_substeps
@@ -305,8 +133,8 @@ def _check_substeps(start: _Start, fps: int, findings: Findings) -> None:
     if cloth.integrator != "explicit":
         return
     families = [(springs, springs.stiffness(cloth), springs.damping(cloth)) for springs in springs_of(start.sheet)]
-    # Nodes that are let go later need shorter steps from then on.
-    inverse_mass = np.where(start.kept, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
+    # Nodes that are released later need shorter steps from then on.
+    inverse_mass = np.where(start.held_for_ever, 0.0, 1.0 / (start.sheet.node_area * cloth.mass_per_area))
     longest = longest_explicit_step(families, inverse_mass)
     if cloth.substeps is not None:
         if reason := too_few_substeps(cloth.substeps, 1.0 / fps, longest):
@@ -322,27 +150,26 @@ def _check_substeps(start: _Start, fps: int, findings: Findings) -> None:
         findings.warn((*start.path, "integrator"), f"{takes}, which takes long: {helps}")
 
 
-def _check_inside(start: _Start, body: str, solid: Solid, findings: Findings) -> None:
+def _check_inside(start: ClothStart, body: str, solid: Solid, findings: Findings) -> None:
     """Refuse cloth in a body: nobody knows which way out is meant. Pinned nodes stay where they are, so they may be."""
     if not touch(start.box, solid.bounds, margin=0.0):
         return
-    triangles = start.sheet.triangles
     points = np.concatenate(
-        [start.position[~start.held], *(_middles(start, parts) for parts in (start.edges, triangles))]
+        [start.position[~start.held], *(_middles(start, parts) for parts in (start.edges, start.sheet.triangles))]
     )
-    near = ((points >= solid.bounds[0]) & (points <= solid.bounds[1])).all(axis=1)
-    inside = points[near][solid.signed_distance(points[near]) < -ROUND_OFF] if near.any() else points[:0]
+    points = points[((points >= solid.bounds[0]) & (points <= solid.bounds[1])).all(axis=1)]
+    inside = points[solid.signed_distance(points) < -ROUND_OFF] if len(points) else points
     if len(inside):
         findings.error(start.path, f'starts inside "{body}", as at {_place(inside[0])}; move one of them')
 
 
-def _middles(start: _Start, parts: NDArray[np.int32]) -> NDArray[np.float64]:
+def _middles(start: ClothStart, parts: NDArray[np.int32]) -> NDArray[np.float64]:
     """Middles of edges or triangles [m] without a pinned node."""
     middles: NDArray[np.float64] = start.position[parts[~start.held[parts].any(axis=1)]].mean(axis=1)
     return middles
 
 
-def _check_crossings(start: _Start, earlier: Sequence[_Start], findings: Findings) -> None:
+def _check_crossings(start: ClothStart, earlier: Sequence[ClothStart], findings: Findings) -> None:
     """Refuse cloth that passes through another or touches it, or a mesh itself.
 
     Contacts keep what crosses crossed, and what touches has no side to be kept on.
@@ -370,7 +197,7 @@ def _check_crossings(start: _Start, earlier: Sequence[_Start], findings: Finding
             )
 
 
-def _crossing_of(one: _Start, other: _Start) -> NDArray[np.float64] | None:
+def _crossing_of(one: ClothStart, other: ClothStart) -> NDArray[np.float64] | None:
     """Where an edge of one cloth passes through or touches a triangle of another [m]."""
     from sim.cloth.start import TOUCHING, first_crossing
 

@@ -2,103 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.kinds.checks.mesh_grids import problem_of_mesh_grid
-from pipeline.model.positions import KeyPath
+from pipeline.kinds.checks.shapes import thin_wall_problem
 from pipeline.model.problems import Findings
 
 if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
+    from pipeline.kinds.checks.cloth_start import ClothStart
     from pipeline.model.job import Job
     from sim.cloth.parameters import PinParameters
     from sim.rigid.parameters import RigidBodyParameters
-    from sim.shapes import Solid
     from sim.shapes.placement import PlacedSolid
 
+# A body whose shortest side has fewer edges of the cloth may show between its nodes, and pass with less than half.
 LEAST_EDGES = 2.0
-"""A body whose shortest side has fewer edges of the cloth may show between its nodes, and pass with less than half."""
-
+# More of a rod's length than this is most of it.
 MOST = 0.5
-"""More of a rod's length than this is most of it."""
-
+# Distances that differ by this share are the same.
 ROUND_OFF = 1.0e-6
-"""Distances that differ by this share are the same."""
-
+# Times of the film at which rods and pins are looked at, beside their keyframes.
 TIMES = 64
-"""At so many times of the film it is looked up where a rod and a pin are, beside their keyframes."""
 
 
-@dataclass(frozen=True, eq=False)
-class ClothAtStart:
-    """A cloth as it starts.
-
-    Attributes:
-        longest_edge: longest distance of neighbouring nodes [m].
-        pinned: where the nodes of each pin are at the start [m], (n, 3) each, by the pin's number.
-    """
-
-    longest_edge: float
-    pinned: Mapping[int, NDArray[np.float64]]
-
-
-def check_bodies_for_cloth(
-    job: Job, solids: Mapping[KeyPath, Solid], cloths: Mapping[int, ClothAtStart], findings: Findings
-) -> None:
+def check_bodies_for_cloth(job: Job, solids: Solids, starts: Sequence[ClothStart], findings: Findings) -> None:
     """Warn of bodies that cloth may let through.
 
     A rod may be thin for a sheet that is pinned along it, and stays so: the sheet hangs from it, and does not have to
     find it.
-
-    Args:
-        job: the job.
-        solids: its solid shapes as far as they can be built, by path.
-        cloths: its cloths, by their numbers.
-        findings: where warnings go.
     """
-    from sim.shapes.placement import PlacedSolid
-
-    if not cloths:
-        return
     for path, solid in solids.items():
-        if path[0] != "rigid" or not isinstance(solid, PlacedSolid):
+        if path[0] != "rigid":
             continue
         axes = np.eye(3)
         sides = solid.scale * (solid.shape.support(axes) + solid.shape.support(-axes))
         body, thickness = job.rigid[int(path[1])], float(sides.min())
         too_coarse = []
-        for number, cloth in cloths.items():
-            rod, pins = _Rod(body, solid, sides, cloth.longest_edge), job.cloth[number].pin
-            if thickness < LEAST_EDGES * cloth.longest_edge and not any(
-                rod.stays_with(pins[pin], nodes, job.frame_count / job.fps) for pin, nodes in cloth.pinned.items()
+        for start in starts:
+            rod, pins = _Rod(body, solid, sides, start.longest_edge), start.cloth.pin
+            if thickness < LEAST_EDGES * start.longest_edge and not any(
+                rod.stays_with(pins[pin], start.position[nodes], job.film_s) for pin, nodes in start.pinned.items()
             ):
-                too_coarse.append(number)
+                too_coarse.append(start)
         if too_coarse:
-            coarsest = max(too_coarse, key=lambda number: cloths[number].longest_edge)
+            coarsest = max(too_coarse, key=lambda start: start.longest_edge)
             findings.warn(
-                ("cloth", coarsest, "shape"),
+                (*coarsest.path, "shape"),
                 f'"{body.name}" is {thickness:.3g} m across, less than two of the longest edges, '
-                f"{cloths[coarsest].longest_edge:.3g} m each: it may show or pass between the nodes; divide the sheet "
+                f"{coarsest.longest_edge:.3g} m each: it may show or pass between the nodes; divide the sheet "
                 "more finely, or make the body larger",
             )
-        if problem := problem_of_mesh_grid(solid, who="cloth", what="cloth"):
+        if problem := thin_wall_problem(solid, who="cloth", what="cloth"):
             findings.warn((*path[:2], "shape"), problem)
 
 
 @dataclass(frozen=True, eq=False)
 class _Rod:
-    """A body beside a cloth, of which two sides are thin if it is a rod.
-
-    Attributes:
-        body: what the job says of it.
-        solid: its shape at the start.
-        sides: of the box around it in its own axes [m], (3,).
-        longest_edge: longest distance of neighbouring nodes of the cloth [m].
-    """
+    """A body beside a cloth; a rod if two of its sides [m], (3,), are thin for the longest edge of the cloth [m]."""
 
     body: RigidBodyParameters
     solid: PlacedSolid
@@ -106,13 +71,7 @@ class _Rod:
     longest_edge: float
 
     def stays_with(self, pin: PinParameters, nodes: NDArray[np.float64], film_s: float) -> bool:
-        """Whether it is a rod along which cloth is pinned for as long as the pin holds.
-
-        Args:
-            pin: what the job says of the pin.
-            nodes: that it holds, at the start [m], (n, 3).
-            film_s: how long the film is [s].
-        """
+        """Whether it is a rod along which a pin holds its nodes, [m], (n, 3) at the start, for as long as it holds."""
         from sim.cloth.pin_paths import path_of_pin
         from sim.core.motion import rotation
         from sim.rigid.paths import path_of

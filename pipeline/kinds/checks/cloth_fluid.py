@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,24 +12,20 @@ from pipeline.kinds.checks.fluid import openings_of
 from pipeline.model.boxes import Box
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from sim.fluid.traits import TRAITS
 
 if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
     from pipeline.model.job import Job
     from sim.cloth.parameters import ClothParameters
     from sim.fluid.opening import Opening
-    from sim.shapes import Solid
 
 
-def fluid_over(job: Job, solids: Mapping[KeyPath, Solid], box: Box) -> float:
-    """Mass of the fluid that falls onto a cloth within the film [kg], if nothing else is in its way and none runs off.
+def fluid_over(job: Job, solids: Solids, box: Box) -> float:
+    """Mass of the fluid that falls onto a cloth's box within the film [kg], if nothing stops it and none runs off.
 
     Blocks by the share of their box that is above the cloth's, jets by where their middle gets to its height; above is
     along the axis that gravity is most nearly along.
-
-    Args:
-        job: the job.
-        solids: its solid shapes as far as they can be built, by path.
-        box: what the cloth spans at the start [m].
     """
     gravity = np.asarray(job.gravity, dtype=np.float64)
     if not gravity.any():
@@ -48,7 +43,7 @@ def fluid_over(job: Job, solids: Mapping[KeyPath, Solid], box: Box) -> float:
                 volume += is_above * solid.volume * float(np.prod(shared / (high - low)[sides]))
         for _, opening in openings_of(fluid):
             if _falls_onto(opening, box, gravity, down):
-                volume += len(opening.points) * opening.layers_due(job.frame_count / job.fps) * fluid.lattice_volume
+                volume += len(opening.points) * opening.layers_due(job.film_s) * fluid.lattice_volume
         mass += fluid.rest_density * min(volume, fluid.most_volume)
     return mass
 
@@ -56,34 +51,24 @@ def fluid_over(job: Job, solids: Mapping[KeyPath, Solid], box: Box) -> float:
 def _falls_onto(opening: Opening, box: Box, gravity: NDArray[np.float64], down: int) -> bool:
     """Whether the middle of a jet comes down to the middle of a box within its sides."""
     sign = float(np.sign(gravity[down]))
-    way = sign * float(box[:, down].mean() - opening.centre[down])
+    drop = sign * float(box[:, down].mean() - opening.centre[down])
     speed, pull = sign * float(opening.velocity[down]), abs(float(gravity[down]))
-    if way <= 0.0:
+    if drop <= 0.0:
         return False
-    time = 2.0 * way / (speed + math.sqrt(speed**2 + 2.0 * pull * way))
+    time = 2.0 * drop / (speed + math.sqrt(speed**2 + 2.0 * pull * drop))
     point = opening.centre + time * opening.velocity + 0.5 * time**2 * gravity
     within = (point >= box[0]) & (point <= box[1])
     within[down] = True
     return bool(within.all())
 
 
-DRIFT_IN_LAYERS: Mapping[str, float] = {"wcsph": 0.5, "dfsph": 0.06, "pcisph": 0.06}
-"""How well buoyancy of a sheet is known, by solver, in the mass of a layer of particles per area: from the force on one
-that is held fast in water with particles of 2 cm (docs/decisions/0023-cloth-and-fluid.md: 41 and 130 N/m² for 29), by
-DFSPH 1.2 kg/m² there, by WCSPH, where water at rest bears shear, ten; PCISPH is taken to be as good as DFSPH, and
-the error to shrink with the particles, as the void about a sheet does."""
-
-
 def check_buoyancy(job: Job, path: KeyPath, cloth: ClothParameters, findings: Findings) -> None:
-    """Warn of loose cloth that weighs so nearly what it displaces that whether it sinks is not known.
-
-    Cloth that a pin holds for ever stays where it is all the same.
-    """
+    """Warn of loose cloth that weighs so nearly what it displaces that whether it sinks is not known."""
     if any(pin.release_s is None for pin in cloth.pin) or not any(job.gravity):
         return
     for fluid in job.fluid:
         displaced = fluid.rest_density * cloth.thickness
-        least = DRIFT_IN_LAYERS[fluid.solver] * fluid.rest_density * 2.0 * fluid.particle_radius
+        least = TRAITS[fluid.solver].buoyancy_error * fluid.rest_density * fluid.spacing
         if abs(cloth.mass_per_area - displaced) < least:
             findings.warn(
                 (*path, "mass_per_area"),

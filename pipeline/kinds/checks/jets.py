@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,39 +20,25 @@ from pipeline.model.problems import Findings, format_path
 from sim.fluid.nozzles import is_same_nozzle
 
 if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
     from pipeline.model.job import Job
     from sim.core.domain import DomainParameters
     from sim.fluid.opening import Opening
-    from sim.shapes import Solid
+    from sim.shapes.solid import Solid
 
 Points = NDArray[np.float64]
+Times = NDArray[np.float64]
 
+# Points of a jet that are looked at; in a domain more than so many spacings across they are farther apart.
 MOST_STEPS = 4000
-"""Points of a jet that are looked at; in a domain more than so many spacings across they are farther apart."""
+# Share of a jet's cross-section that may have something right before it.
 MOST_BLOCKED = 0.5
-"""Share of a jet's cross-section that may have something right before it."""
-
-
-@dataclass(frozen=True)
-class _Way:
-    """How the middle of a jet flies until it meets something: points [m], (k, 3), and when it is there [s], (k,)."""
-
-    points: Points
-    times: NDArray[np.float64]
 
 
 def check_jets(
-    job: Job, solids: Mapping[KeyPath, Solid], openings: Mapping[KeyPath, Opening], spacing: float, findings: Findings
+    job: Job, solids: Solids, openings: Mapping[KeyPath, Opening], spacing: float, findings: Findings
 ) -> None:
-    """Warn of jets that cannot get away from their opening, and of those that run into another nozzle.
-
-    Args:
-        job: the job.
-        solids: its bodies and blocks as far as they can be built, by path.
-        openings: of its emitters, by path.
-        spacing: of the particles [m].
-        findings: where warnings go.
-    """
+    """Warn of jets, of particles of a spacing [m], that cannot leave their opening or run into another nozzle."""
     bodies = [solid for path, solid in solids.items() if path[0] == "rigid"]
     blocks = [solid for path, solid in solids.items() if path[0] == "fluid"]
     for path, opening in openings.items():
@@ -67,11 +51,11 @@ def check_jets(
                 "get away; particles will be squeezed, and their places be taken: move or turn it",
             )
             continue
-        way = _fly(job, opening, [*bodies, *blocks], spacing)
+        flight = _fly(job, opening, [*bodies, *blocks], spacing)
         for other_path, other in openings.items():
             if is_same_nozzle(opening, other, spacing):
                 continue
-            arrival = _arrival(way, opening, other, spacing)
+            arrival = _arrival(*flight, opening, other, spacing=spacing)
             if arrival is not None:
                 findings.warn(
                     path,
@@ -107,24 +91,32 @@ def _room_before(
     return float(ahead[reached[0]]) if len(reached) else needed
 
 
-def _fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float) -> _Way:
-    """The way of a jet's middle until it meets a wall, a body or a block, leaves the domain, or the film ends."""
-    gravity = np.asarray(job.gravity, dtype=np.float64)
-    strength = float(np.linalg.norm(gravity))
-    corners = np.array(list(product(*zip(job.domain.min, job.domain.max, strict=True))))
-    farthest = opening.nozzle_depth + float(np.linalg.norm(corners - opening.centre, axis=1).max())
-    driven_s = opening.nozzle_depth / opening.speed
-    end_s = min(
-        driven_s + _longest_flight(opening.speed, strength, farthest), job.frame_count / job.fps - opening.start_s
-    )
-    if end_s <= 0.0:
-        return _Way(np.zeros((0, 3)), np.zeros(0))
-    fastest = opening.speed + strength * end_s
+def _fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float) -> tuple[Points, Times]:
+    """Path of a jet's middle until it meets a wall, a body or a block, leaves the domain, or the film ends.
+
+    Returns:
+        Points [m], (k, 3), and times [s], (k,).
+    """
+    gravity, driven_s = np.asarray(job.gravity, dtype=np.float64), opening.nozzle_depth / opening.speed
+
+    def places(times: Times) -> Points:
+        flown = np.maximum(times - driven_s, 0.0)[:, None]
+        path: Points = opening.centre + times[:, None] * opening.velocity + 0.5 * flown**2 * gravity
+        return path
+
+    def are_outside(points: Points) -> NDArray[np.bool_]:
+        outside: NDArray[np.bool_] = ((points < job.domain.min) | (points > job.domain.max)).any(axis=1)
+        return outside
+
+    film_s, end_s = job.film_s - opening.start_s, 2.0 * driven_s
+    while end_s < film_s and not are_outside(places(np.array([end_s])))[0]:
+        end_s *= 2.0
+    end_s = max(0.0, min(end_s, film_s))
+    fastest = opening.speed + float(np.linalg.norm(gravity)) * end_s
     steps = min(MOST_STEPS, math.ceil(end_s * fastest / (0.5 * spacing)))
     times = np.linspace(0.0, end_s, steps + 1)
-    flown = np.maximum(times - driven_s, 0.0)[:, None]
-    points = opening.centre + times[:, None] * opening.velocity + 0.5 * flown**2 * gravity
-    inside = _until_first(((points < job.domain.min) | (points > job.domain.max)).any(axis=1))
+    points = places(times)
+    inside = _until_first(are_outside(points))
     points, times = points[:inside], times[:inside]
     stopped = np.zeros(inside, dtype=bool)
     for solid in obstacles:
@@ -132,37 +124,17 @@ def _fly(job: Job, opening: Opening, obstacles: Sequence[Solid], spacing: float)
             # What it comes out of is not in its way: blocks around a nozzle are pushed aside.
             stopped |= (solid.signed_distance(points) < 0.0) & (times > driven_s)
     kept = _until_first(stopped)
-    return _Way(points[:kept], times[:kept])
+    return points[:kept], times[:kept]
 
 
-def _longest_flight(speed: float, gravity: float, distance: float) -> float:
-    """By when what is thrown has been so far away from where it began, whatever its direction [s].
-
-    After t it is at least |v t - g t²/2| away, which is exact straight up. There, fast enough, it gets that far
-    before it turns, v²/2g above; else it has to fall back past its start.
-
-    Args:
-        speed: at first [m/s].
-        gravity: its strength [m/s²].
-        distance: how far [m].
-    """
-    if gravity == 0.0:
-        return distance / speed
-    turning = speed**2 - 2.0 * gravity * distance
-    if turning >= 0.0:
-        # (v - sqrt(v² - 2 g D)) / g, without the difference of nearly equal numbers where gravity is weak.
-        return 2.0 * distance / (speed + math.sqrt(turning))
-    return (speed + math.sqrt(speed**2 + 2.0 * gravity * distance)) / gravity
-
-
-def _arrival(way: _Way, opening: Opening, other: Opening, spacing: float) -> float | None:
+def _arrival(points: Points, times: Times, opening: Opening, other: Opening, *, spacing: float) -> float | None:
     """When the core of a jet comes into another nozzle or its pipe [s], or None."""
-    if not len(way.points):
+    if not len(points):
         return None
     nozzle = cKDTree(np.concatenate([other.nozzle_places(), other.pipe(spacing)]))
-    distance, _ = nozzle.query(way.points)
+    distance, _ = nozzle.query(points)
     near = np.flatnonzero(distance < min(opening.half_size))
-    return float(way.times[near[0]]) if len(near) else None
+    return float(times[near[0]]) if len(near) else None
 
 
 def _box_around(points: Points) -> Box:

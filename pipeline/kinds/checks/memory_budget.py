@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import psutil
 
+from pipeline.model.amounts import count, gigabytes
 from pipeline.model.job import Job
 
 SHARE = 0.9
-"""Share of what is free now that a simulation may claim; the rest is the driver's, the runner's and other stages'."""
+"""Share of what is free now that a simulation may claim."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +29,30 @@ class MemoryBudget:
     owner: str
     on_gpu: bool = False
 
+    def refusal(
+        self, elements: float, called: str, bytes_each: float, *, before: float = 0.0, beside: str = ""
+    ) -> str | None:
+        """Reason why so many elements, with those `before` them, do not fit; None if they do.
+
+        Args:
+            elements: how many.
+            called: what they are, for people: "particles".
+            bytes_each: memory of each [bytes].
+            before: of others that have their place.
+            beside: the others, in words.
+        """
+        need = (elements + before) * bytes_each
+        if need <= self.bytes:
+            return None
+        possible = max(0.0, self.bytes // bytes_each - before)
+        return (
+            f"{count(elements)} {called}{beside} need {gigabytes(need)}, {self.owner} has {gigabytes(self.bytes)}; "
+            f"at most {count(possible)} fit"
+        )
+
 
 def memory_budget(job: Job) -> MemoryBudget:
-    """Free memory for the job's simulation, where it would run.
-
-    Of GPUs only Nvidia's tell. For others, and for a device that does not work here, which is refused elsewhere, the
-    machine's memory counts: it is the bound that is left.
-    """
+    """Free memory for the job's simulation: that of a GPU if it is Nvidia's, else the machine's."""
     from sim.core.runtime import DeviceUnavailableError, resolve_device
 
     try:
@@ -54,9 +72,8 @@ class _NvmlMemory(ctypes.Structure):
 def free_gpu_bytes() -> int | None:
     """Free memory of the first Nvidia GPU that this process may use [bytes]; None where no driver tells.
 
-    Asks the management library that comes with the driver (NVML); unlike CUDA itself it takes no memory of the GPU. It
-    counts GPUs by their slots, CUDA the fastest first: where they differ, name one by its UUID in CUDA_VISIBLE_DEVICES.
-    Of a GPU in slices (MIG), too, only a UUID tells which; by number it is the whole.
+    The driver's management library (NVML), unlike CUDA, takes no memory of the GPU. It counts GPUs by their slots, CUDA
+    the fastest first; where they differ, and for slices (MIG), CUDA_VISIBLE_DEVICES must name a UUID.
     """
     try:
         library = ctypes.CDLL("libnvidia-ml.so.1")

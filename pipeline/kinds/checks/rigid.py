@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.model.boxes import domain_box, overlap, smoke_box, span
-from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 
 if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
     from pipeline.model.job import Job
-    from sim.shapes import PlacedSolid, Solid
 
+# Share of a body's size by which ballast on its surface may be outside, as decimals do not add up exactly.
 ROUND_OFF = 1.0e-6
-"""Share of a body's size by which ballast on its surface may be outside, as decimals do not add up exactly."""
 
 
-def check_places(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+def check_places(job: Job, solids: Solids, findings: Findings) -> None:
     """Note bodies that are wholly outside of the domain and of every smoke's box."""
     domain = domain_box(job.domain)
     regions = [domain, *(smoke_box(smoke, job.domain) for smoke in job.smoke)]
@@ -29,7 +27,7 @@ def check_places(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) 
             findings.error(path, f"is wholly outside the domain: it spans {span(solid.bounds)}, not {span(domain)}")
 
 
-def check_ballast(job: Job, solids: Mapping[KeyPath, PlacedSolid], findings: Findings) -> None:
+def check_ballast(job: Job, solids: Solids, findings: Findings) -> None:
     """Note ballast that lies outside of its body: a slip of the unit, most likely, that would topple the body."""
     for index, body in enumerate(job.rigid):
         solid = solids.get(("rigid", index))
@@ -47,14 +45,14 @@ def check_ballast(job: Job, solids: Mapping[KeyPath, PlacedSolid], findings: Fin
                 )
 
 
-def check_rigid_start(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
+def check_rigid_start(job: Job, solids: Solids, findings: Findings) -> None:
     """Note dynamic bodies that overlap others or walls, as the simulation would refuse them.
 
     Bodies without a shape in `solids` have been found wanting already; then nothing is looked at.
     """
     from sim.rigid.solver import RigidSolver
     from sim.rigid.start import start_problems
-    from sim.shapes import ShapeError
+    from sim.shapes.solid import ShapeError
 
     dynamic = [index for index, body in enumerate(job.rigid) if body.kind == "dynamic"]
     if not dynamic or any(("rigid", index) not in solids for index in range(len(job.rigid))):

@@ -3,79 +3,118 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.kinds.checks.closed_domain import check_shut_in_air
+from pipeline.kinds.checks.closed_domain import check_closed_domain
 from pipeline.kinds.checks.memory_budget import MemoryBudget
-from pipeline.kinds.checks.smoke_bodies import LEAST_LAYERS, check_bodies_in_smoke
+from pipeline.kinds.checks.smoke_bodies import (
+    LEAST_LAYERS,
+    GeometryBuilder,
+    check_bodies_in_smoke,
+    check_mesh_grids,
+    geometry_builder,
+    static_bodies,
+)
 from pipeline.model.amounts import count, gigabytes, rounded_down, rounded_up
-from pipeline.model.boxes import Box, overlap, smoke_box, span, touch
+from pipeline.model.boxes import ALL, Box, overlap, smoke_box, span, touch
 from pipeline.model.positions import KeyPath
-from pipeline.model.problems import Findings, format_path, suggestion
+from pipeline.model.problems import Findings, format_path, unknown_name
 from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, SmokeSourceParameters
 
 if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
     from pipeline.model.job import Job
-    from sim.shapes import PlacedSolid, Solid
+    from sim.shapes.placement import PlacedSolid
+    from sim.shapes.solid import Solid
 
 BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 320, 250
-"""Upper bounds of what a smoke takes: 171 for the solver and all that it may be coupled to (101 for itself and what
-moves in it, multigrid levels included, 32 for fluid, 24 for cloth, 14 for turbulence), and where a CPU computes 144 on
-top for the six snapshots and checkpoints that the simulation may hold at once. On a GPU these are not in its memory."""
+"""Upper bounds: 171 for the solver and its couplings, and, where a CPU computes, 144 for the six snapshots and
+checkpoints that the simulation may hold at once; on a GPU these are not in its memory."""
 BYTES_PER_ROW_ON_GPU = 5 * 32 * 8
-"""On top for each row of cells along z: five reductions (`sim.smoke.reductions`) of 32 lanes, two numbers each. Boxes
-of few cells along z take more for these than for their cells. A CPU has one lane a row, within the bound above."""
-ALL = 1.0 - 1e-6
-"""Share of a box that counts as all of it: sizes and positions written in decimal do not add up exactly."""
+"""On top for each row of cells along z: five reductions (`sim.smoke.reductions`) of 32 lanes, two numbers each."""
 COUNTED_CELLS = 1_000_000
 """A source whose box has more cells than this is taken to have some of its own; in a larger box of smoke nobody looks
 for air that bodies shut in."""
+# Hotter gas is a plasma, which neither these equations nor a film's light describe [K].
 HOTTEST = 10_000.0
-"""Hotter gas is a plasma, which neither these equations nor a film's light describe [K]."""
+# Flames in air or oxygen have 3,500 K at most; wood burns at 1,300 to 1,600 K [K].
 HOTTEST_FLAME = 4_000.0
-"""The hottest flames in air or oxygen have 3,000 to 3,500 K; wood burns at 1,300 to 1,600 K [K]."""
+# Numbers below are degrees Celsius, most likely; the coldest air on earth has 184 K [K].
 COLDEST_AIR = 150.0
-"""Numbers below are degrees Celsius, most likely; the coldest air on earth has 184 K [K]."""
+# Part of smoke or heat that counts as nothing.
 GONE = 0.01
-"""Part of smoke or heat that counts as nothing."""
 SMALLEST_TOLERANCE = 2.0e-7
-"""Divergence that single precision can be rid of, over the largest speed and times the cell [-]: a plume of 32³ cells
-came to 1.4e-7 to 0.7e-7 in 60 iterations a step."""
+"""Divergence that single precision can be rid of, over the largest speed and times the cell [-]."""
+COARSER_SIZES = 4
+"""Cell sizes that are tried for a preview, from the largest down to the one that is written."""
 
 
-def check_smokes(job: Job, solids: Mapping[KeyPath, PlacedSolid], budget: MemoryBudget, findings: Findings) -> int:
-    """Note what is wrong with the smokes, their sources and what moves in them.
-
-    Args:
-        job: the job.
-        solids: its shapes as far as they can be built, where they start, by path.
-        budget: of the machine that simulates.
-        findings: where errors and warnings go.
-
-    Returns:
-        Cells of all smokes.
-    """
-    names = {body.name for body in job.rigid}
+def check_smokes(job: Job, solids: Solids, budget: MemoryBudget, findings: Findings) -> int:
+    """Note what is wrong with the smokes, their sources and what moves in them; returns cells of all smokes."""
     cells, size_bytes = 0, 0.0
-    refused = check_bodies_in_smoke(job, solids, findings)
-    solids = {path: solid for path, solid in solids.items() if path[0] != "rigid" or path[1] not in refused}
+    geometry_of = geometry_builder(job, findings)
     for index, smoke in enumerate(job.smoke):
         more_cells, more_bytes = _check_size(job, index, budget, (cells, size_bytes), findings)
         cells, size_bytes = cells + more_cells, size_bytes + more_bytes
-        _check_air(job, smoke, index, solids, findings)
-        check_shut_in_air(job, smoke, solids, findings)
+        standing = _check_in_cells(job, index, solids, geometry_of, findings)
+        check_mesh_grids(job, smoke, solids, geometry_of, findings)
+        _check_air(job, smoke, index, standing, findings)
+        check_closed_domain(job, smoke, solids, findings)
         for number, source in enumerate(smoke.source):
             path: KeyPath = ("smoke", index, "source", number)
             _check_numbers(job, smoke, source, path, findings)
             _check_following(job, source, path, findings)
-            # Where one is whose body is not known nobody can tell.
-            if path in solids and (source.follow is None or source.follow in names):
-                _check_place(job, index, number, solids, findings)
     return cells
+
+
+def coarser_cell_sizes(job: Job, largest_factor: float, solids: Solids) -> list[float]:
+    """Cell sizes [m] of the smokes, grown by this factor at most, that lose no source and no body.
+
+    Where cells as they are written are wrong already they are kept, so that problems are those of the written job.
+    """
+    geometry_of = geometry_builder(job, Findings())
+
+    def problems(index: int, cell_size: float) -> Findings:
+        smoke = job.smoke[index].model_copy(update={"cell_size": cell_size})
+        changed = job.model_copy(update={"smoke": (*job.smoke[:index], smoke, *job.smoke[index + 1 :])})
+        findings = Findings()
+        _check_in_cells(changed, index, solids, geometry_of, findings)
+        return findings
+
+    factors = np.linspace(largest_factor, 1.0, COARSER_SIZES, endpoint=False).tolist()
+    cell_sizes = []
+    for index, smoke in enumerate(job.smoke):
+        low, high = smoke_box(smoke, job.domain)
+        cell_sizes.append(smoke.cell_size)
+        for cell_size in (smoke.cell_size * factor for factor in factors):
+            if (high - low).min() < LEAST_LAYERS * cell_size or (found := problems(index, cell_size)).errors:
+                continue
+            known = problems(index, smoke.cell_size).warnings if found.warnings else []
+            if Counter(each.path for each in found.warnings) <= Counter(each.path for each in known):
+                cell_sizes[index] = cell_size
+                break
+    return cell_sizes
+
+
+def _check_in_cells(
+    job: Job, index: int, solids: Solids, geometry_of: GeometryBuilder, findings: Findings
+) -> list[PlacedSolid]:
+    """Note bodies and sources that the cells of a smoke cannot show; returns the static bodies that they can."""
+    smoke = job.smoke[index]
+    refused = check_bodies_in_smoke(job, smoke, solids, geometry_of, findings)
+    standing = [solid for number, solid in static_bodies(job, solids).items() if number not in refused]
+    names = {body.name for body in job.rigid}
+    for number, source in enumerate(smoke.source):
+        # The place of a source whose body is unknown is unknown too.
+        path: KeyPath = ("smoke", index, "source", number)
+        if path in solids and (source.follow is None or source.follow in names):
+            _check_place(job, path, solids, standing, findings)
+    return standing
 
 
 # --- the grid ------------------------------------------------------------------------------------------------------
@@ -84,7 +123,7 @@ def check_smokes(job: Job, solids: Mapping[KeyPath, PlacedSolid], budget: Memory
 def _check_size(
     job: Job, index: int, budget: MemoryBudget, before: tuple[int, float], findings: Findings
 ) -> tuple[int, float]:
-    """Cells and bytes of the smoke's grid, which comes after so many of others."""
+    """Cells and bytes of the smoke's grid; `before` are those of other smokes."""
     smoke = job.smoke[index]
     box = smoke_box(smoke, job.domain)
     extent = box[1] - box[0]
@@ -140,22 +179,19 @@ def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, room: fl
     return size
 
 
-def _check_way_out(
-    job: Job, smoke: SmokeParameters, path: KeyPath, solids: Mapping[KeyPath, Solid], findings: Findings
-) -> None:
-    """Note wind into air that static bodies shut in; of a large grid the simulation tells it when it starts."""
+def _check_wind(job: Job, smoke: SmokeParameters, path: KeyPath, standing: Sequence[Solid], findings: Findings) -> None:
+    """Note wind that has no way out of the box, or past static bodies; the latter in small grids only."""
     from sim.smoke.grid import SmokeGrid
 
-    bodies = [
-        solids["rigid", index] for index, body in enumerate(job.rigid)
-        if body.kind == "static" and ("rigid", index) in solids
-    ]  # fmt: skip
+    if problem := smoke.wind_problem():
+        findings.error((*path, "wind"), problem)
+        return
     low, high = smoke_box(smoke, job.domain)
     is_too_large = math.prod(np.ceil((high - low) / smoke.cell_size).tolist()) > COUNTED_CELLS
-    if not (smoke.windward_faces and bodies) or np.any(high <= low) or is_too_large:
+    if not (smoke.windward_faces and standing) or np.any(high <= low) or is_too_large:
         return
     try:
-        grid = SmokeGrid.build(smoke, job.domain, bodies)
+        grid = SmokeGrid.build(smoke, job.domain, standing)
     except ValueError as error:
         # Its message begins with the smoke's name, which the path says as well.
         findings.error(path, str(error).removeprefix(f'smoke "{smoke.name}": '))
@@ -164,15 +200,10 @@ def _check_way_out(
         findings.error((*path, "wind"), smoke.cut_off_problem(cut_off))
 
 
-def _check_air(
-    job: Job, smoke: SmokeParameters, index: int, solids: Mapping[KeyPath, Solid], findings: Findings
-) -> None:
+def _check_air(job: Job, smoke: SmokeParameters, index: int, standing: Sequence[Solid], findings: Findings) -> None:
     """Wind, gusts, gravity and what air does to smoke."""
     path: KeyPath = ("smoke", index)
-    if problem := smoke.wind_problem():
-        findings.error((*path, "wind"), problem)
-    else:
-        _check_way_out(job, smoke, path, solids, findings)
+    _check_wind(job, smoke, path, standing, findings)
     gusts = smoke.turbulence
     smallest = CELLS_PER_EDDY * smoke.cell_size
     if gusts.strength > 0.0 and gusts.size < smallest * (1.0 - 1.0e-9):
@@ -227,73 +258,63 @@ def _check_numbers(
     is_empty = source.density == 0.0 and kelvin == smoke.ambient_temperature
     if is_empty and source.velocity is None:
         findings.warn(path, "has no density, and the temperature of the air: it emits nothing")
-    film_s = job.frame_count / job.fps
-    emits = source.emits_during(0.0, film_s)
-    if emits and source.largest_strength(*source.span_of(0.0, film_s)) == 0.0:
-        findings.warn((*path, "ramp"), f"is 0 whenever it emits in the film's {film_s:g} s: it emits nothing")
+    if not source.emits_during(0.0, job.film_s):
+        findings.warn((*path, "start_s"), f"starts at {source.start_s:g} s, after the film's end at {job.film_s:g} s")
+    elif source.largest_strength(*source.span_of(0.0, job.film_s)) == 0.0:
+        findings.warn((*path, "ramp"), f"is 0 whenever it emits in the film's {job.film_s:g} s: it emits nothing")
 
 
 def _check_following(job: Job, source: SmokeSourceParameters, path: KeyPath, findings: Findings) -> None:
     names = [body.name for body in job.rigid]
     if source.follow is not None and source.follow not in names:
-        hint = suggestion(source.follow, names) or (f"; bodies are {', '.join(names)}" if names else "; add [[rigid]]")
-        findings.error((*path, "follow"), f'no rigid body is named "{source.follow}"{hint}')
+        problem = unknown_name(source.follow, names, "rigid body", plural="bodies", none="; add [[rigid]]")
+        findings.error((*path, "follow"), problem)
 
 
-def _check_place(job: Job, index: int, number: int, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    path: KeyPath = ("smoke", index, "source", number)
-    smoke, source, solid = job.smoke[index], job.smoke[index].source[number], solids[path]
+def _check_place(job: Job, path: KeyPath, solids: Solids, standing: Sequence[Solid], findings: Findings) -> None:
+    smoke, solid = job.smoke[int(path[1])], solids[path]
+    source = smoke.source[int(path[3])]
     body = next((each for each in job.rigid if each.name == source.follow), None)
     box = smoke_box(smoke, job.domain)
     if body is not None and body.kind == "dynamic":
         pass  # nobody knows where it gets
     elif source.keyframe or (body is not None and body.kind == "kinematic"):
-        _check_way(job, path, solid, box, findings)
+        _check_path(job, path, solid, box, findings)
     else:
-        _check_source(job, path, solids, box, findings)
+        _check_source(job, path, solid, standing, findings)
     if source.moves and np.min(solid.bounds[1] - solid.bounds[0]) < smoke.cell_size:
         findings.warn(path, f"is thinner than a cell of {smoke.cell_size:g} m and may emit nothing; enlarge it")
     _check_what_fills_source(job, path, solid, solids, findings)
 
 
-def _check_source(job: Job, path: KeyPath, solids: Mapping[KeyPath, Solid], box: Box, findings: Findings) -> None:
-    """A source that stays: is it in the box, and which cells are its own?"""
-    solid, cell_size = solids[path], job.smoke[int(path[1])].cell_size
+def _check_source(job: Job, path: KeyPath, solid: Solid, standing: Sequence[Solid], findings: Findings) -> None:
+    """A source that stays must be in the box and have cells of its own."""
+    smoke = job.smoke[int(path[1])]
+    box, cell_size = smoke_box(smoke, job.domain), smoke.cell_size
     inside = overlap(solid.bounds, box)
     if inside == 0.0:
         findings.error(path, f"is wholly outside the smoke's grid: it spans {span(solid.bounds)}, not {span(box)}")
         return
     if inside < ALL:
         findings.warn(path, f"{100 * (1 - inside):.0f} % of it are outside the smoke's grid and emit nothing")
-    centres = centres_inside(solid, box, cell_size)
-    if centres is None:
-        return
-    if len(centres) == 0:
+    centres = _centres_inside(solid, box, cell_size)
+    if centres is not None and len(centres) == 0:
         thinnest = float(np.min(solid.bounds[1] - solid.bounds[0]))
         findings.error(
             path,
             f"holds no centre of a cell: it is {thinnest:.3g} m thin, and cells are {cell_size:g} m; "
             "enlarge it or use a smaller cell_size",
         )
-        return
-    if not are_free(job, centres, solid, solids).any():
-        findings.error(path, "lies wholly inside solid bodies, so it emits nothing; move it")
+    elif centres is not None:
+        for body in standing:
+            if touch(body.bounds, solid.bounds, margin=0.0):
+                centres = centres[body.signed_distance(centres) >= 0.0]
+        if len(centres) == 0:
+            findings.error(path, "lies wholly inside solid bodies, so it emits nothing; move it")
 
 
-def are_free(
-    job: Job, centres: NDArray[np.float64], source: Solid, solids: Mapping[KeyPath, Solid]
-) -> NDArray[np.bool_]:
-    """Mask of the centres of cells [m], (n, 3), in a source that lie outside every static body, (n,) bool."""
-    is_free = np.ones(len(centres), bool)
-    for path, body in solids.items():
-        if path[0] == "rigid" and job.rigid[int(path[1])].kind == "static":
-            near = touch(body.bounds, source.bounds, margin=0.0)
-            is_free &= body.signed_distance(centres) >= 0.0 if near else True
-    return is_free
-
-
-def centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float64] | None:
-    """Centres of cells that a solid contains [m], (n, 3); None if they are too many to look at each."""
+def _centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float64] | None:
+    """Centres of cells that a solid contains [m], (n, 3); None if there are too many cells around it."""
     low = np.maximum(solid.bounds[0], box[0])
     high = np.minimum(solid.bounds[1], box[1])
     first = np.ceil((low - box[0]) / cell_size - 0.5)
@@ -304,14 +325,12 @@ def centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.float
         corner + (np.arange(a, b + 1.0) + 0.5) * cell_size for corner, a, b in zip(box[0], first, last, strict=True)
     ]
     centres: NDArray[np.float64] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    if len(centres) == 0:
-        return centres
-    inside: NDArray[np.bool_] = solid.signed_distance(centres) < 0.0
-    return centres[inside]
+    inside: NDArray[np.float64] = centres[solid.signed_distance(centres) < 0.0] if len(centres) else centres
+    return inside
 
 
-def _check_way(job: Job, path: KeyPath, solid: Solid, box: Box, findings: Findings) -> None:
-    """A source on a path: does that come into the box?"""
+def _check_path(job: Job, path: KeyPath, solid: Solid, box: Box, findings: Findings) -> None:
+    """The path of a source must come into the box."""
     from sim.core.motion.paths import path_through
     from sim.rigid.paths import path_of
 
@@ -322,14 +341,12 @@ def _check_way(job: Job, path: KeyPath, solid: Solid, box: Box, findings: Findin
     else:
         low, high = path_of(next(body for body in job.rigid if body.name == source.follow)).hull()
         reach += math.hypot(*source.position)
-    way = np.stack([low - reach, high + reach])
-    if not touch(way, box, margin=0.0):
-        findings.error(path, f"never comes into the smoke's grid: its way spans {span(way)}, not {span(box)}")
+    swept = np.stack([low - reach, high + reach])
+    if not touch(swept, box, margin=0.0):
+        findings.error(path, f"never comes into the smoke's grid: its path spans {span(swept)}, not {span(box)}")
 
 
-def _check_what_fills_source(
-    job: Job, path: KeyPath, source: Solid, solids: Mapping[KeyPath, Solid], findings: Findings
-) -> None:
+def _check_what_fills_source(job: Job, path: KeyPath, source: Solid, solids: Solids, findings: Findings) -> None:
     """Note a source wholly within water or a body that moves, as far as the corners of its box tell."""
     corners = np.array(np.meshgrid(*source.bounds.T)).reshape(3, 8).T
     followed = job.smoke[int(path[1])].source[int(path[3])].follow

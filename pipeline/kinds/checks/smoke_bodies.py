@@ -3,62 +3,65 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.kinds.checks.mesh_grids import problem_of_mesh_grid
+from pipeline.kinds.checks.shapes import thin_wall_problem
 from pipeline.model.amounts import rounded_down
 from pipeline.model.boxes import smoke_box, touch
-from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from sim.smoke.parameters import MOST_CELLS, SmokeParameters
 
 if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
     from pipeline.model.job import Job
     from sim.core.domain import DomainParameters
-    from sim.shapes import PlacedSolid
+    from sim.shapes.body_geometry import BodyGeometry
+    from sim.shapes.placement import PlacedSolid
     from sim.smoke.thin_walls import ThinWalls
 
+GeometryBuilder = Callable[[int], "BodyGeometry | None"]
+
+# Cells along each edge of a smoke's box, at least.
 LEAST_LAYERS = 4.0
-"""Cells along each edge of a smoke's box, at least."""
-
+# Share of a body's surface that cells may miss: what is beside sharp edges they always do.
 MISSED = 0.05
-"""Share of a body's surface that cells may miss without a word: what is beside sharp edges they always do."""
 
 
-def check_bodies_in_smoke(job: Job, solids: Mapping[KeyPath, PlacedSolid], findings: Findings) -> set[int]:
-    """Note bodies that are too thin for the cells of a smoke.
+def geometry_builder(job: Job, findings: Findings) -> GeometryBuilder:
+    """Builder of the geometry of a body that moves, by number; None for one too thin to have an inside, as is noted."""
+    from sim.shapes.body_geometry import BodyGeometry
+    from sim.shapes.solid import ShapeError
 
-    Returns:
-        The static bodies that no smoke can be simulated with, by number.
-    """
-    refused = set()
-    _check_moving_bodies(job, solids, findings)
-    for smoke in job.smoke:
-        box = smoke_box(smoke, job.domain)
-        if not has_grid(smoke, job.domain):
-            continue
-        for index, solid in static_bodies(job, solids).items():
-            if touch(solid.bounds, box, margin=0.0) and not _check_static_body(job, smoke, index, solids, findings):
-                refused.add(index)
-    return refused
+    @cache
+    def build(number: int) -> BodyGeometry | None:
+        try:
+            return BodyGeometry(job.rigid[number])
+        except ShapeError as error:
+            findings.error(("rigid", number, "shape"), f"is too thin for a body that moves in smoke: {error}")
+            return None
+
+    return build
 
 
-def has_grid(smoke: SmokeParameters, domain: DomainParameters) -> bool:
-    """Whether a smoke's box has as many cells as it may; if not, that is told where its size is looked at."""
-    box = smoke_box(smoke, domain)
-    is_large_enough = np.all(box[1] - box[0] >= LEAST_LAYERS * smoke.cell_size)
-    return bool(is_large_enough and math.prod(smoke.cell_counts(domain)) <= MOST_CELLS)
+def check_bodies_in_smoke(
+    job: Job, smoke: SmokeParameters, solids: Solids, geometry_of: GeometryBuilder, findings: Findings
+) -> set[int]:
+    """Note bodies that are too thin for the cells of a smoke; returns the static ones without any cell, by number."""
+    if not _has_grid(smoke, job.domain):
+        return set()
+    _check_moving_bodies(job, smoke, solids, geometry_of, findings)
+    standing = static_bodies(job, solids)
+    box = smoke_box(smoke, job.domain)
+    inside = [number for number, solid in standing.items() if touch(solid.bounds, box, margin=0.0)]
+    return {number for number in inside if not _has_cells(job, smoke, number, standing, findings)}
 
 
-def leaks(walls: ThinWalls) -> bool:
-    """Whether cells miss more of a body than what is beside its edges: air passes through it."""
-    return walls.share > MISSED
-
-
-def static_bodies(job: Job, solids: Mapping[KeyPath, PlacedSolid]) -> dict[int, PlacedSolid]:
+def static_bodies(job: Job, solids: Solids) -> dict[int, PlacedSolid]:
     """The bodies that stand still, as far as they can be built, by number."""
     return {
         index: solids["rigid", index]
@@ -67,77 +70,85 @@ def static_bodies(job: Job, solids: Mapping[KeyPath, PlacedSolid]) -> dict[int, 
     }
 
 
-def bodies_beside(
-    job: Job, smoke: SmokeParameters, index: int, solids: Mapping[KeyPath, PlacedSolid]
-) -> list[PlacedSolid]:
-    """Other static bodies that may hold a centre next to the surface of a static one."""
-    at_rest = static_bodies(job, solids)
-    return [
-        solid
-        for number, solid in at_rest.items()
-        if number != index and touch(solid.bounds, at_rest[index].bounds, margin=smoke.cell_size)
-    ]
+def _has_grid(smoke: SmokeParameters, domain: DomainParameters) -> bool:
+    """Whether a smoke's box has as many cells as it may; if not, the check of its size tells."""
+    box = smoke_box(smoke, domain)
+    is_large_enough = np.all(box[1] - box[0] >= LEAST_LAYERS * smoke.cell_size)
+    return bool(is_large_enough and math.prod(smoke.cell_counts(domain)) <= MOST_CELLS)
 
 
-def _check_static_body(
-    job: Job, smoke: SmokeParameters, index: int, solids: Mapping[KeyPath, PlacedSolid], findings: Findings
+def _has_cells(
+    job: Job, smoke: SmokeParameters, number: int, standing: Mapping[int, PlacedSolid], findings: Findings
 ) -> bool:
-    """Note a static body that has no cell, or too few; whether the smoke can be simulated with it."""
+    """Whether a static body has a cell in a smoke's grid; notes one that has none, or through which air passes."""
     from sim.smoke.grid import SmokeGrid
     from sim.smoke.thin_walls import thin_walls
 
-    solid = solids["rigid", index]
-    thinnest = float(np.ptp(solid.bounds, axis=0).min())
+    solid = standing[number]
     if SmokeGrid.of_box(smoke, job.domain).misses(solid):
+        thinnest = float(np.ptp(solid.bounds, axis=0).min())
         findings.error(
-            ("rigid", index),
+            ("rigid", number),
             f'is {thinnest:.3g} m thin and falls between the cells of smoke "{smoke.name}", {smoke.cell_size:g} m: '
             "the air would not notice it; use a smaller cell_size or a thicker body",
         )
         return False
-    walls = thin_walls(solid, smoke, job.domain, bodies_beside(job, smoke, index, solids))
-    if leaks(walls):
-        findings.warn(("rigid", index), _of_thin_walls(walls, smoke))
+    others = [
+        other
+        for each, other in standing.items()
+        if each != number and touch(other.bounds, solid.bounds, margin=smoke.cell_size)
+    ]
+    _check_walls(thin_walls(solid, smoke, job.domain, others), smoke, number, findings)
     return True
 
 
-def _check_moving_bodies(job: Job, solids: Mapping[KeyPath, PlacedSolid], findings: Findings) -> None:
+def check_mesh_grids(
+    job: Job, smoke: SmokeParameters, solids: Solids, geometry_of: GeometryBuilder, findings: Findings
+) -> None:
+    """Note meshes that can come into a smoke's box, and whose walls are too thin for the finest grid of distances."""
+    from sim.coupling.smoke_reach import can_come
+
+    for number in _moving(job, solids):
+        body, geometry = job.rigid[number], geometry_of(number)
+        if geometry is not None and can_come(body, geometry, smoke, job.domain):
+            problem = thin_wall_problem(solids["rigid", number], who=f'smoke "{smoke.name}"', what="air")
+            if problem is not None:
+                findings.warn(("rigid", number, "shape"), problem)
+
+
+def _moving(job: Job, solids: Solids) -> list[int]:
+    """The bodies that move, as far as they can be built, by number."""
+    return [index for index, body in enumerate(job.rigid) if body.kind != "static" and ("rigid", index) in solids]
+
+
+def _check_moving_bodies(
+    job: Job, smoke: SmokeParameters, solids: Solids, geometry_of: GeometryBuilder, findings: Findings
+) -> None:
     """Note bodies that move, can come into the box of a smoke, and are too thin for its cells."""
     from sim.coupling.smoke_reach import can_come, too_thin_bodies
-    from sim.shapes import ShapeError
-    from sim.shapes.body_geometry import BodyGeometry
     from sim.smoke.thin_walls import thin_walls_on_the_way
 
-    moving = [index for index, body in enumerate(job.rigid) if body.kind != "static" and ("rigid", index) in solids]
-    if not (moving and job.smoke):
-        return
-    bodies = [job.rigid[index] for index in moving]
-    geometries = []
-    for index, body in zip(moving, bodies, strict=True):
-        try:
-            geometries.append(BodyGeometry(body))
-        except ShapeError as error:
-            findings.error(("rigid", index, "shape"), f"is too thin for a body that moves in smoke: {error}")
-            return
-    for smoke in job.smoke:
-        refused = dict(too_thin_bodies(smoke, bodies, geometries, job.domain))
-        for number, reason in refused.items():
-            findings.error(("rigid", moving[number]), reason)
-        for number, (body, geometry) in enumerate(zip(bodies, geometries, strict=True)):
-            if number in refused or not can_come(body, geometry, smoke, job.domain):
-                continue
-            walls = thin_walls_on_the_way(solids["rigid", moving[number]], smoke)
-            if leaks(walls):
-                findings.warn(("rigid", moving[number]), _of_thin_walls(walls, smoke))
-            elif problem := problem_of_mesh_grid(
-                solids["rigid", moving[number]], who=f'smoke "{smoke.name}"', what="air"
-            ):
-                findings.warn(("rigid", moving[number], "shape"), problem)
+    for number in _moving(job, solids):
+        body, solid = job.rigid[number], solids["rigid", number]
+        unturned = replace(solid, rotation=np.eye(3), position=np.zeros(3))
+        is_thick = np.ptp(unturned.bounds, axis=0).min() >= smoke.cell_size
+        walls = thin_walls_on_the_way(solid, smoke)
+        if is_thick and walls.share <= MISSED:
+            continue  # without its geometry, which is dear to build
+        if (geometry := geometry_of(number)) is None:
+            continue
+        if too_thin := too_thin_bodies(smoke, [body], [geometry], job.domain):
+            findings.error(("rigid", number), too_thin[0][1])
+        elif can_come(body, geometry, smoke, job.domain):
+            _check_walls(walls, smoke, number, findings)
 
 
-def _of_thin_walls(walls: ThinWalls, smoke: SmokeParameters) -> str:
-    return (
-        f'has walls thinner than the cells of smoke "{smoke.name}", {smoke.cell_size:g} m, which miss '
-        f"{100.0 * walls.share:.0f} % of its surface: air passes through there; use a cell_size of "
-        f"{rounded_down(walls.thickness):g} m or less, or thicker walls"
-    )
+def _check_walls(walls: ThinWalls, smoke: SmokeParameters, number: int, findings: Findings) -> None:
+    """Note a body of which cells miss more than what is beside its edges: air passes through it."""
+    if walls.share > MISSED:
+        findings.warn(
+            ("rigid", number),
+            f'has walls thinner than the cells of smoke "{smoke.name}", {smoke.cell_size:g} m, which miss '
+            f"{100.0 * walls.share:.0f} % of its surface: air passes through there; use a cell_size of "
+            f"{rounded_down(walls.thickness):g} m or less, or thicker walls",
+        )

@@ -3,46 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from sim.fluid.traits import TRAITS
 
 if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
     from pipeline.model.job import Job
     from sim.fluid.parameters import FluidParameters
     from sim.rigid.parameters import RigidBodyParameters
-    from sim.shapes import Solid
+    from sim.shapes.solid import Solid
 
-WAY_IN_SPACINGS = {"wcsph": 0.4, "dfsph": 0.4, "pcisph": 0.2}
-"""Share of the particle spacing that a signal may cross in a step, by solver. These, and the next, are what the solvers
-have, which are not imported here as that loads Taichi; a test holds them together."""
-REST_NUMBER = {"wcsph": math.inf, "dfsph": 0.1, "pcisph": 0.05}
-"""Largest step over sqrt(d/g), whatever the speed, by solver."""
-SPEED_OF_SOUND_IN_SPEEDS = 10.0
-"""The numerical speed of sound over the largest expected speed, for less than 1 % compression."""
+# Of particles that hit a wall (docs/decisions/0021-fixed-steps-at-impacts.md): omega d/c_s in a lattice, omega on the
+# samples of a wall over that, and the compression over v/c_s; omega grows with the cube of the density.
 FREQUENCY_AT_REST = 1.1
-"""omega d/c_s of a particle in a lattice; this and what follows: docs/decisions/0021-fixed-steps-at-impacts.md."""
 STIFFENING_AT_WALLS = math.sqrt(28.0)
-"""At most omega of a particle that is shot onto the samples of a wall, over that."""
 COMPRESSION_BY_IMPACTS = 1.9
-"""Compression of a particle that hits a wall at v, over v/c_s, measured; omega grows with the cube of its density."""
+# With these two longer steps bear impacts too: they take a particle's speed before it is pressed onto the samples.
 WALL_FRICTION_AT_IMPACTS = 1.0
 ARTIFICIAL_VISCOSITY_AT_IMPACTS = 0.1
-"""With these two longer steps bear impacts too: they take a particle's speed before it is pressed onto the samples."""
 
 
-def check_time_steps(job: Job, solids: Mapping[KeyPath, Solid], findings: Findings) -> None:
-    """Warn of fixed steps above what will be stable, in the flow or where it hits a wall.
-
-    Args:
-        job: the job.
-        solids: its shapes as far as they can be built, by path.
-        findings: where warnings go.
-    """
+def check_time_steps(job: Job, solids: Solids, findings: Findings) -> None:
+    """Warn of fixed steps above what will be stable, in the flow or where it hits a wall."""
     for index, fluid in enumerate(job.fluid):
         if fluid.dt == "adaptive":
             continue
@@ -62,7 +48,7 @@ def check_time_steps(job: Job, solids: Mapping[KeyPath, Solid], findings: Findin
             )
 
 
-def expected_speed(job: Job, solids: Mapping[KeyPath, Solid]) -> float:
+def expected_speed(job: Job, solids: Solids) -> float:
     """Largest speed [m/s] of fluid or bodies: the one that each starts with, and a fall through the whole domain.
 
     Spinning bodies count with the speed of their surface, kinematic ones with the largest on their path. All fluids
@@ -90,11 +76,10 @@ def _body_speed(body: RigidBodyParameters, solid: Solid, fall: float) -> float:
 
 def stable_dt(job: Job, fluid: FluidParameters, speed: float) -> float:
     """Largest step [s] at a largest speed [m/s], by signals, cfl k d / (c_s + v), and by gravity."""
-    spacing, gravity = 2.0 * fluid.particle_radius, math.hypot(*job.gravity)
-    sound = _speed_of_sound(fluid, speed)
-    way = fluid.cfl * WAY_IN_SPACINGS[fluid.solver] * spacing
-    by_signals = way / (sound + speed) if sound + speed > 0.0 else math.inf
-    by_gravity = REST_NUMBER[fluid.solver] * math.sqrt(spacing / gravity) if gravity > 0.0 else math.inf
+    traits, gravity = TRAITS[fluid.solver], math.hypot(*job.gravity)
+    signal_speed = _speed_of_sound(fluid, speed) + speed
+    by_signals = fluid.cfl * traits.cfl_number * fluid.spacing / signal_speed if signal_speed > 0.0 else math.inf
+    by_gravity = traits.gravity_number * math.sqrt(fluid.spacing / gravity) if gravity > 0.0 else math.inf
     return min(by_signals, by_gravity)
 
 
@@ -107,12 +92,11 @@ def _dt_bearing_impacts(fluid: FluidParameters, speed: float) -> float:
     sound = _speed_of_sound(fluid, speed)
     if softened or sound == 0.0:
         return math.inf
-    at_rest = FREQUENCY_AT_REST * sound / (2.0 * fluid.particle_radius)
+    at_rest = FREQUENCY_AT_REST * sound / fluid.spacing
     return 2.0 / (at_rest * STIFFENING_AT_WALLS * (1.0 + COMPRESSION_BY_IMPACTS * speed / sound) ** 3)
 
 
 def _speed_of_sound(fluid: FluidParameters, speed: float) -> float:
     """The numerical one [m/s]; 0 in implicit solvers, which have none."""
-    if fluid.solver != "wcsph":
-        return 0.0
-    return fluid.sound_speed or SPEED_OF_SOUND_IN_SPEEDS * speed
+    traits = TRAITS[fluid.solver]
+    return fluid.sound_speed or traits.speed_ratio * speed if traits.has_sound_speed else 0.0

@@ -27,8 +27,7 @@ def schema_version(connection: sqlite3.Connection) -> int:
 def migrate(connection: sqlite3.Connection) -> None:
     """Bring a manifest to the newest schema, each step in a transaction of its own.
 
-    Raises:
-        ManifestError: it was written by a newer program.
+    Raises ManifestError: it was written by a newer program.
     """
     version = schema_version(connection)
     refuse_newer(version)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pipeline.stages.base import Stage
 
 PROGRESS_INTERVAL_S = 0.2
-"""Shortest time between two reports of progress [s]: they are for eyes, and for the watch on stalled tasks."""
+"""Shortest time between two reports of progress [s]."""
 
 
 @cache
@@ -66,7 +66,7 @@ class AttemptContext:
         """Yield the path to write to; on leaving, validate, fsync, rename and receipt it, and tell the runner."""
         if artifact not in self.task.outputs:
             raise PipelineError(f"{self.task.id} commits {artifact}, which is not one of its outputs")
-        commit = artifacts.committing(
+        with artifacts.committing(
             self.layout,
             artifact,
             task=self.task,
@@ -75,8 +75,7 @@ class AttemptContext:
             validate=validate,
             inputs=self._inputs,
             device=device,
-        )
-        with commit:
+        ) as commit:
             yield commit.path
         if commit.kept_aside is not None:
             print(f"{artifact} had been edited by hand; the edited file is kept as {commit.kept_aside}", flush=True)
@@ -116,11 +115,7 @@ def run_attempt(
 ) -> None:
     """Run one attempt from `Started` to `Finished` or `Failed`; whatever the stage raises becomes `Failed`.
 
-    Args:
-        assignment: what to run.
-        emit: takes the events, as they happen.
-        stop_requested: whether the task should checkpoint and return.
-        prepare: called first, under the same care; opens the log.
+    `prepare` is called first, under the same care, and opens the log. `emit` takes the events as they happen.
     """
     task, attempt = assignment.task, assignment.attempt
     began = time.monotonic()
@@ -140,7 +135,7 @@ def run_attempt(
         details = traceback.format_exc()
         with suppress(OSError):  # on a full disk the failure must get through, even if its traceback cannot
             print(details, end="", flush=True)
-        failure, full = (classify(error), describe(error)), full_place(error)
+        kind, message, full = classify(error), describe(error), full_place(error)
     else:
         details = full = ""
         if not missing:
@@ -148,10 +143,9 @@ def run_attempt(
             return
         done = len(task.outputs) - len(missing)
         if stop_requested():
-            failure = FailureKind.CANCELLED, f"stopped after {done} of {len(task.outputs)} outputs"
+            kind, message = FailureKind.CANCELLED, f"stopped after {done} of {len(task.outputs)} outputs"
         else:
-            failure = FailureKind.FAILED, f"the stage returned without committing {missing[0]}"
-    kind, message = failure
+            kind, message = FailureKind.FAILED, f"the stage returned without committing {missing[0]}"
     emit(Failed(task.id, attempt, kind, message, details, time.monotonic() - began, peak_memory_bytes(), full))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from pipeline.run.executors.base import Executor
 
 KINDS = ("processes", "dask", "inline")
-
-SETTINGS = ("executor", "scheduler", "workers")
-"""Names of the options; also those under which the queue keeps them."""
 
 executor_options = (
     click.option(
@@ -45,25 +42,16 @@ executor_options = (
 
 @dataclass(frozen=True, slots=True)
 class ExecutorChoice:
-    """Which executor, and where.
+    """Which executor, and where."""
 
-    Attributes:
-        kind: one of KINDS.
-        scheduler: address of a Dask scheduler, or absolute path of its file; None: a cluster of this machine alone.
-        workers: how many workers that one has.
-    """
-
-    kind: str = "processes"
+    executor: str = "processes"  # one of KINDS
+    # address of a Dask scheduler, or absolute path of its file; None: a cluster of this machine alone
     scheduler: str | None = None
-    workers: int | None = None
+    workers: int | None = None  # how many workers that one has
 
     @classmethod
     def of(cls, executor: str | None, scheduler: str | None, workers: int | None) -> ExecutorChoice:
-        """What the options mean.
-
-        Raises:
-            UsageError: they do not go together.
-        """
+        """What the options mean. Raises UsageError if they do not go together."""
         if scheduler is not None and workers is not None:
             raise click.UsageError("--workers is for a cluster of this machine; with --scheduler, start workers there")
         if executor not in {None, "dask"} and (scheduler or workers):
@@ -76,16 +64,12 @@ class ExecutorChoice:
     @property
     def settings(self) -> tuple[tuple[str, str], ...]:
         """For the queue."""
-        values = (None if self.kind == "processes" else self.kind, self.scheduler, self.workers)
-        return tuple((name, str(value)) for name, value in zip(SETTINGS, values, strict=True) if value is not None)
+        values = {**asdict(self), "executor": None if self.executor == "processes" else self.executor}
+        return tuple((name, str(value)) for name, value in values.items() if value is not None)
 
     @classmethod
     def from_settings(cls, settings: tuple[tuple[str, str], ...]) -> ExecutorChoice:
-        """From the queue.
-
-        Raises:
-            PipelineError: an entry of the queue says what this program does not know.
-        """
+        """From the queue. Raises PipelineError if an entry says what this program does not know."""
         values = dict(settings)
         kind, workers = values.get("executor", "processes"), values.get("workers")
         if kind not in KINDS or (workers is not None and not workers.isdecimal()):
@@ -95,13 +79,7 @@ class ExecutorChoice:
 
 @dataclass(frozen=True, slots=True)
 class Machines:
-    """An executor, and what it offers.
-
-    Attributes:
-        executor: runs the tasks.
-        capacity: what they may use at a time.
-        machine: the most that one task can be given, where that is less; else None.
-    """
+    """An executor, what tasks may use at a time, and the most that one of them can be given, where that is less."""
 
     executor: Executor
     capacity: Resources
@@ -112,13 +90,7 @@ class Machines:
 def open_machines(
     choice: ExecutorChoice, layout: JobLayout, here: Resources, say: Callable[[str], None]
 ) -> Iterator[Machines]:
-    """Make an executor ready; it is shut down at the end of the block.
-
-    Args:
-        choice: which one.
-        layout: the job's folder.
-        here: what may be used of this machine.
-        say: called with what a person should know.
+    """Make an executor ready with what may be used of this machine, `here`; it is shut down at the end of the block.
 
     Raises:
         PipelineError: Dask is not installed, or there is no cluster.
@@ -126,7 +98,7 @@ def open_machines(
     from pipeline.run.executors.inline import InlineExecutor
     from pipeline.run.executors.processes import ProcessExecutor
 
-    match choice.kind:
+    match choice.executor:
         case "processes":
             with ProcessExecutor(gpus=here.gpus) as processes:
                 yield Machines(processes, here)
@@ -141,12 +113,8 @@ def open_machines(
 def require_named_devices(job: Job, stages: Collection[str]) -> None:
     """Refuse a device that each of several machines would choose for itself: CPU and GPU round differently.
 
-    Args:
-        job: the job.
-        stages: the stages that are to run.
-
     Raises:
-        PipelineError: one of these leaves its device open.
+        PipelineError: one of the stages that are to run leaves its device open.
     """
     devices = (("device", "simulate", job.device), ("render.device", "render", job.render.device))
     names = [name for name, stage, device in devices if stage in stages and device == "auto"]
@@ -160,12 +128,8 @@ def require_named_devices(job: Job, stages: Collection[str]) -> None:
 def require_possible(job: Job, stages: Collection[str]) -> None:
     """Refuse before any work what has to be done and cannot be done here.
 
-    Args:
-        job: the job.
-        stages: the stages that are to run.
-
     Raises:
-        StageUnavailableError: one of these cannot run on this machine.
+        StageUnavailableError: one of the stages that are to run cannot run on this machine.
     """
     from pipeline.stages import STAGES
 
@@ -177,11 +141,7 @@ def require_possible(job: Job, stages: Collection[str]) -> None:
 
 
 def scheduler_address(named: str) -> str:
-    """An address as it is, or that in the file that `dask scheduler --scheduler-file` wrote.
-
-    Raises:
-        PipelineError: it is neither.
-    """
+    """An address as it is, or that in the file that `dask scheduler --scheduler-file` wrote. Raises PipelineError."""
     if "://" in named:
         return named
     try:

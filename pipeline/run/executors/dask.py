@@ -1,8 +1,8 @@
 """The executor for several machines: worker processes under the workers of a Dask cluster.
 
-Dask carries driver tasks, which start attempts and pass paths; the manifest stays the truth. Dask itself tries nothing
-again and chooses no worker: attempts are the runner's business, and a task is only given to a worker that has room for
-it now, so that none waits behind another on a busy worker.
+Dask carries driver tasks, which start attempts and pass paths. It tries nothing again and chooses no worker: attempts
+are the runner's business, and a task is only given to a worker that has room for it now, so that none waits behind
+another.
 
 A worker that is lost costs the tasks on it, as a lost process does. A scheduler that is lost costs all tasks under way;
 when it is back within the executor's patience the run goes on, else it ends and can be resumed.
@@ -23,22 +23,15 @@ from pipeline.base.errors import PipelineError
 from pipeline.base.resources import fits
 from pipeline.base.task import FailureKind, Resources, TaskId
 from pipeline.run.events import CapacityChanged, ExecutorEvent, Failed, Finished, TaskEvent
-from pipeline.run.executors.base import Assignment, ShutDownOnExit
-from pipeline.run.executors.dask_connection import Connection, Ended, Message, SchedulerLost, Workers
+from pipeline.run.executors.base import Assignment, Executor
+from pipeline.run.executors.dask_connection import Connection, DriverEnded, Message, SchedulerLost, Workers
 from pipeline.run.executors.dask_slots import Offer, Slots
-from pipeline.run.executors.processes import WorkerLimits
 from pipeline.run.executors.worker_process import log_tail
 
 PATIENCE_S = 300.0
 """How long a run waits for a scheduler or for workers [s]: a restart, or a queue that gives out machines."""
 GATHER_S = 3.0
-"""How long a run waits for further workers once there is one [s]: what the largest has is settled by them.
-
-Those of the runner's own terminal are all there when the first one is, but may take their time to say who they are: a
-run waits until all have, and no longer than this.
-"""
-_CONNECT_S = 2.0
-"""How long one try to connect may take [s]; the run stops for it."""
+"""How long a run waits for further workers once there is one [s], as the largest settles what a task can be given."""
 _RECONNECT_PAUSE_S = 2.0
 _KILL_MARGIN_S = 15.0
 """A task that is not reported as ended so long after its grace is given up, wherever it runs [s]."""
@@ -61,13 +54,12 @@ class _Attempt:
     given_up_at: float | None = None
 
 
-class DaskExecutor(ShutDownOnExit):
+class DaskExecutor(Executor):
     """Runs assignments on a Dask cluster; see `Executor` for what it promises.
 
     Args:
         scheduler: its address, e.g. `tcp://farm:8786`.
         folder: the job's folder, absolute, which all workers see under the same path.
-        limits: for the worker processes.
         of_runner: whether the Dask workers belong to the runner's own terminal.
         patience_s: how long to wait for a scheduler and for workers [s].
         say: called with what a person should know.
@@ -81,14 +73,12 @@ class DaskExecutor(ShutDownOnExit):
         scheduler: str,
         folder: Path,
         *,
-        limits: WorkerLimits | None = None,
         of_runner: bool = False,
         patience_s: float = PATIENCE_S,
         say: Callable[[str], None] = print,
     ) -> None:
         self._scheduler = scheduler
         self._folder = folder
-        self._limits = limits or WorkerLimits()
         self._of_runner = of_runner
         self.patience_s = patience_s
         self._say = say
@@ -191,7 +181,7 @@ class DaskExecutor(ShutDownOnExit):
         match message:
             case Workers():
                 self._take_workers(message)
-            case Ended(key, end, reason):
+            case DriverEnded(key, end, reason):
                 attempt = next((each for each in self._running.values() if each.future.key == key), None)
                 if attempt is not None and end is not None:
                     if not attempt.started:  # it was refused
@@ -218,7 +208,7 @@ class DaskExecutor(ShutDownOnExit):
         for task_id, attempt in [*self._running.items()]:
             address = attempt.offer.address
             known = workers.offers.get(address)
-            if address not in workers.present or (known is not None and known[0].identity != attempt.offer.identity):
+            if address not in workers.present or (known is not None and known.identity != attempt.offer.identity):
                 self._end(
                     task_id, FailureKind.WORKER_LOST, f"the Dask worker {address} on {attempt.offer.host} is gone"
                 )
@@ -285,9 +275,7 @@ class DaskExecutor(ShutDownOnExit):
             time.sleep(min(max(0.0, timeout_s), self._next_try - now))
             return
         try:
-            self._connection = Connection(
-                self._scheduler, self._folder, limits=self._limits, of_runner=self._of_runner, timeout_s=_CONNECT_S
-            )
+            self._connection = Connection(self._scheduler, self._folder, of_runner=self._of_runner)
         except OSError as error:
             self._next_try = time.monotonic() + _RECONNECT_PAUSE_S
             self._obstacle = str(error)

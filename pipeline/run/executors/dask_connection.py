@@ -25,40 +25,31 @@ from pipeline.run.events import Failed, Finished, TaskEvent
 from pipeline.run.executors import dask_driver
 from pipeline.run.executors.base import Assignment
 from pipeline.run.executors.dask_slots import Offer, offer_from
-from pipeline.run.executors.processes import WorkerLimits
+from pipeline.run.executors.failures import describe
 
+_CONNECT_S = 2.0
+"""How long one try to connect may take [s]; the run stops for it."""
 _POLL_S = 0.5
 """How often the scheduler is asked for its workers [s]."""
 _ANSWER_S = 10.0
-"""A scheduler that takes twice as long to answer is taken for gone; a worker that takes longer is told of [s]."""
+"""A scheduler that takes twice as long to answer counts as gone; a worker that takes longer is reported [s]."""
 _ASK_AGAIN_S = 10.0
 """A worker that did not answer, or could not, is asked again after this pause [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """The workers that tasks may be given to, by address, each with its number of threads.
+    """The workers of the cluster."""
 
-    Attributes:
-        offers: those that may get tasks.
-        present: addresses of all that the scheduler knows, those as well that are paused or on their way out.
-        remarks: what is wrong with workers that get no tasks, a sentence each.
-    """
-
-    offers: Mapping[str, tuple[Offer, int]]
+    offers: Mapping[str, Offer]  # those that may get tasks, by address
+    # addresses of all that the scheduler knows, those as well that are paused or on their way out
     present: frozenset[str]
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  # what is wrong with workers that get no tasks, a sentence each
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
-    """Dask is done with an attempt.
-
-    Attributes:
-        key: Dask's name of the task.
-        end: what its driver returned; None if Dask lost it.
-        reason: why it was lost.
-    """
+class DriverEnded:
+    """Dask is done with the task `key`: `end` is what its driver returned; None if Dask lost it, for a `reason`."""
 
     key: str
     end: Finished | Failed | None
@@ -72,30 +63,22 @@ class SchedulerLost:
     reason: str
 
 
-Message = TaskEvent | Workers | Ended | SchedulerLost
+Message = TaskEvent | Workers | DriverEnded | SchedulerLost
 
 
 class Connection:
     """A connection to a Dask scheduler, for one run of one job.
 
-    Args:
-        address: of the scheduler, e.g. `tcp://farm:8786` or `tls://farm:8786`; certificates come from Dask's settings.
-        folder: the job's folder.
-        limits: for the worker processes; a worker's memory tag bounds its tasks where they name no limit.
-        of_runner: whether the Dask workers belong to the runner's own terminal.
-        timeout_s: how long to try to connect [s].
+    The address is such as `tcp://farm:8786` or `tls://farm:8786`; certificates come from Dask's settings.
 
     Raises:
         OSError: there is no scheduler, or this machine is too busy to ask for one.
     """
 
-    def __init__(
-        self, address: str, folder: Path, *, limits: WorkerLimits, of_runner: bool = False, timeout_s: float = 10.0
-    ) -> None:
+    def __init__(self, address: str, folder: Path, *, of_runner: bool) -> None:
         self.messages: SimpleQueue[Message] = SimpleQueue()
         self._folder = folder
         self._of_runner = of_runner
-        self._limits = limits
         self._run = uuid.uuid4().hex
         self._topic = f"physics-pipeline {folder}"
         self._greetings: dict[str, dask_driver.Greeting] = {}
@@ -105,7 +88,7 @@ class Connection:
         for name in ("distributed", "distributed.client"):  # what matters of it is said here, in our own words
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
-            self._client = Client(address, timeout=timeout_s, set_as_default=False, name="pipeline")
+            self._client = Client(address, timeout=_CONNECT_S, set_as_default=False, name="pipeline")
         except AssertionError as error:  # Dask's way to say that its thread did not start within ten seconds
             raise OSError("Dask did not start in time: this machine is very busy, or was asleep") from error
         try:
@@ -119,12 +102,11 @@ class Connection:
         """Start an attempt on a worker, and on no other."""
         # Dask keeps statistics for each name before the first hyphen: one a stage, not one a task.
         key = f"{assignment.task.stage}-{assignment.task.id}:{assignment.attempt}/{self._run}"
-        memory_bytes = offer.resources.memory_bytes or None
-        limits = replace(self._limits, task_memory_bytes=self._limits.task_memory_bytes or memory_bytes)
-        order = dask_driver.DriverOrder(key, self._topic, self._run, offer.identity, limits)
+        memory_bytes = assignment.memory_bytes or offer.resources.memory_bytes or None
+        order = dask_driver.DriverOrder(key, self._topic, self._run, offer.identity)
         future = self._client.submit(
             dask_driver.drive,
-            assignment,
+            replace(assignment, memory_bytes=memory_bytes),
             order,
             key=key,
             workers=[offer.address],
@@ -155,10 +137,7 @@ class Connection:
         self._client.loop.add_callback(call)
 
     async def _tell(self, function: Callable[..., None], *arguments: Any, to: list[str] | None) -> None:
-        """Call a function in workers. Those that do not answer are given up by who waits for them.
-
-        A scheduler that does not answer is the watch's business.
-        """
+        """Call a function in workers. Those that do not answer are given up by who waits for them."""
         call = self._client._run(function, *arguments, workers=to, on_error="ignore")
         with suppress(OSError, TimeoutError):
             await asyncio.wait_for(call, _ANSWER_S)
@@ -166,16 +145,13 @@ class Connection:
     async def _watch(self) -> None:
         try:
             while not self._closing:
-                self._require_running()
+                if self._client.status != "running":
+                    raise ConnectionError("the connection broke")
                 self.messages.put(await asyncio.wait_for(self._look(), 2 * _ANSWER_S))
                 await asyncio.sleep(_POLL_S)
         except Exception as error:  # whatever it is, the runner must hear of it, or it waits for ever
             if not self._closing:
-                self.messages.put(SchedulerLost(_describe(error)))
-
-    def _require_running(self) -> None:
-        if self._client.status != "running":
-            raise ConnectionError("the connection broke")
+                self.messages.put(SchedulerLost(describe(error)))
 
     async def _look(self) -> Workers:
         assert self._client.scheduler is not None
@@ -195,25 +171,25 @@ class Connection:
             if remark := self._objection(greeting):
                 remarks.append(remark)
             elif info["status"] == "running":
-                offers[address] = offer_from(address, info, identity=greeting.identity), info["nthreads"]
+                offers[address] = offer_from(address, info, identity=greeting.identity)
         return Workers(offers, frozenset(workers), tuple(remarks))
 
     async def _greet(self, address: str, host: str) -> None:
-        """Ask a worker who it is. One that does not answer, or cannot, is told of, and asked again later."""
+        """Ask a worker who it is. One that does not answer, or cannot, is reported, and asked again later."""
         call = self._client._run(dask_driver.greet, self._folder, self._of_runner, workers=[address], on_error="return")
         try:
             answer = (await asyncio.wait_for(call, _ANSWER_S)).get(address)
         except TimeoutError:
             remark = "it does not answer"
         except Exception as error:  # whatever it is, it is told; the watch finds out whether the scheduler is there
-            remark = _describe(error)
+            remark = describe(error)
         else:
             if isinstance(answer, dask_driver.Greeting):
                 self._greetings[address] = answer
                 self._unanswered.pop(address, None)
                 self._asked.pop(address, None)
                 return
-            remark = f"it cannot say who it is: {_describe(answer)}"
+            remark = f"it cannot say who it is: {describe(answer)}"
         self._unanswered[address] = f"the Dask worker {address} on {host} gets no task: {remark}"
         await asyncio.sleep(_ASK_AGAIN_S)
         self._asked.pop(address, None)
@@ -248,15 +224,11 @@ class Connection:
             self.messages.put(SchedulerLost("the connection broke"))
             return
         if future.status != "finished":
-            self.messages.put(Ended(str(future.key), None, f"Dask reports it as {future.status}"))
+            self.messages.put(DriverEnded(str(future.key), None, f"Dask reports it as {future.status}"))
             return
         try:
             end = pickle.loads(future.result(timeout=_ANSWER_S))  # noqa: S301 - as above
         except Exception as error:  # it may be any, from the network up; the attempt is lost with it
-            self.messages.put(Ended(str(future.key), None, _describe(error)))
+            self.messages.put(DriverEnded(str(future.key), None, describe(error)))
         else:
-            self.messages.put(Ended(str(future.key), end))
-
-
-def _describe(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+            self.messages.put(DriverEnded(str(future.key), end))

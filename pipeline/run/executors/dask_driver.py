@@ -27,7 +27,7 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from pipeline.base.task import FailureKind, TaskId
 from pipeline.run.events import Failed, Finished, Progress, TaskEvent
 from pipeline.run.executors.base import Assignment
-from pipeline.run.executors.processes import ProcessExecutor, WorkerLimits
+from pipeline.run.executors.processes import ProcessExecutor
 
 if TYPE_CHECKING:
     from distributed import Worker
@@ -52,19 +52,12 @@ _FOLDERS = ("pipeline", "sim", "render", "blender_scripts")
 
 @dataclass(frozen=True, slots=True)
 class Greeting:
-    """What a Dask worker is.
+    """What a Dask worker is."""
 
-    Attributes:
-        identity: name of this incarnation.
-        host: name of its machine.
-        sees_folder: whether the job's folder is there.
-        software: digest of the program and the versions of the packages that decide the bits of a result.
-    """
-
-    identity: str
+    identity: str  # name of this incarnation
     host: str
-    sees_folder: bool
-    software: str
+    sees_folder: bool  # whether the job's folder is there
+    software: str  # see `software`
 
 
 async def greet(folder: Path, of_runner: bool, dask_worker: Worker) -> Greeting:
@@ -111,9 +104,8 @@ class _Leave:
 class _JobSupervisor(threading.Thread):
     """Owns the worker processes of one job; they die with this thread, and it dies with the Dask worker."""
 
-    def __init__(self, limits: WorkerLimits) -> None:
+    def __init__(self) -> None:
         super().__init__(name="job supervisor", daemon=True)
-        self._limits = limits
         self._commands: SimpleQueue[Assignment | _Cancel | _Leave] = SimpleQueue()
         self._inboxes: dict[tuple[TaskId, int], SimpleQueue[TaskEvent]] = {}
         self._lock = threading.Lock()
@@ -139,7 +131,7 @@ class _JobSupervisor(threading.Thread):
 
     def run(self) -> None:
         """The thread."""
-        executor = ProcessExecutor(self._limits)
+        executor = ProcessExecutor()
         try:
             self._serve(executor)
         finally:
@@ -203,15 +195,13 @@ class _Supervisors:
         self._threads: dict[Path, _JobSupervisor] = {}
         self._leaving = False
 
-    def run_attempt(
-        self, assignment: Assignment, limits: WorkerLimits
-    ) -> tuple[_JobSupervisor, SimpleQueue[TaskEvent]] | None:
+    def run_attempt(self, assignment: Assignment) -> tuple[_JobSupervisor, SimpleQueue[TaskEvent]] | None:
         """Begin an attempt; None when this Dask worker is leaving."""
         with self._lock:
             while not self._leaving:
                 supervisor = self._threads.get(assignment.root)
                 if supervisor is None:
-                    supervisor = self._threads[assignment.root] = _JobSupervisor(limits)
+                    supervisor = self._threads[assignment.root] = _JobSupervisor()
                     supervisor.start()
                 inbox = supervisor.run_attempt(assignment)
                 if inbox is not None:
@@ -241,8 +231,7 @@ _supervisors = _Supervisors()
 class LeavingPlugin(WorkerPlugin):
     """Ends the tasks of a Dask worker that leaves: on SIGTERM, and when its scheduler is gone.
 
-    Args:
-        of_runner: the Dask worker belongs to the runner's own terminal; Ctrl-C there is the runner's business.
+    Where the worker belongs to the runner's own terminal (`of_runner`), Ctrl-C there is the runner's business.
     """
 
     name = "physics-pipeline"
@@ -282,22 +271,14 @@ def release(root: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class DriverOrder:
-    """What a driver has to know besides its assignment.
+    """What a driver has to know besides its assignment."""
 
-    Attributes:
-        key: Dask's name of its task.
-        topic: under which Dask passes events on to the runner, each as a pickled `(run, event)`.
-        run: which run of the job it is for.
-        identity: the incarnation of the worker that was chosen. Dask may start a task again that was lost with its
-            worker; there it ends at once, since the runner decides about further attempts.
-        limits: for the worker processes.
-    """
-
-    key: str
-    topic: str
-    run: str
+    key: str  # Dask's name of its task
+    topic: str  # under which Dask passes events on to the runner, each as a pickled `(run, event)`
+    run: str  # which run of the job it is for
+    # the incarnation of the worker that was chosen. Dask may start a task again that was lost with its worker; there it
+    # ends at once, since the runner decides about further attempts
     identity: str
-    limits: WorkerLimits
 
 
 def drive(assignment: Assignment, order: DriverOrder) -> bytes:
@@ -308,7 +289,7 @@ def drive(assignment: Assignment, order: DriverOrder) -> bytes:
         obstacle = "its Dask worker was replaced"
     elif not _is_wanted(worker, order.key):
         obstacle = "nobody waits for it any more"
-    elif (begun := _supervisors.run_attempt(assignment, order.limits)) is None:
+    elif (begun := _supervisors.run_attempt(assignment)) is None:
         obstacle = "its Dask worker is leaving"
     if obstacle or begun is None:
         return pickle.dumps(Failed(assignment.task.id, assignment.attempt, FailureKind.WORKER_LOST, obstacle))

@@ -1,14 +1,14 @@
 """Which Dask worker gets a task: arithmetic on what workers offer and what is taken of it.
 
 Workers say what they offer with Dask's resource tags: `--resources "CPU=16 MEM=64e9 GPU=1"`. Dask's own scheduler would
-put tasks with tags into the queues of workers that are busy, where a frame may wait for the end of a simulation; so the
-worker is chosen here, and only for a task that fits into what is free.
+put tasks with tags into the queues of workers that are busy, so the worker is chosen here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 from pipeline.base.resources import fits, minus, plus
@@ -19,20 +19,14 @@ CPU_TAG, MEMORY_TAG, GPU_TAG = "CPU", "MEM", "GPU"
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """A Dask worker.
+    """A Dask worker."""
 
-    Attributes:
-        address: where it listens.
-        identity: name of this incarnation; one that was restarted at the same address has another.
-        host: its machine.
-        resources: what tasks may occupy of it.
-        tags: the resource tags that it has. Dask runs no task that asks for a tag which its worker does not have.
-    """
-
-    address: str
-    identity: str
+    address: str  # where it listens
+    identity: str  # name of this incarnation; one that was restarted at the same address has another
     host: str
-    resources: Resources
+    resources: Resources  # what tasks may occupy of it
+    threads: int  # how many tasks it runs at a time
+    # the resource tags that it has. Dask runs no task that asks for a tag which its worker does not have
     tags: frozenset[str] = frozenset()
 
     def demand(self, need: Resources) -> dict[str, float]:
@@ -41,20 +35,18 @@ class Offer:
         return {tag: float(amount) for tag, amount in amounts.items() if amount and tag in self.tags}
 
 
-def offered(tags: Mapping[str, float], *, threads: int, memory_bytes: int) -> Resources:
-    """What a worker offers, by its tags; without a tag, its number of threads, its memory limit, and no GPU."""
-    return Resources(
-        cores=int(tags.get(CPU_TAG, threads)),
-        memory_bytes=int(tags.get(MEMORY_TAG, memory_bytes)),
+def offer_from(address: str, info: Mapping[str, Any], *, identity: str) -> Offer:
+    """What a worker offers, by what Dask's scheduler tells of it.
+
+    Where a tag is missing, that is its number of threads, its memory limit, and no GPU.
+    """
+    tags = info["resources"]
+    resources = Resources(
+        cores=int(tags.get(CPU_TAG, info["nthreads"])),
+        memory_bytes=int(tags.get(MEMORY_TAG, info["memory_limit"])),
         gpus=int(tags.get(GPU_TAG, 0)),
     )
-
-
-def offer_from(address: str, info: Mapping[str, Any], *, identity: str) -> Offer:
-    """An offer from what Dask's scheduler tells of a worker."""
-    tags = info["resources"]
-    resources = offered(tags, threads=info["nthreads"], memory_bytes=info["memory_limit"])
-    return Offer(address, identity, info["host"], resources, frozenset(tags))
+    return Offer(address, identity, info["host"], resources, info["nthreads"], frozenset(tags))
 
 
 @dataclass(slots=True)
@@ -76,15 +68,12 @@ class Slots:
     @property
     def offers(self) -> list[Offer]:
         """The workers that tasks are given to."""
-        return [worker.offer for worker in self._workers.values() if worker.trusted]
+        return [worker.offer for worker in self._trusted(())]
 
     @property
     def total(self) -> Resources:
         """All workers together."""
-        total = Resources(0, 0, 0)
-        for offer in self.offers:
-            total = plus(total, offer.resources)
-        return total
+        return reduce(plus, (offer.resources for offer in self.offers), Resources(0, 0, 0))
 
     @property
     def largest(self) -> Resources:
@@ -96,26 +85,22 @@ class Slots:
             gpus=max((each.gpus for each in offers), default=0),
         )
 
-    def update(self, offers: Mapping[str, tuple[Offer, int]], present: Collection[str] = ()) -> None:
-        """Take in which workers there are now, by address, with their number of threads.
+    def update(self, offers: Mapping[str, Offer], present: Collection[str] = ()) -> None:
+        """Take in which workers there are now: `offers` by address, and addresses of others that are `present`.
 
         One that went takes what was taken of it with it; one that came back as another incarnation is free. One that is
         there still and offers nothing, because it is paused or has yet to say who it is, keeps its tasks meanwhile.
-
-        Args:
-            offers: those that tasks may be given to.
-            present: addresses of others that are there.
         """
         for address, worker in [*self._workers.items()]:
             if address in offers:
-                if offers[address][0].identity != worker.offer.identity:
+                if offers[address].identity != worker.offer.identity:
                     del self._workers[address]
             elif address in present:
                 worker.trusted = False
             else:
                 del self._workers[address]
-        for address, (offer, threads) in offers.items():
-            self._workers.setdefault(address, _Worker(offer, offer.resources, threads)).trusted = True
+        for address, offer in offers.items():
+            self._workers.setdefault(address, _Worker(offer, offer.resources, offer.threads)).trusted = True
             self._seen.add(offer.resources)
 
     def remove(self, address: str) -> None:
@@ -135,22 +120,13 @@ class Slots:
         best = max(able, key=lambda each: (min(need.memory_bytes, each.memory_bytes), each.cores, -each.gpus))
         return Resources(min(need.cores, best.cores), min(need.memory_bytes, best.memory_bytes), need.gpus)
 
-    def take(self, need: Resources, *, stage: str, reserved: Iterable[str] = ()) -> Offer | None:
+    def take(self, need: Resources, *, stage: str, reserved: Collection[str] = ()) -> Offer | None:
         """Choose a worker for a task and take what the task needs of it; None when it fits nowhere now.
 
         Of those that it fits on, one that has run the stage before, so that Blender is warm there; else the fullest, so
-        that room is left for tasks that need more.
-
-        Args:
-            need: what the task occupies.
-            stage: its stage.
-            reserved: addresses that are kept for others.
+        that room is left for tasks that need more. Workers at `reserved` addresses are kept for others.
         """
-        fitting = [
-            worker
-            for address, worker in self._workers.items()
-            if worker.trusted and address not in reserved and worker.threads > 0 and fits(need, worker.free)
-        ]
+        fitting = [each for each in self._trusted(reserved) if each.threads > 0 and fits(need, each.free)]
         if not fitting:
             return None
         best = min(fitting, key=lambda each: (stage not in each.stages, each.free.cores, each.offer.address))
@@ -159,14 +135,14 @@ class Slots:
         best.stages.add(stage)
         return best.offer
 
-    def emptiest(self, need: Resources, *, reserved: Iterable[str] = ()) -> str | None:
+    def emptiest(self, need: Resources, *, reserved: Collection[str] = ()) -> str | None:
         """Address of the worker that will have room for this need first, going by its free cores; None: none ever."""
-        able = [
-            worker
-            for address, worker in self._workers.items()
-            if worker.trusted and address not in reserved and fits(need, worker.offer.resources)
-        ]
+        able = [each for each in self._trusted(reserved) if fits(need, each.offer.resources)]
         return max(able, key=lambda each: (each.free.cores, each.offer.address)).offer.address if able else None
+
+    def _trusted(self, reserved: Collection[str]) -> list[_Worker]:
+        """The workers that may get tasks, but for those at addresses that are kept for others."""
+        return [each for address, each in self._workers.items() if each.trusted and address not in reserved]
 
     def give_back(self, offer: Offer, need: Resources) -> None:
         """A task has ended; nothing happens if its worker is gone."""

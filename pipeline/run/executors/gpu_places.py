@@ -1,7 +1,6 @@
 """Which of the machine's GPUs a task is given: the scheduler counts them, here each of them has its place.
 
-A simulation computes on the first one, as Taichi chooses that itself, wherever it is to go; so pictures take the
-highest that is free.
+A simulation computes on the first one, as Taichi chooses that itself; so pictures take the highest that is free.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ from pipeline.stages.gpus import own_gpus, require_some
 class GpuPlaces:
     """Places of GPUs, counted from 0, and how many tasks are on each. Safe to use from several threads.
 
-    Args:
-        own: the places that tasks may be given; None: all there are.
+    `own` are the places that tasks may be given; None: all there are.
     """
 
     def __init__(self, own: Sequence[int] | None) -> None:
@@ -33,8 +31,7 @@ class GpuPlaces:
         Args:
             warm: places where Blender waits with the scene; one of these, if one is free.
             first: it computes on the first GPU whatever it is given, even one that is taken or not among the own.
-            there: how many GPUs there are, where all may be given; None: that is not known, and the lowest that is
-                free is given, as the scheduler lets no more be in use than there are.
+            there: how many GPUs there are, where all may be given; None: unknown, and the lowest that is free is given.
 
         Raises:
             PipelineError: there is none to give.

@@ -10,11 +10,11 @@ from dataclasses import replace
 from pipeline.base.task import FailureKind, TaskId
 from pipeline.run.events import Failed, TaskEvent
 from pipeline.run.executors.attempt import run_attempt
-from pipeline.run.executors.base import Assignment, ShutDownOnExit
+from pipeline.run.executors.base import Assignment, Executor
 from pipeline.stages.gpus import first_gpu
 
 
-class InlineExecutor(ShutDownOnExit):
+class InlineExecutor(Executor):
     """Runs one assignment per `wait`, in the calling process; what it prints goes into the attempt's log.
 
     Nothing interrupts a running task here, so `cancel` and timeouts act only on tasks that have not begun, and what a

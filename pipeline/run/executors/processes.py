@@ -13,15 +13,15 @@ import time
 from dataclasses import dataclass, replace
 from math import inf
 
-from pipeline.base.memory import machine_memory_bytes
+from pipeline.base.memory import machine_memory_bytes, resident_memory_bytes
 from pipeline.base.resources import MEMORY_SHARE
 from pipeline.base.task import FailureKind, TaskId
 from pipeline.run.events import Failed, Finished, Progress, TaskEvent
-from pipeline.run.executors.base import Assignment, ShutDownOnExit
+from pipeline.run.executors.base import Assignment, Executor
 from pipeline.run.executors.channel import Channel
 from pipeline.run.executors.failures import full_place, is_disk_full
 from pipeline.run.executors.gpu_places import places_of_process
-from pipeline.run.executors.worker import Stop, Vitals
+from pipeline.run.executors.worker import StopAttempt
 from pipeline.run.executors.worker_process import WorkerProcess, log_tail
 
 _STACK_DUMP_S = 1.0
@@ -29,45 +29,29 @@ _STACK_DUMP_S = 1.0
 _RETIRE_GRACE_S = 20.0
 """Time a worker gets to leave by itself, writing its kernel cache for instance, before it is killed [s]."""
 FURTHER_WORKERS = 6
-"""Idle workers beyond one a core: as many as there are stages. They cost memory and no time; starting Blender anew
-for every frame, as one worker a core did on two cores with three stages, made the quickstart's frames three times as
-slow."""
+"""Idle workers beyond one a core: as many as there are stages, as a Blender for every frame would be slow."""
 _MEMORY_WATCH_S = 0.5
 """How often the memory of busy workers is looked at [s]; a look takes a fraction of a millisecond."""
-PREPARATION_S = 4 * 3600.0
-"""A worker that prepares what is done once on a machine is silent meanwhile. Cycles' kernels took 7.5 minutes on one
-core; so long no compiler takes, and a driver that hangs does not keep a farm for ever [s]."""
 _POLL_S = 0.2
 """How often exits are looked for where the system has no pidfd [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerLimits:
-    """When a worker is replaced, and when a task is ended.
+    """When a worker is replaced."""
 
-    Attributes:
-        tasks_per_worker: a worker is replaced after this many tasks.
-        resident_memory_bytes: a worker larger than this after a task is replaced; None: a quarter of the machine's.
-        workers: idle workers are ended when there would be more in all; None: one a core, and one for each further
-            stage, so that stages that take turns frame by frame all keep theirs warm.
-        stall_timeout_s: a task that shows no sign of life for so long is ended as stalled, where its assignment names
-            no limit of its own [s].
-        task_memory_bytes: a task whose processes hold more together is ended as out of memory, where its assignment
-            names no limit of its own; None: what tasks may claim of the machine.
-    """
-
-    tasks_per_worker: int = 50
+    tasks_per_worker: int = 50  # a worker is replaced after this many tasks
+    # a worker larger than this after a task is replaced; None: a quarter of the machine's
     resident_memory_bytes: int | None = None
+    # idle workers are ended when there would be more in all; None: one a core, and one for each further stage, so that
+    # stages that take turns frame by frame all keep theirs warm
     workers: int | None = None
-    stall_timeout_s: float = 900.0
-    task_memory_bytes: int | None = None
 
 
-class ProcessExecutor(ShutDownOnExit):
+class ProcessExecutor(Executor):
     """Runs assignments in worker processes of this machine; see `Executor` for what it promises.
 
-    Workers die with the thread that submits to this executor (that is how Linux's PR_SET_PDEATHSIG counts), so use it
-    from one that lives as long as the run; the main one is best.
+    Workers die with the thread that submits to this executor, so use it from one that lives as long as the run.
     """
 
     def __init__(self, limits: WorkerLimits | None = None, *, gpus: int | None = None) -> None:
@@ -76,7 +60,7 @@ class ProcessExecutor(ShutDownOnExit):
         self._gpus = gpus
         memory_bytes = machine_memory_bytes()
         self._memory_limit = self._limits.resident_memory_bytes or memory_bytes // 4
-        self._task_memory_limit = self._limits.task_memory_bytes or int(memory_bytes * MEMORY_SHARE)
+        self._task_memory_limit = int(memory_bytes * MEMORY_SHARE)
         self._memory_watched_at = 0.0
         self._worker_limit = self._limits.workers or (os.cpu_count() or 1) + FURTHER_WORKERS
         self._places = places_of_process()
@@ -135,7 +119,7 @@ class ProcessExecutor(ShutDownOnExit):
             if worker.assignment is not None and worker.assignment.task.id == task_id:
                 sentence = "cancelled"
                 if grace_s > 0:
-                    worker.channel.send(Stop(task_id, worker.assignment.attempt))
+                    worker.channel.send(StopAttempt(task_id, worker.assignment.attempt))
                     sentence = f"cancelled; it did not stop by itself within {grace_s:g} s"
                 worker.end_by(time.monotonic() + grace_s, FailureKind.CANCELLED, sentence)
 
@@ -188,8 +172,7 @@ class ProcessExecutor(ShutDownOnExit):
         assignment = worker.assignment
         if assignment is not None:
             kind, sentence = worker.explain_exit()
-            seconds = time.monotonic() - worker.began
-            details = log_tail(assignment.log)
+            seconds, details = time.monotonic() - worker.began, log_tail(assignment.log)
             peak = worker.peak_memory_bytes
             self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence, details, seconds, peak))
             self._give_place_back(assignment)
@@ -229,9 +212,6 @@ class ProcessExecutor(ShutDownOnExit):
             return
         for message in worker.channel.receive():
             worker.last_sign = time.monotonic()
-            if isinstance(message, Vitals):
-                worker.resident_memory_bytes = message.resident_memory_bytes
-                continue
             self._events.append(worker.explain_failure(message) if isinstance(message, Failed) else message)
             if isinstance(message, Progress):
                 worker.note_progress(message)
@@ -250,7 +230,7 @@ class ProcessExecutor(ShutDownOnExit):
         return (
             worker.single_use
             or worker.tasks_done >= self._limits.tasks_per_worker
-            or worker.resident_memory_bytes > self._memory_limit
+            or resident_memory_bytes(worker.pid) > self._memory_limit
         )
 
     def _seconds_to_next_deadline(self) -> float:
@@ -262,15 +242,9 @@ class ProcessExecutor(ShutDownOnExit):
             if worker.kill_at is not None:
                 deadlines.append(worker.kill_at)
             elif worker.assignment is not None:
-                deadlines.append(worker.last_sign + self._stall_s(worker, worker.assignment))
+                deadlines.append(worker.last_sign + worker.stall_s)
                 deadlines.append(worker.limited_since + (worker.assignment.timeout_s or inf))
         return min(deadlines, default=inf) - now
-
-    def _stall_s(self, worker: WorkerProcess, assignment: Assignment) -> float:
-        """How long it may be silent now [s]."""
-        if worker.limited_since == inf:
-            return PREPARATION_S
-        return assignment.stall_s or self._limits.stall_timeout_s
 
     def _enforce_deadlines(self, worker: WorkerProcess, now: float) -> None:
         if worker.kill_at is not None:
@@ -280,7 +254,7 @@ class ProcessExecutor(ShutDownOnExit):
             return
         if worker.assignment is None:
             return
-        stall_s, timeout_s = self._stall_s(worker, worker.assignment), worker.assignment.timeout_s or inf
+        stall_s, timeout_s = worker.stall_s, worker.assignment.timeout_s or inf
         if now - worker.last_sign >= stall_s:
             kind, sentence = FailureKind.STALLED, f"no sign of life for {stall_s:g} s; the log shows where it hung"
         elif now - worker.limited_since >= timeout_s:

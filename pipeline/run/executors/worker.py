@@ -25,7 +25,6 @@ from pathlib import Path
 from queue import SimpleQueue
 from types import FrameType
 
-from pipeline.base.memory import resident_memory_bytes
 from pipeline.base.task import TaskId
 from pipeline.run.events import Failed, Finished, TaskEvent
 from pipeline.run.executors.attempt import run_attempt
@@ -41,18 +40,11 @@ _OOM_SCORE = "500"
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class StopAttempt:
     """To the worker: the attempt should checkpoint and return."""
 
     task_id: TaskId
     attempt: int
-
-
-@dataclass(frozen=True, slots=True)
-class Vitals:
-    """From the worker, just before the end of each attempt: how large it is now."""
-
-    resident_memory_bytes: int
 
 
 def main() -> None:
@@ -89,16 +81,20 @@ class _Worker:
 
     def _emit(self, event: TaskEvent) -> None:
         if isinstance(event, Finished | Failed):
-            # In this order: the supervisor may send the next assignment, or close the channel, once it has the event.
-            self._current = None
-            self._channel.send(Vitals(resident_memory_bytes()))
+            self._current = None  # before the supervisor has the event, and sends the next assignment
         self._channel.send(event)
 
     def _listen(self) -> None:
-        """Sort the supervisor's messages; runs in its own thread, so that a Stop reaches a task that is running."""
+        """Sort the supervisor's messages; runs in its own thread, so that a stop reaches a task that is running."""
         try:
             while True:
-                self._sort(self._channel.receive())
+                message: Assignment | StopAttempt = self._channel.receive()
+                if isinstance(message, Assignment):
+                    self._stop.clear()
+                    self._current = (message.task.id, message.attempt)
+                    self._assignments.put(message)
+                elif self._current == (message.task_id, message.attempt):
+                    self._stop.set()
         except (EOFError, ConnectionError):
             pass
         except Exception:  # a message that cannot be read, say; nobody else would ever notice
@@ -107,14 +103,6 @@ class _Worker:
         if self._current is not None:  # the supervisor died in the middle of our task
             _end_with_all()
         self._assignments.put(None)
-
-    def _sort(self, message: Assignment | Stop) -> None:
-        if isinstance(message, Assignment):
-            self._stop.clear()
-            self._current = (message.task.id, message.attempt)
-            self._assignments.put(message)
-        elif self._current == (message.task_id, message.attempt):
-            self._stop.set()
 
     def _on_terminate(self, _signal: int, _frame: FrameType | None) -> None:
         self._terminated = True
@@ -149,9 +137,7 @@ def _end_with_all() -> None:
 
 
 def _start_guardian(scratch: str) -> None:
-    """Start a shell that outlives this process by a moment, and takes the rest of the process group with it.
-
-    Before that it removes the temporary folder `scratch`, which the supervisor cannot if it was killed.
+    """Start a shell that outlives this process by a moment, and takes `scratch` and the rest of the group with it.
 
     It waits for the end of a pipe whose other end is open in this process alone, and never closed by it: only the
     kernel does that, however this process ends.

@@ -25,6 +25,8 @@ from pipeline.run.executors.worker import STACK_DUMP_SIGNAL
 from render.temporary_folder import environment_of_child
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+PREPARATION_S = 4 * 3600.0
+"""How long a worker may be silent while it prepares what is done once on a machine, such as Cycles' kernels [s]."""
 _LOG_TAIL_LINES = 20
 WorkerKey = tuple[str, int, int | None]
 """Stage, thread count and GPU."""
@@ -36,32 +38,20 @@ _COMMAND_SHOWN = 100
 class WorkerProcess:
     """A process that runs one assignment after another, in a session and process group of its own.
 
-    Attributes:
-        key: stage, thread count and GPU that it is warm for.
-        assignment: what it runs, or None.
-        idle: it waits for an assignment.
-        single_use: it is to be replaced after the task that it ended last.
-        resident_memory_bytes: how large it was when its last task ended.
-        tasks_done: how many tasks it has ended.
-        began: when its assignment was given to it, monotonic [s].
-        limited_since: since when the assignment's limit of time counts, monotonic [s]; inf: not yet, it prepares.
-        last_sign: when it last said anything, monotonic [s].
-        peak_memory_bytes: most that it and all it started were seen to hold together during its assignment.
-        kill_at: when its process group is killed, monotonic [s], or None.
-        verdict: what its task fails of, when it is us who end it.
+    It is warm for the stage, thread count and GPU of its `key`. Times are monotonic [s].
     """
 
     def __init__(self, key: WorkerKey, first: Assignment) -> None:
         self.key = key
         self.assignment: Assignment | None = None
         self.idle = False
-        self.single_use = False
-        self.resident_memory_bytes = 0
+        self.single_use = False  # to be replaced after the task that it ended last
         self.tasks_done = 0
-        self.began = self.last_sign = self.limited_since = time.monotonic()
-        self.peak_memory_bytes = 0
-        self.kill_at: float | None = None
-        self.verdict: tuple[FailureKind, str] | None = None
+        self.began = self.last_sign = time.monotonic()
+        self.limited_since = self.began  # since when the assignment's limit of time counts; inf: not yet, it prepares
+        self.peak_memory_bytes = 0  # most that it and all it started were seen to hold together during its assignment
+        self.kill_at: float | None = None  # when its process group is killed
+        self.verdict: tuple[FailureKind, str] | None = None  # what its task fails of, when it is us who end it
         self._out_of_memory_kills = 0
         self._process, self.channel, self._scratch = _spawn(first)
         self.exit_descriptor = _open_exit_descriptor(self._process.pid)
@@ -70,6 +60,12 @@ class WorkerProcess:
     def pid(self) -> int:
         """Process id; that of its group as well."""
         return self._process.pid
+
+    @property
+    def stall_s(self) -> float:
+        """How long its assignment may be silent now [s]."""
+        assert self.assignment is not None
+        return PREPARATION_S if self.limited_since == inf else self.assignment.stall_s
 
     def assign(self, assignment: Assignment) -> None:
         """Hand over an attempt."""
@@ -91,8 +87,8 @@ class WorkerProcess:
     def end_assignment(self, *, failed: bool) -> None:
         """The attempt is over; what was planned against it is off.
 
-        A worker is not used again after a failure, whose traces it may carry, nor after a long task: there is no other
-        like it to be warm for, and its memory is wanted by the stages that follow.
+        A worker is not used again after a failure, whose traces it may carry, nor after a long task, as its memory is
+        wanted by the stages that follow.
         """
         assert self.assignment is not None
         self.single_use = failed or self.assignment.task.checkpointed
@@ -108,7 +104,7 @@ class WorkerProcess:
         return size
 
     def leave_evidence(self, sentence: str) -> None:
-        """Write into its task's log why it is about to be ended, and what its processes are doing; then their stacks.
+        """Write into its task's log why it is ended, and what its processes are doing; then their stacks.
 
         A process that was stopped from outside is continued for that, as it could write nothing.
         """
@@ -121,7 +117,7 @@ class WorkerProcess:
             self._process.send_signal(signal.SIGCONT)
 
     def explain_failure(self, failed: Failed) -> Failed:
-        """What it says of its task, or rather: a Blender that the kernel killed looks like one that was lost."""
+        """What it says of its task; but a Blender that the kernel killed looks like one that was lost."""
         failed = replace(failed, peak_memory_bytes=max(failed.peak_memory_bytes, self.peak_memory_bytes))
         if failed.kind is FailureKind.WORKER_LOST and self._memory_ran_out():
             sentence = f"{failed.message}; the kernel killed it: the machine is out of memory"
@@ -202,8 +198,8 @@ def _describe_process(pid: int) -> str:
 def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, ExitStack]:
     """Start a fresh interpreter; what it prints before its first task goes into that task's log.
 
-    Its temporary folder is its own: Blender and Taichi leave theirs behind where they are killed. The last of what is
-    returned removes it.
+    Its temporary folder is its own, as Blender and Taichi leave theirs behind where they are killed. The last of what
+    is returned removes it.
     """
     first.log.parent.mkdir(parents=True, exist_ok=True)
     ours, theirs = socket.socketpair()

@@ -10,56 +10,34 @@ from html import escape
 WIDTH, HEIGHT = 640.0, 240.0
 LEFT, RIGHT, TOP, BOTTOM = 68.0, 12.0, 10.0, 34.0
 
-COLORS = 8
-"""Classes `c0` to `c7`, then from the start again."""
-DASHES = ("", "7 4", "2 3", "9 3 2 3", "14 4", "4 4 1 4")
-"""Of lines of one colour, in order."""
-MAX_POINTS = 1200
-"""Two for each of 600 columns: more cannot be told apart at this width."""
-MOST_DIGITS = 9
-"""Of a tick's number: more do not fit to the left of the axis."""
-SMALLEST = 1.0e-290
-"""What is smaller counts as zero: parts of it cannot be told from zero in double precision."""
-LOGARITHMIC_FROM = 30.0
-"""Ratio of the largest to the smallest value from which an axis that may be logarithmic is."""
+COLORS = 8  # classes `c0` to `c7` of report.css, then from the start again
+DASHES = ("", "7 4", "2 3", "9 3 2 3", "14 4", "4 4 1 4")  # of lines of one colour, in order
+MAX_POINTS = 1200  # two for each of 600 columns: more cannot be told apart at this width
+MOST_DIGITS = 9  # of a tick's number: more do not fit to the left of the axis
+SMALLEST = 1.0e-290  # what is smaller counts as zero: parts of it cannot be told from zero in double precision
+LOGARITHMIC_FROM = 30.0  # ratio of the largest to the smallest value from which an axis that may be logarithmic is
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line of a chart.
+    """A line of a chart."""
 
-    Attributes:
-        label: in the legend.
-        x: rising.
-        y: as many; what is not finite leaves a gap.
-        color: index of its colour.
-        dash: index of its dashes.
-    """
-
-    label: str
-    x: Sequence[float]
-    y: Sequence[float]
-    color: int = 0
-    dash: int = 0
+    label: str  # in the legend
+    x: Sequence[float]  # rising
+    y: Sequence[float]  # as many; what is not finite leaves a gap
+    color: int = 0  # index of its colour
+    dash: int = 0  # index of its dashes
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Where values lie on the paper.
+    """Where values lie on the paper."""
 
-    Attributes:
-        low: value at the beginning.
-        high: value at the end.
-        start: the beginning on the paper [pixels].
-        end: the end on the paper [pixels].
-        logarithmic: distances are ratios.
-    """
-
-    low: float
-    high: float
-    start: float
-    end: float
-    logarithmic: bool = False
+    low: float  # value at the beginning
+    high: float  # value at the end
+    start: float  # the beginning on the paper [pixels]
+    end: float  # the end on the paper [pixels]
+    logarithmic: bool = False  # distances are ratios
 
     def place(self, value: float) -> float:
         """Where a value lies [pixels]."""
@@ -70,13 +48,13 @@ class Axis:
         return self.start + share * (self.end - self.start)
 
     def labels(self, count: int) -> list[tuple[float, str]]:
-        """Where about so many round numbers lie [pixels], and what they are, told apart."""
+        """Places [pixels] and texts of round numbers on the axis, about `count` of them, that can be told apart."""
         ticks = self.ticks(count)
         step = abs(ticks[1] - ticks[0]) if len(ticks) > 1 and not self.logarithmic else None
         return [(self.place(tick), _number(tick, abs(tick) if step is None else step)) for tick in ticks]
 
     def ticks(self, count: int) -> list[float]:
-        """About so many round numbers on the axis."""
+        """Round numbers on the axis, about `count` of them."""
         if self.logarithmic:
             first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
             every = max(1, math.ceil((last - first + 1) / count))
@@ -88,12 +66,9 @@ class Axis:
 
 
 def line_chart(lines: Sequence[Line], *, x_label: str, may_be_logarithmic: bool = False) -> str:
-    """A chart as an SVG element.
+    """A chart of lines, of which one has a finite value at least, as an SVG element.
 
-    Args:
-        lines: at least one of them with a finite value.
-        x_label: under the x axis.
-        may_be_logarithmic: use a logarithmic y axis where positive values differ by much; zeros then leave gaps.
+    `may_be_logarithmic`: use a logarithmic y axis where positive values differ by much; zeros then leave gaps.
     """
     x_values = [x for line in lines for x, y in zip(line.x, line.y, strict=True) if math.isfinite(y)]
     y_values = [y for line in lines for y in line.y if math.isfinite(y)]

@@ -15,29 +15,20 @@ from pipeline.model.job import Job
 from pipeline.show.picture_set import evenly_spread
 from pipeline.store.receipts import read_receipt
 
-MOST_BYTES = 24 << 20
-"""Of a film that is put into the page: a browser holds the page in memory, a third larger as text."""
-PLAYABLE = frozenset({"h264", "av1"})
-"""Codecs that the usual browsers play; H.265 and ProRes are not among them."""
+MOST_BYTES = 24 << 20  # of a film that is put into the page: a browser holds the page in memory, a third larger as text
+PLAYABLE = frozenset({"h264", "av1"})  # codecs that the usual browsers play; H.265 and ProRes are not among them
 LOOP_PICTURES, LOOP_WIDTH, LOOP_FPS = 90, 640, 15.0
 
 
 @dataclass(frozen=True)
 class ReportFilm:
-    """A film as the report shows it.
-
-    Attributes:
-        content: its bytes.
-        mime: what they are.
-        width, height: of its picture [pixels].
-        remark: why it is not the film itself, or not that of the job as it is now; empty if it is.
-    """
+    """A film as the report shows it."""
 
     content: bytes
     mime: str
     width: int
     height: int
-    remark: str = ""
+    remark: str = ""  # why it is not the film itself, or not that of the job as it is now; empty if it is
 
     @property
     def address(self) -> str:
@@ -50,15 +41,8 @@ def film_of(
 ) -> ReportFilm | None:
     """The film that was committed; None before there is one.
 
-    Args:
-        layout: the job's folder.
-        job: the job.
-        current: the files that are of the job as it is now; None if that cannot be told.
-        pictures: frames that were made alike, from the first on, of which a loop is made where one is needed.
-
-    Raises:
-        PipelineError: a loop is needed, and a picture is damaged.
-        OSError: a file cannot be read.
+    `current` are the files of the job as it is now (None: that cannot be told); of `pictures`, frames that were made
+    alike, from the first on, a loop is made where one is needed. Raises PipelineError if one of them is damaged then.
     """
     path = layout.film
     artifact = ArtifactPath(path.relative_to(layout.root).as_posix())

@@ -4,69 +4,62 @@ from __future__ import annotations
 
 import tempfile
 from base64 import b64encode
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pipeline.base.errors import MissingInputError, PipelineError, StageUnavailableError
 from pipeline.base.layout import JobLayout
 from pipeline.base.quantities import COUNT_OF_FLUID
-from pipeline.base.task import ArtifactPath, TaskState
+from pipeline.base.task import ArtifactPath
 from pipeline.job.loading import load_job
 from pipeline.kinds.table import bodies
 from pipeline.model.job import Job
 from pipeline.record.reader import ManifestReader, StageTiming
 from pipeline.run.assessment import assess_job
-from pipeline.run.solver_numbers import Warned, simulation_numbers
+from pipeline.run.solver_numbers import CountedWarning, simulation_numbers
 from pipeline.show.picture_set import PictureSet, evenly_spread, picture_set
 from pipeline.show.report.film import ReportFilm, film_of
 from pipeline.show.report.panels import JobNumbers
-from pipeline.show.report.versions import MadeWith, made_with
+from pipeline.store.origins import origins_of
+from pipeline.store.receipts import read_receipt
 
 SHEET_PICTURES, SHEET_COLUMNS = 12, 4
-SHEET_WIDTH = 1200
-"""At most [pixels]; small pictures are not enlarged."""
+SHEET_WIDTH = 1200  # at most [pixels]; small pictures are not enlarged
+
+
+@dataclass(frozen=True, slots=True)
+class MadeWith:
+    """What made some files of a stage."""
+
+    stage: str
+    tools: Mapping[str, str]  # versions of the stage and of its tools; empty if the parameters were not kept
+    maker: str  # program, Python and kind of machine
+    host: str
+    files: int  # how many
 
 
 @dataclass(frozen=True)
 class JobReport:
-    """A job as its report shows it.
-
-    Attributes:
-        job: the job as submitted.
-        title: its name, or its folder where another job of the report has the same name.
-        done: finished tasks.
-        total: planned tasks.
-        outcome: how the last run ended, or None.
-        timings: what each stage has taken.
-        numbers: what the solvers told.
-        warnings: what they warned of.
-        unreadable: frames of the cache that cannot be read.
-        unreadable_whitewater: files of whitewater that cannot.
-        drawn_on: number of frames by the device that drew them.
-        sheet: its pictures side by side, as the bytes of a WebP picture; None before there are any.
-        sheet_remark: what to say of the frames on it, and of those that are not; empty if there is nothing.
-        film: None before there is one.
-        versions: what made its files.
-        text: of its job file, as submitted.
-    """
+    """A job as its report shows it."""
 
     job: Job
-    title: str
-    done: int
-    total: int
-    outcome: str | None
+    title: str  # its name, or its folder where another job of the report has the same name
+    done: int  # tasks
+    total: int  # planned tasks
+    outcome: str | None  # of the last run
     timings: tuple[StageTiming, ...]
     numbers: JobNumbers
-    warnings: tuple[Warned, ...]
-    unreadable: tuple[int, ...]
+    warnings: tuple[CountedWarning, ...]
+    unreadable: tuple[int, ...]  # frames of the cache
     unreadable_whitewater: tuple[ArtifactPath, ...]
-    drawn_on: dict[str, int]
-    sheet: bytes | None
-    sheet_remark: str
+    drawn_on: dict[str, int]  # number of frames by device
+    sheet: bytes | None  # its pictures side by side, as a WebP picture; None before there are any
+    sheet_remark: str  # on the frames that are on it and those that are not
     film: ReportFilm | None
     versions: tuple[MadeWith, ...]
-    text: str
+    text: str  # of its job file
 
     @property
     def facts(self) -> dict[str, str]:
@@ -119,27 +112,21 @@ class JobReport:
 
 
 def gather(layout: JobLayout, *, title: str) -> JobReport:
-    """Look at a job's folder.
+    """Look at the folder of a submitted job.
 
-    Args:
-        layout: the folder of a submitted job.
-        title: what to call the job.
-
-    Raises:
-        PipelineError: the job file or the manifest cannot be used, or a picture is damaged.
+    Raises PipelineError if the job file or the manifest cannot be used, or a picture is damaged.
     """
     job = load_job(layout.job_file)
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         summary, timings, last = manifest.summary(), manifest.stage_timings(), manifest.last_run()
         drawn_on = manifest.devices("render")
         artifacts = manifest.artifacts()
-    finished = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
     simulation = simulation_numbers(layout, history=True)
     frames = picture_set(job, layout)
     return JobReport(
         job=job,
         title=title,
-        done=sum(stage.counts.get(state, 0) for stage in summary for state in finished),
+        done=sum(stage.done for stage in summary),
         total=sum(stage.total for stage in summary),
         outcome=last.outcome,
         timings=tuple(timings),
@@ -154,6 +141,23 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         versions=tuple(made_with(layout, artifacts, stages=[timing.stage for timing in timings])),
         text=layout.job_file.read_text(encoding="utf-8"),
     )
+
+
+def made_with(layout: JobLayout, artifacts: Iterable[ArtifactPath], *, stages: Sequence[str]) -> list[MadeWith]:
+    """What made which artifacts, by their receipts, in the order of `stages`."""
+    tools: dict[str, tuple[tuple[str, str], ...]] = {}
+    files: Counter[tuple[str, tuple[tuple[str, str], ...], str, str]] = Counter()
+    for path in artifacts:
+        receipt = read_receipt(layout, path)
+        if receipt is None:
+            continue
+        if receipt.parameters not in tools:
+            (origin,) = origins_of(layout, [receipt])
+            tools[receipt.parameters] = tuple((origin.tools or {}).items())
+        files[receipt.stage, tools[receipt.parameters], receipt.maker, receipt.host] += 1
+    found = [MadeWith(stage, dict(tools), maker, host, count) for (stage, tools, maker, host), count in files.items()]
+    place = {stage: index for index, stage in enumerate(stages)}
+    return sorted(found, key=lambda each: place.get(each.stage, len(place)))
 
 
 def as_data(picture: bytes) -> str:

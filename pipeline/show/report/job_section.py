@@ -8,22 +8,15 @@ from html import escape
 from pipeline.base import wording
 from pipeline.record.reader import StageTiming
 from pipeline.run.plan import frame_ranges
-from pipeline.run.whitewater_numbers import unreadable_whitewater
+from pipeline.run.solver_numbers import unreadable_whitewater
 from pipeline.show.report.film import ReportFilm
-from pipeline.show.report.job_report import JobReport, as_data
-from pipeline.show.report.versions import MadeWith
+from pipeline.show.report.job_report import JobReport, MadeWith, as_data
 
-LEAST_SHARE = 0.07
-"""Of all time: what a stage must have taken to have its name on the bar."""
+LEAST_SHARE = 0.07  # of all time: what a stage must have taken to have its name on the bar
 
 
 def job_section(report: JobReport, *, headed: bool) -> str:
-    """All about a job but the charts, which jobs share.
-
-    Args:
-        report: the job.
-        headed: whether its name stands above it, as several need it.
-    """
+    """All about a job but the charts, which jobs share; below its name (`headed`) where there are several."""
     facts = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in report.facts.items())
     told = f"<dl>{facts}</dl>{_warnings(report)}"
     film = "" if report.film is None else _film(report.film, report.title)

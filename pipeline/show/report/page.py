@@ -1,48 +1,60 @@
-"""The report's page: HTML with its style, charts, pictures and numbers inside. Pure."""
+"""The report's page: HTML with its style, charts, pictures and numbers inside."""
 
 from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Iterable, Sequence
 from html import escape
+from importlib.resources import files
+from pathlib import Path
 
-from pipeline.show.report.chart import COLORS, line_chart, swatch
-from pipeline.show.report.job_report import JobReport
+from pipeline.base import wording
+from pipeline.base.files import replace_durably
+from pipeline.base.layout import JobLayout
+from pipeline.job.loading import load_job
+from pipeline.show.report.chart import line_chart, swatch
+from pipeline.show.report.job_report import JobReport, gather
 from pipeline.show.report.job_section import job_section, origins_section
 from pipeline.show.report.panels import Panel, panels_of
 
 
-def page(reports: Sequence[JobReport], *, written: str) -> str:
-    """The page of one job, or of several in the same charts.
+def write_report(layouts: Sequence[JobLayout], path: Path) -> None:
+    """Write the report of a submitted job, or of several in comparison, as one HTML file.
 
-    Args:
-        reports: the jobs; titles differ.
-        written: when, in words.
+    Raises:
+        PipelineError: a job cannot be read.
+        OSError: the file cannot be written.
     """
-    title = " and ".join(report.title for report in reports)
+    names = [load_job(layout.job_file).name for layout in layouts]
+    titles = [str(layout.root) if names.count(name) > 1 else name for layout, name in zip(layouts, names, strict=True)]
+    reports = [gather(layout, title=title) for layout, title in zip(layouts, titles, strict=True)]
+    replace_durably(path, page(reports, written=f"Report of {wording.moment(time.time())}"))
+
+
+def page(reports: Sequence[JobReport], *, written: str) -> str:
+    """The page of one job, or of several in the same charts."""
+    title, several = " and ".join(report.title for report in reports), len(reports) > 1
     found = panels_of([report.numbers for report in reports])
-    sections = [_section(f"Solvers{_over(reports)}", _charts(found.panels, found.zero))]
-    if len(reports) > 1:
+    sections = [_section("Solvers in comparison" if several else "Solvers", _charts(found.panels, found.zero))]
+    if several:
         sections.insert(0, _section("Energy kept", _energies(reports)))
     body = [
         f"<header><h1>{escape(title)}</h1><p>{escape(written)}</p></header>",
-        *(job_section(report, headed=len(reports) > 1) for report in reports),
+        *(job_section(report, headed=several) for report in reports),
         *sections,
-        _section("What it was made of", "".join(origins_section(each, headed=len(reports) > 1) for each in reports)),
+        _section("What it was made of", "".join(origins_section(each, headed=several) for each in reports)),
     ]
+    style = files(__package__).joinpath("report.css").read_text(encoding="utf-8")
     data = _json({"written": written, "jobs": [report.as_json() for report in reports]})
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f"<style>{style}</style>\n</head>\n<body>\n"
         + "\n".join(body)
         + f'\n<script type="application/json" id="numbers">{data}</script>\n</body>\n</html>\n'
     )
-
-
-def _over(reports: Sequence[JobReport]) -> str:
-    return "" if len(reports) == 1 else " in comparison"
 
 
 def _energies(reports: Sequence[JobReport]) -> str:
@@ -99,51 +111,3 @@ def _finite(data: object) -> object:
     if isinstance(data, list | tuple):
         return [_finite(value) for value in data]
     return data
-
-
-_STYLE = """
-:root { color-scheme: light dark; --paper: #fcfcfb; --soft-paper: #f2f1ed;
-  --ink: #1d1d1b; --soft: #62615c; --rule: #dddcd6; --bar: #cfe0f5;
-  --warn: #8a4b00; --c0: #2a78d6; --c1: #d9541e; --c2: #12875f; --c3: #a86f00; --c4: #b93c7f; --c5: #4a3aa7;
-  --c6: #6b6b66; --c7: #c22f2f;
-  --s0: #2567b5; --s1: #b8481a; --s2: #107350; --s3: #8a5c00; --s4: #9c3369;
-  --s5: #4a3aa7; --s6: #5c5c58; --s7: #a82828; }
-@media (prefers-color-scheme: dark) { :root { --paper: #171716;
-  --soft-paper: #222120; --ink: #ecebe6; --soft: #a3a29b; --rule: #3a3936;
-  --bar: #24456b; --warn: #f0b45c; --c0: #5a9fee; --c1: #f07c4a; --c2: #35b98a; --c3: #d9a02c; --c4: #e578b0;
-  --c5: #a196f0; --c6: #a9a8a1; --c7: #f07373; } }
-body { margin: 0 auto; max-width: 86rem; padding: 1.5rem; background: var(--paper); color: var(--ink);
-  font: 15px/1.45 system-ui, sans-serif; }
-h1 { font-size: 1.9rem; letter-spacing: -.015em; margin: 0; } h2 { font-size: 1.25rem; margin: 2.4rem 0 .8rem; }
-h3 { font-size: 1.05rem; margin: 1.8rem 0 .6rem; } header { margin-bottom: 1.2rem; }
-.head { display: grid; grid-template-columns: minmax(0, 3fr) minmax(16rem, 2fr); gap: 1.6rem; align-items: start; }
-@media (max-width: 50rem) { .head { grid-template-columns: 1fr; } }
-.film { display: block; width: 100%; height: auto; border-radius: 6px; background: #111; }
-.shares { display: flex; height: 2rem; border-radius: 6px; overflow: hidden; gap: 1px; }
-.shares span { flex: 0 1 0; min-width: 2px; overflow: hidden; white-space: nowrap; color: #fff; font-size: 13px;
-  line-height: 2rem; padding-left: .5rem; box-sizing: border-box; text-overflow: ellipsis; }
-.shares span:empty { padding: 0; }
-details { border-top: 1px solid var(--rule); padding: .6rem 0; } summary { cursor: pointer; font-weight: 600; }
-pre { overflow-x: auto; font: 13px/1.45 ui-monospace, monospace; background: var(--soft-paper); padding: 1rem;
-  border-radius: 6px; }
-.texts td, .texts th { text-align: left; vertical-align: top; } .texts td { white-space: normal; }
-header p, .quiet { color: var(--soft); margin: .3rem 0; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.2rem; margin: 0 0 .8rem; }
-dt { color: var(--soft); } dd { margin: 0; }
-.warnings { color: var(--warn); padding-left: 1.2rem; }
-.sheet { max-width: 100%; display: block; margin: .8rem 0; border-radius: 4px; }
-.wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .8rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
-th:first-child { text-align: left; } thead th { color: var(--soft); font-weight: 500; }
-.bar { position: relative; min-width: 9rem; } .bar span { position: absolute; inset: 3px auto 3px 0;
-  background: var(--bar); border-radius: 2px; z-index: -1; }
-.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 28rem), 1fr)); gap: 1.6rem; }
-figure { margin: 0; } figcaption { font-weight: 600; }
-figure ul { list-style: none; margin: .2rem 0; padding: 0; display: flex; flex-wrap: wrap; gap: .1rem 1rem;
-  font-size: 13px; color: var(--soft); }
-figure > svg { width: 100%; height: auto; display: block; } .swatch { width: 28px; height: 8px; margin-right: .4rem; }
-.line { fill: none; stroke-width: 1.8; stroke-linejoin: round; stroke-linecap: round; }
-.grid { stroke: var(--rule); } .axis { stroke: var(--soft); } .tick { fill: var(--soft); font-size: 11.5px; }
-""" + " ".join(
-    f".c{index} {{ stroke: var(--c{index}); }} .b{index} {{ background: var(--s{index}); }}" for index in range(COLORS)
-)

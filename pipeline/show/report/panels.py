@@ -23,15 +23,10 @@ TOTAL_ENERGY = "Total mechanical energy"
 
 @dataclass(frozen=True, slots=True)
 class JobNumbers:
-    """All that the solvers told of a job.
+    """All that the solvers told of a job."""
 
-    Attributes:
-        name: the job's name, different for each job of a report.
-        frames: the frames that are there, in order.
-    """
-
-    name: str
-    frames: tuple[FrameNumbers, ...]
+    name: str  # of the job, different for each job of a report
+    frames: tuple[FrameNumbers, ...]  # that are there, in order
 
     @property
     def solvers(self) -> list[str]:
@@ -57,32 +52,20 @@ class JobNumbers:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A chart's worth of lines.
+    """A chart's worth of lines."""
 
-    Attributes:
-        title: what kind of quantity.
-        unit: of the y axis.
-        lines: at least one.
-        logarithmic: whether its axis may be logarithmic.
-    """
-
-    title: str
-    unit: str
-    lines: tuple[Line, ...]
-    logarithmic: bool = False
+    title: str  # what kind of quantity
+    unit: str  # of the y axis
+    lines: tuple[Line, ...]  # at least one
+    logarithmic: bool = False  # whether its axis may be logarithmic
 
 
 @dataclass(frozen=True, slots=True)
 class Panels:
-    """The charts of a report.
+    """The charts of a report."""
 
-    Attributes:
-        panels: those with something to see.
-        zero: numbers that are zero in every frame of every job, in words.
-    """
-
-    panels: tuple[Panel, ...]
-    zero: tuple[str, ...]
+    panels: tuple[Panel, ...]  # those with something to see
+    zero: tuple[str, ...]  # numbers that are zero in every frame of every job, in words
 
 
 def panels_of(jobs: Sequence[JobNumbers]) -> Panels:
@@ -109,7 +92,8 @@ def panels_of(jobs: Sequence[JobNumbers]) -> Panels:
         if any(_is_seen(series.y) for series in of)
     ]
     total = _total_energy(jobs)
-    first = [total] if total is not None and (len(jobs) > 1 or _solvers_with_energy(jobs[0]) > 1) else []
+    with_energy = sum(MECHANICAL_ENERGY in job.names(solver) for job in jobs for solver in job.solvers)
+    first = [total] if total is not None and (len(jobs) > 1 or with_energy > 1) else []
     return Panels(tuple(first + panels), tuple(label for label, is_zero in zero.items() if is_zero))
 
 
@@ -167,10 +151,6 @@ def _total_energy(jobs: Sequence[JobNumbers]) -> Panel | None:
 def _is_seen(values: Sequence[float]) -> bool:
     """Whether a line is more than zero."""
     return any(math.isfinite(value) and value != 0.0 for value in values)
-
-
-def _solvers_with_energy(job: JobNumbers) -> int:
-    return sum(MECHANICAL_ENERGY in job.names(solver) for solver in job.solvers)
 
 
 def _value(frame: FrameNumbers, solver: str, name: str) -> float:

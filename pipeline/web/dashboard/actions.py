@@ -13,7 +13,8 @@ from pipeline.base.lease import live_holder
 from pipeline.queue.changes import another_try, cancel_job, continuation, pause_job, set_priority
 from pipeline.queue.farm import start_in_background
 from pipeline.queue.job_queue import JobQueue
-from pipeline.web.dashboard.farm_view import JobCard, JobState
+from pipeline.queue.states import JobState
+from pipeline.web.dashboard.farm_view import JobCard
 
 MOST_PRIORITY = 1000
 """As on the command line."""
@@ -31,12 +32,7 @@ class Action(NamedTuple):
 
 
 def actions_of(card: JobCard, *, has_runner: bool) -> tuple[Action, ...]:
-    """The buttons of a job.
-
-    Args:
-        card: the job.
-        has_runner: whether somebody runs the queue.
-    """
+    """The buttons of a job; `has_runner`: somebody runs the queue."""
     state, queued = card.state, card.entry is not None
     turn = "It goes on when its turn comes." if has_runner else "Nobody runs the queue: a runner starts for it."
     resume = Action("resume", "Resume", turn)
@@ -77,9 +73,6 @@ class Queue:
     """The queue behind the buttons, and its runners, known from their start on, before they hold the lease.
 
     Safe to share between threads.
-
-    Attributes:
-        spool: the farm's queue.
     """
 
     def __init__(self, spool: JobQueue) -> None:
@@ -88,15 +81,7 @@ class Queue:
         self._started: tuple[int, float] | None = None
 
     def act(self, name: str, action: str, value: str) -> str:
-        """Carry out an action.
-
-        Args:
-            name: the job.
-            action: an Action's key, or "priority".
-            value: of a priority.
-
-        Returns:
-            The outcome, in a sentence.
+        """Carry out an action of a job, by its key, or set its priority; returns the outcome in a sentence.
 
         Raises:
             PipelineError: it cannot be done; says why.

@@ -21,10 +21,11 @@ from starlette.types import ASGIApp
 from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.queue.job_queue import JobQueue
+from pipeline.queue.states import JobState
 from pipeline.store.receipts import read_receipt
 from pipeline.web.auth import REPORT_POLICY, Access, Gate, form_of
 from pipeline.web.dashboard.actions import Queue, actions_of
-from pipeline.web.dashboard.farm_view import FarmView, JobCard, JobState, Kept
+from pipeline.web.dashboard.farm_view import FarmView, JobCard, Kept
 from pipeline.web.dashboard.job_view import STATE_GROUPS, Question, film_of, look_at_job
 from pipeline.web.dashboard.machine import Machine
 from pipeline.web.dashboard.pages import FARM_PARTS, JOB_PARTS, Pages, Part, job_url
@@ -70,11 +71,7 @@ class Dashboard:
             Route("/jobs/{name}/report", self.report),
             Route("/jobs/{name}/{action}", self.action, methods=["POST"]),
         ]
-        handlers: dict[Any, Callable[[Request, Exception], Response]] = {
-            HTTPException: self._http_error,
-            PipelineError: self._pipeline_error,
-            OSError: self._disk_error,
-        }
+        handlers = dict.fromkeys((HTTPException, PipelineError, OSError), self._error)
         app = Starlette(routes=routes, exception_handlers=handlers)
         app.router.redirect_slashes = False
         return Gate(app, self.access, refuse=self._message, ask=self._ask, welcome=self._welcome)
@@ -237,16 +234,12 @@ class Dashboard:
     def _welcome(self, _request: Request) -> Response:
         return HTMLResponse(self.pages.draw("welcome.html", farm=""))
 
-    def _http_error(self, request: Request, error: Exception) -> Response:
-        assert isinstance(error, HTTPException)
-        return self._message(request, error.status_code, error.detail)
-
-    def _pipeline_error(self, request: Request, error: Exception) -> Response:
+    def _error(self, request: Request, error: Exception) -> Response:
+        if isinstance(error, HTTPException):
+            return self._message(request, error.status_code, error.detail)
+        if isinstance(error, OSError):
+            return self._message(request, 503, f"the farm's disk: {error.strerror or error}")
         return self._message(request, 404 if isinstance(error, NotThereError) else 409, str(error))
-
-    def _disk_error(self, request: Request, error: Exception) -> Response:
-        assert isinstance(error, OSError)
-        return self._message(request, 503, f"the farm's disk: {error.strerror or error}")
 
 
 def _grouped(jobs: list[JobCard]) -> list[tuple[str, list[JobCard]]]:

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from pipeline.base.task import TaskState
-from pipeline.record.pages import StagePace
-from pipeline.record.reader import StageSummary
+from pipeline.record.reader import StagePace, StageSummary
 
 DONE = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
 LOST = (TaskState.FAILED, TaskState.UPSTREAM_FAILED)
@@ -66,9 +65,7 @@ def stage_rows(
     """The stages of a job.
 
     Args:
-        summaries: numbers of tasks by state.
-        paces: how fast stages are.
-        long_tasks: by stage.
+        summaries, paces, long_tasks: of the stages: numbers of tasks by state, speed, long tasks by stage.
         busy_s: how long attempts of a stage took in the last `window_s`, those beside each other added up [s].
         window_s: length of that time [s]; 0 if nothing runs.
     """

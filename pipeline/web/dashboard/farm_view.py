@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
@@ -16,10 +15,9 @@ from pipeline.base.errors import ManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import LeaseHolder, live_holder
 from pipeline.queue.job_queue import JobQueue, QueuedJob
-from pipeline.queue.states import state_of
+from pipeline.queue.states import JobState, state_after, state_of
 from pipeline.record.glance import Version, glance, version_of
 from pipeline.record.reader import AttemptRow, LastRun, ManifestReader, StageSummary
-from pipeline.run.events import JobOutcome
 from pipeline.store.artifacts import holds_frames
 from pipeline.web.dashboard.estimates import LongTask, Remaining, StageRow, remaining, stage_rows
 from pipeline.web.dashboard.places import NotThereError, Places, printable
@@ -33,27 +31,6 @@ WINDOW_S = 120.0
 
 T = TypeVar("T")
 _NO_RUN = LastRun(None, None)
-
-
-class JobState(StrEnum):
-    """State of a job in the farm."""
-
-    RUNNING = "running"
-    PAUSING = "pausing"
-    QUEUED = "queued"
-    PAUSED = "paused"
-    FAILED = "failed"
-    INTERRUPTED = "interrupted"
-    """Its last run neither ended nor goes on: it was killed."""
-    STOPPED = "stopped"
-    """It was cancelled, or stopped otherwise, and is not in the queue."""
-    RECORDED = "recorded"
-    """A recording: its frames are there, and nobody has asked for a film of them."""
-    NOT_STARTED = "not started"
-    """It has never run, and nothing is there of it."""
-    DONE = "done"
-    UNKNOWN = "unknown"
-    """Its record cannot be read."""
 
 
 class Picture(NamedTuple):
@@ -164,13 +141,7 @@ class _Remembered:
 
 @dataclass
 class FarmView:
-    """A view of a farm; records that have not changed are not read again.
-
-    Attributes:
-        places: the farm's folder.
-        spool: the farm's queue.
-        kept: the farm as it was last seen.
-    """
+    """A view of a farm, which is `kept` for a while; records that have not changed are not read again."""
 
     places: Places
     spool: JobQueue
@@ -218,7 +189,7 @@ class FarmView:
         except (NotThereError, OSError) as error:
             # Before its first run a queued job has no folder yet.
             waits = entry is not None and entry.text is not None and not os.path.lexists(self.places.farm / name)
-            state = JobState.UNKNOWN if entry is None else JobState(state_of(entry, runs=False))
+            state = JobState.UNKNOWN if entry is None else state_of(entry, runs=False)
             shown, flaw = printable(name), "" if waits else printable(str(error))
             if shown != name:
                 flaw = "the name of its folder is not UTF-8, so it can be no job's; rename it"
@@ -232,7 +203,7 @@ class FarmView:
         remembered = self._record(name, layout, runs=holder is not None)
         record, flaw = remembered.record, remembered.flaw
         if entry is not None:
-            state = JobState(state_of(entry, runs=holder is not None))
+            state = state_of(entry, runs=holder is not None)
         elif holder is not None:
             state = JobState.RUNNING
         elif flaw:
@@ -240,7 +211,7 @@ class FarmView:
         elif record.last_run.run is None:
             state = self._state_without_run(name, layout, record)
         else:
-            state = _state_of_outcome(record.last_run.outcome)
+            state = state_after(record.last_run.outcome)
         changed = max(submitted, remembered.version.changed_ns / 1e9)
         return JobCard(name, state, entry, holder, record, flaw, changed)
 
@@ -251,7 +222,7 @@ class FarmView:
             OSError: its folder cannot be read.
         """
         with suppress(NotThereError):
-            self.places.file(name, layout.take_story.name)
+            self.places.file(name, layout.recording_story.name)
             return JobState.RECORDED
         # A record may be lost; that of a recording that crashed is empty, as it is filled at the end.
         is_new = record.is_empty and not holds_frames(layout)
@@ -282,12 +253,7 @@ class FarmView:
 
 
 def read_record(manifest: ManifestReader, *, runs: bool) -> Record:
-    """Read what the list shows of a job's manifest.
-
-    Args:
-        manifest: the manifest.
-        runs: whether somebody runs the job; attempts that are open are else left over from a killed run.
-    """
+    """Read what the list shows of a job's manifest; unless the job `runs`, open attempts are those of a killed run."""
     now = time.time()
     summaries, running = manifest.summary(), tuple(manifest.running_attempts()) if runs else ()
     picture, pictures = manifest.newest_and_count_in("frames", ".png")
@@ -336,11 +302,3 @@ def _holds_job(layout: JobLayout) -> bool:
         return layout.job_file.is_file() or layout.manifest.is_file()
     except PermissionError:
         return True
-
-
-def _state_of_outcome(outcome: str | None) -> JobState:
-    if outcome == JobOutcome.SUCCEEDED:
-        return JobState.DONE
-    if outcome in (JobOutcome.FAILED, JobOutcome.TOO_MANY_FAILURES):
-        return JobState.FAILED
-    return JobState.INTERRUPTED if outcome is None else JobState.STOPPED

@@ -7,8 +7,6 @@ import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.base.errors import ManifestError
@@ -16,8 +14,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import TaskId, TaskState
 from pipeline.job.loading import MAX_BYTES
 from pipeline.record.glance import glance
-from pipeline.record.pages import TaskPage, TaskRow
-from pipeline.record.reader import AttemptRow, EventRow, ManifestReader
+from pipeline.record.reader import AttemptRow, EventRow, ManifestReader, TaskPage, TaskRow
 from pipeline.show.report.film import PLAYABLE
 from pipeline.web.dashboard.estimates import DONE, LOST
 from pipeline.web.dashboard.farm_view import JobCard, Picture, picture_of
@@ -139,10 +136,8 @@ def look_at_job(places: Places, card: JobCard, question: Question) -> JobDetail:
     layout = JobLayout(places.farm / card.name)
     found = _NOTHING
     if not card.flaw and card.total:
-        try:
+        with suppress(ManifestError, OSError, ValueError):  # changed since; the next look says what it is
             found = glance(layout.manifest, lambda manifest: _ask(manifest, question))
-        except (ManifestError, OSError, ValueError):
-            found = _NOTHING  # changed since the card was made; the next look says what it is
     return JobDetail(
         card=card,
         question=question,
@@ -187,10 +182,8 @@ def _story(places: Places, card: JobCard, question: Question, found: _Found) -> 
     shown = shown or (found.attempts[0] if found.attempts else None)
     log, size = "", 0
     if shown is not None and shown.log:
-        try:
+        with suppress(NotThereError, OSError):  # cleaned away, or not begun
             log, size = places.tail(card.name, shown.log, LOG_BYTES)
-        except (NotThereError, OSError):
-            log = ""  # cleaned away, or not begun
     return Story(found.row, found.attempts, 0 if shown is None else shown.number, log, size > LOG_BYTES)
 
 
@@ -227,21 +220,9 @@ def film_of(places: Places, card: JobCard) -> Film | None:
 def _codec(places: Places, name: str) -> str:
     """Codec of a job's film, as its job file says; the usual one where that says nothing."""
     try:
-        path = places.file(name, JobLayout(places.farm / name).job_file.name)
-        status = path.stat()
-        return _codec_in(path, (status.st_ino, status.st_mtime_ns, status.st_size))
-    except (NotThereError, OSError):
-        return USUAL_CODEC
-
-
-@lru_cache(maxsize=256)
-def _codec_in(path: Path, _version: tuple[int, int, int]) -> str:
-    """As it is asked for each second, a job file is read once a version. Raises OSError."""
-    with path.open("rb") as file:
-        content = file.read(MAX_BYTES + 1)
-    try:
-        movie = tomllib.loads(content.decode("utf-8-sig")).get("movie")
-    except (ValueError, RecursionError):  # none of ours; whether its film is played the browser finds out
+        with places.file(name, JobLayout(places.farm / name).job_file.name).open("rb") as file:
+            movie = tomllib.loads(file.read(MAX_BYTES + 1).decode("utf-8-sig")).get("movie")
+    except (NotThereError, OSError, ValueError, RecursionError):  # whether its film is played the browser finds out
         return USUAL_CODEC
     return str(movie.get("codec", USUAL_CODEC)) if isinstance(movie, dict) else USUAL_CODEC
 

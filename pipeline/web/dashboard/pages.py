@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from pipeline.base import wording
 from pipeline.base.task import TaskState
-from pipeline.record.pages import TaskRow
+from pipeline.record.reader import TaskRow
 from pipeline.web.dashboard.job_view import Question
 from pipeline.web.dashboard.places import printable
 

@@ -23,11 +23,7 @@ class Places:
         self.farm = farm.resolve()
 
     def job(self, name: str) -> Path:
-        """The folder of a job.
-
-        Raises:
-            NotThereError: there is none, or it is a link that leads out of the farm.
-        """
+        """The folder of a job. Raises NotThereError: there is none, or it is a link that leads out of the farm."""
         try:
             root = (self.farm / checked_name(name)).resolve()
         except (QueueError, OSError, RuntimeError) as error:  # a circle of links is a RuntimeError

@@ -32,15 +32,7 @@ class Thumbnails:
         return f"{status.st_mtime_ns:x}-{status.st_size:x}-{size}"
 
     def get(self, path: Path, size: str) -> bytes:
-        """The small version of a frame, a WebP picture.
-
-        Args:
-            path: a committed picture.
-            size: one of WIDTHS.
-
-        Raises:
-            NotThereError: it is gone, or no picture.
-        """
+        """The small version of a frame, a WebP picture. Raises NotThereError: it is gone, or no picture."""
         tag = self.tag(path, size)
         content = self._kept.get((path, size), tag)
         if content is None:

@@ -1,9 +1,9 @@
-"""Bodies by kind: `DRAWERS` says of each kind what is kept of a body and how that is drawn."""
+"""Bodies by form: `DRAWERS` says of each form what is kept of a body and how that is drawn."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.kinds.table import material_of
+from pipeline.kinds.table import KINDS, material_of
 from pipeline.model.looks import BODY, parts_of
 from pipeline.store.cache import read_frame, read_smoke_density
 from pipeline.web.drawing.canvas import Canvas, Rgb
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sim.core.snapshots import Snapshot
 
 MeshOf = Callable[[str, str], tuple[NDArray[Any], NDArray[Any]] | None]
-"""Vertices [m] and faces of a part of a rigid body, by their names; None before they are made."""
+"""Vertices [m] and faces of a part of a body, by their names; None before they are made."""
 
 PLAIN, SPEED, PRESSURE = "plain", "speed", "pressure"
 """Colourings of particles; the speed is computed from velocities, every other value is an array of the snapshot."""
@@ -49,14 +49,14 @@ class Range:
 class Extents:
     """Smallest and largest values that were seen, so that colours mean the same in every frame."""
 
-    # of particles by the value's name, of a smoke's density by "smoke/" and its name
+    # of points by the value's name, of cells by "density of " and the body's name
     values: dict[str, tuple[float, float]] = field(default_factory=dict)
     top_speed: float = 0.0  # largest speed that the solvers told of any frame [m/s]; 0 if they did not
 
     def see(self, bodies: Mapping[str, Body]) -> None:
         """Take the bodies of a frame into account."""
         for body_name, body in bodies.items():
-            for name, (low, high) in DRAWERS[body.kind].extents(body_name, body).items():
+            for name, (low, high) in _drawer_of(body.kind).extents(body_name, body).items():
                 least, most = self.values.get(name, (math.inf, -math.inf))
                 self.values[name] = min(least, low), max(most, high)
 
@@ -75,6 +75,7 @@ class Extents:
 class Look:
     """Settings of a picture."""
 
+    layers: frozenset[str] = frozenset()  # that are shown; of bodies by `pipeline.kinds.base.Display`
     color_by: str = PLAIN  # values that colour particles, by their name, or `PLAIN`
     smoke_as: str = POINTS  # `POINTS` or `SLICE`
     slice_axis: str = "y"  # "x", "y" or "z"
@@ -83,29 +84,33 @@ class Look:
 
 @dataclass(frozen=True)
 class Setting:
-    """All that drawers need besides a body: its job, the meshes of rigid bodies, the look, and the extents so far."""
+    """All that is needed besides a body to draw it: its job, the meshes of parts, the look, and the extents so far."""
 
     job: Job
     mesh: MeshOf
     look: Look = field(default_factory=Look)
     extents: Extents = field(default_factory=Extents)
 
+    def parameters(self, body: Body, name: str) -> Any:
+        """What the job says of a body; None if it has no such body."""
+        return next((each for each in KINDS[body.kind].bodies(self.job) if each.name == name), None)
+
 
 @dataclass(frozen=True)
-class BodyDrawer:
-    """Rules for the bodies of one kind."""
+class Drawer:
+    """Rules for the bodies of one form (`pipeline.kinds.base.Display`)."""
 
-    layer: str  # name of the box that shows and hides them
-    of: Callable[[Snapshot, int], Body]  # a body of a snapshot; of particles, at most so many
+    of: Callable[[Snapshot, int], Body]  # a body of a snapshot; of points, at most so many
     draw: Callable[[Canvas, str, Any, Setting], None]  # draws a body of a name as things `/KIND/NAME...`
     # smallest and largest values of a body that colours depend on, see `Extents`
     extents: Callable[[str, Any], dict[str, tuple[float, float]]] = lambda _name, _body: {}
-    # reads a body from a cached frame, where the whole snapshot would be too much
-    read: Callable[[Path, str], Body] | None = None
 
 
-def particles_of(snapshot: Snapshot, most: int) -> Particles:
-    """The particles; of more than `most`, every second, third, ... by number: the same ones in every frame."""
+# --- points ---
+
+
+def _particles_of(snapshot: Snapshot, most: int) -> Particles:
+    """The points; of more than `most`, every second, third, ... by number: the same ones in every frame."""
     position = np.asarray(snapshot.arrays["position"], np.float32)
     count = len(position)
     step = every(count, most)
@@ -121,7 +126,8 @@ def particles_of(snapshot: Snapshot, most: int) -> Particles:
         velocity = np.asarray(snapshot.arrays["velocity"], np.float32)[chosen]
         values[SPEED] = np.linalg.norm(velocity, axis=1).astype(np.float32)
     rest_density = snapshot.number("rest_density") if "rest_density" in snapshot.attributes else None
-    return Particles(own(position[chosen]), values, snapshot.number("particle_radius"), rest_density, count)
+    radius = snapshot.number(KINDS[snapshot.kind].display.radius)
+    return Particles(snapshot.kind, own(position[chosen]), values, radius, rest_density, count)
 
 
 def _extents_of_particles(_name: str, cloud: Particles) -> dict[str, tuple[float, float]]:
@@ -135,7 +141,7 @@ def _extents_of_particles(_name: str, cloud: Particles) -> dict[str, tuple[float
 
 
 def _draw_particles(canvas: Canvas, name: str, cloud: Particles, setting: Setting) -> None:
-    """Round particles; those that have no such values in one colour."""
+    """Round points; those that have no such values in one colour."""
     colors: Colors | Rgb
     values = cloud.values.get(setting.look.color_by)
     if values is None:
@@ -143,90 +149,111 @@ def _draw_particles(canvas: Canvas, name: str, cloud: Particles, setting: Settin
     else:
         span = setting.extents.range(setting.look.color_by, cloud)
         colors = ramp(values, span.low, span.high, around=span.around)
-    canvas.points(f"/fluid/{name}", cloud.position, colors, radius=cloud.radius)
+    canvas.points(f"/{cloud.kind}/{name}", cloud.position, colors, radius=cloud.radius)
 
 
-def _pose_of(snapshot: Snapshot, _most: int) -> Pose:
-    return Pose(*(np.asarray(snapshot.arrays[key], np.float64) for key in ("position", "orientation")))
-
-
-def _draw_parts(canvas: Canvas, name: str, pose: Pose, setting: Setting) -> None:
-    """All parts of a rigid body whose meshes are there."""
-    parameters = next((each for each in setting.job.rigid if each.name == name), None)
-    for part in () if parameters is None else parts_of(parameters.shape.type):
-        mesh = setting.mesh(name, part)
-        if mesh is not None:
-            color, path = color_of(setting.job, name, part, BODY_COLOR), f"/rigid/{name}/{part}"
-            canvas.mesh(path, *mesh, color, position=pose.position, orientation=pose.orientation)
+# --- meshes and parts ---
 
 
 def _sheet_of(snapshot: Snapshot, _most: int) -> Sheet:
     arrays = snapshot.arrays
-    return Sheet(np.asarray(arrays["position"], np.float32), np.asarray(arrays["triangles"], np.int32))
+    position, triangles = np.asarray(arrays["position"], np.float32), np.asarray(arrays["triangles"], np.int32)
+    return Sheet(snapshot.kind, position, triangles)
 
 
 def _draw_sheet(canvas: Canvas, name: str, sheet: Sheet, setting: Setting) -> None:
     color = color_of(setting.job, name, BODY, CLOTH)
-    canvas.mesh(f"/cloth/{name}", sheet.position, sheet.triangles, color, two_sided=True)
+    canvas.mesh(f"/{sheet.kind}/{name}", sheet.position, sheet.triangles, color, two_sided=True)
+
+
+def _pose_of(snapshot: Snapshot, _most: int) -> Pose:
+    position, orientation = (np.asarray(snapshot.arrays[key], np.float64) for key in ("position", "orientation"))
+    return Pose(snapshot.kind, position, orientation)
+
+
+def _draw_parts(canvas: Canvas, name: str, pose: Pose, setting: Setting) -> None:
+    """All parts of a body whose meshes are there."""
+    parameters = setting.parameters(pose, name)
+    for part in () if parameters is None else parts_of(parameters.shape.type):
+        mesh = setting.mesh(name, part)
+        if mesh is not None:
+            color, path = color_of(setting.job, name, part, BODY_COLOR), f"/{pose.kind}/{name}/{part}"
+            canvas.mesh(path, *mesh, color, position=pose.position, orientation=pose.orientation)
+
+
+# --- density ---
 
 
 def _smoke_of(snapshot: Snapshot, _most: int) -> Smoke:
     x, y, z = snapshot.vector("origin")
-    return Smoke(np.asarray(snapshot.arrays["density"], np.float32), (x, y, z), snapshot.number("cell_size"))
+    density = np.asarray(snapshot.arrays["density"], np.float32)
+    return Smoke(snapshot.kind, density, (x, y, z), snapshot.number("cell_size"))
 
 
 def _extents_of_smoke(name: str, smoke: Smoke) -> dict[str, tuple[float, float]]:
-    return {f"smoke/{name}": (0.0, float(smoke.density.max()))} if smoke.density.size else {}
+    return {f"density of {name}": (0.0, float(smoke.density.max()))} if smoke.density.size else {}
 
 
 def _draw_smoke(canvas: Canvas, name: str, smoke: Smoke, setting: Setting) -> None:
     """Points, a cell each, or a slice."""
-    parameters = next((each for each in setting.job.smoke if each.name == name), None)
+    parameters = setting.parameters(smoke, name)
     if parameters is None:
         return
-    look, (_, densest) = setting.look, setting.extents.values.get(f"smoke/{name}", (0.0, 0.0))
+    look, path = setting.look, f"/{smoke.kind}/{name}"
+    _, densest = setting.extents.values.get(f"density of {name}", (0.0, 0.0))
     if look.smoke_as == SLICE:
         box = parameters.corners(setting.job.domain)
         across = cut(smoke, axis=look.slice_axis, share=look.slice_share, box=box, densest=densest)
         if across is not None:
-            canvas.slice(f"/smoke/{name}", across)
+            canvas.slice(path, across)
     else:
         cells = points(smoke, densest=densest)
-        canvas.points(f"/smoke/{name}", cells.position, cells.colors, radius=0.4 * smoke.cell_size)
+        canvas.points(path, cells.position, cells.colors, radius=0.4 * smoke.cell_size)
 
 
-DRAWERS: Mapping[str, BodyDrawer] = {
-    "fluid": BodyDrawer("Particles", particles_of, _draw_particles, _extents_of_particles),
-    "cloth": BodyDrawer("Cloth", _sheet_of, _draw_sheet),
-    "rigid": BodyDrawer("Rigid bodies", _pose_of, _draw_parts),
-    "smoke": BodyDrawer(
-        "Smoke", _smoke_of, _draw_smoke, _extents_of_smoke, lambda path, name: Smoke(*read_smoke_density(path, name))
-    ),
+DRAWERS: Mapping[str, Drawer] = {
+    "points": Drawer(_particles_of, _draw_particles, _extents_of_particles),
+    "mesh": Drawer(_sheet_of, _draw_sheet),
+    "parts": Drawer(_pose_of, _draw_parts),
+    "density": Drawer(_smoke_of, _draw_smoke, _extents_of_smoke),
 }
-"""Drawers by kind of body."""
+"""Drawers by form."""
+
+
+def _drawer_of(kind: str) -> Drawer:
+    return DRAWERS[KINDS[kind].display.form]
+
+
+# --- bodies of any kind ---
+
+
+def body_of(snapshot: Snapshot, most: int) -> Body:
+    """A body of a snapshot; of points, at most so many."""
+    return _drawer_of(snapshot.kind).of(snapshot, most)
 
 
 def read_bodies(path: Path, kinds: Mapping[str, str], most: int) -> dict[str, Body]:
-    """All bodies of a cached frame, whose kinds are given by name; of particles, at most so many."""
+    """All bodies of a cached frame, whose kinds are given by name; of points, at most so many."""
     found: dict[str, Body] = {}
-    for kind, drawer in DRAWERS.items():
-        names = [name for name, of in kinds.items() if of == kind]
-        if drawer.read is not None:
-            found |= {name: drawer.read(path, name) for name in names}
-        elif names:
-            snapshots = read_frame(path, kind=kind).bodies
-            found |= {name: drawer.of(snapshot, most) for name, snapshot in snapshots.items()}
+    for kind in dict.fromkeys(kind for kind in kinds.values() if kind in KINDS):
+        if KINDS[kind].display.form == "density":  # whose other grids would be too much
+            names = [name for name, of in kinds.items() if of == kind]
+            found |= {name: Smoke(kind, *read_smoke_density(path, name)) for name in names}
+        else:
+            found |= {name: body_of(snapshot, most) for name, snapshot in read_frame(path, kind=kind).bodies.items()}
     return found
 
 
-def draw_bodies(
-    canvas: Canvas, bodies: Mapping[str, Body], setting: Setting, *, layers: Collection[str] | None = None
-) -> None:
-    """Draw bodies, by name; only those of some layers if these are given."""
+def draw_bodies(canvas: Canvas, bodies: Mapping[str, Body], setting: Setting) -> None:
+    """Draw those of some bodies, by name, whose layers are shown."""
     for name, body in bodies.items():
-        drawer = DRAWERS[body.kind]
-        if layers is None or drawer.layer in layers:
-            drawer.draw(canvas, name, body, setting)
+        if KINDS[body.kind].display.layer in setting.look.layers:
+            _drawer_of(body.kind).draw(canvas, name, body, setting)
+
+
+def has_form(job: Job, form: str) -> bool:
+    """Whether a job has bodies of a form."""
+    return any(kind.display.form == form and kind.bodies(job) for kind in KINDS.values())
 
 
 def color_of(job: Job, body: str, part: str, usual: Rgb) -> Rgb:

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.web.drawing.camera import camera_orientation, quaternion_of, vertical_fov
 from pipeline.web.drawing.colors import Colors
 from pipeline.web.drawing.smoke_pictures import Slice
-from render.camera_path import View
+from render.camera_path import SENSOR_WIDTH_MM, View
 
 Rgb = tuple[int, int, int]
 NO_TURN = (1.0, 0.0, 0.0, 0.0)
@@ -61,14 +61,7 @@ class Canvas:
                 del self._kinds[name]
 
     def points(self, name: str, position: NDArray[np.float32], colors: Colors | Rgb, *, radius: float) -> None:
-        """Round particles.
-
-        Args:
-            name: of the thing.
-            position: [m], (n, 3).
-            colors: of each, (n, 3), or of all.
-            radius: of each [m].
-        """
+        """Round particles at positions [m], (n, 3), of one radius [m]; colours of each, (n, 3), or of all."""
         if not len(position):
             return
         middle = (position.min(axis=0) + position.max(axis=0)) / 2.0
@@ -107,13 +100,10 @@ class Canvas:
 
         Args:
             name: of the thing.
-            vertices: [m], (n, 3), in its own axes.
-            faces: (k, 3) vertex indices.
-            color: sRGB.
-            opacity: 0 to 1; opaque if omitted.
+            vertices, faces: [m], (n, 3), in its own axes, and their indices, (k, 3).
+            color, opacity: sRGB, and 0 to 1; opaque if omitted.
             two_sided: as cloth is.
-            position: where its origin is [m].
-            orientation: unit quaternion w, x, y, z.
+            position, orientation: of its axes: [m], and a unit quaternion w, x, y, z.
         """
         rows, triangles = np.asarray(vertices, np.float32), np.asarray(faces, np.uint32)
         if not len(triangles):
@@ -184,16 +174,9 @@ class Canvas:
 
 def box_edges(low: Sequence[float], high: Sequence[float]) -> NDArray[np.float32]:
     """The twelve edges of a box [m], (12, 2, 3)."""
-    ends = np.array([low, high], np.float32)
-    edges = []
-    for axis in range(3):
-        first, second = (each for each in range(3) if each != axis)
-        for a in (0, 1):
-            for b in (0, 1):
-                edge = np.empty((2, 3), np.float32)
-                edge[:, axis], edge[:, first], edge[:, second] = ends[:, axis], ends[a, first], ends[b, second]
-                edges.append(edge)
-    return np.array(edges)
+    corners = np.array(list(product(*zip(low, high, strict=True))), np.float32)
+    pairs = [pair for pair in combinations(range(8), 2) if np.count_nonzero(np.diff(corners[list(pair)], axis=0)) == 1]
+    return corners[pairs]
 
 
 def _vector(values: ArrayLike) -> NDArray[np.float64]:
@@ -203,3 +186,38 @@ def _vector(values: ArrayLike) -> NDArray[np.float64]:
 def _quaternion(values: ArrayLike) -> NDArray[np.float64]:
     quaternion = _vector(values)
     return quaternion / np.linalg.norm(quaternion)
+
+
+# --- cameras ---
+
+
+def begin_at(server: viser.ViserServer, position: ArrayLike, target: ArrayLike, *, fov: float) -> None:
+    """Have pages begin at a place, looking at another [m], with this angle from the lower to the upper edge [rad]."""
+    camera = server.initial_camera
+    camera.position, camera.look_at = np.asarray(position, np.float64), np.asarray(target, np.float64)
+    camera.up, camera.fov = (0.0, 0.0, 1.0), fov
+
+
+def vertical_fov(view: View, aspect: float) -> float:
+    """Angle between the lower and the upper edge of a picture [rad]; Blender's sensor fits its longer side."""
+    tangent = SENSOR_WIDTH_MM / 2.0 / view.focal_length_mm
+    return 2.0 * float(np.arctan(tangent / max(1.0, aspect)))
+
+
+def camera_orientation(view: View) -> NDArray[np.float64]:
+    """Unit quaternion w, x, y, z of a camera whose axes are right, down and forward, level as Blender's is."""
+    forward = np.asarray(view.look_at, np.float64) - np.asarray(view.position, np.float64)
+    distance = np.linalg.norm(forward)
+    forward = forward / distance if distance > 0.0 else np.array([0.0, 0.0, -1.0])
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    length = np.linalg.norm(right)
+    right = right / length if length > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return quaternion_of(np.stack([right, np.cross(forward, right), forward], axis=1))
+
+
+def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternion w, x, y, z of a rotation matrix, whose columns are the turned axes."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return np.array([w, x, y, z])

@@ -22,15 +22,9 @@ BODY = (176, 176, 170)
 
 
 def ramp(values: ArrayLike, low: float, high: float, *, around: bool = False) -> Colors:
-    """Colours of values.
+    """Colours of values, (n,), between those of the first and the last colour; what is not finite counts as low.
 
-    Args:
-        values: (n,); what is not finite counts as low.
-        low, high: values of the first and the last colour.
-        around: the middle between them is neutral.
-
-    Returns:
-        (n, 3) sRGB, uint8.
+    `around`: the middle is neutral. Returns sRGB, (n, 3) uint8.
     """
     stops = _rgb(_AROUND if around else _RISING)
     span = high - low

@@ -1,10 +1,10 @@
-"""Bodies as they are drawn: arrays in world axes, one class for each kind."""
+"""Bodies as they are drawn: arrays in world axes, one class for each form (`pipeline.kinds.base.Display`)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,9 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Particles:
-    """Particles of a fluid, or of its whitewater."""
+    """Points, such as particles of a fluid or its whitewater."""
 
-    kind: ClassVar[str] = "fluid"
+    kind: str
     position: Floats  # [m], (n, 3)
     values: Mapping[str, Floats]  # quantities that they can be coloured by, (n,) each, by name
     radius: float  # of a particle [m]
@@ -26,9 +26,9 @@ class Particles:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A cloth: positions of its nodes [m], (n, 3), and its triangles, (k, 3) int32."""
+    """A mesh, such as a cloth: positions of its nodes [m], (n, 3), and its triangles, (k, 3) int32."""
 
-    kind: ClassVar[str] = "cloth"
+    kind: str
     position: Floats
     triangles: NDArray[np.int32]
 
@@ -37,16 +37,16 @@ class Sheet:
 class Pose:
     """Place of a rigid body: position [m], (3,), and orientation, a unit quaternion w, x, y, z, (4,)."""
 
-    kind: ClassVar[str] = "rigid"
+    kind: str
     position: NDArray[np.float64]
     orientation: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Smoke:
-    """The cells of a smoke that are not empty."""
+    """The cells of a grid that are not empty, such as those of a smoke."""
 
-    kind: ClassVar[str] = "smoke"
+    kind: str
     density: Floats  # (nx, ny, nz) [-]
     origin: tuple[float, float, float]  # lower corner of the first cell [m]
     cell_size: float  # [m]

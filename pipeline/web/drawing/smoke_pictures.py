@@ -59,17 +59,12 @@ def cut(
     box: tuple[tuple[float, float, float], tuple[float, float, float]],
     densest: float,
 ) -> Slice | None:
-    """A slice across an axis.
+    """A slice across an axis, "x", "y" or "z"; None where there is no smoke.
 
     Args:
-        smoke: of a frame.
-        axis: "x", "y" or "z".
         share: where in the box, 0 at its lower face and 1 at its upper.
         box: the smoke's whole box [m], of which `smoke` has what is not empty.
         densest: density that is opaque white.
-
-    Returns:
-        None where there is no smoke.
     """
     normal = AXES.index(axis)
     place = box[0][normal] + share * (box[1][normal] - box[0][normal])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,31 +18,15 @@ Vector = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 FOLLOWING_RATE = 15.0
-"""Rate of the spring to the mouse [1/s]: critically damped, most of the way in 0.2 s."""
-
+"""Rate of the spring to the mouse [1/s]: critically damped, most of the distance in 0.2 s."""
 LARGEST_SPEED = 3.0
 """Nothing is led faster [m/s]: a body gets 2.5 mm on in a substep of cloth then, and a mouse jumps at will."""
-
 SPIN_DECAY = 6.0
 """A held body stops turning at this rate [1/s]."""
-
 AT_REST = 1.0e-6
 """Closer to the mouse than this [m], nodes are left where they are."""
-
 GRABBED_SPACINGS = 1.5
-"""Cloth is grabbed by the nodes within so many spacings: a single node would be drawn into a spike."""
-
-
-class Constraint(Protocol):
-    """A constraint that leads something towards a target [m], (3,)."""
-
-    target: Vector
-
-    def move(self, dt: float) -> None:
-        """Lead it on for a frame of dt [s]."""
-
-    def release(self) -> None:
-        """End it."""
+"""Cloth is grabbed by the nodes within this many spacings: a single node would be drawn into a spike."""
 
 
 def towards(target: Vector, position: Vector, velocity: Vector, dt: float) -> Vector:
@@ -101,11 +85,7 @@ class BodyPath:
 
 
 class NodePath:
-    """A path of nodes of a cloth, led as one; when they are released they fly on, unless they are a pin's.
-
-    Attributes:
-        nodes: numbers of the nodes within the cloth, (k,).
-    """
+    """A path of nodes of a cloth, (k,), led as one; when they are released they fly on, unless they are a pin's."""
 
     def __init__(self, cloth: Any, name: str, nodes: NDArray[np.int64], *, stays: bool) -> None:
         """Hold nodes of the cloth of this name; `stays`: for ever, as a pin does."""
@@ -133,6 +113,10 @@ class NodePath:
             self._cloth.let_go(self._name, self.nodes.tolist())
 
 
+Constraint = BodySpring | BodyPath | NodePath
+"""What leads something towards its `target` [m], (3,)."""
+
+
 class Handle(NamedTuple):
     """Something that a browser holds: a body, a pin by its number, or a place of a cloth, one for each browser."""
 
@@ -142,11 +126,7 @@ class Handle(NamedTuple):
 
 
 class Drags:
-    """All that browsers hold in a scene.
-
-    Args:
-        job: as it is simulated.
-    """
+    """All that browsers hold in a scene."""
 
     def __init__(self, job: Job) -> None:
         self._job = job

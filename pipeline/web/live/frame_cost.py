@@ -3,49 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.kinds.checks.steps import SPEED_OF_SOUND_IN_SPEEDS, stable_dt
+from pipeline.kinds.checks.steps import stable_dt
 from pipeline.kinds.cloth import count_cloth_nodes
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.time_step import VISCOUS_NUMBER
+from sim.fluid.traits import TRAITS
 
 if TYPE_CHECKING:
     from pipeline.model.job import Job
 
 NODE_SUBSTEP_S = 1.4e-6
-"""Core time of a node in a substep of cloth in contact [s]. Twice what the scene alone was measured to take (10 000
-nodes, 20 substeps: 101 to 144 ms of processor time, docs/live.md): threads wait for each other, and page and browser
-want their share of the cores."""
-
+"""Core time of a node in a substep of cloth in contact [s], with room for page and browser (docs/guide/live.md)."""
 APART_SHARE = 0.4
-"""Of it, where cloth does not collide with itself: measured are 0.25 to 0.35 on two cores."""
-
-PARTICLE_STEP_S = {"wcsph": 0.45e-6, "dfsph": 2.3e-6, "pcisph": 1.7e-6}
-"""Core time of a particle in a step at a support of two spacings [s] (docs/guide/live.md)."""
-
+"""Share of it where cloth does not collide with itself."""
 VISCOUS_STEP_S = 12.0e-6
-"""Time that solving for viscosity adds to it [s]: 20 to 70 iterations a step, where a pressure takes 3 to 12."""
-
+"""Core time of a particle that solving for viscosity adds to a step [s]: 20 to 70 iterations."""
 BODIES_FACTOR = 2.0
 """Factor of an implicit pressure that carries bodies, near which it is solved for ten times better."""
-
-STEP_S = {"wcsph": 0.25e-3, "dfsph": 1.7e-3, "pcisph": 1.7e-3}
-"""Of a step, however few particles there are, and however many cores: launches of its kernels [s]."""
-
 VISCOUS_LAUNCHES_S = 3.0e-3
-"""Time that solving for viscosity adds to that [s]."""
-
-SPLASHING = {"wcsph": 1.6, "dfsph": 1.8, "pcisph": 1.8}
-"""Largest speed over that of a fall from the top: jets are faster, and squeezed particles of wcsph are stiffer."""
-
+"""Time of launches that solving for viscosity adds to a step [s]."""
 BRAKED = 0.5
-"""The same of a fluid so stiff that its viscosity is solved for."""
+"""Largest speed over that of a fall from the top, of a fluid so stiff that its viscosity is solved for."""
 
 
 def fewest_for_bodies(job: Job) -> int:
@@ -56,7 +40,7 @@ def fewest_for_bodies(job: Job) -> int:
 
 
 def cloth_frame_s(job: Job, *, power: float) -> float:
-    """Time that a frame of the cloths takes [s], on so many cores."""
+    """Time that a frame of the cloths takes [s], on as many cores as `power`."""
     if not job.cloth:
         return 0.0
     substeps = max(job.cloth[0].substeps or DEFAULT_SUBSTEPS, fewest_for_bodies(job))
@@ -65,23 +49,15 @@ def cloth_frame_s(job: Job, *, power: float) -> float:
 
 
 def fluid_frame_s(job: Job, particles: int, *, power: float) -> float:
-    """Time that a frame of the fluids takes [s], on so many cores.
-
-    Args:
-        job: as it is simulated live.
-        particles: of all fluids.
-        power: cores that compute it.
-
-    Raises:
-        ShapeError: a block cannot be built.
-    """
+    """Time that a frame of the fluids takes [s], of this many particles. Raises ShapeError: a block cannot be built."""
     if not job.fluid:
         return 0.0
     shared, is_viscous = job.fluid[0], _is_implicit(job)
-    particle_s = PARTICLE_STEP_S[shared.solver] * (shared.support_in_spacings / 2.0) ** 3
-    if shared.solver != "wcsph" and any(body.kind == "dynamic" for body in job.rigid):
+    traits = TRAITS[shared.solver]
+    particle_s = traits.particle_step_s * (shared.support_in_spacings / 2.0) ** 3
+    if not traits.has_sound_speed and any(body.kind == "dynamic" for body in job.rigid):
         particle_s *= BODIES_FACTOR
-    step_s = STEP_S[shared.solver]
+    step_s = traits.step_s
     if is_viscous:
         particle_s, step_s = particle_s + VISCOUS_STEP_S, step_s + VISCOUS_LAUNCHES_S
     return steps_a_frame(job) * (particles * particle_s / power + step_s)
@@ -94,7 +70,7 @@ def steps_a_frame(job: Job) -> float:
         dt = float(shared.dt)
     else:
         is_viscous = _is_implicit(job)
-        dt = stable_dt(job, shared, (BRAKED if is_viscous else SPLASHING[shared.solver]) * _fall_speed(job))
+        dt = stable_dt(job, shared, (BRAKED if is_viscous else TRAITS[shared.solver].splash_factor) * _fall_speed(job))
         stiffest = _stiffest(job)
         if stiffest > 0.0 and not is_viscous:
             dt = min(dt, VISCOUS_NUMBER * (2.0 * shared.particle_radius) ** 2 / stiffest)
@@ -106,15 +82,8 @@ def _is_implicit(job: Job) -> bool:
     from sim.fluid.viscosity_implicit import is_implicit
 
     shared = job.fluid[0]
-    speed = _fall_speed(job)
-    return is_implicit(
-        shared.viscosity_solver,
-        viscosity=_stiffest(job),
-        spacing=2.0 * shared.particle_radius,
-        speed=speed if shared.solver != "wcsph" else shared.sound_speed or SPEED_OF_SOUND_IN_SPEEDS * speed,
-        dt=shared.dt,
-        cfl=shared.cfl,
-    )
+    signal_speed = shared.sound_speed or TRAITS[shared.solver].speed_ratio * _fall_speed(job)
+    return is_implicit(shared, _stiffest(job), signal_speed)
 
 
 def _stiffest(job: Job) -> float:
@@ -124,7 +93,7 @@ def _stiffest(job: Job) -> float:
 
 def _fall_speed(job: Job) -> float:
     """Largest speed [m/s] of what falls from the top of a block, or out of an opening, to the domain's floor."""
-    from sim.shapes import build_solid
+    from sim.shapes.placement import build_solid
 
     points, velocities = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for fluid in job.fluid:
@@ -141,22 +110,6 @@ def _fall_speed(job: Job) -> float:
     return expected_speed(np.concatenate(points), np.concatenate(velocities), job.domain, job.gravity)
 
 
-FRAME_COSTS: Mapping[str, Callable[[Job, int, float], float]] = {
-    "cloth": lambda job, _particles, power: cloth_frame_s(job, power=power),
-    "fluid": lambda job, particles, power: fluid_frame_s(job, particles, power=power),
-}
-"""Estimates by kind of body, of a job, its particles and its cores; bodies of other kinds cost next to nothing."""
-
-
 def frame_s(job: Job, particles: int, *, power: float) -> float:
-    """Time that a frame of a scene takes [s].
-
-    Args:
-        job: as it is simulated live.
-        particles: of all fluids.
-        power: cores that compute it.
-
-    Raises:
-        ShapeError: a block cannot be built.
-    """
-    return sum(cost(job, particles, power) for cost in FRAME_COSTS.values())
+    """Time that a frame of a scene takes [s]; rigid bodies cost next to nothing. Raises ShapeError as above."""
+    return cloth_frame_s(job, power=power) + fluid_frame_s(job, particles, power=power)

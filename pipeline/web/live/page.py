@@ -6,12 +6,12 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.web.live.parameters import Parameter, Value
+from pipeline.kinds.live_parameters import Parameter, Value
+from pipeline.web.live.admission import told_changes
 from pipeline.web.live.recording import Recorder
 from pipeline.web.live.saving import save_job
 from pipeline.web.live.scene import LiveScene
 from pipeline.web.live.session import Session, Status
-from pipeline.web.live.step_size import told_changes
 
 if TYPE_CHECKING:
     import viser
@@ -21,21 +21,13 @@ DECADE_STEP = 0.02
 
 
 class LivePage:
-    """The page of a session, which all browsers share.
-
-    Args:
-        server: viser's.
-        session: the scene.
-        recorder: records it, and has the job as it was read: differences from that for the sake of speed are told.
-        folder: where jobs are saved.
-    """
+    """The page of a session, which all browsers share; jobs are saved in the folder."""
 
     def __init__(self, server: viser.ViserServer, session: Session, recorder: Recorder, folder: Path) -> None:
         self._session, self._recorder, self._folder = session, recorder, folder
         self._written = recorder.loaded.job
         self._sliders: dict[str, tuple[Parameter, Any]] = {}
         self._revision = session.revision
-        self._said = self._noticed = ""
         gui = server.gui
         gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
@@ -56,24 +48,19 @@ class LivePage:
         async def _(client: Any) -> None:
             session.ask(session.drags.release_all, client.client_id)
 
-    # --- from the session's thread ----------------------------------------------------------------------------------
+    # --- from the session's thread ---
 
     def show(self) -> None:
         """Show where the scene is."""
         self._scene.show(self._session.bodies(), self._session.drags.pins)
 
     def tell(self, status: Status) -> None:
-        """Show the status, and the parameters if something other than the page has changed them."""
+        """Show the status, and the parameters if something other than the page has changed them; only news are sent."""
         self._changes.content = _plain(told_changes(self._written, self._session.values))
         self._pause.label = "Go on" if status.is_paused else "Pause"
         self._record.label = "Stop recording" if self._recorder.is_recording else "Record"
-        written = _written(status, self._session.speed)
-        if written != self._said:
-            self._said = written
-            self._state.content = written
-        if status.message != self._noticed:
-            self._noticed = status.message
-            self._notice.content = f"**{_plain(status.message)}**" if status.message else ""
+        self._state.content = _written(status, self._session.speed)
+        self._notice.content = f"**{_plain(status.message)}**" if status.message else ""
         if self._session.revision != self._revision:
             self._revision = self._session.revision
             for name, (parameter, handle) in self._sliders.items():
@@ -83,7 +70,7 @@ class LivePage:
                 if parameter.widget == "decades":
                     handle.label = _label(parameter, self._session.values[name])
 
-    # --- what it is made of -----------------------------------------------------------------------------------------
+    # --- what it is made of ---
 
     def _add_clock(self, gui: Any) -> None:
         session = self._session
@@ -117,10 +104,9 @@ class LivePage:
         elif parameter.widget == "decades":
             low, high = math.log10(parameter.low), math.log10(parameter.high)
             marks = ((low, f"{parameter.low:.0e}"), (high, f"{parameter.high:.0e}"))
-            handle = gui.add_slider(
-                _label(parameter, start), low, high, DECADE_STEP, _shown(parameter, start), marks=marks,
-                hint=f"{parameter.name}: the slider has the power of ten",
-            )  # fmt: skip
+            hint = f"{parameter.name}: the slider has the power of ten"
+            label, shown = _label(parameter, start), _shown(parameter, start)
+            handle = gui.add_slider(label, low, high, DECADE_STEP, shown, marks=marks, hint=hint)
         else:
             step = 1 if parameter.widget == "whole" else (parameter.high - parameter.low) / 200.0
             handle = gui.add_slider(parameter.label, parameter.low, parameter.high, step, start, hint=parameter.name)

@@ -24,6 +24,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
 from pipeline.job.loading import job_of_text
 from pipeline.job.overrides import Override
+from pipeline.kinds.live_parameters import Value
 from pipeline.record.manifest import Manifest
 from pipeline.record.reconcile import reconcile
 from pipeline.run.executors.failures import describe, is_out_of_memory
@@ -32,7 +33,6 @@ from pipeline.stages.simulate import SimulateStage
 from pipeline.store.artifacts import committing
 from pipeline.store.cache import validate_frame, write_frame
 from pipeline.store.provenance import maker
-from pipeline.web.live.parameters import Value
 from pipeline.web.live.saving import bodies_led_before, numbered_paths, text_with_values
 from pipeline.web.live.session import Session
 from sim.core.world import FrameReport
@@ -52,12 +52,6 @@ class Recorder:
     Attributes:
         loaded: the job, as it was read.
         became: the outcome of the last recording that has ended, "" before.
-
-    Args:
-        loaded: the job.
-        session: the scene.
-        output: where jobs' folders lie.
-        device: that computes the frames.
     """
 
     def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:
@@ -134,7 +128,6 @@ class _Recording:
     """A recording on its way to the disk. It holds its folder's lease: nobody runs a job whose frames still come.
 
     Attributes:
-        layout: its folder.
         frames: number of committed ones; the writer's thread counts them.
         is_told: whether its job file has them all: not until the end, nor where nothing could be written then.
     """
@@ -160,11 +153,7 @@ class _Recording:
             self._held = held.pop_all()
 
     def add(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
-        """Have a frame written; waits while another one waits.
-
-        Raises:
-            LeaseLostError: the folder is another process's now.
-        """
+        """Have a frame written; waits while another one waits. Raises LeaseLostError."""
         self._lease.check()
         mine = replace(report, frame=self._handed_in, time_s=self._handed_in * self._dt)
         self._writer.submit(partial(self._commit, mine, bodies))
@@ -205,7 +194,7 @@ class _Recording:
             "led": self._led(),
             "note": "Steered by hand: no job file makes these frames again.",
         }
-        replace_durably(self.layout.take_story, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
+        replace_durably(self.layout.recording_story, json.dumps(story, indent=2, ensure_ascii=False) + "\n")
 
     def _led(self) -> list[str]:
         """Bodies that the job has at rest, and that could be led here."""
@@ -214,21 +203,16 @@ class _Recording:
         return [*(bodies_led_before(self._loaded) or ()), *here]
 
     def _commit(self, report: FrameReport, bodies: Mapping[str, Snapshot]) -> None:
-        """Write a frame into the folder, if that is ours: its frames may have been counted by another process.
-
-        Raises:
-            LeaseLostError: it is another process's now.
-        """
+        """Write a frame into the folder. Raises LeaseLostError: it is another process's, which counts its frames."""
         self._lease.heartbeat()  # which asks now, as this process may have stood still since the last time
-        commit = committing(
+        with committing(
             self.layout,
             self.layout.frame_cache(report.frame),
             task=self._task,
             attempt=1,
             fingerprint=self._fingerprint,
             validate=validate_frame,
-        )
-        with commit:
+        ) as commit:
             write_frame(commit.path, bodies, report, device=self._device)
         self.frames += 1
 
@@ -257,11 +241,7 @@ def _told(error: BaseException) -> str:
 
 
 def _new_folder(output: Path, stem: str) -> Path:
-    """A folder that nobody has, made.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """A folder that nobody has, made. Raises OSError: it cannot be made."""
     for folder in numbered_paths(output, stem):
         try:
             folder.mkdir(parents=True)

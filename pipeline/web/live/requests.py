@@ -19,7 +19,8 @@ class Requests:
     """A queue of calls from any thread, met by the thread that owns the scene.
 
     Attributes:
-        refused: number of requests that were refused so far.
+        revision: grows with every request that is refused.
+        silent: requests that leave a refusal standing.
 
     Args:
         message: the first one.
@@ -28,7 +29,8 @@ class Requests:
     def __init__(self, message: str) -> None:
         self._queue: SimpleQueue[tuple[Request, tuple[Any, ...]]] = SimpleQueue()
         self._result, self._refusal = message, ""
-        self.refused = 0
+        self.revision = 0
+        self.silent: tuple[Request, ...] = ()
 
     @property
     def message(self) -> str:
@@ -48,30 +50,25 @@ class Requests:
         """Have a method called between two frames; an error that is meant for people becomes the message."""
         self._queue.put((request, arguments))
 
-    def meet(self, wait_s: float, *, silent: tuple[Request, ...]) -> None:
+    def meet_requests(self, wait_s: float = 0.0) -> None:
         """Do all that was asked for; wait for the first request for so long at most [s].
-
-        Args:
-            wait_s: longest wait [s].
-            silent: requests that leave a refusal standing.
 
         Raises:
             CannotGoOnError: a scene that had to begin anew has no memory.
         """
         try:
-            asked = self._queue.get(timeout=wait_s) if wait_s > 0.0 else self._queue.get_nowait()
+            request, arguments = self._queue.get(timeout=wait_s) if wait_s > 0.0 else self._queue.get_nowait()
             while True:
-                request, arguments = asked
                 try:
                     request(*arguments)
                 except CannotGoOnError:
                     raise
                 except (ValueError, PipelineError, OSError) as error:
                     self._refusal = str(error)
-                    self.refused += 1
+                    self.revision += 1
                 else:
-                    if request not in silent:
+                    if request not in self.silent:
                         self._refusal = ""
-                asked = self._queue.get_nowait()
+                request, arguments = self._queue.get_nowait()
         except Empty:
             return

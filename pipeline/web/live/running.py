@@ -1,7 +1,8 @@
-"""`pipeline live`, put together: the scene in this thread, its page beside it."""
+"""`pipeline live`, put together: the scene in this thread, its page beside it, and the loop between them."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from pipeline.base.errors import PipelineError, StageUnavailableError
 from pipeline.run.executors.failures import describe, is_out_of_memory
-from pipeline.web.live.loop import run
 from pipeline.web.live.recording import Recorder
 from pipeline.web.live.requests import CannotGoOnError
 from pipeline.web.live.session import Session
@@ -18,6 +18,13 @@ from pipeline.web.serving import address, page_server
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
     from pipeline.model.job import Job
+    from pipeline.web.live.page import LivePage
+
+SHOWN_EVERY_S = 1.0 / 30.0
+"""Least time between two pictures of a page, on average."""
+TOLD_EVERY_S = 0.2
+LONGEST_WAIT_S = 0.05
+"""Longest wait for requests and the end, while time stands still or is slow."""
 
 
 def show_live(
@@ -38,14 +45,11 @@ def show_live(
     """Run a scene until it `ends`, and show it.
 
     Args:
-        loaded: the job as it was read.
-        job: as it is simulated, `pipeline.web.live.admission.live_job`.
-        host, port: address to listen at.
+        loaded, job: the job as it was read, and as it is simulated (`live_job`).
         gave_up: whether live changed the job for the sake of speed.
         longest_frame_s: a frame that takes longer counts as blown up [s].
-        output: where recordings become jobs' folders.
-        folder: where jobs are saved.
-        threads: of the processor; all if omitted.
+        output, folder: where recordings become jobs' folders, and where jobs are saved.
+        threads: of the processor; None for all.
         paused: begin standing still.
         say: prints a line: the page's address, and the outcome of a recording that goes on at the end.
         ends: whether it is over.
@@ -94,3 +98,48 @@ def _memory_told(job: Job) -> Iterator[None]:
         if not is_out_of_memory(error):
             raise
         raise CannotGoOnError(f"{job.name} cannot go on, as no memory is left: {describe(error)}") from error
+
+
+# --- the loop ---
+
+
+def run(session: Session, page: LivePage, *, ends: Callable[[], bool]) -> None:
+    """Run a session until it `ends`: in real time, or as fast as it gets where that is slower.
+
+    Lost time is not made up for. Where there is no memory to meet a request or to show the scene, the scene goes back;
+    a second time, before the page was told, that would help no more.
+
+    Raises:
+        CannotGoOnError: there is no memory for the scene.
+        MemoryError, RuntimeError: there is none for the page, or what was asked for, either.
+    """
+    due = show_due = told_at = time.perf_counter()
+    shown, was_told, trouble = (-1, -1), True, ""
+    while not ends():
+        if trouble:  # not within the handler: an error's traceback would keep the old scene
+            session.free_memory(trouble)
+            was_told, trouble = False, ""
+        try:
+            now = time.perf_counter()
+            session.meet_requests(0.0 if not session.is_paused and now >= due else _wait(session, now, due))
+            now = time.perf_counter()
+            if not session.is_paused and now >= due:
+                session.advance()
+                due = max(due + session.dt / session.speed, time.perf_counter())
+            now = time.perf_counter()
+            moment = (session.revision, session.world.frame)
+            if moment != shown and now >= show_due:
+                page.show()
+                # Not so long after this: of frames that take two thirds of that time, only every other would be seen.
+                shown, show_due = moment, max(show_due + SHOWN_EVERY_S, now)
+            if now - told_at >= TOLD_EVERY_S:
+                page.tell(session.status())
+                told_at, was_told = now, True
+        except (MemoryError, RuntimeError) as error:
+            if not (was_told and is_out_of_memory(error)):
+                raise
+            trouble = describe(error)
+
+
+def _wait(session: Session, now: float, due: float) -> float:
+    return LONGEST_WAIT_S if session.is_paused else min(LONGEST_WAIT_S, max(due - now, 1e-4))

@@ -12,19 +12,15 @@ from pipeline.base.files import sync
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import changed_text, job_of_text
 from pipeline.job.overrides import Override, without_key
-from pipeline.web.live.parameters import Value, overrides_of, parameters_of
+from pipeline.kinds.live_parameters import Value
+from pipeline.web.live.parameters import overrides_of, parameters_of
 
 if TYPE_CHECKING:
     from pipeline.job.loading import LoadedJob
 
 
 def text_with_values(loaded: LoadedJob, values: Mapping[str, Value], changes: Sequence[Override] = ()) -> str:
-    """The job's text with these values: remarks, order and all other keys stay.
-
-    Args:
-        loaded: the job, as it was read.
-        values: of its live parameters, by name.
-        changes: further ones.
+    """The job's text with these values and changes: remarks, order and all other keys stay.
 
     Raises:
         JobFileError: the values make no job.
@@ -64,7 +60,7 @@ def save_job(loaded: LoadedJob, values: Mapping[str, Value], folder: Path) -> tu
         except BaseException:
             path.unlink()
             raise
-        story = JobLayout(loaded.path.parent).take_story.name
+        story = JobLayout(loaded.path.parent).recording_story.name
         note = f"; {story} is not there, so bodies that rested before the recording may be kinematic in it"
         return path, (note if led is None and loaded.job.rigid else "")
     raise AssertionError("numbers do not end")
@@ -75,7 +71,7 @@ def bodies_led_before(loaded: LoadedJob) -> list[str] | None:
     if loaded.job.recorded is None:
         return []
     try:
-        story = json.loads(JobLayout(loaded.path.parent).take_story.read_text(encoding="utf-8"))
+        story = json.loads(JobLayout(loaded.path.parent).recording_story.read_text(encoding="utf-8"))
         led = story["led"] if story["take"] == loaded.job.recorded else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

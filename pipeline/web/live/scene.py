@@ -9,16 +9,16 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
-from pipeline.web.drawing.bodies import DRAWERS, Setting, draw_bodies
-from pipeline.web.drawing.camera import begin_at
-from pipeline.web.drawing.canvas import Canvas, Rgb
+from pipeline.web.drawing.bodies import Look, Setting, body_of, draw_bodies
+from pipeline.web.drawing.canvas import Canvas, Rgb, begin_at
 from pipeline.web.drawing.colors import PIN
 from pipeline.web.live.drags import is_draggable
 from render.parameters import CameraParameters
 from sim.core.snapshots import Snapshot
-from sim.rigid.static import StaticBody
+from sim.shapes.placement import build_solid
 
 OnDrag = Callable[[str, str, Any], None]
 """Called with the kind of the thing, its name and viser's event."""
@@ -34,7 +34,6 @@ class LiveScene:
     """The bodies of a running job in the scene of a viser server.
 
     Args:
-        server: what pages connect to.
         job: as it is simulated.
         of_film: the placed camera of the job as it was read: bodies that rest there stand still no more in `job`.
         on_drag: called when bodies that move, cloths and pins are dragged.
@@ -50,10 +49,8 @@ class LiveScene:
         if "z-" not in job.domain.open_faces:
             width, depth = (float(each) for each in (high - low)[:2])
             place = (float(middle[0]), float(middle[1]), float(low[2]) - 1e-3)
-            server.scene.add_grid(
-                "/floor", width=width, height=depth, plane="xy", cell_size=0.1, section_size=0.5, position=place,
-                    cell_color=FLOOR_COLOR, section_color=FLOOR_COLOR,
-            )  # fmt: skip
+            floor = server.scene.add_grid("/floor", width, depth, cell_size=0.1, section_size=0.5, position=place)
+            floor.cell_color = floor.section_color = FLOOR_COLOR
         position, target = middle + size * np.array([0.35, -0.8, 0.35]), middle
         if of_film.position is not None and not isinstance(of_film.look_at, str):
             position = np.asarray(of_film.position)
@@ -62,20 +59,16 @@ class LiveScene:
         self._ball = icosphere(subdivisions=2, radius=PIN_SHARE * size)
         meshes: dict[tuple[str, str], tuple[NDArray[Any], NDArray[Any]]] = {}
         for body in job.rigid:
-            mesh = StaticBody(body).rest_mesh()
+            mesh = build_solid(body).rest_mesh()
             for part in parts_of(body.shape.type):
                 piece = mesh.piece(part)
                 meshes[body.name, part] = piece.vertices.astype(np.float32), piece.faces.astype(np.uint32)
-        self._setting = Setting(job, lambda body, part: meshes[body, part])
+        look = Look(frozenset(kind.display.layer for kind in KINDS.values()))
+        self._setting = Setting(job, lambda body, part: meshes[body, part], look)
 
     def show(self, snapshots: Mapping[str, Snapshot], pins: Mapping[int, tuple[str, NDArray[np.int64]]]) -> None:
-        """Show where everything is: a ball at the middle of each pin's nodes leads them.
-
-        Args:
-            snapshots: bodies by name.
-            pins: cloth and nodes of those that hold, by number.
-        """
-        bodies = {name: DRAWERS[body.kind].of(body, ALL) for name, body in snapshots.items()}
+        """Show where all bodies are, by name, and a ball at the middle of each pin's nodes, by the pin's number."""
+        bodies = {name: body_of(snapshot, ALL) for name, snapshot in snapshots.items()}
         with self._canvas.picture():
             draw_bodies(self._canvas, bodies, self._setting)
             for number, (cloth, nodes) in pins.items():

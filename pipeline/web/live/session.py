@@ -9,18 +9,25 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.base.errors import PipelineError
+from pipeline.kinds.live_parameters import Parameter, Value
 from pipeline.run.executors.failures import describe, is_out_of_memory
-from pipeline.web.live.checkpoints import FRAMES_BETWEEN, Checkpoint, Checkpoints
+from pipeline.web.live.admission import told_changes
 from pipeline.web.live.drags import Drags
-from pipeline.web.live.frame_timer import LONGEST_FRAME_S, FrameTimer
-from pipeline.web.live.parameters import Parameter, Value, parameters_of, set_parameter
+from pipeline.web.live.parameters import parameters_of, set_parameter
 from pipeline.web.live.requests import CannotGoOnError, Requests
-from pipeline.web.live.step_size import told_changes
+from pipeline.web.live.soundness import (
+    FRAMES_BETWEEN,
+    LONGEST_FRAME_S,
+    Checkpoint,
+    Checkpoints,
+    FrameTimer,
+    require_sound,
+)
 from sim.core.snapshots import Snapshot
 from sim.core.solver import SimulationDivergedError
 
@@ -30,10 +37,6 @@ if TYPE_CHECKING:
 
 MOST_SUBSTEPS = 2000
 """A frame that needs more counts as blown up, before it has taken long."""
-
-FASTEST = 200.0
-"""A scene in which anything moves faster [m/s] has blown up: nothing of a tabletop does, and a jet's water comes with
-half of that."""
 
 FIRST = "The first frame compiles kernels: up to a minute, once on a machine."
 NO_MEMORY = "No memory was left"
@@ -62,18 +65,16 @@ class _FrameLeftError(Exception):
     """Nobody wants the frame any more that is being computed."""
 
 
-class Session:
+class Session(Requests):
     """A scene, its parameters, its drags, and its clock.
 
-    Requests come from any thread (`ask`, `ask_reset`) and are met between frames (`meet_requests`) by the thread that
-    owns the session; all other methods are that thread's.
+    All methods but `ask` and `ask_reset` are for the thread that owns the session.
 
     Attributes:
+        revision: grows when the scene or its parameters change in another way than by time and on request.
         job: as it is simulated.
-        parameters: those that can be changed, by name.
-        values: their present values, by name.
+        parameters, values: what can be changed, and its present values, by name.
         drags: everything that browsers hold.
-        is_paused: whether time stands still.
         speed: simulated over wall time that is wanted, 1 for real time.
         report: of the last frame; None before the first.
         on_frame: called after each frame with its report, as a recording does; None: nobody.
@@ -81,8 +82,8 @@ class Session:
         ends: asked within frames whether all is over, so that the frame need not be computed to its end.
 
     Args:
-        job: cloth, bodies and fluid; `sim.core.runtime.initialize` must have run.
-        written: the job as it was read, if it is simulated in other substeps, say: after a blow-up that is named.
+        job: as `live_job` makes it; `sim.core.runtime.initialize` must have run.
+        written: the job as it was read, if that differs: after a blow-up it is told how.
         gave_up: whether it was live that changed it for the sake of speed, which --as-written prevents.
         longest_frame_s: a frame that takes longer counts as blown up [s]; infinite where slow frames were asked for.
         clock: tells the time [s].
@@ -100,6 +101,7 @@ class Session:
         longest_frame_s: float = LONGEST_FRAME_S,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
+        super().__init__(FIRST)
         self.job, self._written, self._gave_up = job, written or job, gave_up
         self._clock, self._timer = clock, FrameTimer(longest_frame_s, clock=clock)
         self.parameters: dict[str, Parameter] = {each.name: each for each in parameters_of(job, written=written)}
@@ -111,7 +113,8 @@ class Session:
         self.on_jump: Callable[[], None] | None = None
         self.ends: Callable[[], bool] = lambda: False
         self.dt = 1.0 / job.fps
-        self._requests, self._jumps = Requests(FIRST), 0
+        # A grab that is refused is followed by what the mouse does with nothing in hand.
+        self.silent = (self.drags.move, self.drags.release, self.drags.release_all)
         self._is_reset_asked = threading.Event()
         self._begins: deque[float] = deque(maxlen=max(10, job.fps))
         self._build()
@@ -129,49 +132,15 @@ class Session:
         self._frame_ms = 0.0
         self._substeps_asked: Value | None = None
 
-    # --- from any thread --------------------------------------------------------------------------------------------
-
-    def ask(self, request: Callable[..., object], *arguments: Any) -> None:
-        """Have a method called between two frames; an error that is meant for people becomes the message."""
-        self._requests.ask(request, *arguments)
-
     def ask_reset(self) -> None:
         """Have all begin anew; a frame that is being computed is left for it."""
         self._is_reset_asked.set()
         self.ask(self.reset)
 
-    # --- the owner's: the loop --------------------------------------------------------------------------------------
-
-    def meet_requests(self, wait_s: float = 0.0) -> None:
-        """Do all that was asked for; wait for the first request for so long at most [s].
-
-        Raises:
-            CannotGoOnError: a scene that had to begin anew has no memory.
-        """
-        # A grab that is refused is followed by what the mouse does with nothing in hand.
-        drags = self.drags
-        self._requests.meet(wait_s, silent=(drags.move, drags.release, drags.release_all))
-
-    @property
-    def message(self) -> str:
-        """The last refusal, until another request is met; else the last result."""
-        return self._requests.message
-
-    @message.setter
-    def message(self, result: str) -> None:
-        self._requests.message = result
-
-    @property
-    def revision(self) -> int:
-        """Number that grows when the scene or its parameters change in another way than by time and on request."""
-        return self._jumps + self._requests.refused
+    # --- the loop ---
 
     def advance(self) -> None:
-        """Compute a frame; after a blow-up, go back to where the scene was sound.
-
-        Raises:
-            CannotGoOnError: there is no memory for that either.
-        """
+        """Compute a frame; after a blow-up, go back to where the scene was sound. Raises CannotGoOnError: no memory."""
         began = self._clock()
         self._begins.append(began)
         what = remedy = ""
@@ -179,7 +148,7 @@ class Session:
             self.drags.advance(self.dt)
             self._timer.begin_frame()
             report = self.world.advance_frame()
-            _require_sound(report)
+            require_sound(report)
             took_s = self._clock() - began
             bodies = None if self.on_frame is None else self.world.snapshots()
             checkpoint = None if report.frame % FRAMES_BETWEEN else Checkpoint.of(self.world, self.values)
@@ -201,7 +170,7 @@ class Session:
             self._go_back(what, remedy=remedy)
             return
         self.report = report
-        self._requests.clear(FIRST)
+        self.clear(FIRST)
         self._frame_ms = 1e3 * took_s
         self._substeps_asked = self.values.get("cloth.substeps")
         if self.on_frame is not None and bodies is not None:
@@ -210,14 +179,7 @@ class Session:
             self._checkpoints.append(checkpoint)
 
     def free_memory(self, trouble: str) -> None:
-        """Go back to where the scene was sound, as there was no memory for something else than a frame.
-
-        Args:
-            trouble: the error in words.
-
-        Raises:
-            CannotGoOnError: there is no memory for it either.
-        """
+        """Go back to where the scene was sound, as there was no memory for something else. Raises CannotGoOnError."""
         self._go_back(f"{NO_MEMORY}: {trouble}", remedy="")
 
     def status(self) -> Status:
@@ -226,15 +188,21 @@ class Session:
         rate = 0.0 if self.is_paused or span <= 0.0 else (len(self._begins) - 1) * self.dt / span
         substeps = {} if self.report is None else self.report.substeps
         return Status(
-            self.world.frame, self.world.time_s, self._frame_ms, substeps, self._substeps_asked, rate, self.is_paused,
-            self.message,
-        )  # fmt: skip
+            frame=self.world.frame,
+            time_s=self.world.time_s,
+            frame_ms=self._frame_ms,
+            substeps=substeps,
+            substeps_asked=self._substeps_asked,
+            real_time=rate,
+            is_paused=self.is_paused,
+            message=self.message,
+        )
 
     def bodies(self) -> dict[str, Snapshot]:
         """All bodies now; arrays that no later frame changes."""
         return self.world.snapshots()
 
-    # --- the owner's: requests --------------------------------------------------------------------------------------
+    # --- requests ---
 
     def pause(self, is_paused: bool) -> None:
         """Stop time, or let it go on."""
@@ -253,11 +221,7 @@ class Session:
         self.speed = speed
 
     def reset(self) -> None:
-        """Begin anew, with the parameters as they are.
-
-        Raises:
-            CannotGoOnError: there is no memory for it.
-        """
+        """Begin anew, with the parameters as they are. Raises CannotGoOnError: there is no memory for it."""
         self._is_reset_asked.clear()
         self.message = ""
         values, has_room = dict(self.values), True
@@ -273,11 +237,7 @@ class Session:
                 self._begin_anew(values)
 
     def set(self, name: str, value: object) -> None:
-        """Give a parameter another value.
-
-        Raises:
-            ValueError: there is no such parameter, or it cannot have that.
-        """
+        """Give a parameter another value. Raises ValueError: there is no such parameter, or it cannot have that."""
         if name not in self.parameters:
             raise ValueError(f'nothing is named "{name}"')
         parameter = self.parameters[name]
@@ -288,25 +248,17 @@ class Session:
         self.values[name] = wanted
         self._changes.append((self.world.frame, f"{name} = {wanted}"))
 
-    # --- inside -----------------------------------------------------------------------------------------------------
+    # --- inside ---
 
     def _after_substep(self) -> str | None:
-        """Fault of the frame that is being computed, if it has any.
-
-        Raises:
-            _FrameLeftError: nobody waits for it.
-        """
+        """Fault of the frame that is being computed, if it has any. Raises _FrameLeftError: nobody waits for it."""
         if self.ends() or self._is_reset_asked.is_set():
             raise _FrameLeftError
         return self._timer.after_substep()
 
     def _begin_anew(self, values: Mapping[str, Value]) -> None:
-        """Build the scene again, with these values, and nothing held; a value that is refused is told.
-
-        Raises:
-            ShapeError, ValueError: as `sim.build.build_world`; the world that there was stays as it is.
-        """
-        self._jumps += 1
+        """Build the scene again, with nothing held; refused values are told. What cannot be built leaves the old."""
+        self.revision += 1
         if self.on_jump is not None:
             self.on_jump()
         self._build()
@@ -353,10 +305,8 @@ class Session:
     def _go_back(self, what: str, *, remedy: str) -> None:
         """Go back to the newest checkpoint that can be trusted; else to the start with the values of then, and stop.
 
-        Args:
-            what: happened, a sentence without its stop.
-            remedy: a sentence that follows a space, for where nobody changed or dragged anything; beside `FASTER`, the
-                changes of live are not told, as to take them back makes no frame faster.
+        The message tells `what` happened; where nobody changed or dragged anything, it adds the `remedy`. Beside
+        `FASTER`, the changes of live are not told, as to take them back makes no frame faster.
         """
         now = self.world.frame
         checkpoint = self._checkpoints.trusted(now)
@@ -383,15 +333,3 @@ class Session:
             cause += remedy
         place = "the start, with its values" if checkpoint is None else f"{self.world.time_s:.2f} s"
         self.message = f"{what}. {cause} Back at {place}. {self.message}".rstrip()
-
-
-def _require_sound(report: FrameReport) -> None:
-    """Blow-ups show as speeds long before they show as values that are no numbers.
-
-    Raises:
-        SimulationDivergedError: something is absurdly fast.
-    """
-    for name, numbers in report.diagnostics.items():
-        speed = float(numbers.get("max_speed", 0.0))
-        if not speed <= FASTEST:
-            raise SimulationDivergedError(name, report.frame, report.time_s, f"something moves at {speed:.3g} m/s")

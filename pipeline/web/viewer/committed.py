@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.base.layout import JobLayout
@@ -13,36 +12,26 @@ from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
 from pipeline.store.receipts import Receipt, read_receipt
 
-Stamp = tuple[tuple[int, int] | None, ...]
-"""Modification time [ns] and size of receipts; None where there is none. It differs when one of them was replaced."""
+FileStamp = tuple[int, int]
+"""Modification time [ns] and size of a file."""
+Stamp = tuple[FileStamp | None, ...]
+"""Stamps of receipts; None where there is none. It differs when one of them was replaced."""
 
 SETTLED_NS = 2_000_000_000
 """File systems tell times to two seconds at worst."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    stamp: tuple[int, int]
-    receipt: Receipt | None
-
-
 class CommittedFrames:
     """The frames that a simulation has committed, looked at again and again while it goes on.
 
-    Frames of an earlier version of the simulation do not count, as in `solver_numbers`.
-
-    Attributes:
-        folder: of the receipts of frames.
-
-    Args:
-        layout: the job's folder; it is only read.
+    Frames of an earlier version of the simulation do not count. `folder` is that of their receipts.
     """
 
     def __init__(self, layout: JobLayout) -> None:
         self._layout = layout
         self.folder = layout.receipt(layout.frame_cache(0)).parent
-        self._folder_stamp: int | None = None
-        self._seen: dict[str, _Seen] = {}
+        self._folder_stamp: FileStamp | None = None
+        self._seen: dict[int, tuple[FileStamp, Receipt | None]] = {}
         self._receipts: dict[int, Receipt] = {}
 
     @property
@@ -56,28 +45,25 @@ class CommittedFrames:
 
     def update(self) -> bool:
         """Look again; returns whether frames have come, gone or been replaced. Reads only receipts that are new."""
-        folder_stamp = self._settled_time_of_folder()
+        folder_stamp = stamp_of(self.folder)
+        if folder_stamp is not None and time.time_ns() - folder_stamp[0] <= SETTLED_NS:
+            folder_stamp = None  # another receipt may come at the same time of the file system's clock
         if folder_stamp is not None and folder_stamp == self._folder_stamp:
             return False
-        seen: dict[str, _Seen] = {}
-        paths = sorted(self.folder.glob("[0-9]*.h5.json"))
-        for path in paths:
-            stamp = stamp_of(path)
+        seen: dict[int, tuple[FileStamp, Receipt | None]] = {}
+        for path in sorted(self.folder.glob("[0-9]*.h5.json")):
+            frame, stamp = int(path.name.removesuffix(".h5.json")), stamp_of(path)
             if stamp is None:
                 continue
-            before = self._seen.get(path.name)
-            if before is not None and before.stamp == stamp:
-                seen[path.name] = before
-            else:
-                artifact = ArtifactPath(path.relative_to(self._layout.receipts).as_posix().removesuffix(".json"))
-                seen[path.name] = _Seen(stamp, read_receipt(self._layout, artifact))
+            before = self._seen.get(frame)
+            if before is None or before[0] != stamp:
+                before = stamp, read_receipt(self._layout, self._layout.frame_cache(frame))
+            seen[frame] = before
         self._folder_stamp = folder_stamp  # only now: what could not be read is tried again
         if seen == self._seen:
             return False
         self._seen = seen
-        receipts = {
-            int(name.removesuffix(".h5.json")): each.receipt for name, each in seen.items() if each.receipt is not None
-        }
+        receipts = {frame: receipt for frame, (_, receipt) in seen.items() if receipt is not None}
         newest = max(receipts.values(), key=lambda receipt: receipt.finished, default=None)
         self._receipts = {
             frame: receipt
@@ -86,40 +72,27 @@ class CommittedFrames:
         }
         return True
 
-    def _settled_time_of_folder(self) -> int | None:
-        """When a receipt last came to the folder [ns]; None while it is so recent that another may have the same time.
-
-        Of ten thousand frames, looking at the folder takes a microsecond, and at all receipts a tenth of a second.
-        """
-        stamp = stamp_of(self.folder)
-        return stamp[0] if stamp is not None and time.time_ns() - stamp[0] > SETTLED_NS else None
-
-    def known_hash(self, frame: int) -> str | None:
-        """Hash of a cached frame as it was when it was last looked for; None if it was not there."""
-        receipt = self._receipts.get(frame)
-        return None if receipt is None else receipt.hash
-
     def bounds_are_known(self, job: Job, frame: int) -> bool:
         """Whether the film's bounds are there, and not those of an earlier simulation: of this frame and the last one.
 
         They are made when the whole film is simulated, from bounds of each frame, and those from the cached frames.
         """
         film = read_receipt(self._layout, self._layout.film_bounds())
-        if film is None:
-            return False
+        fingerprints = set()
         for number in (frame, job.frame_count - 1):
             own = read_receipt(self._layout, self._layout.frame_bounds(number))
-            cached = self._receipts.get(number)
-            if own is None or cached is None or own.inputs.get(cached.artifact) != cached.hash:
+            cached = read_receipt(self._layout, self._layout.frame_cache(number))
+            if film is None or own is None or cached is None or own.inputs.get(cached.artifact) != cached.hash:
                 return False
             if film.inputs.get(own.artifact) != own.hash:
                 return False
-        return True
+            fingerprints.add(cached.fingerprint)
+        return len(fingerprints) == 1
 
     def derived(self, frame: int, artifact: ArtifactPath) -> bool:
         """Whether a file that is made from a frame is there, and was made from the frame as it is now."""
-        receipt, cached = read_receipt(self._layout, artifact), self._receipts[frame]
-        return receipt is not None and receipt.inputs.get(cached.artifact) == cached.hash
+        receipt, cached = (read_receipt(self._layout, each) for each in (artifact, self._layout.frame_cache(frame)))
+        return receipt is not None and cached is not None and receipt.inputs.get(cached.artifact) == cached.hash
 
     def is_there(self, artifact: ArtifactPath) -> bool:
         """Whether a file that does not depend on frames is committed."""
@@ -132,28 +105,21 @@ class CommittedFrames:
 
 def artifacts_of_frame(job: Job, layout: JobLayout, frame: int | None) -> list[ArtifactPath]:
     """All files that a frame is shown from; None: those that belong to no frame."""
-    meshes = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
+    artifacts = [layout.body_mesh(body.name, part) for body in job.rigid for part in parts_of(body.shape.type)]
     if frame is None:
-        return meshes
-    return [
-        *meshes,
-        layout.frame_cache(frame),
-        *(layout.surface(fluid.name, frame) for fluid in job.fluid),
-        *(layout.whitewater(fluid, frame) for fluid in job.whitewater),
-        *(
-            [layout.film_bounds(), layout.frame_bounds(frame), layout.frame_bounds(job.frame_count - 1)]
-            if job.camera.frames_action
-            else []
-        ),
-    ]
+        return artifacts
+    artifacts.append(layout.frame_cache(frame))
+    artifacts += [layout.surface(fluid.name, frame) for fluid in job.fluid]
+    artifacts += [layout.whitewater(fluid, frame) for fluid in job.whitewater]
+    if job.camera.frames_action:
+        last = job.frame_count - 1
+        artifacts += [layout.film_bounds(), layout.frame_bounds(frame), layout.frame_bounds(last)]
+        artifacts.append(layout.frame_cache(last))
+    return artifacts
 
 
-def stamp_of(path: Path) -> tuple[int, int] | None:
-    """Modification time [ns] and size of a file, None if there is none.
-
-    Raises:
-        OSError: the file system does not say.
-    """
+def stamp_of(path: Path) -> FileStamp | None:
+    """The stamp of a file, None if there is none. Raises OSError: the file system does not say."""
     try:
         status = path.stat()
     except FileNotFoundError:

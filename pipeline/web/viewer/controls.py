@@ -8,9 +8,9 @@ from typing import Any
 import viser
 
 from pipeline.model.job import Job
-from pipeline.web.drawing.bodies import PLAIN, POINTS, SLICE, SPEED
+from pipeline.web.drawing.bodies import PLAIN, POINTS, SLICE, SPEED, Look, has_form
 from pipeline.web.viewer.numbers import SolverSeries, label
-from pipeline.web.viewer.scene import SURFACES, Shown
+from pipeline.web.viewer.scene import SURFACES
 from pipeline.web.viewer.texts import NO_FRAME
 
 RATES = (120, 60, 30, 24, 15, 10, 5, 2, 1)
@@ -19,21 +19,14 @@ RATES = (120, 60, 30, 24, 15, 10, 5, 2, 1)
 class Controls:
     """The panel beside the scene.
 
-    Attributes:
-        slider, play, steps, rate, repeat, follow: of playing.
-        plotted: which of the solvers' numbers is plotted.
-        through: asks for the view of the film's camera.
-        title, notice, legend, plot, table: texts.
-
     Args:
-        gui: of the server.
-        job: the job.
         rate: frames a second at first.
         waits: whether there is no frame yet, so that the newest is to be followed.
+        changed: called when another thing is to be shown or plotted.
     """
 
-    def __init__(self, gui: viser.GuiApi, job: Job, *, rate: int, waits: bool) -> None:
-        self._gui = gui
+    def __init__(self, gui: viser.GuiApi, job: Job, *, rate: int, waits: bool, changed: Callable[[Any], None]) -> None:
+        self._gui, self._changed = gui, changed
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
         self.title, self.notice = gui.add_html(""), gui.add_html("")
@@ -48,7 +41,7 @@ class Controls:
             self._layer_folder = gui.add_folder("Things")
             self._color_by: Any = gui.add_dropdown("Particles by", (SPEED, PLAIN), initial_value=SPEED)
             self.legend = gui.add_html("")
-            with gui.add_folder("Smoke", visible=bool(job.smoke)):
+            with gui.add_folder("Smoke", visible=has_form(job, "density")):
                 self._smoke_as = gui.add_dropdown("As", (POINTS, SLICE), initial_value=POINTS)
                 self._slice_axis = gui.add_dropdown("Across", ("x", "y", "z"), initial_value="y")
                 self._slice_share = gui.add_slider("At", 0.0, 1.0, 0.01, 0.5, hint="share of the smoke's box")
@@ -61,21 +54,15 @@ class Controls:
             self.rate = gui.add_dropdown("Frames a second", rates, initial_value=str(rate), hint=hint)
             self.repeat = gui.add_checkbox("Repeat", initial_value=True)
             self.follow = gui.add_checkbox("Follow the newest", initial_value=waits, hint="while the job runs")
-        self._color_by.visible = bool(job.fluid)
+        self._color_by.visible = has_form(job, "points")
         self._layers: dict[str, Any] = {}
         self._choices: dict[str, tuple[str, str]] = {}
-        self._changed: Callable[[Any], None] | None = None
-
-    def when_changed(self, changed: Callable[[Any], None]) -> None:
-        """Have this called when another thing is to be shown or plotted."""
-        self._changed = changed
-        choices = (self._color_by, self._smoke_as, self._slice_axis, self._slice_share, self.plotted)
-        for control in (*choices, *self._layers.values()):
+        for control in (self._color_by, self._smoke_as, self._slice_axis, self._slice_share, self.plotted):
             control.on_update(changed)
 
-    def shown(self) -> Shown:
+    def look(self) -> Look:
         """The chosen look."""
-        return Shown(
+        return Look(
             layers=frozenset(layer for layer, box in self._layers.items() if box.value),
             color_by=self._color_by.value,
             smoke_as=self._smoke_as.value,
@@ -100,8 +87,7 @@ class Controls:
             for name in layers:
                 if name not in self._layers:
                     self._layers[name] = self._gui.add_checkbox(name, initial_value=name != SURFACES)
-                    if self._changed is not None:
-                        self._layers[name].on_update(self._changed)
+                    self._layers[name].on_update(self._changed)
 
     def offer_values(self, names: Collection[str]) -> None:
         """Offer the values that particles can be coloured by."""

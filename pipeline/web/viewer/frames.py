@@ -34,8 +34,8 @@ class ShownFrame:
     troubles: tuple[str, ...] = ()  # files that could not be read, in sentences
 
     @property
-    def fluids(self) -> dict[str, Particles]:
-        """The fluids among its bodies."""
+    def clouds(self) -> dict[str, Particles]:
+        """The bodies of points."""
         return {name: body for name, body in self.bodies.items() if isinstance(body, Particles)}
 
     @property
@@ -51,10 +51,7 @@ def read_shown_frame(
     """Read a committed frame; files that are missing yet are left out, those that are damaged are told.
 
     Args:
-        job: the job.
-        layout: its folder, which is only read.
-        committed: its frames, this one among them.
-        frame: its number.
+        committed: the job's frames, one of which has the number `frame`.
         most_particles: of a fluid that are kept.
         surfaces: whether to read the fluids' surfaces, which take longer than all the rest.
 
@@ -63,17 +60,10 @@ def read_shown_frame(
     """
     path = layout.path(layout.frame_cache(frame))
     try:
-        return _read(job, layout, committed, frame, most_particles=most_particles, surfaces=surfaces)
+        numbers = read_numbers(path)
+        bodies = read_bodies(path, numbers.kinds, most_particles)
     except (KeyError, TypeError, ValueError) as error:  # readable, but not what a frame holds
         raise InvalidArtifactError(f"{path}: lacks what a frame has: {error}") from error
-
-
-def _read(
-    job: Job, layout: JobLayout, committed: CommittedFrames, frame: int, *, most_particles: int, surfaces: bool
-) -> ShownFrame:
-    path = layout.path(layout.frame_cache(frame))
-    numbers = read_numbers(path)
-    bodies = read_bodies(path, numbers.kinds, most_particles)
     meshes: dict[str, SurfaceMesh] = {}
     whitewater: dict[str, Particles] = {}
     troubles: list[str] = []
@@ -104,7 +94,7 @@ def _whitewater(layout: JobLayout, fluid: str, frame: int, most: int) -> Particl
     chosen = slice(None, None, every(count, most))
     radius = float(cloud.radius.mean()) if count else 0.0
     speed = np.linalg.norm(cloud.velocity[chosen], axis=1).astype(np.float32)
-    return Particles(own(cloud.position[chosen]), {SPEED: speed}, radius, None, count)
+    return Particles("whitewater", own(cloud.position[chosen]), {SPEED: speed}, radius, None, count)
 
 
 def _view(

@@ -7,12 +7,21 @@ from collections.abc import Mapping, Sequence
 from html import escape
 
 from pipeline.base.quantities import MECHANICAL_ENERGY, PARTS_OF_ENERGY, SHARE, in_order, quantity
+from pipeline.show.report.chart import Line, line_chart
 from pipeline.store.cache import FrameNumbers
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 340.0, 130.0, 46.0, 8.0, 8.0, 20.0
-MOST_POINTS = 300
 FIRST_CHOICES = ("kinetic_energy", "density_error", "divergence", "iterations", "max_speed")
 """Plotted before anybody chooses: the first of these that there is."""
+PLOT_STYLE = (
+    "<style>.plot{font-size:12px;padding:0 .8em}.plot svg{display:block;width:100%;font:17px system-ui}"
+    ".plot .tick{fill:currentColor;opacity:.7}.plot .grid,.plot .axis{stroke:currentColor;opacity:.2}"
+    ".plot .line{fill:none;stroke-width:3;stroke-linejoin:round}"
+    ".plot .c0{stroke:none}.plot .c1{stroke:#3f97e0}.plot .c2{stroke:#f08a3c}</style>"
+)
+TABLE_STYLE = (
+    "<style>.numbers{font-size:12px;line-height:1.35;padding:0 .8em}.numbers table{width:100%;margin:.1em 0 .7em}"
+    ".numbers td{padding:0}.numbers td+td{text-align:right;font-variant-numeric:tabular-nums}</style>"
+)
 
 
 class SolverSeries:
@@ -58,11 +67,8 @@ class SolverSeries:
     def first_choice(self) -> tuple[str, str] | None:
         """Number that is plotted before anybody chooses."""
         names = self.names()
-        for wanted in FIRST_CHOICES:
-            for solver, name in names:
-                if name == wanted:
-                    return solver, name
-        return names[0] if names else None
+        wanted = (each for choice in FIRST_CHOICES for each in names if each[1] == choice)
+        return next(wanted, names[0] if names else None)
 
     def of(self, solver: str, name: str) -> tuple[list[int], list[float]]:
         """Frames, and the number of a solver at each, shares in per cent."""
@@ -102,15 +108,11 @@ def table(numbers: FrameNumbers) -> str:
             for known in (quantity(name, of_kind=kind) for name in in_order(values))
         )
         parts.append(f"<b>{escape(solver)}</b><table>{rows}</table>")
-    style = (
-        "<style>.numbers{font-size:12px;line-height:1.35;padding:0 .8em}.numbers table{width:100%;margin:.1em 0 .7em}"
-        ".numbers td{padding:0}.numbers td+td{text-align:right;font-variant-numeric:tabular-nums}</style>"
-    )
-    return f'{style}<div class="numbers">{"".join(parts)}</div>'
+    return f'{TABLE_STYLE}<div class="numbers">{"".join(parts)}</div>'
 
 
 def plot(frames: Sequence[int], values: Sequence[float], *, current: int | None, last: int) -> str:
-    """A number over the frames as an SVG element, with a mark at the frame that is seen.
+    """A number over the frames as HTML, with a mark at the frame that is seen.
 
     Args:
         frames: rising.
@@ -119,58 +121,14 @@ def plot(frames: Sequence[int], values: Sequence[float], *, current: int | None,
         last: the film's last frame, where the axis ends.
     """
     if not frames:
-        return '<div style="padding:0 .8em;opacity:.6;font-size:12px">nothing to plot yet</div>'
-    low, high = min(0.0, *values), max(0.0, *values)
-    if high - low <= 1e-12 * max(abs(low), abs(high), 1e-290):
-        high = low + 1.0
-    width, height = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
-
-    def place(frame: float, value: float) -> tuple[float, float]:
-        x = LEFT + width * (frame / max(last, 1))
-        return x, TOP + height * (1.0 - (value - low) / (high - low))
-
-    line = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*each) for each in _thinned(frames, values)))
-    base = place(0, 0.0)[1]
-    labels = {base: "0", TOP + 7: f"{high:.3g}"} if high > 0.0 else {TOP + 7: "0", TOP + height: f"{low:.3g}"}
-    parts = [
-        f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" style="display:block;width:100%;font:10px system-ui" '
-        f'fill="currentColor" role="img">',
-        f'<line x1="{LEFT:g}" x2="{WIDTH - RIGHT:g}" y1="{base:.1f}" y2="{base:.1f}" stroke="currentColor" '
-        'opacity=".3"/>',
-        *(
-            f'<text x="{LEFT - 5:g}" y="{y:.1f}" text-anchor="end" opacity=".7">{text}</text>'
-            for y, text in labels.items()
-        ),
-        f'<text x="{LEFT:g}" y="{HEIGHT - 6:g}" opacity=".7">frame 0</text>',
-        f'<text x="{WIDTH - RIGHT:g}" y="{HEIGHT - 6:g}" text-anchor="end" opacity=".7">{last}</text>',
-        f'<polyline points="{line}" fill="none" stroke="#3f97e0" stroke-width="1.6" stroke-linejoin="round"/>',
-    ]
+        return f'{PLOT_STYLE}<div class="plot" style="opacity:.6">nothing to plot yet</div>'
+    whole = Line("the film", [0, max(last, 1)], [0.0, 0.0])  # not drawn, but the axes hold it
+    lines, told = [whole, Line("values", frames, values, color=1)], ""
     if current is not None:
-        x, _ = place(current, 0.0)
-        parts.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{TOP:g}" y2="{TOP + height:g}" stroke="#f08a3c"/>')
+        lines.append(Line("now", [current, current], [min(0.0, *values), max(0.0, *values)], color=2))
         if current in frames:
-            value = values[frames.index(current)]
-            _, y = place(current, value)
-            anchor, shift = ("end", -6) if x > WIDTH / 2 else ("start", 6)
-            parts.append(
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="#f08a3c"/>'
-                f'<text x="{x + shift:.1f}" y="{max(y - 5, TOP + 8):.1f}" text-anchor="{anchor}" '
-                f'fill="#f08a3c">{value:.4g}</text>'
-            )
-    return "".join([*parts, "</svg>"])
-
-
-def _thinned(frames: Sequence[int], values: Sequence[float]) -> list[tuple[int, float]]:
-    """The lowest and the highest of each piece of a long film, so that no peak is lost."""
-    pairs = list(zip(frames, values, strict=True))
-    if len(pairs) <= MOST_POINTS:
-        return pairs
-    size = math.ceil(2 * len(pairs) / MOST_POINTS)
-    kept: list[tuple[int, float]] = []
-    for start in range(0, len(pairs), size):
-        piece = pairs[start : start + size]
-        kept += sorted({min(piece, key=lambda each: each[1]), max(piece, key=lambda each: each[1])})
-    return kept
+            told = f"frame {current}: {values[frames.index(current)]:.4g}"
+    return f'{PLOT_STYLE}<div class="plot">{line_chart(lines, x_label=f"frames 0 to {last}")}{told}</div>'
 
 
 def _with_energy(of: Mapping[str, float]) -> dict[str, float]:

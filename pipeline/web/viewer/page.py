@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,15 +20,14 @@ from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
 from pipeline.store.cache import read_numbers
 from pipeline.web.bounded_cache import BoundedCache
-from pipeline.web.drawing.bodies import Extents
-from pipeline.web.drawing.camera import begin_at, camera_orientation, vertical_fov
-from pipeline.web.drawing.canvas import Canvas
+from pipeline.web.drawing.bodies import Extents, Look
+from pipeline.web.drawing.canvas import Canvas, begin_at, camera_orientation, vertical_fov
 from pipeline.web.viewer.committed import CommittedFrames, Stamp, artifacts_of_frame, stamp_of
 from pipeline.web.viewer.controls import Controls
 from pipeline.web.viewer.frames import ShownFrame, read_shown_frame
 from pipeline.web.viewer.numbers import SolverSeries, plot, table
 from pipeline.web.viewer.playback import Playback
-from pipeline.web.viewer.scene import CAMERA, SURFACES, JobScene, Shown
+from pipeline.web.viewer.scene import CAMERA, SURFACES, JobScene
 from pipeline.web.viewer.texts import lacking, legend, notice, thinned, title
 
 if TYPE_CHECKING:
@@ -46,7 +45,6 @@ class ViewPage:
     """A job in the browsers of a server.
 
     Args:
-        server: what pages connect to.
         layout: the job's folder, which is only read.
         most_particles: of a fluid that are drawn.
         most_bytes: of frames that are kept in memory.
@@ -67,7 +65,7 @@ class ViewPage:
         self._series, self._extents = SolverSeries(), Extents()
         self._spoilt: dict[int, tuple[str, str]] = {}  # by frame: the hash it should have, and what is wrong
         self._job_trouble = self._files_trouble = ""
-        self._canvas = Canvas(server)
+        self.canvas = Canvas(server)
         self.playback = Playback(rate=float(min(self._job.fps, 60)))
         self._drawn: tuple[object, ...] = ()
         self._panel: tuple[object, ...] = ()
@@ -75,8 +73,9 @@ class ViewPage:
         self._shown: ShownFrame | None = None
         self._look_from_aside()
         waits = not any(self._committed.folder.glob("*.h5.json"))
-        self._controls = Controls(server.gui, self._job, rate=int(self.playback.rate), waits=waits)
-        self._controls.offer_layers(self._scene.layers)
+        changed = self._when_used(lambda _: None)
+        self.controls = Controls(server.gui, self._job, rate=int(self.playback.rate), waits=waits, changed=changed)
+        self.controls.offer_layers(self._scene.layers)
         self._wire()
 
     @property
@@ -89,21 +88,6 @@ class ViewPage:
         """The frames that can be seen."""
         return self._committed.numbers
 
-    @property
-    def things(self) -> frozenset[str]:
-        """Names of everything that is drawn."""
-        return self._canvas.names
-
-    @property
-    def notice(self) -> str:
-        """Troubles that the page tells, as HTML."""
-        return str(self._controls.notice.content)
-
-    @property
-    def table(self) -> str:
-        """The solvers' numbers that the page shows, as HTML."""
-        return str(self._controls.table.content)
-
     def run(self, stop: threading.Event) -> None:
         """Show frames until told to stop."""
         while not stop.is_set():
@@ -113,12 +97,8 @@ class ViewPage:
 
     def advance(self, now: float) -> float:
         """Do everything that is due at a time [s]; returns how long there is nothing more to do [s]."""
-        while True:
-            try:
-                command = self._commands.get_nowait()
-            except Empty:
-                break
-            command(now)
+        while not self._commands.empty():  # nobody else takes any
+            self._commands.get_nowait()(now)
         try:
             if now >= self._next_look:
                 self._next_look = now + LOOK_S
@@ -129,7 +109,7 @@ class ViewPage:
             self._show(frame)
         except OSError as error:  # a right that was taken away, or a server of files that is gone: it may come back
             self._files_trouble = f"{self._layout.root} cannot be read now: {error}"
-            self._tell(self.playback.frame, self._controls.shown())
+            self._tell(self.playback.frame, self.controls.look())
             return LOOK_S
         due = self.playback.wait(now)
         waits = [self._next_look - now, *([] if due is None else [due]), *([0.0] if pending else [])]
@@ -148,17 +128,17 @@ class ViewPage:
                 self._scene = JobScene(self._job, self._layout, self._committed)
                 self._loaded.clear()
                 self._drawn = ()
-                self._controls.offer_layers(self._scene.layers)
+                self.controls.offer_layers(self._scene.layers)
             except (PipelineError, OSError) as error:
                 self._job_trouble = f"{self._layout.job_file}: {error}; shown as it was before"
         if self._committed.update():
             frames = self._committed.numbers
-            self.playback.offer(frames, follow=self._controls.follow.value)
+            self.playback.offer(frames, follow=self.controls.follow.value)
             self._series.keep(frames)
             self._spoilt = {frame: told for frame, told in self._spoilt.items() if frame in frames}
-            self._controls.offer_frames(frames)
+            self.controls.offer_frames(frames)
             if self.playback.frame is not None and not self.playback.plays:
-                self._controls.slider.value = self.playback.frame
+                self.controls.slider.value = self.playback.frame
 
     def _read_numbers(self, until: float) -> bool:
         """Read numbers of frames that are new; returns whether there are more."""
@@ -176,22 +156,15 @@ class ViewPage:
             except InvalidArtifactError as error:
                 self._spoilt[frame] = (source, str(error))
         if changed:
-            self._controls.offer_numbers(self._series)
+            self.controls.offer_numbers(self._series)
         return False
 
     def _is_spoilt(self, frame: int) -> bool:
         """Whether a frame could not be read, and was not simulated anew since."""
         return frame in self._spoilt and self._spoilt[frame][0] == self._committed.receipt(frame).hash
 
-    def _known(self, frame: int) -> tuple[str | None, ...]:
-        """Hashes of a frame, and of the last one, on which the camera may depend.
-
-        Receipts may be newer: then a frame is read again when this has caught up.
-        """
-        return tuple(self._committed.known_hash(number) for number in (frame, self._job.frame_count - 1))
-
     def _load(self, frame: int, stamp: Stamp, *, surfaces: bool) -> ShownFrame | None:
-        state = (stamp, self._known(frame), surfaces)
+        state = (stamp, surfaces)
         shown = self._loaded.get(frame, state)
         if shown is None:
             try:
@@ -214,29 +187,29 @@ class ViewPage:
     # --- what is seen ---
 
     def _show(self, frame: int | None) -> None:
-        settings = self._controls.shown()
+        look = self.controls.look()
         self._extents.top_speed = self._series.largest("max_speed")
         stamp = self._committed.stamp(artifacts_of_frame(self._job, self._layout, frame))
-        wanted = (frame, stamp, None if frame is None else self._known(frame), settings, self._extents.top_speed)
+        wanted = (frame, stamp, look, self._extents.top_speed)
         if wanted != self._drawn:
-            shown = None if frame is None else self._load(frame, stamp, surfaces=SURFACES in settings.layers)
-            self._scene.draw(self._canvas, shown, settings, self._extents)
+            shown = None if frame is None else self._load(frame, stamp, surfaces=SURFACES in look.layers)
+            self._scene.draw(self.canvas, shown, look, self._extents)
             self._shown, self._drawn = shown, wanted
             if frame is not None and self.playback.plays:
-                self._controls.slider.value = frame
+                self.controls.slider.value = frame
             if shown is not None:
-                self._controls.offer_values({name for cloud in shown.fluids.values() for name in cloud.values})
-        self._tell(frame, settings)
+                self.controls.offer_values({name for cloud in shown.clouds.values() for name in cloud.values})
+        self._tell(frame, look)
 
-    def _tell(self, frame: int | None, settings: Shown) -> None:
+    def _tell(self, frame: int | None, look: Look) -> None:
         """Text and plot; viser sends only what differs."""
-        controls, shown = self._controls, self._shown
+        controls, shown = self.controls, self._shown
         # A recording that goes on has more frames than its job asks for, until it ends.
         count = max(self._job.frame_count, 1 + max(self.frames, default=0))
         controls.title.content = title(self._job.name, shown, frame, done=len(self.frames), count=count)
         remarks = [*thinned(shown), *lacking(shown)] if shown is not None else []
-        controls.notice.content = notice(self._troubles(frame, settings), remarks)
-        controls.legend.content = self._legend(settings.color_by)
+        controls.notice.content = notice(self._troubles(frame, look), remarks)
+        controls.legend.content = self._legend(look.color_by)
         controls.play.label = "Pause" if self.playback.plays else "Play"
         chosen = controls.chosen_numbers()
         panel = (frame, chosen, self._series.version, count)
@@ -247,7 +220,7 @@ class ViewPage:
             numbers = self._series.numbers(frame)
             controls.table.content = "" if numbers is None else table(numbers)
 
-    def _troubles(self, frame: int | None, settings: Shown) -> list[str]:
+    def _troubles(self, frame: int | None, look: Look) -> list[str]:
         troubles = [trouble for trouble in (self._job_trouble, self._files_trouble) if trouble]
         if frame is None:
             where = f"{self._layout.root} has no frame yet; they appear here as soon as they are simulated"
@@ -256,28 +229,27 @@ class ViewPage:
             troubles.append(f"frame {frame} cannot be read, see: pipeline verify ({self._spoilt[frame][1]})")
         if self._shown is not None:
             troubles += self._shown.troubles
-            if SURFACES in settings.layers and not self._shown.surfaces:
+            if SURFACES in look.layers and not self._shown.surfaces:
                 troubles.append(f"frame {frame} has no surface yet")
-            if CAMERA in settings.layers and self._shown.view is None:
+            if CAMERA in look.layers and self._shown.view is None:
                 troubles.append("where the camera is follows when the whole film is simulated")
         return [*troubles, *self._scene.troubles]
 
     def _legend(self, color_by: str) -> str:
-        fluids = self._shown.fluids.values() if self._shown is not None else ()
-        cloud = next((of for of in fluids if color_by in of.values), None)
+        clouds = self._shown.clouds.values() if self._shown is not None else ()
+        cloud = next((of for of in clouds if color_by in of.values), None)
         return "" if cloud is None else legend(color_by, self._extents.range(color_by, cloud))
 
     # --- controls ---
 
     def _wire(self) -> None:
-        controls = self._controls
+        controls = self.controls
         controls.slider.on_update(self._when_used(lambda _: self.playback.seek(int(controls.slider.value))))
         controls.play.on_click(self._when_used(self._play_or_pause))
         controls.steps.on_click(self._when_used(lambda _: self._step(controls.steps.value)))
         controls.rate.on_update(self._when_used(lambda now: self.playback.set_rate(float(controls.rate.value), now)))
         controls.repeat.on_update(self._when_used(lambda _: setattr(self.playback, "repeats", controls.repeat.value)))
         controls.follow.on_update(self._when_used(lambda _: self._go_to_newest()))
-        controls.when_changed(self._when_used(lambda _: None))
         controls.through.on_click(self._look_through)
 
     def _when_used(self, command: Callable[[float], None]) -> Callable[[Any], None]:
@@ -300,10 +272,10 @@ class ViewPage:
         far = len(self.frames)
         self.playback.step({"first": -far, "back": -1, "next": 1, "last": far}[where])
         if self.playback.frame is not None:
-            self._controls.slider.value = self.playback.frame
+            self.controls.slider.value = self.playback.frame
 
     def _go_to_newest(self) -> None:
-        if self._controls.follow.value:
+        if self.controls.follow.value:
             self._step("last")
 
     # --- where it is seen from ---

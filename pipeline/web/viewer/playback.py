@@ -34,12 +34,7 @@ class Playback:
         return self._frames[self._index] if self._frames else None
 
     def offer(self, frames: Sequence[int], *, follow: bool = False) -> None:
-        """Tell the frames that there are.
-
-        Args:
-            frames: their numbers, ascending; they may also have become fewer.
-            follow: go to the newest.
-        """
+        """Tell the frames that there are now, ascending; `follow`: go to the newest."""
         before = self.frame
         self._frames = tuple(frames)
         self._index = 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,10 @@ from numpy.typing import NDArray
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
+from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
-from pipeline.web.drawing.bodies import DRAWERS, SPEED, Extents, Look, Setting, color_of, draw_bodies
+from pipeline.web.drawing.bodies import Extents, Look, Setting, color_of, draw_bodies
 from pipeline.web.drawing.canvas import Canvas, box_edges
 from pipeline.web.drawing.colors import PIN, SURFACE, WHITEWATER
 from pipeline.web.drawing.shapes import Pose
@@ -25,31 +25,17 @@ from sim.core.motion.rotation import from_degrees
 
 DOMAIN_COLOR, CAMERA_COLOR = (120, 130, 146), (240, 190, 90)
 SURFACES, SPRAY, DOMAIN, PINS, CAMERA = "Surfaces", "Whitewater", "Domain", "Pins", "Camera"
-"""Layers beside those of `DRAWERS`."""
-
-
-@dataclass(frozen=True)
-class Shown(Look):
-    """A look that also says which layers are shown."""
-
-    color_by: str = SPEED
-    layers: frozenset[str] = frozenset()
+"""Layers beside those of the kinds of bodies."""
 
 
 class JobScene:
-    """Frames of a job on a canvas.
-
-    Args:
-        job: the job.
-        layout: its folder, which is only read.
-        committed: tells which files of it may be read.
-    """
+    """Frames of a job on a canvas; its folder is only read."""
 
     def __init__(self, job: Job, layout: JobLayout, committed: CommittedFrames) -> None:
         self._job, self._layout, self._committed = job, layout, committed
         self._meshes: dict[ArtifactPath, tuple[Stamp, tuple[NDArray[Any], NDArray[Any]]]] = {}
         self._standing = {
-            body.name: Pose(np.array(body.position), from_degrees(body.rotation_deg))
+            body.name: Pose("rigid", np.array(body.position), from_degrees(body.rotation_deg))
             for body in job.rigid
             if body.kind == "static"
         }
@@ -64,7 +50,7 @@ class JobScene:
         """Layers that this job has."""
         job = self._job
         has = {
-            **{drawer.layer: getattr(job, kind) for kind, drawer in DRAWERS.items()},
+            **{kind.display.layer: kind.bodies(job) for kind in KINDS.values()},
             SURFACES: job.fluid,
             SPRAY: job.whitewater,
             DOMAIN: True,
@@ -73,20 +59,20 @@ class JobScene:
         }
         return [layer for layer, there in has.items() if there]
 
-    def draw(self, canvas: Canvas, frame: ShownFrame | None, shown: Shown, extents: Extents) -> None:
+    def draw(self, canvas: Canvas, frame: ShownFrame | None, look: Look, extents: Extents) -> None:
         """Draw a frame; None: only what stays the same."""
         self.troubles = []
-        job, layers = self._job, shown.layers
+        job, layers = self._job, look.layers
         bodies = {**({} if frame is None else frame.bodies), **self._standing}
         with canvas.picture():
             if DOMAIN in layers:
                 canvas.lines("/domain", box_edges(job.domain.min, job.domain.max), DOMAIN_COLOR)
-            draw_bodies(canvas, bodies, Setting(job, self._mesh, shown, extents), layers=layers)
+            draw_bodies(canvas, bodies, Setting(job, self._mesh, look, extents))
             if frame is None:
                 return
             if SURFACES in layers:
                 for name, mesh in frame.surfaces.items():
-                    opacity = 0.45 if DRAWERS["fluid"].layer in layers else None
+                    opacity = 0.45 if KINDS["fluid"].display.layer in layers else None
                     color = color_of(job, name, BODY, SURFACE)
                     canvas.mesh(f"/surface/{name}", mesh.vertices, mesh.faces, color, opacity=opacity)
             if SPRAY in layers:

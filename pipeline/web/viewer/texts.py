@@ -35,7 +35,7 @@ def notice(troubles: Sequence[str], remarks: Sequence[str]) -> str:
 
 def thinned(shown: ShownFrame) -> list[str]:
     """Numbers of drawn particles, where not all are."""
-    clouds = {**shown.fluids, **{f"whitewater of {name}": of for name, of in shown.whitewater.items()}}
+    clouds = {**shown.clouds, **{f"whitewater of {name}": of for name, of in shown.whitewater.items()}}
     return [
         f"{name}: {len(cloud.position):,} of {cloud.count:,} particles are drawn"
         for name, cloud in clouds.items()
@@ -47,8 +47,8 @@ def lacking(shown: ShownFrame) -> list[str]:
     """Values that caches of earlier versions do not have."""
     return [
         f"{name}: the cache holds no pressures, as an earlier version simulated this frame"
-        for name, cloud in shown.fluids.items()
-        if PRESSURE not in cloud.values
+        for name, cloud in shown.clouds.items()
+        if cloud.kind == "fluid" and PRESSURE not in cloud.values
     ]
 
 

@@ -24,13 +24,7 @@ class KeyframeParameters(Parameters):
 
 
 def placed_at_first_keyframe(data: Any, what: str) -> Any:
-    """What a job file says of something with keyframes, with the pose of the first as its place.
-
-    So everybody who asks where it starts gets that pose.
-
-    Args:
-        data: as it comes to a validator, before anything is known about it.
-        what: how to call the thing in messages.
+    """Raw data of something with keyframes, `what` in messages, with the pose of the first as its place.
 
     Raises:
         ValueError: it is placed elsewhere as well.
@@ -38,14 +32,13 @@ def placed_at_first_keyframe(data: Any, what: str) -> Any:
     if not isinstance(data, dict) or not isinstance(data.get("keyframe"), list | tuple) or not data["keyframe"]:
         return data
     first = data["keyframe"][0]
-    placed = [key for key in ("position", "rotation_deg") if key in data]
     if isinstance(first, KeyframeParameters):
         first = first.model_dump()
     if not isinstance(first, dict) or "position" not in first:
         return data  # the keyframe's own validation says what is wrong with it
     start = {key: first[key] for key in ("position", "rotation_deg") if key in first}
-    for key in placed:
-        if tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
+    for key in ("position", "rotation_deg"):
+        if key in data and tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
             raise ValueError(f"{key} differs from that of the first keyframe, which places the {what}; remove {key}")
     return {**data, **start}
 

@@ -2,56 +2,81 @@
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim.core.motion import rotation
-from sim.core.motion.arc_length import ArcLength
 from sim.core.motion.parameters import KeyframeParameters
+from sim.core.motion.rotation import Array
 from sim.core.parameters import Vector3
 
-Array = NDArray[np.float64]
-
-LOOKUPS_PER_INTERVAL = 32
-"""Times between two keyframes at which the speed is looked up: the crest of a parabola is missed by 0.1 %."""
+LOOKUPS_PER_INTERVAL = 32  # of the speed between two keyframes: a parabola's crest is missed by 0.1 %
 
 
 class Motion(NamedTuple):
-    """Pose and velocity of the shape's origin at one time.
+    """Pose and velocity of the shape's origin at one time."""
 
-    Attributes:
-        position: [m], (3,).
-        orientation: unit quaternion w, x, y, z, (4,).
-        velocity: [m/s], (3,).
-        angular_velocity: about world axes [rad/s], (3,).
-    """
+    position: Array  # [m], (3,)
+    orientation: Array  # unit quaternion w, x, y, z, (4,)
+    velocity: Array  # [m/s], (3,)
+    angular_velocity: Array  # about world axes [rad/s], (3,)
 
-    position: Array
-    orientation: Array
-    velocity: Array
-    angular_velocity: Array
+    def speed_within(self, reach: float) -> float:
+        """Upper bound of the speed [m/s] of points up to `reach` [m] from the origin."""
+        return float(np.linalg.norm(self.velocity) + reach * np.linalg.norm(self.angular_velocity))
 
 
-class Path(Protocol):
+@dataclass(frozen=True)
+class ArcLength:
+    """Upper bound of the arc length that points of a body travel, linear between times; at rest before the first."""
+
+    times: Array  # ascending [s], (n,)
+    lengths: Array  # travelled by then [m], (n,), not descending
+    speed: float  # after the last time [m/s]
+
+    def time_of_travel(self, distance: float, start_s: float) -> float:
+        """Time [s] from `start_s` [s] on in which a point may travel a distance > 0 [m]; infinite if never."""
+        last_s, last = float(self.times[-1]), float(self.lengths[-1])
+        begun = float(np.interp(start_s, self.times, self.lengths)) + self.speed * max(start_s - last_s, 0.0)
+        goal = begun + distance
+        if goal < last:
+            return float(np.interp(goal, self.lengths, self.times)) - start_s
+        return last_s + (goal - last) / self.speed - start_s if self.speed > 0.0 else math.inf
+
+
+class Path(ABC):
     """Motion of a kinematic body by time."""
 
+    @abstractmethod
     def at(self, time_s: float) -> Motion:
         """Its motion at a simulated time [s]."""
 
-    def largest_speed(self, reach: float) -> float:
-        """The largest speed [m/s] that points up to `reach` [m] from the shape's origin may ever have."""
-
+    @abstractmethod
     def arc_length(self, reach: float) -> ArcLength:
-        """Upper bound of the arc length that such points travel."""
+        """Upper bound of the arc length that points up to `reach` [m] from the shape's origin travel."""
 
+    @abstractmethod
     def hull(self) -> tuple[Array, Array]:
         """Lower and upper corner [m] of a box around all places of the shape's origin; infinite where it goes on."""
 
+    @abstractmethod
+    def _lookups(self) -> Array:
+        """Times [s] whose motions stand for all others."""
 
-class SteadyPath:
+    def largest_speed(self, reach: float) -> float:
+        """The largest speed [m/s] that points up to `reach` [m] from the shape's origin may ever have."""
+        return max(self._speeds(reach))
+
+    def _speeds(self, reach: float) -> list[float]:
+        return [self.at(float(time)).speed_within(reach) for time in self._lookups()]
+
+
+class SteadyPath(Path):
     """Constant velocity and angular velocity from a starting pose."""
 
     def __init__(self, position: Array, orientation: Array, velocity: Array, angular_velocity: Array) -> None:
@@ -68,21 +93,20 @@ class SteadyPath:
             orientation=rotation.product(turned, self._start.orientation),
         )
 
-    def largest_speed(self, reach: float) -> float:
-        """The largest speed [m/s] that points up to `reach` [m] from the shape's origin may ever have."""
-        return _speed_bound(self._start, reach)
-
     def arc_length(self, reach: float) -> ArcLength:
-        """Upper bound of the arc length that such points travel."""
+        """See `Path`."""
         return ArcLength(np.zeros(1), np.zeros(1), self.largest_speed(reach))
 
     def hull(self) -> tuple[Array, Array]:
-        """Lower and upper corner [m] of a box around all places of the shape's origin; infinite where it goes on."""
+        """See `Path`."""
         place, velocity = self._start.position, self._start.velocity
         return np.where(velocity < 0.0, -np.inf, place), np.where(velocity > 0.0, np.inf, place)
 
+    def _lookups(self) -> Array:
+        return np.zeros(1)
 
-class KeyframePath:
+
+class KeyframePath(Path):
     """A path through keyframes; at rest before the first and after the last.
 
     Positions are cubic Hermite splines with the tangents of a parabola through three neighbours (Catmull-Rom on
@@ -123,19 +147,14 @@ class KeyframePath:
         orientation, spin = self._bezier(k, s, span)
         return Motion(position, orientation, velocity, spin)
 
-    def largest_speed(self, reach: float) -> float:
-        """The largest speed [m/s] that points up to `reach` [m] from the shape's origin may ever have."""
-        return max((_speed_bound(self.at(float(time)), reach) for time in self._lookups()), default=0.0)
-
     def arc_length(self, reach: float) -> ArcLength:
-        """Upper bound of the arc length that such points travel; between look-ups the larger speed."""
-        times = self._lookups()
-        speeds = np.array([_speed_bound(self.at(float(time)), reach) for time in times])
+        """See `Path`; between look-ups the larger speed counts."""
+        times, speeds = self._lookups(), np.array(self._speeds(reach))
         lengths = np.cumsum(np.maximum(speeds[1:], speeds[:-1]) * np.diff(times))
         return ArcLength(times, np.append(0.0, lengths), 0.0)
 
     def hull(self) -> tuple[Array, Array]:
-        """Lower and upper corner [m] of a box around all places of the shape's origin, as far as look-ups tell."""
+        """See `Path`; as far as look-ups tell."""
         places = np.stack([self.at(float(time)).position for time in self._lookups()])
         return places.min(axis=0), places.max(axis=0)
 
@@ -184,15 +203,7 @@ def path_onwards(
 ) -> KeyframePath:
     """From a pose at a time [s] straight to another, or the same orientation if omitted, in so many seconds; then rest.
 
-    What was sized when the scene was built does not follow a path that is taken later: the speeds that a fluid expects
-    of bodies, and the stiffness that it has from them.
-
-    Args:
-        now: where the path starts.
-        time_s: when [s].
-        position: where it leads [m].
-        rotation_deg: about x, then y, then z [degrees].
-        within_s: how long it takes [s], > 0.
+    What was sized when the scene was built, such as the speeds that a fluid expects of bodies, does not follow it.
 
     Raises:
         ValueError: the pose is not finite, or the way takes no time.
@@ -205,11 +216,6 @@ def path_onwards(
     orientation = now.orientation if rotation_deg is None else rotation.from_degrees(rotation_deg)
     times, orientations = [time_s, time_s + within_s], np.stack([now.orientation, orientation])
     return KeyframePath(times, np.stack([now.position, np.asarray(position)]), orientations, linear=True)
-
-
-def _speed_bound(motion: Motion, reach: float) -> float:
-    """Upper bound of the speed [m/s] of points up to `reach` [m] from the origin."""
-    return float(np.linalg.norm(motion.velocity) + reach * np.linalg.norm(motion.angular_velocity))
 
 
 def path_through(keyframes: Sequence[KeyframeParameters], *, linear: bool) -> KeyframePath:

@@ -12,12 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Where all bodies are: the moving ones, the static ones, and last the domain, which walls belong to.
+    """Where all bodies are: the moving ones, the static ones, and last the domain, which walls belong to."""
 
-    Attributes:
-        position: centres of mass [m], (n, 3).
-        rotation: body axes to world axes, (n, 3, 3).
-    """
-
-    position: Array
-    rotation: Array
+    position: Array  # centres of mass [m], (n, 3)
+    rotation: Array  # body axes to world axes, (n, 3, 3)

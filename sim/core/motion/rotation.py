@@ -32,8 +32,7 @@ _MATRIX = _coefficients(
 def _bilinear(p: Array, q: Array, coefficients: Array) -> Array:
     """Bilinear forms of quaternions, (..., k): for a few of them much faster than term by term."""
     pairs = p[..., :, None] * q[..., None, :]
-    result: Array = np.einsum("...i,ik->...k", pairs.reshape(*pairs.shape[:-2], 16), coefficients)
-    return result
+    return np.einsum("...i,ik->...k", pairs.reshape(*pairs.shape[:-2], 16), coefficients)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -54,14 +53,12 @@ def product(p: Array, q: Array) -> Array:
 
 def conjugate(q: Array) -> Array:
     """The inverse rotation, (..., 4)."""
-    inverse: Array = q * _CONJUGATE
-    return inverse
+    return q * _CONJUGATE
 
 
 def normalized(q: Array) -> Array:
     """Scaled to unit length, (..., 4)."""
-    unit: Array = q / np.sqrt(np.square(q).sum(axis=-1, keepdims=True))
-    return unit
+    return q / np.sqrt(np.square(q).sum(axis=-1, keepdims=True))
 
 
 def matrices(q: Array) -> Array:
@@ -73,8 +70,7 @@ def from_matrix(rotation: Array) -> Array:
     """Unit quaternion with w >= 0 of one rotation matrix (3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    quaternion: Array = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
-    return quaternion
+    return Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
 
 
 def from_degrees(rotation_deg: tuple[float, float, float]) -> Array:

@@ -28,13 +28,9 @@ def test_a_record_with_damaged_pages_is_told_with_a_remedy_that_works(layout: Jo
     content = bytearray(layout.manifest.read_bytes())
     content[4096:] = b"\xa5" * (len(content) - 4096)
     layout.manifest.write_bytes(content)
-    job: list[object] = {
-        "status": [layout.root],
-        "explain": [layout.root, "simulate"],
-        "plan": [layout.job_file, "--output", layout.root.parent],
-        "submit": [layout.job_file, "--output", layout.root.parent],
-    }[command]
-    refused = pipeline(command, *job)
+    of_file = [layout.job_file, "--output", layout.root.parent]
+    of_folder = {"status": [layout.root], "explain": [layout.root, "simulate"]}
+    refused = pipeline(command, *of_folder.get(command, of_file))
     assert (refused.exit_code, refused.stdout) == (1, "")
     assert "manifest.db is damaged" in refused.stderr
     remedy = shlex.split(refused.stderr.strip().rpartition("with: pipeline ")[2])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from checked_jobs import says
 from cloth_jobs import BALL, SHEET, errors, warnings
 
 from pipeline.base.errors import JobFileError
@@ -11,104 +12,88 @@ FILM = "frames = 60\n" + SHEET
 EDGE = '[[cloth.pin]]\nedge = "x-"\n'
 
 
+def without_line(problem: str) -> str:
+    """A problem without the file and the line that it begins with."""
+    return problem.partition(" ")[2]
+
+
+def pin_path(first_s: float, last_s: float, offset: str = "[0.1, 0.0, 0.0]") -> str:
+    return f"keyframe = [{{ time_s = {first_s} }}, {{ time_s = {last_s}, offset = {offset} }}]"
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         (EDGE + "release_s = 0", "cloth[0].pin[0].release_s: must be > 0 s, got 0"),
-        (
-            EDGE + "release_s = 0.2\nkeyframe = [{ time_s = 0.3 }, { time_s = 0.5, offset = [0.1, 0.0, 0.0] }]",
-            "cloth[0].pin[0]: release_s is 0.2 s, before its path starts at 0.3 s: release it later, or remove its "
-            "keyframes",
-        ),
-        (
-            EDGE + "keyframe = [{ time_s = 0.0 }]",
-            "cloth[0].pin[0]: keyframe: a path needs two keyframes at least; add one, or remove it",
-        ),
+        (EDGE + "release_s = 0.2\n" + pin_path(0.3, 0.5), "cloth[0].pin[0]: release_s is 0.2 s ... starts at 0.3 s"),
+        (EDGE + "keyframe = [{ time_s = 0.0 }]", "cloth[0].pin[0]: keyframe: a path needs two keyframes"),
         (
             '[[cloth.pin]]\nregion = { type = "box", min = [-1.0, 0.2, 0.0], max = [1.0, -0.2, 1.0] }',
-            "cloth[0].pin[0].region: max must not be below min along y, got 0.2 m to -0.2 m; swap them",
+            "cloth[0].pin[0].region: max must not be below min along y, got 0.2 m to -0.2 m",
         ),
-        ('[[cloth.pin]]\ncorner = "x-"', 'expected "x-y-", "x+y-", "x-y+" or "x+y+", got the text "x-"'),
         ("mass_per_area = 0.0", "cloth[0].mass_per_area: must be > 0 kg/m², got 0"),
         ("stretch_stiffness = -1.0", "cloth[0].stretch_stiffness: must be > 0 N/m, got -1"),
     ],
-    ids=["release at once", "release before path", "one keyframe", "region", "corner", "mass", "stiffness"],
 )
 def test_what_no_cloth_can_be_is_refused_where_it_is_written(text, expected, tmp_path):
     with pytest.raises(JobFileError) as refused:
         errors(FILM + text, tmp_path)
-    assert expected in str(refused.value)
+    (problem,) = refused.value.problems
+    assert says(without_line(problem), expected)
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("velocity = [0.0, 0.0, -2e4]", "cloth[0].velocity: must be below 10000 m/s, got 20000 m/s; units are SI"),
-        ("wind = [1e4, 0.0, 0.0]", "cloth[0].wind: must be below 10000 m/s, got 10000 m/s; units are SI"),
+        ("velocity = [0.0, 0.0, -2e4]", "cloth[0].velocity: must be below 10000 m/s, got 20000 m/s"),
+        ("wind = [1e4, 0.0, 0.0]", "cloth[0].wind: must be below 10000 m/s, got 10000 m/s"),
         (
             BALL.replace("0.3]", "0.5]").replace("0.1", "0.45"),
-            'cloth[0]: starts inside "ball", as at (-0.2, -0.2, 0.5) m',
+            'cloth[0]: starts inside "ball" ... (-0.2, -0.2, 0.5)',
         ),
         (
             'integrator = "explicit"\nsubsteps = 20\nstretch_stiffness = 1e6',
-            "cloth[0].substeps: 20 substeps a frame are 0.000833 s each, and explicit springs of this stiffness and "
-            "mass are stable up to 9.58e-06 s; give substeps = 1739 or more",
+            "cloth[0].substeps: 20 substeps a frame are 0.000833 s ... 9.58e-06 s; give substeps = 1739",
         ),
     ],
-    ids=["velocity", "wind", "engulfed", "stiff"],
-)  # fmt: skip
+)
 def test_what_cannot_be_simulated_is_refused(text, expected, tmp_path):
     (problem,) = errors(FILM + text, tmp_path)
-    assert expected in problem
+    assert says(without_line(problem), expected)
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (
-            EDGE + "release_s = 1.0",
-            "cloth[0].pin[0].release_s: lets go at 1 s, after the film's end at 1 s, so it holds all through",
-        ),
-        (
-            EDGE + "keyframe = [{ time_s = 2.0 }, { time_s = 3.0, offset = [0.1, 0.0, 0.0] }]",
-            "cloth[0].pin[0].keyframe: starts to move at 2 s, after the film's end at 1 s; make its times earlier",
-        ),
-        (
-            EDGE + "keyframe = [{ time_s = 0.0 }, { time_s = 0.5 }]",
-            "cloth[0].pin[0].keyframe: never moves: all keyframes are where it starts",
-        ),
+        (EDGE + "release_s = 1.0", "cloth[0].pin[0].release_s: lets go at 1 s, after the film's end at 1 s"),
+        (EDGE + pin_path(2.0, 3.0), "cloth[0].pin[0].keyframe: starts to move at 2 s, after the film's end at 1 s"),
+        (EDGE + pin_path(0.0, 0.5, "[0.0, 0.0, 0.0]"), "cloth[0].pin[0].keyframe: never moves"),
         (
             # 0.3 m in 2 ms at a constant speed; a substep of 1/1200 s; cells of 5 cm have diagonals of 7.07 cm.
-            EDGE + "keyframe = [{ time_s = 0.0 }, { time_s = 0.002, offset = [0.3, 0.0, 0.0] }]\n"
-            'interpolation = "linear"',
-            "cloth[0].pin[0].keyframe: moves at up to 150 m/s, 0.125 m in a substep, further than the 0.0707 m between "
-            "neighbouring nodes: the cloth is torn along; give it more time, or the cloth more substeps",
+            EDGE + pin_path(0.0, 0.002, "[0.3, 0.0, 0.0]") + '\ninterpolation = "linear"',
+            "cloth[0].pin[0].keyframe: moves at up to 150 m/s, 0.125 m in a substep, further than the 0.0707 m",
         ),
-        (
-            "wind = [5.0, 0.0, 0.0]\nair_density = 0.0",
-            "cloth[0].wind: has no effect without air_density; give that a value, or remove the wind",
-        ),
+        ("wind = [5.0, 0.0, 0.0]\nair_density = 0.0", "cloth[0].wind: has no effect without air_density"),
         (
             "wind = [5.0, 0.0, 0.0]\ndrag = 0.0\nskin_drag = 0.0",
-            "cloth[0].wind: has no effect without drag and skin_drag; give that a value, or remove the wind",
+            "cloth[0].wind: has no effect without drag",
         ),
     ],
-    ids=["late release", "late path", "no path", "fast", "vacuum", "no drag"],
 )
 def test_what_the_film_will_not_show_is_told(text, expected, tmp_path):
     (warning,) = warnings(FILM + text, tmp_path)
-    assert expected in warning
+    assert says(without_line(warning), expected)
 
 
 @pytest.mark.parametrize("substeps", ["", "substeps = 400\n"], ids=["as many as springs need", "given"])
 def test_a_fast_pin_of_explicit_springs_is_judged_by_the_substeps_that_are_given(substeps, tmp_path):
     """0.3 m in 2 ms are 6 mm in a substep of 1/24000 s; how long steps of explicit springs are is not known here."""
-    path = "keyframe = [{ time_s = 0.0 }, { time_s = 0.002, offset = [0.3, 0.0, 0.0] }]\ninterpolation = 'linear'"
+    path = pin_path(0.0, 0.002, "[0.3, 0.0, 0.0]") + "\ninterpolation = 'linear'"
     assert warnings(f'{FILM}integrator = "explicit"\n{substeps}{EDGE}{path}', tmp_path) == []
 
 
 def test_a_pin_that_rests_moves_and_lets_go_within_the_film_is_fine(tmp_path):
-    path = "keyframe = [{ time_s = 0.2 }, { time_s = 0.5, offset = [0.1, 0.0, 0.0] }]\nrelease_s = 0.4"
+    path = pin_path(0.2, 0.5) + "\nrelease_s = 0.4"
     assert warnings(FILM + EDGE + path, tmp_path) == []
 
 
@@ -125,30 +110,27 @@ def mesh_job(folder, vertices, faces, suffix="") -> str:
     return SHEET.replace('"rectangle", size = [0.4, 0.4], counts = [9, 9]', '"mesh", file = "shawl.obj"') + suffix
 
 
+RECTANGLE = [f"{x} {y} 0" for x, y in ((0, 0), (400, 0), (400, 300), (0, 300))]
+
+
 @pytest.mark.parametrize(
     ("vertices", "faces", "expected"),
     [
+        ([*SQUARE, "0.1 0 0"], ["1 2 3 4", "1 2 5"], "1 triangles ... no area ... (0, -0.1, 0) m ... 0, 1 and 4"),
         (
-            [*SQUARE, "0.1 0 0"], ["1 2 3 4", "1 2 5"],
-            "1 triangles of \"shawl.obj\" have no area, the first at (0, -0.1, 0) m between vertices 0, 1 and 4, "
-            "counted from 0; remove them",
+            [*SQUARE, "0.1 0.1 0.1"],
+            ["1 2 3", "1 3 4", "1 3 5"],
+            "1 edges ... three triangles or more, the first at (0, 0, -0.05) m between vertices 0 and 2",
         ),
-        (
-            [*SQUARE, "0.1 0.1 0.1"], ["1 2 3", "1 3 4", "1 3 5"],
-            "1 edges of \"shawl.obj\" have three triangles or more, the first at (0, 0, -0.05) m between vertices 0 "
-            "and 2",
-        ),
-        (["nan 0 0", *SQUARE[1:]], ["1 2 3 4"], "vertex 0 of \"shawl.obj\" is not finite; export it again"),
-        (["1 1 1"] * 3, ["1 2 3"], "\"shawl.obj\" is 0 m across, which must be between 1e-06 m and 1e+06 m; check"),
-        ([f"{x} 0 0" for x in range(3)], ["1 2 3"], "1 triangles of \"shawl.obj\" have no area"),
-        (SQUARE, [], "\"shawl.obj\" has no triangles; export it as a mesh"),
+        (["nan 0 0", *SQUARE[1:]], ["1 2 3 4"], 'vertex 0 of "shawl.obj" is not finite'),
+        (["1 1 1"] * 3, ["1 2 3"], '"shawl.obj" is 0 m across, which must be between 1e-06 m and 1e+06 m'),
+        ([f"{x} 0 0" for x in range(3)], ["1 2 3"], '1 triangles of "shawl.obj" have no area'),
+        (SQUARE, [], '"shawl.obj" has no triangles'),
     ],
-    ids=["no area", "branching", "not finite", "one place", "a line", "no triangles"],
-)  # fmt: skip
+)
 def test_a_mesh_that_is_no_sheet_is_refused_and_its_vertices_are_named(vertices, faces, expected, tmp_path):
     (problem,) = errors(mesh_job(tmp_path, vertices, faces), tmp_path)
-    assert problem.startswith("drape.toml:6 cloth[0].shape: shape.file: ")
-    assert expected in problem
+    assert says(problem, f"drape.toml:6 cloth[0].shape: shape.file: {expected}")
 
 
 @pytest.mark.parametrize(
@@ -160,12 +142,10 @@ def test_a_mesh_that_is_no_sheet_is_refused_and_its_vertices_are_named(vertices,
         (SQUARE, ["1 2 3", "1 4 3"], ["turned 1 of 2 triangles"]),
         # So far away that vertices of the sheet would be merged, if it counted for its size.
         ([*SQUARE, "5e6 nan 0"], ["1 2 3 4"], ["merged 1 split or unused vertices"]),
-        ([f"{x} {y} 0" for x, y in ((0, 0), (400, 0), (400, 300), (0, 300))], ["1 2 3 4"],
-         ["is 400 m across, the domain 1 m; files have no unit and are read in metres: give shape.size"]),
+        (RECTANGLE, ["1 2 3 4"], ["is 400 m across, the domain 1 m"]),
         ([*SQUARE, *(each[:-1] + "0.1" for each in SQUARE)], ["1 2 3 4", "8 7 6 5"], []),
     ],
-    ids=["split", "collapsed", "two-sided", "turned", "unused", "millimetres", "two parts"],
-)  # fmt: skip
+)
 def test_a_mesh_that_can_be_repaired_is_and_it_is_said(vertices, faces, expected, tmp_path):
     told = warnings(mesh_job(tmp_path, vertices, faces), tmp_path)
     assert len(told) == len(expected)

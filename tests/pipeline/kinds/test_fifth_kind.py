@@ -18,13 +18,18 @@ from numpy.typing import NDArray
 from places import HELPERS, PROJECT
 from pydantic import Field
 
+from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
+from pipeline.job.loading import load_job
 from pipeline.kinds import table
-from pipeline.kinds.base import Kind, Product
+from pipeline.kinds.base import Display, Kind, Product
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.problems import Findings
 from pipeline.store.cache import read_frame
+from pipeline.web.live.admission import live_job
+from pipeline.web.serving import page_server
+from pipeline.web.viewer.page import ViewPage
 from render.bounds import reach_of_particles
 from render.parameters import MaterialParameters
 from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
@@ -139,6 +144,7 @@ GRAIN = Kind(
     ),
     objects=objects,
     reach=reach,
+    display=Display("Grains", "points"),
     facts=lambda grain, _count: f"grains of radius {grain.radius:g} m",
 )
 
@@ -244,6 +250,28 @@ def test_it_is_in_the_pictures(film):
     with av.open(str(film.path(film.picture(1)))) as picture:
         red, green, blue = next(picture.decode(video=0)).to_ndarray(format="rgb24").astype(int).transpose(2, 0, 1)
     assert np.count_nonzero((red > 2 * green) & (red > 2 * blue)) > 20
+
+
+def test_the_viewer_shows_it_where_the_cache_has_it(film):
+    with page_server() as server:
+        page = ViewPage(server, film, most_particles=10_000, most_bytes=10**8)
+        for frame in (0, FRAMES - 1):
+            page.playback.seek(frame)
+            page.advance(0.0)
+            drawn = server.scene.get_handle_by_name("/grain/sand")
+            cached = read_frame(film.path(film.frame_cache(frame)), "sand").bodies["sand"]
+            np.testing.assert_allclose(drawn.points + drawn.position, cached.arrays["position"], atol=1.0e-3)
+            assert drawn.point_size == 2.0 * cached.number("radius")
+        assert "Grains" in page.controls._layers
+        assert "speed" in page.controls._color_by.options
+        page.controls._layers["Grains"].value = False
+        page.advance(0.0)
+        assert "/grain/sand" not in page.canvas.names
+
+
+def test_it_does_not_run_live(tmp_path):
+    with pytest.raises(PipelineError, match="sandfall: grain does not run live"):
+        live_job(load_job(written(tmp_path)))
 
 
 def test_the_report_tells_of_it(film):

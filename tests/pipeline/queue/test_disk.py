@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import namedtuple
-from pathlib import Path
 
 import click
 import pytest
@@ -25,7 +24,7 @@ def estimated(frames: int, costs: dict[str, StageCost]) -> float:
     return disk.estimate_bytes(assessments, costs, SIZE)
 
 
-def test_an_estimate_grows_with_the_frames_that_are_to_be_made() -> None:
+def test_an_estimate_grows_with_the_frames_that_are_to_be_made():
     ten, twenty = estimated(10, {}), estimated(20, {})
     # 26 bytes a particle and 1.2 a pixel; checkpoints and the film are there once.
     assert twenty - ten == pytest.approx(10 * (22_000 + 26e6 + 1_000 + 1.2 * 1920 * 1080))
@@ -40,7 +39,7 @@ def test_an_estimate_grows_with_the_frames_that_are_to_be_made() -> None:
         ({"format": "exr", "passes": ["depth", "normal"]}, (1.2 + 17.0) / 2),
     ],
 )
-def test_masters_and_deep_pictures_count_with_what_they_take(render: dict, bytes_per_pixel: float) -> None:
+def test_masters_and_deep_pictures_count_with_what_they_take(render, bytes_per_pixel):
     scene = {"name": "still", "frames": 1, "rigid": [{"name": "b", "shape": {"type": "sphere", "radius": 0.1}}]}
     job = Job.model_validate({**scene, "render": render, "movie": {"codec": "prores"}}, strict=False)
     size = disk.size_of(job, Findings())
@@ -48,16 +47,16 @@ def test_masters_and_deep_pictures_count_with_what_they_take(render: dict, bytes
     assert size.film_factor == 30.0
 
 
-def test_what_the_stages_have_taken_counts_more_than_what_jobs_usually_take() -> None:
+def test_what_the_stages_have_taken_counts_more_than_what_jobs_usually_take():
     costs = {"render": StageCost("render", 1.0, 5e6), "simulate": StageCost("simulate", 1.0, 1e6)}
     assert estimated(20, costs) - estimated(10, costs) == pytest.approx(10 * 6e6)
 
 
-def test_what_is_up_to_date_takes_nothing() -> None:
+def test_what_is_up_to_date_takes_nothing():
     assert disk.estimate_bytes([], {}, SIZE) == 0.0
 
 
-def test_the_reserve_is_a_share_of_a_small_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reserve_is_a_share_of_a_small_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: Usage(10 * 2**30, 0, 2**30))
     assert disk.usual_reserve_bytes(tmp_path) == 2**29
     assert disk.shortage(tmp_path, None) is None
@@ -76,12 +75,12 @@ OPTION = click.Option(["--x"])
     ("text", "size"),
     [("0", 0), ("500", 500), ("500MB", 500_000_000), ("2GiB", 2 * 2**30), ("1.5 k", 1500), ("1TB", 10**12)],
 )
-def test_sizes_are_read(text: str, size: int) -> None:
+def test_sizes_are_read(text, size):
     assert parse_size(CONTEXT, OPTION, text) == size
 
 
 @pytest.mark.parametrize("text", ["", "GB", "-1", "1e9", "two", "1PB"])
-def test_what_is_no_size_is_refused(text: str) -> None:
+def test_what_is_no_size_is_refused(text):
     with pytest.raises(click.BadParameter, match="is not a size"):
         parse_size(CONTEXT, OPTION, text)
 
@@ -89,5 +88,5 @@ def test_what_is_no_size_is_refused(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "seconds"), [("90s", 90), ("30m", 1800), ("12h", 43200), ("7d", 604800), ("2w", 1209600)]
 )
-def test_ages_are_read(text: str, seconds: float) -> None:
+def test_ages_are_read(text, seconds):
     assert parse_age(CONTEXT, OPTION, text) == seconds

@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 from collections.abc import Iterator
-from pathlib import Path
 from subprocess import Popen
 
 import pytest
@@ -19,14 +18,14 @@ from pipeline.run.executors.inline import InlineExecutor
 
 
 @pytest.fixture
-def farm(tmp_path: Path) -> Iterator[Farm]:
+def farm(tmp_path) -> Iterator[Farm]:
     farm = Farm(tmp_path)
     yield farm
     farm.close()
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def undisturbed(tmp_path_factory) -> dict[str, bytes]:
     """What six frames of the synthetic job are."""
     root = tmp_path_factory.mktemp("undisturbed") / "job"
     with InlineExecutor() as executor:
@@ -59,7 +58,7 @@ def assert_long_done_once(farm: Farm, name: str, *, begins: dict[str, bytes]) ->
 
 
 @pytest.mark.slow
-def test_two_submits_at_once_take_turns(farm: Farm, undisturbed: dict[str, bytes]) -> None:
+def test_two_submits_at_once_take_turns(farm, undisturbed):
     files = [farm.job(name, pause_s=0.02) for name in "ab"]
     for process in [farm.start("submit", path.name) for path in files]:
         farm.finish(process)
@@ -73,9 +72,7 @@ def test_two_submits_at_once_take_turns(farm: Farm, undisturbed: dict[str, bytes
 
 
 @pytest.mark.slow
-def test_a_more_urgent_job_goes_first_and_the_other_continues_where_it_was(
-    farm: Farm, undisturbed: dict[str, bytes]
-) -> None:
+def test_a_more_urgent_job_goes_first_and_the_other_continues_where_it_was(farm, undisturbed):
     slow = start_long(farm, "slow")
     urgent = farm.start("submit", farm.job("urgent").name, "--priority", "5")
     wait_until(lambda: farm.queue.find("urgent") is not None, "it was never queued")
@@ -88,9 +85,7 @@ def test_a_more_urgent_job_goes_first_and_the_other_continues_where_it_was(
 
 
 @pytest.mark.slow
-def test_a_job_submitted_detached_runs_in_the_background_and_can_be_watched(
-    farm: Farm, undisturbed: dict[str, bytes]
-) -> None:
+def test_a_job_submitted_detached_runs_in_the_background_and_can_be_watched(farm, undisturbed):
     submitted = farm.run("submit", farm.job("a", pause_s=0.1).name, "--detach")
     assert "a is queued; the queue runs in the background" in submitted.out
     assert not submitted.out.startswith("renders/")
@@ -100,9 +95,7 @@ def test_a_job_submitted_detached_runs_in_the_background_and_can_be_watched(
 
 
 @pytest.mark.slow
-def test_a_terminal_that_has_its_own_film_leaves_detached_jobs_to_the_background(
-    farm: Farm, undisturbed: dict[str, bytes]
-) -> None:
+def test_a_terminal_that_has_its_own_film_leaves_detached_jobs_to_the_background(farm, undisturbed):
     own = farm.start("submit", farm.job("own", frames=60, pause_s=1.0).name)
     wait_until(lambda: farm.is_running("own"), "it never began")
     farm.run("submit", farm.job("other").name, "--detach")
@@ -114,9 +107,7 @@ def test_a_terminal_that_has_its_own_film_leaves_detached_jobs_to_the_background
 
 
 @pytest.mark.slow
-def test_ctrl_c_while_a_job_of_somebody_else_runs_pauses_the_own_one_and_leaves_the_other_queued(
-    farm: Farm, undisturbed: dict[str, bytes]
-) -> None:
+def test_ctrl_c_while_a_job_of_somebody_else_runs_pauses_the_own_one_and_leaves_the_other_queued(farm, undisturbed):
     other = farm.job("other", frames=60, pause_s=1.0)
     farm.queue.put(new_entry("other", text=other.read_text(), background=True))
     terminal = farm.start("submit", farm.job("own").name)
@@ -132,7 +123,7 @@ def test_ctrl_c_while_a_job_of_somebody_else_runs_pauses_the_own_one_and_leaves_
 
 
 @pytest.mark.slow
-def test_paused_resumed_and_nothing_is_done_twice(farm: Farm, undisturbed: dict[str, bytes]) -> None:
+def test_paused_resumed_and_nothing_is_done_twice(farm, undisturbed):
     submitted = start_long(farm, "a")
     assert "a pauses as soon as what runs is finished" in farm.run("pause", "a").out
     stopped = farm.finish(submitted, code=8)
@@ -147,7 +138,7 @@ def test_paused_resumed_and_nothing_is_done_twice(farm: Farm, undisturbed: dict[
 
 
 @pytest.mark.slow
-def test_cancelled_stops_at_once_and_keeps_what_is_finished(farm: Farm) -> None:
+def test_cancelled_stops_at_once_and_keeps_what_is_finished(farm):
     running = farm.start("submit", farm.job("a", pause_s=1.5).name)
     wait_until(lambda: farm.frames_done("a") > 0, "it never began to work")
     farm.faults("a", {}, pause_s=600.0)
@@ -163,7 +154,7 @@ def test_cancelled_stops_at_once_and_keeps_what_is_finished(farm: Farm) -> None:
 
 
 @pytest.mark.slow
-def test_cancelled_while_its_own_command_runs_a_more_urgent_job(farm: Farm) -> None:
+def test_cancelled_while_its_own_command_runs_a_more_urgent_job(farm):
     low = start_long(farm, "low")
     farm.job("urgent", pause_s=600.0)
     urgent = farm.start("submit", "urgent.toml", "--priority", "5")
@@ -177,7 +168,7 @@ def test_cancelled_while_its_own_command_runs_a_more_urgent_job(farm: Farm) -> N
 
 
 @pytest.mark.slow
-def test_failed_tasks_are_tried_again_by_rerun(farm: Farm, undisturbed: dict[str, bytes]) -> None:
+def test_failed_tasks_are_tried_again_by_rerun(farm, undisturbed):
     path = farm.job("a")
     farm.faults("a", {"double/000002": ["fail"]})
     farm.run("submit", path.name, code=5)
@@ -190,7 +181,7 @@ def test_failed_tasks_are_tried_again_by_rerun(farm: Farm, undisturbed: dict[str
 
 
 @pytest.mark.slow
-def test_when_a_runner_is_killed_whoever_waits_takes_the_queue_over(farm: Farm, undisturbed: dict[str, bytes]) -> None:
+def test_when_a_runner_is_killed_whoever_waits_takes_the_queue_over(farm, undisturbed):
     runner = start_long(farm, "a")
     waiting = farm.start("submit", farm.job("b").name)
     wait_until(lambda: farm.queue.find("b") is not None, "it was never queued")
@@ -204,7 +195,7 @@ def test_when_a_runner_is_killed_whoever_waits_takes_the_queue_over(farm: Farm, 
 
 
 @pytest.mark.slow
-def test_another_version_submitted_meanwhile_follows_and_both_commands_end_well(farm: Farm) -> None:
+def test_another_version_submitted_meanwhile_follows_and_both_commands_end_well(farm):
     first = start_long(farm, "a")
     second = farm.start("submit", farm.job("a", frames=60, pause_s=1.0, focal_length_mm=70.0).name)
     wait_until(lambda: (entry := farm.queue.find("a")) is not None and entry.text is not None, "never queued")
@@ -216,7 +207,7 @@ def test_another_version_submitted_meanwhile_follows_and_both_commands_end_well(
 
 
 @pytest.mark.slow
-def test_a_folder_moved_elsewhere_continues_there(farm: Farm, tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+def test_a_folder_moved_elsewhere_continues_there(farm, tmp_path, undisturbed):
     submitted = start_long(farm, "a")
     farm.run("pause", "a")
     farm.finish(submitted, code=8)
@@ -238,9 +229,7 @@ def test_a_folder_moved_elsewhere_continues_there(farm: Farm, tmp_path: Path, un
 
 
 @pytest.mark.slow
-def test_a_disk_that_gets_too_full_pauses_the_job_and_more_room_continues_it(
-    farm: Farm, undisturbed: dict[str, bytes]
-) -> None:
+def test_a_disk_that_gets_too_full_pauses_the_job_and_more_room_continues_it(farm, undisturbed):
     refused = farm.run("submit", farm.job("a").name, "--reserve", "1000TB", code=7)
     assert "less than the reserve" in refused.err
     entry = farm.queue.find("a")

@@ -27,7 +27,7 @@ MANY_LOOKS = 100_000
 
 
 @pytest.fixture
-def queue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobQueue:
+def queue(tmp_path, monkeypatch) -> JobQueue:
     monkeypatch.setattr("pipeline.queue.farm.LOOK_INTERVAL_S", 0.001)
     monkeypatch.setattr("pipeline.queue.farm.BUSY_RETRY_S", 0.01)
     return JobQueue(tmp_path)
@@ -39,11 +39,13 @@ def work(
     def run_job(job: QueuedJob, control: FarmControl, _observer: TakeOver) -> Outcome:
         return Outcome(run(job, control))
 
+    def after_turn(name: str, _folder: Path, ended: Ended) -> None:
+        if told is not None:
+            told.append((name, ended))
+
     queue.make()
     with Lease.acquire(queue.lease) as lease:
-        runner = FarmRunner(queue, lease, run_job, print, submission=submission)
-        runner.after_turn = lambda name, _folder, ended: (told if told is not None else []).append((name, ended))
-        return runner.work()
+        return FarmRunner(queue, lease, run_job, print, after_turn, submission=submission).work()
 
 
 def until_stopped(control: FarmControl) -> JobOutcome:
@@ -54,9 +56,7 @@ def until_stopped(control: FarmControl) -> JobOutcome:
     return DONE
 
 
-def test_an_urgent_job_whose_folder_was_busy_goes_first_as_soon_as_it_is_free(
-    queue: JobQueue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_urgent_job_whose_folder_was_busy_goes_first_as_soon_as_it_is_free(queue, monkeypatch):
     monkeypatch.setattr("pipeline.queue.farm.BUSY_RETRY_S", 3600.0)
     queue.put(new_entry("low", text="x"))
     queue.put(new_entry("urgent", text="x", priority=9))
@@ -87,9 +87,7 @@ def test_an_urgent_job_whose_folder_was_busy_goes_first_as_soon_as_it_is_free(
         (errno.ENOSPC, Desired.PAUSE, DiskFullError, "the disk is full"),
     ],
 )
-def test_a_folder_that_refuses_ends_the_turn_of_its_job_alone(
-    queue: JobQueue, number: int, desired: Desired, error: type[PipelineError], note: str
-) -> None:
+def test_a_folder_that_refuses_ends_the_turn_of_its_job_alone(queue, number, desired, error, note):
     queue.put(new_entry("a", text="x", priority=1))
     queue.put(new_entry("b", text="x"))
     told: list[tuple[str, Ended]] = []
@@ -106,7 +104,7 @@ def test_a_folder_that_refuses_ends_the_turn_of_its_job_alone(
     assert (left.name, left.desired, note in left.note) == ("a", desired, True)
 
 
-def test_a_fault_of_the_programs_own_is_told_before_it_ends_the_runner(queue: JobQueue) -> None:
+def test_a_fault_of_the_programs_own_is_told_before_it_ends_the_runner(queue):
     queue.put(new_entry("a", text="x"))
     told: list[tuple[str, Ended]] = []
 
@@ -119,7 +117,7 @@ def test_a_fault_of_the_programs_own_is_told_before_it_ends_the_runner(queue: Jo
     assert (name, str(ended.error)) == ("a", "a fault")
 
 
-def test_a_job_that_was_taken_over_by_another_process_is_waited_for(queue: JobQueue) -> None:
+def test_a_job_that_was_taken_over_by_another_process_is_waited_for(queue):
     queue.put(new_entry("a", text="x", priority=1))
     queue.put(new_entry("b", text="x"))
     turns: list[str] = []
@@ -135,7 +133,7 @@ def test_a_job_that_was_taken_over_by_another_process_is_waited_for(queue: JobQu
     assert queue.listing().jobs == ()
 
 
-def test_a_job_that_goes_while_a_more_urgent_one_runs_was_not_ended_by_its_own_turn(queue: JobQueue) -> None:
+def test_a_job_that_goes_while_a_more_urgent_one_runs_was_not_ended_by_its_own_turn(queue):
     own = new_entry("own", text="x")
     queue.put(own)
 
@@ -149,7 +147,7 @@ def test_a_job_that_goes_while_a_more_urgent_one_runs_was_not_ended_by_its_own_t
     assert work(queue, run, submission=own.submission) is None
 
 
-def test_a_queue_that_vanishes_with_its_disk_cancels_nothing(queue: JobQueue) -> None:
+def test_a_queue_that_vanishes_with_its_disk_cancels_nothing(queue):
     queue.put(new_entry("a", text="x"))
 
     def run(_job: QueuedJob, control: FarmControl) -> JobOutcome:
@@ -164,9 +162,7 @@ def test_a_queue_that_vanishes_with_its_disk_cancels_nothing(queue: JobQueue) ->
     assert told[0][1].reason is None
 
 
-def test_the_disk_that_is_looked_at_is_the_one_that_the_job_is_written_to(
-    queue: JobQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_disk_that_is_looked_at_is_the_one_that_the_job_is_written_to(queue, tmp_path, monkeypatch):
     (tmp_path / "other disk").mkdir()
     (tmp_path / "a").symlink_to(tmp_path / "other disk")
     asked: list[Path] = []
@@ -177,9 +173,7 @@ def test_the_disk_that_is_looked_at_is_the_one_that_the_job_is_written_to(
     assert asked == [tmp_path / "other disk", tmp_path]
 
 
-def test_what_could_not_be_taken_over_is_taken_over_at_the_next_event(
-    queue: JobQueue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_could_not_be_taken_over_is_taken_over_at_the_next_event(queue, monkeypatch):
     job = new_entry("a", text="x")
     queue.put(job)
     observer = TakeOver(queue, job)
@@ -211,15 +205,11 @@ def test_what_could_not_be_taken_over_is_taken_over_at_the_next_event(
         (JobOutcome.DRAINED, None, 130),
     ],
 )
-def test_exit_codes_say_how_it_ended_and_not_what_was_asked(
-    kind: JobOutcome | None, reason: StopReason | None, code: int
-) -> None:
+def test_exit_codes_say_how_it_ended_and_not_what_was_asked(kind, reason, code):
     assert exit_code_of(Ended(None if kind is None else Outcome(kind), reason)) == code
 
 
-def test_resumed_a_job_keeps_the_cores_and_the_reserve_that_it_was_given(
-    queue: JobQueue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resumed_a_job_keeps_the_cores_and_the_reserve_that_it_was_given(queue, monkeypatch):
     paused = new_entry("synthetic", text=job_text(), desired=Desired.PAUSE, cores=1, reserve_bytes=0)
     resumed: list[QueuedJob] = []
     monkeypatch.setattr(
@@ -233,9 +223,7 @@ def test_resumed_a_job_keeps_the_cores_and_the_reserve_that_it_was_given(
 
 
 @pytest.mark.slow
-def test_a_runner_in_the_background_takes_no_module_from_the_working_folder(
-    queue: JobQueue, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runner_in_the_background_takes_no_module_from_the_working_folder(queue, tmp_path, monkeypatch):
     queue.make()
     (tmp_path / "click.py").write_text("open('run', 'w').close()\n")
     monkeypatch.chdir(tmp_path)

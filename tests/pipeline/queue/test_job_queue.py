@@ -14,7 +14,6 @@ import textwrap
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from command_line import pipeline
@@ -26,7 +25,7 @@ from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob, QueueError, c
 
 
 @pytest.fixture
-def queue(tmp_path: Path) -> JobQueue:
+def queue(tmp_path) -> JobQueue:
     return JobQueue(tmp_path)
 
 
@@ -34,19 +33,19 @@ def names(queue: JobQueue) -> list[str]:
     return [job.name for job in queue.listing().jobs]
 
 
-def test_a_farm_where_nothing_was_submitted_has_an_empty_queue_and_nothing_is_made_for_looking(queue: JobQueue) -> None:
+def test_a_farm_where_nothing_was_submitted_has_an_empty_queue_and_nothing_is_made_for_looking(queue):
     assert queue.listing().jobs == queue.waiting() == ()
     assert queue.find("film") is None
     assert not queue.folder.exists()
 
 
-def test_jobs_go_by_priority_and_then_by_age(queue: JobQueue) -> None:
+def test_jobs_go_by_priority_and_then_by_age(queue):
     for position, (name, priority) in enumerate([("a", 0), ("b", 5), ("c", 0), ("d", -1), ("e", 5)]):
         queue.put(replace(new_entry(name, priority=priority), submitted=100.0 + position))
     assert names(queue) == ["b", "e", "a", "c", "d"]
 
 
-def test_an_entry_comes_back_as_it_was_written(queue: JobQueue) -> None:
+def test_an_entry_comes_back_as_it_was_written(queue):
     job = new_entry(
         "my film",
         priority=3,
@@ -64,7 +63,7 @@ def test_an_entry_comes_back_as_it_was_written(queue: JobQueue) -> None:
     assert queue.find("my film") == job
 
 
-def test_submitted_again_a_waiting_job_keeps_its_place_and_the_same_run_its_ticket(queue: JobQueue) -> None:
+def test_submitted_again_a_waiting_job_keeps_its_place_and_the_same_run_its_ticket(queue):
     first = queue.enqueue(new_entry("a", text="1"))
     time.sleep(0.01)
     queue.enqueue(new_entry("b", text="1"))
@@ -75,7 +74,7 @@ def test_submitted_again_a_waiting_job_keeps_its_place_and_the_same_run_its_tick
     assert names(queue) == ["a", "b"]
 
 
-def test_the_text_that_a_run_has_taken_over_asks_for_no_second_run(queue: JobQueue) -> None:
+def test_the_text_that_a_run_has_taken_over_asks_for_no_second_run(queue):
     first = queue.enqueue(new_entry("a", text="1"))
     layout = queue.layout("a")
     layout.root.mkdir()
@@ -85,21 +84,21 @@ def test_the_text_that_a_run_has_taken_over_asks_for_no_second_run(queue: JobQue
     assert queue.enqueue(new_entry("a", text="2")).submission != first.submission
 
 
-def test_a_failed_job_submitted_again_runs_again(queue: JobQueue) -> None:
+def test_a_failed_job_submitted_again_runs_again(queue):
     first = queue.enqueue(new_entry("a", text="1"))
     queue.change("a", desired=Desired.NONE, note="failed")
     again = queue.enqueue(new_entry("a", text="1"))
     assert (again.desired, again.note, again.submission != first.submission) == (Desired.RUN, "", True)
 
 
-def test_run_again_while_a_new_version_waits_it_is_that_version_that_runs(queue: JobQueue) -> None:
+def test_run_again_while_a_new_version_waits_it_is_that_version_that_runs(queue):
     queue.enqueue(new_entry("a", text="new version"))
     again = queue.enqueue(new_entry("a", rerun_stages=("render",)))
     assert (again.text, again.rerun_stages) == ("new version", ("render",))
     assert queue.find("a") == again
 
 
-def test_entries_that_nobody_changes_are_read_once(queue: JobQueue, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entries_that_nobody_changes_are_read_once(queue, monkeypatch):
     for name in "ab":
         queue.put(new_entry(name))
         os.utime(queue.folder / "queue" / f"{name}.json", (1.0, 1.0))
@@ -115,7 +114,7 @@ def test_entries_that_nobody_changes_are_read_once(queue: JobQueue, monkeypatch:
     assert len(read) == 1
 
 
-def test_what_killed_writers_left_is_swept_and_entries_stay(queue: JobQueue) -> None:
+def test_what_killed_writers_left_is_swept_and_entries_stay(queue):
     queue.put(new_entry("a"))
     left = queue.folder / "queue" / ".a.json.part.77"
     left.write_text("half")
@@ -127,9 +126,7 @@ def test_what_killed_writers_left_is_swept_and_entries_stay(queue: JobQueue) -> 
     ("number", "sentence"),
     [(errno.ENOLCK, "has no locks"), (errno.EOPNOTSUPP, "has no locks"), (errno.ENOSYS, "has no locks")],
 )
-def test_a_file_system_without_locks_is_told(
-    queue: JobQueue, monkeypatch: pytest.MonkeyPatch, number: int, sentence: str
-) -> None:
+def test_a_file_system_without_locks_is_told(queue, monkeypatch, number, sentence):
     def flock(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
@@ -140,7 +137,7 @@ def test_a_file_system_without_locks_is_told(
         Lease.acquire(queue.lease)
 
 
-def test_a_farm_that_cannot_be_written_to_is_told(queue: JobQueue, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_farm_that_cannot_be_written_to_is_told(queue, monkeypatch):
     def make(_queue: JobQueue) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
@@ -150,13 +147,13 @@ def test_a_farm_that_cannot_be_written_to_is_told(queue: JobQueue, monkeypatch: 
 
 
 @pytest.mark.parametrize("command", ["pause", "cancel"])
-def test_a_folder_that_is_none_is_not_made_by_a_command_about_a_job(tmp_path: Path, command: str) -> None:
+def test_a_folder_that_is_none_is_not_made_by_a_command_about_a_job(tmp_path, command):
     told = pipeline(command, "film", "--output", tmp_path / "typo")
     assert (told.exit_code, '"film" is not in the queue' in told.stderr) == (1, True)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_record_of_one_job_hides_no_other_from_the_list(queue: JobQueue) -> None:
+def test_a_damaged_record_of_one_job_hides_no_other_from_the_list(queue):
     queue.put(new_entry("good"))
     queue.put(new_entry("bad"))
     queue.layout("bad").root.mkdir()
@@ -171,7 +168,7 @@ def test_a_damaged_record_of_one_job_hides_no_other_from_the_list(queue: JobQueu
 @pytest.mark.parametrize(
     "name", ["", ".", "..", ".farm", "a/b", "../a", "a\0b", "x" * 201, "a\nb", "a\x1b[2J", "caf\udce9"]
 )
-def test_a_name_cannot_lead_out_of_the_farm(queue: JobQueue, name: str) -> None:
+def test_a_name_cannot_lead_out_of_the_farm(queue, name):
     with pytest.raises(QueueError, match="cannot be the name"):
         checked_name(name)
     with pytest.raises(QueueError):
@@ -202,7 +199,7 @@ def test_a_name_cannot_lead_out_of_the_farm(queue: JobQueue, name: str) -> None:
         new_entry("a").to_json().replace('"cores": null', '"cores": null, "code": "x"').encode(),
     ],
 )
-def test_a_file_that_is_no_entry_is_told_and_the_others_go_on(queue: JobQueue, content: bytes) -> None:
+def test_a_file_that_is_no_entry_is_told_and_the_others_go_on(queue, content):
     queue.put(new_entry("good"))
     (queue.folder / "queue" / "a.json").write_bytes(content)
     listing = queue.listing()
@@ -231,7 +228,7 @@ while True:
 """
 
 
-def test_threads_that_overlap_exclude_each_other_and_leave_the_lock_whole(queue: JobQueue) -> None:
+def test_threads_that_overlap_exclude_each_other_and_leave_the_lock_whole(queue):
     is_in, order = threading.Event(), []
 
     def second() -> None:
@@ -255,7 +252,7 @@ def test_threads_that_overlap_exclude_each_other_and_leave_the_lock_whole(queue:
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_of_a_change_it_leaves_no_lock_and_loses_no_job(queue: JobQueue) -> None:
+def test_killed_in_the_middle_of_a_change_it_leaves_no_lock_and_loses_no_job(queue):
     generator = random.Random(6)
     queue.put(new_entry("bystander"))
     queue.put(new_entry("mine"))

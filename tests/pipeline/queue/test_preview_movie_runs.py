@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import av
 import drawing_stages
@@ -17,6 +16,7 @@ import psutil
 import pytest
 from click.testing import Result
 from command_line import pipeline
+from farm_processes import wait_until
 from places import HELPERS, PROJECT
 from processes_seen import lives
 
@@ -25,18 +25,16 @@ from pipeline.base.task import TaskState
 from pipeline.job.loading import load_job
 from pipeline.queue.preview_movie import PreviewMovie
 from pipeline.run.events import Committed, RunStarted, StateChanged
-from pipeline.run.frame_order import spread_turns
-from pipeline.run.plan import NEVER_MADE, Assessment, Reason, Verdict, plan_job
+from pipeline.run.plan import NEVER_MADE, Assessment, Reason, Verdict, plan_job, spread_turns
 from pipeline.stages import STAGES
 from pipeline.store.receipts import Receipt
 from render.movie import validate_movie
 
 FRAMES = 8
-PATIENCE_S = 60.0
 
 
 @pytest.fixture(autouse=True)
-def without_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_pauses(monkeypatch) -> None:
     """Films as often as they can be made, and tasks that draw."""
     monkeypatch.setattr("pipeline.queue.preview_movie.SHORTEST_PAUSE_S", 0.01)
     monkeypatch.setattr("pipeline.queue.preview_movie.SHARE", 1.0e6)
@@ -122,21 +120,16 @@ def test_frames_of_an_earlier_version_of_the_job_are_not_shown(tmp_path):
     assert {gravity for _, gravity in colors(layout.root / "seen.mp4")} == {-20}
 
 
-def test_a_job_can_do_without(tmp_path):
-    write_job(tmp_path, more="movie.so_far = false")
-    result, _ = submit(tmp_path, pause_s=0.4)
-    assert result.exit_code == 0, result.output
-    assert "the preview movie" not in result.output
-
-
-def test_the_film_so_far_of_an_earlier_run_goes_with_one_that_does_without(tmp_path):
+def test_a_job_can_do_without_and_the_film_so_far_of_an_earlier_run_goes(tmp_path):
     write_job(tmp_path)
     result, layout = submit(tmp_path, wait=6, fail=7)
     assert result.exit_code == 5, result.output
     assert layout.preview_movie.exists()
     write_job(tmp_path, more="movie.so_far = false")
-    result, _ = submit(tmp_path)
+    layout.path(layout.picture(0)).unlink()
+    result, _ = submit(tmp_path, pause_s=0.4)
     assert result.exit_code == 0, result.output
+    assert "the preview movie" not in result.output
     assert not layout.preview_movie.exists()
 
 
@@ -193,13 +186,6 @@ def watched(folder: Path, *, frames: int, drawn: int) -> tuple[PreviewMovie, lis
         for task in tasks
     ]
     return PreviewMovie(job, layout, said.append, said.append), said, assessments
-
-
-def wait_until(condition: Any, what: str) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < until, what
-        time.sleep(0.01)
 
 
 def test_a_frame_that_turns_out_up_to_date_is_shown(tmp_path):

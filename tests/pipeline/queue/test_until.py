@@ -47,7 +47,7 @@ NO_PICTURE = (
 
 
 @pytest.fixture
-def farm(tmp_path: Path) -> Iterator[Farm]:
+def farm(tmp_path) -> Iterator[Farm]:
     farm = Farm(tmp_path)
     yield farm
     farm.close()
@@ -58,14 +58,14 @@ def stages_until(*until: str) -> list[str]:
     return [*dict.fromkeys(task.stage for task in plan_job(job, JobLayout(Path("renders/small")), STAGES, until))]
 
 
-def test_a_plan_holds_a_stage_and_what_it_needs() -> None:
+def test_a_plan_holds_a_stage_and_what_it_needs():
     assert stages_until("simulate") == ["simulate"]
     assert stages_until("surface") == ["simulate", "surface"]
     assert stages_until("surface", "volume") == ["simulate", "surface", "volume"]
     assert stages_until("movie") == stages_until()
 
 
-def test_a_stage_that_comes_later_is_not_even_asked_for_its_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stage_that_comes_later_is_not_even_asked_for_its_plan(monkeypatch):
     def refuse(*_: object) -> None:
         raise StageUnavailableError("no Blender here")
 
@@ -74,14 +74,12 @@ def test_a_stage_that_comes_later_is_not_even_asked_for_its_plan(monkeypatch: py
 
 
 @pytest.mark.parametrize(("until", "told"), [("cloth", "nothing for the stage"), ("rendr", "the stages are bodies, ")])
-def test_a_stage_that_the_job_or_the_program_lacks_is_refused(until: str, told: str) -> None:
+def test_a_stage_that_the_job_or_the_program_lacks_is_refused(until, told):
     with pytest.raises(PlanError, match=told):
         stages_until(until)
 
 
-def test_what_is_wrong_with_pictures_does_not_count_where_none_is_drawn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_wrong_with_pictures_does_not_count_where_none_is_drawn(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("small.toml").write_text(NO_PICTURE)
     refused = pipeline("check", "small")
@@ -94,14 +92,14 @@ def test_what_is_wrong_with_pictures_does_not_count_where_none_is_drawn(
     assert "particle" in pipeline("check", "small", "--until", "simulate").stderr  # what is simulated still counts
 
 
-def test_a_goal_is_kept_in_the_folder_and_goes_into_what_is_queued_later(tmp_path: Path) -> None:
+def test_a_goal_is_kept_in_the_folder_and_goes_into_what_is_queued_later(tmp_path):
     queue = JobQueue(tmp_path)
     layout = queue.layout("small")
     layout.root.mkdir()
     layout.job_file.write_text(SCENE)
     assert read_goal(layout) == ()
     write_goal(layout, ["surface", "volume"])
-    assert read_goal(layout) == continuation(queue, "small").entry.until == ("surface", "volume")
+    assert read_goal(layout) == continuation(queue, "small")[0].until == ("surface", "volume")
     layout.goal.write_text("garbage")
     assert read_goal(layout) == ()
     write_goal(layout, ["simulate"])
@@ -110,9 +108,7 @@ def test_a_goal_is_kept_in_the_folder_and_goes_into_what_is_queued_later(tmp_pat
 
 
 @pytest.mark.slow
-def test_submitted_until_a_stage_where_nothing_can_be_rendered_and_later_to_its_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_submitted_until_a_stage_where_nothing_can_be_rendered_and_later_to_its_end(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     absent = tmp_path / "no-blender"
     monkeypatch.setenv("PIPELINE_BLENDER", str(absent))
@@ -143,7 +139,7 @@ def test_submitted_until_a_stage_where_nothing_can_be_rendered_and_later_to_its_
 
 
 @pytest.mark.slow
-def test_a_plain_submit_continues_to_the_film_and_the_queue_keeps_the_goal_of_a_paused_job(farm: Farm) -> None:
+def test_a_plain_submit_continues_to_the_film_and_the_queue_keeps_the_goal_of_a_paused_job(farm):
     path = farm.job("a", frames=60, pause_s=1.0)
     running = farm.start("submit", path.name, "--until", "double")
     wait_until(lambda: farm.frames_done("a") > 0, "it never began to work")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ DONE = {task.id: TaskState.SUCCEEDED for task in TASKS}
 
 
 @pytest.fixture
-def layout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobLayout:
+def layout(tmp_path, monkeypatch) -> JobLayout:
     """A job whose last run did everything."""
     monkeypatch.setattr("pipeline.queue.following.POLL_INTERVAL_S", 0.02)
     layout = JobLayout(tmp_path)
@@ -51,7 +52,7 @@ def watch_while(layout: JobLayout, runner: Callable[[Lease], None]) -> int:
         running.join()
 
 
-def test_a_film_that_was_done_when_its_entry_went_was_not_cancelled(layout: JobLayout) -> None:
+def test_a_film_that_was_done_when_its_entry_went_was_not_cancelled(layout):
     queue = JobQueue.of(layout)
     entry = queue.enqueue(new_entry(layout.root.name))
     with Lease.acquire(layout.lease):  # it runs, and its run is on record as ended already
@@ -60,9 +61,7 @@ def test_a_film_that_was_done_when_its_entry_went_was_not_cancelled(layout: JobL
     assert follower.follow() == 0
 
 
-def test_a_runner_that_ends_between_two_looks_leaves_a_film_and_not_a_job_that_waits(
-    layout: JobLayout, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runner_that_ends_between_two_looks_leaves_a_film_and_not_a_job_that_waits(layout, monkeypatch):
     queue = JobQueue.of(layout)
     entry = queue.enqueue(new_entry(layout.root.name))
     with Lease.acquire(layout.lease):
@@ -76,19 +75,39 @@ def test_a_runner_that_ends_between_two_looks_leaves_a_film_and_not_a_job_that_w
     assert follower.follow() == 0
 
 
-def test_a_run_that_says_it_did_everything_is_a_success(layout: JobLayout, capsys: pytest.CaptureFixture[str]) -> None:
-    def succeed(lease: Lease) -> None:
-        with Manifest(layout.manifest) as manifest:
-            manifest.begin_run("film", run=lease.holder.token)
-            manifest.end_run(JobOutcome.SUCCEEDED)
-
-    assert watch_while(layout, succeed) == 0
-    assert "movie.mp4 is done" in capsys.readouterr().err
+def succeed(layout: JobLayout, lease: Lease) -> None:
+    with Manifest(layout.manifest) as manifest:
+        manifest.begin_run("film", run=lease.holder.token)
+        manifest.end_run(JobOutcome.SUCCEEDED)
 
 
-def test_the_film_so_far_is_named_once_while_the_job_runs(
-    layout: JobLayout, capsys: pytest.CaptureFixture[str]
-) -> None:
+def die_while_planning(layout: JobLayout, lease: Lease) -> None:
+    with Manifest(layout.manifest) as manifest:
+        manifest.begin_run("film", run=lease.holder.token)
+
+
+def drain(layout: JobLayout, lease: Lease) -> None:
+    with Manifest(layout.manifest) as manifest:
+        manifest.begin_run("film", run=lease.holder.token)
+        manifest.set_states({TASKS[-1].id: TaskState.CANCELLED})
+        manifest.end_run(JobOutcome.DRAINED)
+
+
+@pytest.mark.parametrize(
+    ("runner", "code", "told"),
+    [
+        (succeed, 0, "movie.mp4 is done"),
+        (drain, 5, "it is stopped with 3 of 4 tasks done"),
+        (die_while_planning, 5, "it is interrupted"),
+        (lambda *_: None, 5, "it is interrupted with 4 of 4 tasks done; continue with: pipeline resume"),
+    ],
+)
+def test_a_run_is_a_success_only_if_it_says_so(layout, capsys, runner, code, told):
+    assert watch_while(layout, partial(runner, layout)) == code
+    assert told in capsys.readouterr().err
+
+
+def test_the_film_so_far_is_named_once_while_the_job_runs(layout, capsys):
     def make_film(_: Lease) -> None:
         layout.preview_movie.touch()
         time.sleep(0.2)
@@ -97,44 +116,11 @@ def test_the_film_so_far_is_named_once_while_the_job_runs(
     assert capsys.readouterr().err.count(f"the preview movie, made anew now and then: {layout.preview_movie}") == 1
 
 
-def test_a_run_that_was_killed_before_it_had_a_record_is_no_success(
-    layout: JobLayout, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert watch_while(layout, lambda _: None) == 5
-    assert "it is interrupted with 4 of 4 tasks done; continue with: pipeline resume" in capsys.readouterr().err
-
-
-def test_a_run_that_was_killed_before_it_had_planned_is_no_success(layout: JobLayout) -> None:
-    def die_while_planning(lease: Lease) -> None:
-        with Manifest(layout.manifest) as manifest:
-            manifest.begin_run("film", run=lease.holder.token)
-
-    assert watch_while(layout, die_while_planning) == 5
-
-
-def test_a_run_that_was_stopped_is_no_success_and_that_is_said(
-    layout: JobLayout, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def drain(lease: Lease) -> None:
-        with Manifest(layout.manifest) as manifest:
-            manifest.begin_run("film", run=lease.holder.token)
-            manifest.set_states({TASKS[-1].id: TaskState.CANCELLED})
-            manifest.end_run(JobOutcome.DRAINED)
-
-    assert watch_while(layout, drain) == 5
-    assert "it is stopped with 3 of 4 tasks done" in capsys.readouterr().err
-
-
-def test_a_run_that_ended_before_the_first_look_is_judged_by_the_record(layout: JobLayout) -> None:
+def test_a_run_that_ended_before_the_first_look_is_judged_by_the_record(layout):
     assert watch(layout) == 0
 
 
-def test_a_runner_that_is_still_making_its_manifest_is_waited_for(layout: JobLayout) -> None:
+def test_a_runner_that_is_still_making_its_manifest_is_waited_for(layout):
     layout.manifest.write_bytes(b"")  # as SQLite leaves it until the first commit
 
-    def succeed(lease: Lease) -> None:
-        with Manifest(layout.manifest) as manifest:
-            manifest.begin_run("film", run=lease.holder.token)
-            manifest.end_run(JobOutcome.SUCCEEDED)
-
-    assert watch_while(layout, succeed) == 0
+    assert watch_while(layout, partial(succeed, layout)) == 0

@@ -16,9 +16,9 @@ from record_samples import film, make_film
 from pipeline.base.errors import ManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import FailureKind, TaskId, TaskState
-from pipeline.record.manifest import SUCCEEDED, LastRun, Manifest, StageSummary, artifact_row, is_on_network
+from pipeline.record.manifest import Manifest, artifact_row, is_on_network
 from pipeline.record.migrations import migrations, schema_version
-from pipeline.record.reader import ManifestReader
+from pipeline.record.reader import SUCCEEDED, LastRun, ManifestReader, StageSummary
 from pipeline.store.receipts import Receipt
 
 SIMULATE = TaskId("simulate")
@@ -172,24 +172,17 @@ def test_a_transaction_is_kept_whole_or_not_at_all(layout: JobLayout) -> None:
         assert manifest.states()[RENDER] is TaskState.PENDING
 
 
-def test_a_run_is_clean_only_if_the_last_one_ended(layout: JobLayout) -> None:
+def test_a_run_is_clean_only_if_the_last_one_ended_and_how_is_known_only_then(layout: JobLayout) -> None:
     with Manifest(layout.manifest) as manifest:
-        assert not manifest.begin_run("film")
-        manifest.end_run()
-        assert manifest.begin_run("film")
+        assert manifest.last_run() == LastRun(None, None)
+        assert not manifest.begin_run("film", run="first")
+        manifest.end_run("failed")
+        assert manifest.last_run() == LastRun("first", "failed")
+        assert manifest.begin_run("film", run="second")
+        assert manifest.last_run() == LastRun("second", None)
         assert not manifest.begin_run("film")
         manifest.end_run("cancelled", clean=False)
         assert not manifest.begin_run("film")
-
-
-def test_how_the_last_run_ended_is_known_only_once_it_has_ended(layout: JobLayout) -> None:
-    with Manifest(layout.manifest) as manifest:
-        assert manifest.last_run() == LastRun(None, None)
-        manifest.begin_run("film", run="first")
-        manifest.end_run("failed")
-        assert manifest.last_run() == LastRun("first", "failed")
-        manifest.begin_run("film", run="second")
-        assert manifest.last_run() == LastRun("second", None)
 
 
 KILLED_WRITER = """
@@ -291,7 +284,6 @@ def test_damage_that_shows_at_writing_is_named_too(layout: JobLayout) -> None:
 
 
 def test_a_manifest_that_is_only_busy_is_not_called_damaged(layout: JobLayout, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.record.reader.BUSY_TIMEOUT_S", 0.0)
     monkeypatch.setattr(
         "pipeline.record.manifest.is_on_network", lambda _: True
     )  # a rollback journal, which locks readers out
@@ -299,7 +291,7 @@ def test_a_manifest_that_is_only_busy_is_not_called_damaged(layout: JobLayout, m
         manifest.record_plan(film(1))
         manifest._connection.execute("BEGIN EXCLUSIVE")
         with pytest.raises(ManifestError, match=r"manifest\.db cannot be read \(database is locked\)"):
-            Manifest.open_readonly(layout.manifest)
+            Manifest.open_readonly(layout.manifest, timeout_s=0.0)
 
 
 def test_a_folder_that_is_not_there_is_not_called_damage(tmp_path: Path) -> None:

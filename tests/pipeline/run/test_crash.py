@@ -12,6 +12,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from farm_processes import wait_until
 from places import HELPERS
 from processes_seen import lives
 from synthetic_jobs import contents, job_text, run_synthetic
@@ -19,7 +20,8 @@ from synthetic_stages import write_faults
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import read_holder
-from pipeline.record.manifest import SUCCEEDED, Manifest
+from pipeline.record.manifest import Manifest
+from pipeline.record.reader import SUCCEEDED
 from pipeline.run.executors.inline import InlineExecutor
 
 FRAMES = 12
@@ -45,7 +47,12 @@ def wait_for_artifacts(root: Path, count: int, runner: subprocess.Popen[str]) ->
     until = time.monotonic() + PATIENCE_S
     while committed(root) < count and runner.poll() is None:
         assert time.monotonic() < until, f"{committed(root)} of {count} artifacts"
-        time.sleep(0.005)
+        time.sleep(0.005)  # so that the kill comes at that artifact, and not some later
+
+
+def wait_for_child(root: Path) -> None:
+    pid = root / "child.pid"
+    wait_until(lambda: pid.exists() and pid.read_text() != "", "no child was ever started")
 
 
 def workers_of(runner: subprocess.Popen[str]) -> list[psutil.Process]:
@@ -53,10 +60,7 @@ def workers_of(runner: subprocess.Popen[str]) -> list[psutil.Process]:
 
 
 def assert_all_gone(processes: list[psutil.Process]) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while any(map(lives, processes)):
-        assert time.monotonic() < until, f"still there: {processes}"
-        time.sleep(0.01)
+    wait_until(lambda: not any(map(lives, processes)), f"still there: {processes}")
 
 
 def assert_like_undisturbed(root: Path, tmp_path: Path) -> None:
@@ -101,26 +105,23 @@ def disturb(root: Path, seed: int, kills: int) -> list[str]:
     return killed
 
 
-def test_killed_at_random_moments_a_job_ends_like_an_undisturbed_one(tmp_path: Path) -> None:
+def test_killed_at_random_moments_a_job_ends_like_an_undisturbed_one(tmp_path):
     assert {"runner", "worker"} <= set(disturb(tmp_path / "job", seed=1, kills=4))
     assert_like_undisturbed(tmp_path / "job", tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2, 8))
-def test_killed_often_at_random_moments_a_job_ends_like_an_undisturbed_one(tmp_path: Path, seed: int) -> None:
+def test_killed_often_at_random_moments_a_job_ends_like_an_undisturbed_one(tmp_path, seed):
     assert len(disturb(tmp_path / "job", seed=seed, kills=8)) >= 4
     assert_like_undisturbed(tmp_path / "job", tmp_path)
 
 
-def test_a_killed_runner_takes_its_workers_with_it_and_its_lease_is_taken_over(tmp_path: Path) -> None:
+def test_a_killed_runner_takes_its_workers_with_it_and_its_lease_is_taken_over(tmp_path):
     root = tmp_path / "job"
     write_faults(root, {"film": ["child"]})
     runner = start_runner(root)
-    until = time.monotonic() + PATIENCE_S
-    while not ((root / "child.pid").exists() and (root / "child.pid").read_text()):
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    wait_for_child(root)
     family = psutil.Process(runner.pid).children(recursive=True)
     assert int((root / "child.pid").read_text()) in {process.pid for process in family}
     runner.kill()
@@ -137,7 +138,7 @@ def test_a_killed_runner_takes_its_workers_with_it_and_its_lease_is_taken_over(t
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_a_signal_drains_the_runner_and_the_next_run_continues(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_drains_the_runner_and_the_next_run_continues(tmp_path, number):
     root = tmp_path / "job"
     write_faults(root, {}, pause_s=0.1)
     runner = start_runner(root)
@@ -152,23 +153,16 @@ def test_a_signal_drains_the_runner_and_the_next_run_continues(tmp_path: Path, n
     assert_like_undisturbed(root, tmp_path)
 
 
-def test_temporary_files_of_workers_go_although_the_runner_was_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_temporary_files_of_workers_go_although_the_runner_was_killed(tmp_path, monkeypatch):
     root, temporary = tmp_path / "job", tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setenv("TMPDIR", str(temporary))
     write_faults(root, {"film": ["temporary files and hang"]})
     runner = start_runner(root)
-    until = time.monotonic() + PATIENCE_S
-    while not ((root / "child.pid").exists() and (root / "child.pid").read_text()):
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    wait_for_child(root)
     assert Path((root / "temporary").read_text()).is_relative_to(temporary)
     family = psutil.Process(runner.pid).children(recursive=True)
     runner.kill()
     runner.communicate()
     assert_all_gone(family)
-    while list(temporary.iterdir()):
-        assert time.monotonic() < until, f"left: {list(temporary.iterdir())}"
-        time.sleep(0.01)
+    wait_until(lambda: not list(temporary.iterdir()), "temporary files are left")

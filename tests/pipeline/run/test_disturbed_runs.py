@@ -26,7 +26,7 @@ from pipeline.run.executors.processes import ProcessExecutor
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path) -> Path:
     return tmp_path / "job"
 
 
@@ -44,7 +44,7 @@ class Reacting(Recorder):
 
 
 @pytest.mark.parametrize(("times", "kind"), [(1, JobOutcome.DRAINED), (2, JobOutcome.CANCELLED)])
-def test_an_interrupted_run_is_continued_by_the_next(root: Path, times: int, kind: JobOutcome) -> None:
+def test_an_interrupted_run_is_continued_by_the_next(root, times, kind):
     write_faults(root, {}, pause_s=0.05)
     control = RunControl()
 
@@ -56,7 +56,7 @@ def test_an_interrupted_run_is_continued_by_the_next(root: Path, times: int, kin
     interrupter = Reacting(Committed, interrupt)
     text = job_text(frames=40)  # two seconds of simulation: enough to be interrupted in
     with ProcessExecutor() as executor:
-        outcome = run_synthetic(root, executor, text, observer=interrupter, control=control)
+        outcome = run_synthetic(root, executor, text, observers=[interrupter.notify], control=control)
     assert (outcome.kind, outcome.exit_code, outcome.failures) == (kind, 130, ())
     done = {event.receipt.artifact for event in interrupter.of(Committed)}
     assert 3 <= len(done) < 81
@@ -68,14 +68,14 @@ def test_an_interrupted_run_is_continued_by_the_next(root: Path, times: int, kin
     assert contents(root) == contents(root.parent / "undisturbed")
 
 
-def test_a_job_that_runs_already_is_left_alone(root: Path) -> None:
+def test_a_job_that_runs_already_is_left_alone(root):
     root.mkdir()
     with Lease.acquire(JobLayout(root).lease), pytest.raises(JobBusyError, match=f"process {os.getpid()} "):
         run_recorded(root)
     assert not JobLayout(root).job_file.exists()
 
 
-def test_the_lease_is_renewed_while_the_run_is_planned(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lease_is_renewed_while_the_run_is_planned(root, monkeypatch):
     monkeypatch.setattr("pipeline.base.lease.HEARTBEAT_INTERVAL_S", 0.01)
     lease = JobLayout(root).lease
 
@@ -88,11 +88,11 @@ def test_the_lease_is_renewed_while_the_run_is_planned(root: Path, monkeypatch: 
 
     with InlineExecutor() as executor:
         observer = Reacting(RunStarted, take_time_until_the_lease_is_renewed)
-        outcome = run_synthetic(root, executor, observer=observer)
+        outcome = run_synthetic(root, executor, observers=[observer.notify])
     assert outcome.kind is JobOutcome.SUCCEEDED
 
 
-def test_a_run_whose_lease_was_taken_over_stops(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_whose_lease_was_taken_over_stops(root, monkeypatch):
     monkeypatch.setattr("pipeline.base.lease.HEARTBEAT_INTERVAL_S", 0.01)
     write_faults(root, {}, pause_s=0.1)
     lease = JobLayout(root).lease
@@ -104,7 +104,7 @@ def test_a_run_whose_lease_was_taken_over_stops(root: Path, monkeypatch: pytest.
         part.replace(lease)
 
     with InlineExecutor() as executor, pytest.raises(LeaseLostError, match=r"taken over by process \d+ on elsewhere"):
-        run_synthetic(root, executor, observer=Reacting(Committed, take_over_from_elsewhere))
+        run_synthetic(root, executor, observers=[Reacting(Committed, take_over_from_elsewhere).notify])
     assert lease.exists()
 
 
@@ -133,10 +133,10 @@ class LosingExecutor(InlineExecutor):
 
 
 @pytest.mark.parametrize("kind", [FailureKind.WORKER_LOST, FailureKind.STALLED, FailureKind.CANCELLED])
-def test_a_commit_whose_word_was_lost_is_adopted_and_not_made_again(root: Path, kind: FailureKind) -> None:
+def test_a_commit_whose_word_was_lost_is_adopted_and_not_made_again(root, kind):
     recorder = Recorder()
     with LosingExecutor("double/000002.bin", kind) as executor:
-        outcome = run_synthetic(root, executor, observer=recorder)
+        outcome = run_synthetic(root, executor, observers=[recorder.notify])
     assert (outcome.kind, outcome.ran, outcome.failures) == (JobOutcome.SUCCEEDED, 8, ())
     assert executor.submitted.count(TaskId("double/000002")) == 1
     assert "double/000002.bin" in {event.receipt.artifact for event in recorder.of(Committed)}
@@ -146,7 +146,7 @@ def test_a_commit_whose_word_was_lost_is_adopted_and_not_made_again(root: Path, 
     assert run_recorded(root)[1].ran() == []
 
 
-def test_after_an_end_by_force_the_next_run_looks_for_receipts_that_nobody_told_of(root: Path) -> None:
+def test_after_an_end_by_force_the_next_run_looks_for_receipts_that_nobody_told_of(root):
     write_faults(root, {"double/000001": ["segfault"]})
     with ProcessExecutor() as executor:
         run_synthetic(root, executor)
@@ -156,7 +156,7 @@ def test_after_an_end_by_force_the_next_run_looks_for_receipts_that_nobody_told_
     assert recorder.ran() == []  # its receipt was adopted
 
 
-def test_a_file_that_vanishes_while_its_task_ends_fails_the_task(root: Path) -> None:
+def test_a_file_that_vanishes_while_its_task_ends_fails_the_task(root):
     """Its stage found the frames there; the record did not know of them, and one is gone before it is told."""
     run_recorded(root)
     with Manifest(JobLayout(root).manifest) as manifest:
@@ -167,7 +167,7 @@ def test_a_file_that_vanishes_while_its_task_ends_fails_the_task(root: Path) -> 
             (root / "steps/000003.bin").unlink()
 
     with InlineExecutor() as executor:
-        outcome = run_synthetic(root, executor, observer=Reacting(Finished, remove))
+        outcome = run_synthetic(root, executor, observers=[Reacting(Finished, remove).notify])
     assert outcome.kind is JobOutcome.FAILED
     assert "steps/000003.bin was there when its task ended" in outcome.failures[0].message
     assert run_recorded(root)[0].kind is JobOutcome.SUCCEEDED

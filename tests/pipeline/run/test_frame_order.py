@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from pipeline.model.job import Job
-from pipeline.run.frame_order import frame_turns, spread_turns
+from pipeline.run.plan import frame_turns, spread_turns
 
 
 def in_turn(turns: list[int]) -> list[int]:

@@ -19,8 +19,7 @@ from synthetic_stages import write_faults
 from pipeline.base import memory
 from pipeline.base.errors import JobFileError
 from pipeline.base.layout import JobLayout
-from pipeline.base.policy import Policy
-from pipeline.base.task import FailureKind, Resources, Task, TaskId, TaskState
+from pipeline.base.task import FailureKind, Resources, TaskId, TaskState
 from pipeline.job.loading import load_job
 from pipeline.run.checked_job import load_checked_job
 from pipeline.run.events import Failed, JobOutcome
@@ -28,9 +27,8 @@ from pipeline.run.executors import worker_process
 from pipeline.run.executors.failures import classify
 from pipeline.run.executors.inline import InlineExecutor
 from pipeline.run.executors.processes import ProcessExecutor, WorkerLimits
-from pipeline.run.scheduler import Scheduler
 from pipeline.stages import STAGES
-from render.blender import BlenderUnavailableError, ExecutableRenderer, FrameRenderError
+from render.blender import BlenderUnavailableError, ChildRenderer, FrameRenderError
 
 __all__ = ["layout"]
 
@@ -51,9 +49,7 @@ def limited(layout: JobLayout, name: str, **limits: float) -> object:
 # --- memory ---
 
 
-def test_a_task_whose_child_grew_too_large_is_out_of_memory_and_its_child_gone(
-    executor: ProcessExecutor, layout: JobLayout
-) -> None:
+def test_a_task_whose_child_grew_too_large_is_out_of_memory_and_its_child_gone(executor, layout):
     write_faults(layout.root, {"film": ["large child"]})
     failed = failure(run(executor, limited(layout, "film", memory_bytes=300_000_000)))
     assert failed.kind is FailureKind.OUT_OF_MEMORY
@@ -65,9 +61,7 @@ def test_a_task_whose_child_grew_too_large_is_out_of_memory_and_its_child_gone(
     assert_gone(child)
 
 
-def test_a_blender_that_the_kernel_killed_for_want_of_memory_is_no_lost_worker(
-    executor: ProcessExecutor, layout: JobLayout, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_blender_that_the_kernel_killed_for_want_of_memory_is_no_lost_worker(executor, layout, monkeypatch):
     kills = iter([4, 5])  # before the task, and when it failed
     monkeypatch.setattr(worker_process, "out_of_memory_kills", lambda: next(kills))
     write_faults(layout.root, {"steps": ["lose Blender"]})
@@ -77,12 +71,12 @@ def test_a_blender_that_the_kernel_killed_for_want_of_memory_is_no_lost_worker(
     assert "the machine is out of memory" in failed.message
 
 
-def test_a_log_that_cannot_be_read_ends_nothing(tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_read_ends_nothing(tmp_path):
     assert worker_process.log_tail(tmp_path) == ""  # a folder: an OSError, as from a shared disk whose server is away
     assert worker_process.log_tail(tmp_path / "absent") == ""
 
 
-def test_a_blender_that_was_killed_otherwise_is_a_lost_worker(executor: ProcessExecutor, layout: JobLayout) -> None:
+def test_a_blender_that_was_killed_otherwise_is_a_lost_worker(executor, layout):
     write_faults(layout.root, {"steps": ["lose Blender"]})
     assert failure(run(executor, assign(layout, "steps"))).kind is FailureKind.WORKER_LOST
 
@@ -90,16 +84,14 @@ def test_a_blender_that_was_killed_otherwise_is_a_lost_worker(executor: ProcessE
 @pytest.mark.parametrize(
     ("end", "kind"), [("os.kill(os.getpid(), 9)", FailureKind.WORKER_LOST), ("sys.exit(1)", FailureKind.FAILED)]
 )
-def test_a_blender_that_is_killed_while_it_starts_is_lost_and_one_that_refuses_is_not(
-    tmp_path: Path, end: str, kind: FailureKind
-) -> None:
+def test_a_blender_that_is_killed_while_it_starts_is_lost_and_one_that_refuses_is_not(tmp_path, end, kind):
     blender = tmp_path / "blender"
     blender.write_text(
         f"#!{sys.executable}\nimport os, sys\nif sys.argv[1:] != ['--version']:\n    {end}\nprint('Blender 5.0.1')\n"
     )
     blender.chmod(0o755)
     with pytest.raises(BlenderUnavailableError) as refused:
-        ExecutableRenderer(tmp_path / "scene.json", threads=1, blender=str(blender))
+        ChildRenderer(tmp_path / "scene.json", threads=1, blender=str(blender))
     assert classify(refused.value) is kind
 
 
@@ -111,11 +103,11 @@ def test_a_blender_that_is_killed_while_it_starts_is_lost_and_one_that_refuses_i
         FrameRenderError(3, "System is out of GPU memory"),
     ],
 )
-def test_libraries_that_run_out_of_memory_are_understood(error: Exception) -> None:
+def test_libraries_that_run_out_of_memory_are_understood(error):
     assert classify(error) is FailureKind.OUT_OF_MEMORY
 
 
-def test_a_process_tree_has_the_grandchildren_and_their_memory() -> None:
+def test_a_process_tree_has_the_grandchildren_and_their_memory():
     grandchild = "import time; held = bytearray(b'x') * 60_000_000; print('held', flush=True); time.sleep(600)"
     child = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {grandchild!r}])"
     process = subprocess.Popen([sys.executable, "-c", child], stdout=subprocess.PIPE, start_new_session=True)
@@ -132,7 +124,7 @@ def test_a_process_tree_has_the_grandchildren_and_their_memory() -> None:
     assert memory.tree_memory_bytes(process.pid) == 0
 
 
-def test_a_containers_memory_is_what_its_control_group_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_containers_memory_is_what_its_control_group_leaves(tmp_path, monkeypatch):
     inner = tmp_path / "inner"
     inner.mkdir()
     monkeypatch.setattr(memory, "_control_groups", lambda: [inner, tmp_path])
@@ -145,9 +137,7 @@ def test_a_containers_memory_is_what_its_control_group_leaves(tmp_path: Path, mo
 # --- stalls and timeouts ---
 
 
-def test_a_stalled_task_is_ended_with_its_processes_and_stacks_in_its_log(
-    executor: ProcessExecutor, layout: JobLayout
-) -> None:
+def test_a_stalled_task_is_ended_with_its_processes_and_stacks_in_its_log(executor, layout):
     write_faults(layout.root, {"film": ["child"]})
     # Longer than a worker takes to start on a busy machine, which shows no sign of life.
     failed = failure(run(executor, limited(layout, "film", stall_s=5.0)))
@@ -162,8 +152,8 @@ def test_a_stalled_task_is_ended_with_its_processes_and_stacks_in_its_log(
 
 
 def test_a_worker_that_was_stopped_from_outside_is_ended_as_stalled_and_the_log_says_that_it_was_stopped(
-    executor: ProcessExecutor, layout: JobLayout
-) -> None:
+    executor, layout
+):
     write_faults(layout.root, {"film": ["hang"]})
     executor.submit(limited(layout, "film", stall_s=15.0))
     until = time.monotonic() + PATIENCE_S
@@ -184,10 +174,10 @@ def test_a_worker_that_was_stopped_from_outside_is_ended_as_stalled_and_the_log_
 def run_with(root: Path, limits: str, **options: object) -> tuple[object, Recorder]:
     recorder = Recorder()
     with ProcessExecutor(WorkerLimits(workers=2)) as executor:
-        return run_synthetic(root, executor, job_text() + limits, observer=recorder, **options), recorder
+        return run_synthetic(root, executor, job_text() + limits, observers=[recorder.notify], **options), recorder
 
 
-def test_a_frame_that_takes_too_long_fails_and_the_others_go_on(tmp_path: Path) -> None:
+def test_a_frame_that_takes_too_long_fails_and_the_others_go_on(tmp_path):
     write_faults(tmp_path / "job", {"double/000002": ["hang"]})
     outcome, recorder = run_with(tmp_path / "job", "[limits.double]\ntimeout_s = 15\nattempts = 1\n")
     assert outcome.kind is JobOutcome.FAILED
@@ -197,14 +187,14 @@ def test_a_frame_that_takes_too_long_fails_and_the_others_go_on(tmp_path: Path) 
     assert len(recorder.of(Failed)) == 1
 
 
-def test_a_stage_says_how_often_its_tasks_are_tried(tmp_path: Path) -> None:
+def test_a_stage_says_how_often_its_tasks_are_tried(tmp_path):
     write_faults(tmp_path / "job", {"double/000001": ["segfault"] * 4, "film": ["segfault"] * 2})
     outcome, recorder = run_with(tmp_path / "job", "[limits.double]\nattempts = 5\n")
     assert outcome.kind is JobOutcome.SUCCEEDED
     assert [each.task_id for each in recorder.of(Failed)].count("double/000001") == 4
 
 
-def test_a_stage_says_which_share_of_failures_stops_the_job(tmp_path: Path) -> None:
+def test_a_stage_says_which_share_of_failures_stops_the_job(tmp_path):
     write_faults(tmp_path / "job", {f"double/{k:06d}": ["fail"] for k in range(6)})
     with InlineExecutor() as executor:
         outcome = run_synthetic(
@@ -216,14 +206,14 @@ def test_a_stage_says_which_share_of_failures_stops_the_job(tmp_path: Path) -> N
     assert (outcome.kind, len(outcome.failures)) == (JobOutcome.TOO_MANY_FAILURES, 2)
 
 
-def test_limits_rerun_nothing(tmp_path: Path) -> None:
+def test_limits_rerun_nothing(tmp_path):
     with InlineExecutor() as executor:
         run_synthetic(tmp_path / "job", executor)
         limits = "".join(f"[limits.{stage}]\ntimeout_s = 600\nmemory_gb = 2\n" for stage in ("steps", "double"))
         assert run_synthetic(tmp_path / "job", executor, job_text() + limits).ran == 0
 
 
-def test_limits_are_in_no_fingerprint_of_any_stage(tmp_path: Path) -> None:
+def test_limits_are_in_no_fingerprint_of_any_stage(tmp_path):
     (tmp_path / "plain.toml").write_text(job_text())
     limits = "".join(f"[limits.{stage.name}]\ntimeout_s = 600\nattempts = 7\n" for stage in STAGES)
     (tmp_path / "limited.toml").write_text(job_text() + limits)
@@ -243,23 +233,8 @@ def test_limits_are_in_no_fingerprint_of_any_stage(tmp_path: Path) -> None:
         ("[limits.render]\ntimeout = 5", "timeout_s"),
     ],
 )
-def test_limits_of_what_is_no_stage_or_no_limit_are_refused(tmp_path: Path, limits: str, complaint: str) -> None:
+def test_limits_of_what_is_no_stage_or_no_limit_are_refused(tmp_path, limits, complaint):
     (tmp_path / "job.toml").write_text(job_text() + limits)
     with pytest.raises(JobFileError) as refused:
         load_checked_job(tmp_path / "job.toml")
     assert complaint in str(refused.value)
-
-
-def test_the_scheduler_goes_by_the_policy_of_the_tasks_stage() -> None:
-    tasks = [
-        Task(TaskId(f"{stage}/0"), stage, (), (), parameters=None)  # type: ignore[arg-type]
-        for stage in ("often", "once")
-    ]
-    scheduler = Scheduler(
-        tasks, capacity=Resources(cores=2), policies={"often": Policy(attempts=3), "once": Policy(attempts=1)}
-    )
-    scheduler.start()
-    for task in tasks:
-        scheduler.handle(Failed(task.id, 1, FailureKind.WORKER_LOST, ""))
-    assert scheduler.state(TaskId("often/0")) is TaskState.READY
-    assert scheduler.state(TaskId("once/0")) is TaskState.FAILED

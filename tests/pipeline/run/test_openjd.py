@@ -60,7 +60,7 @@ def pipeline(*arguments: object) -> str:
 
 
 @pytest.fixture
-def synthetic(tmp_path: Path) -> JobLayout:
+def synthetic(tmp_path) -> JobLayout:
     layout = JobLayout(tmp_path / "job")
     layout.root.mkdir()
     layout.job_file.write_text(job_text())
@@ -91,7 +91,7 @@ def run_frames(layout: JobLayout, stage: str, frames: set[int] | None = None, st
 # --- the template ---
 
 
-def test_a_step_a_stage_that_depends_on_those_it_reads(synthetic: JobLayout) -> None:
+def test_a_step_a_stage_that_depends_on_those_it_reads(synthetic):
     steps = steps_of(synthetic)
     assert list(steps) == ["steps", "double", "film"]
     assert [step.get("dependencies") for step in steps.values()] == [
@@ -101,7 +101,7 @@ def test_a_step_a_stage_that_depends_on_those_it_reads(synthetic: JobLayout) -> 
     ]
 
 
-def test_frames_that_do_not_depend_on_each_other_are_cut_into_chunks(synthetic: JobLayout) -> None:
+def test_frames_that_do_not_depend_on_each_other_are_cut_into_chunks(synthetic):
     steps = steps_of(synthetic)
     [parameter] = steps["double"]["parameterSpace"]["taskParameterDefinitions"]
     assert (parameter["type"], parameter["range"]) == ("CHUNK[INT]", "0-5")
@@ -110,7 +110,7 @@ def test_frames_that_do_not_depend_on_each_other_are_cut_into_chunks(synthetic: 
     assert "parameterSpace" not in steps["film"]
 
 
-def test_the_reference_runtime_accepts_the_template(synthetic: JobLayout) -> None:
+def test_the_reference_runtime_accepts_the_template(synthetic):
     path = synthetic.root / "openjd.json"
     template = template_of(synthetic)
     path.write_text(json.dumps(template))
@@ -123,7 +123,7 @@ def test_the_reference_runtime_accepts_the_template(synthetic: JobLayout) -> Non
 # --- running a stage by itself ---
 
 
-def test_stages_run_one_by_one_give_what_a_run_gives_and_are_taken_over(synthetic: JobLayout, tmp_path: Path) -> None:
+def test_stages_run_one_by_one_give_what_a_run_gives_and_are_taken_over(synthetic, tmp_path):
     assert run_frames(synthetic, "steps").ran == 1
     assert run_frames(synthetic, "double", {3, 4, 5}).ran == 3
     assert run_frames(synthetic, "double", {0, 1, 2, 3}) == StageOutcome(3, 1, ())
@@ -135,7 +135,7 @@ def test_stages_run_one_by_one_give_what_a_run_gives_and_are_taken_over(syntheti
     assert (outcome.kind, outcome.ran) == (JobOutcome.SUCCEEDED, 0)
 
 
-def test_a_stage_whose_inputs_are_missing_or_damaged_says_so(synthetic: JobLayout) -> None:
+def test_a_stage_whose_inputs_are_missing_or_damaged_says_so(synthetic):
     with pytest.raises(PipelineError, match=r"double/000000 needs steps/000000.bin: it was never made; run the stage"):
         run_frames(synthetic, "double", {0})
     run_frames(synthetic, "steps")
@@ -144,7 +144,7 @@ def test_a_stage_whose_inputs_are_missing_or_damaged_says_so(synthetic: JobLayou
         run_frames(synthetic, "double", {2})
 
 
-def test_a_failing_frame_does_not_stop_the_others_and_is_tried_again(synthetic: JobLayout) -> None:
+def test_a_failing_frame_does_not_stop_the_others_and_is_tried_again(synthetic):
     run_frames(synthetic, "steps")
     write_faults(synthetic.root, {"double/000001": ["fail"]})
     outcome = run_frames(synthetic, "double")
@@ -152,7 +152,7 @@ def test_a_failing_frame_does_not_stop_the_others_and_is_tried_again(synthetic: 
     assert run_frames(synthetic, "double") == StageOutcome(1, 5, ())
 
 
-def test_a_full_disk_ends_it(synthetic: JobLayout) -> None:
+def test_a_full_disk_ends_it(synthetic):
     run_frames(synthetic, "steps")
     write_faults(synthetic.root, {"double/000001": ["disk full"]})
     outcome = run_frames(synthetic, "double")
@@ -160,13 +160,13 @@ def test_a_full_disk_ends_it(synthetic: JobLayout) -> None:
     assert outcome.up_to_date == 0  # those after it were not looked at
 
 
-def test_a_stage_that_is_stopped_continues_later(synthetic: JobLayout) -> None:
+def test_a_stage_that_is_stopped_continues_later(synthetic):
     outcome = run_frames(synthetic, "steps", stop=True)
     assert [failed.kind for failed in outcome.failures] == [FailureKind.CANCELLED]
     assert run_frames(synthetic, "steps").ran == 1
 
 
-def test_every_try_has_a_number_of_its_own_also_beside_others(synthetic: JobLayout) -> None:
+def test_every_try_has_a_number_of_its_own_also_beside_others(synthetic):
     """The number of a try that was killed, or that another machine has just begun, has no receipt yet."""
     log = synthetic.log(TaskId("steps"), 1)
     log.parent.mkdir()
@@ -182,7 +182,7 @@ def test_every_try_has_a_number_of_its_own_also_beside_others(synthetic: JobLayo
 
 
 @pytest.mark.slow
-def test_a_job_run_by_the_reference_runtime_has_the_same_frames(tmp_path: Path) -> None:
+def test_a_job_run_by_the_reference_runtime_has_the_same_frames(tmp_path):
     (tmp_path / "small.toml").write_text(JOB)
     pipeline("export", "openjd", tmp_path / "small.toml", "--output", tmp_path / "farm", *CPU)
     template = tmp_path / "farm" / "small" / "openjd.json"

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import random
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -12,10 +11,10 @@ from record_samples import film, parameter_set
 from pipeline.base.errors import PlanError
 from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
-from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId
 from pipeline.model.job import Job
-from pipeline.record.manifest import ArtifactRow, StageCost, artifact_row
+from pipeline.record.manifest import artifact_row
+from pipeline.record.reader import ArtifactRow, StageCost
 from pipeline.record.reconcile import FileCondition, FileProblem
 from pipeline.run.plan import (
     Assessment,
@@ -65,9 +64,8 @@ def assess_film(
     rows: dict[ArtifactPath, ArtifactRow],
     problems: dict[ArtifactPath, FileProblem] | None = None,
     forced: frozenset[TaskId] = frozenset(),
-    known: list[Task] | None = None,
 ) -> dict[TaskId, Assessment]:
-    sets: dict[str, ParameterSet] = {task.parameters.digest: task.parameters for task in known or film(1)}
+    sets = {task.parameters.digest: task.parameters for task in film(1)}
     found = assess(tasks, rows, problems or {}, parameters=sets.get, forced=forced)
     return {assessment.task.id: assessment for assessment in found}
 
@@ -76,7 +74,7 @@ def with_verdict(assessments: dict[TaskId, Assessment], verdict: Verdict) -> lis
     return [task for task, assessment in assessments.items() if assessment.verdict is verdict]
 
 
-def test_nothing_is_up_to_date_at_first() -> None:
+def test_nothing_is_up_to_date_at_first():
     assessments = assess_film(film(2), {})
     assert with_verdict(assessments, Verdict.STALE) == ["simulate", "render/000000", "render/000001", "film"]
     assert summarize(assessments.values()) == [
@@ -86,7 +84,7 @@ def test_nothing_is_up_to_date_at_first() -> None:
     ]
 
 
-def test_a_finished_film_is_up_to_date() -> None:
+def test_a_finished_film_is_up_to_date():
     tasks = film(FRAMES)
     rows = rows_of(tasks)
     assessments = assess_film(tasks, rows)
@@ -95,7 +93,7 @@ def test_a_finished_film_is_up_to_date() -> None:
     assert summarize(assessments.values()) == ["simulate: up to date", "render 0-5: up to date", "film: up to date"]
 
 
-def test_a_new_camera_reruns_frames_and_film_only_and_is_named() -> None:
+def test_a_new_camera_reruns_frames_and_film_only_and_is_named():
     assessments = assess_film(film(FRAMES, camera=(0, -4, 2)), rows_of(film(FRAMES)))
     assert summarize(assessments.values()) == [
         "simulate: up to date",
@@ -104,7 +102,7 @@ def test_a_new_camera_reruns_frames_and_film_only_and_is_named() -> None:
     ]
 
 
-def test_a_new_viscosity_reruns_the_simulation_and_perhaps_the_rest() -> None:
+def test_a_new_viscosity_reruns_the_simulation_and_perhaps_the_rest():
     assessments = assess_film(film(2, viscosity=2.0), rows_of(film(2)))
     assert with_verdict(assessments, Verdict.STALE) == ["simulate"]
     assert with_verdict(assessments, Verdict.DOWNSTREAM) == ["render/000000", "render/000001", "film"]
@@ -112,12 +110,12 @@ def test_a_new_viscosity_reruns_the_simulation_and_perhaps_the_rest() -> None:
     assert assessments[TaskId("render/000001")].reasons[0].text == "cache/000001.h5 will be made anew"
 
 
-def test_parameters_that_the_record_has_lost_are_told_as_such() -> None:
+def test_parameters_that_the_record_has_lost_are_told_as_such():
     found = assess(film(1, viscosity=2.0), rows_of(film(1)), {}, parameters=lambda _: None)
     assert found[0].reasons[0].text == "its parameters changed; what they were is not on record"
 
 
-def test_a_longer_film_continues_the_simulation_and_keeps_every_frame() -> None:
+def test_a_longer_film_continues_the_simulation_and_keeps_every_frame():
     assessments = assess_film(film(FRAMES), rows_of(film(4)))
     simulate = assessments[TaskId("simulate")]
     assert simulate.rebuilds == ("cache/000004.h5", "cache/000005.h5")
@@ -128,7 +126,7 @@ def test_a_longer_film_continues_the_simulation_and_keeps_every_frame() -> None:
     assert reason.text == "frames/000004.png is a new input, and 1 more like it"
 
 
-def test_a_shorter_film_reruns_only_what_is_made_of_all_frames() -> None:
+def test_a_shorter_film_reruns_only_what_is_made_of_all_frames():
     assessments = assess_film(film(4), rows_of(film(FRAMES)))
     assert with_verdict(assessments, Verdict.STALE) == ["film"]
     (reason,) = assessments[TaskId("film")].reasons
@@ -136,7 +134,7 @@ def test_a_shorter_film_reruns_only_what_is_made_of_all_frames() -> None:
 
 
 @pytest.mark.parametrize("condition", list(FileCondition))
-def test_a_file_that_does_not_count_reruns_its_task_and_perhaps_those_after_it(condition: FileCondition) -> None:
+def test_a_file_that_does_not_count_reruns_its_task_and_perhaps_those_after_it(condition):
     tasks = film(FRAMES)
     problems = {CACHE_2: FileProblem(condition, "what was found")}
     assessments = assess_film(tasks, rows_of(tasks), problems)
@@ -146,7 +144,7 @@ def test_a_file_that_does_not_count_reruns_its_task_and_perhaps_those_after_it(c
     assert with_verdict(assessments, Verdict.DOWNSTREAM) == ["render/000002", "film"]
 
 
-def test_a_changed_input_is_named_although_its_maker_is_up_to_date() -> None:
+def test_a_changed_input_is_named_although_its_maker_is_up_to_date():
     tasks = film(FRAMES)
     rows = rows_of(tasks)
     rows[PICTURE_2] = rows[PICTURE_2]._replace(hash="another")
@@ -157,7 +155,7 @@ def test_a_changed_input_is_named_although_its_maker_is_up_to_date() -> None:
     assert assess_film(tasks, rows)[TaskId("film")].reasons[0].text == "its inputs changed"
 
 
-def test_the_same_content_made_anew_stops_the_rerun() -> None:
+def test_the_same_content_made_anew_stops_the_rerun():
     """Early cutoff: the rebuilt cache file has the old hash, so its picture is up to date at dispatch."""
     tasks = film(FRAMES)
     rows = rows_of(tasks)
@@ -170,7 +168,7 @@ def test_the_same_content_made_anew_stops_the_rerun() -> None:
     assert not up_to_date(render, rows)
 
 
-def test_forced_tasks_run_whatever_the_record_says() -> None:
+def test_forced_tasks_run_whatever_the_record_says():
     tasks = film(2)
     assessments = assess_film(tasks, rows_of(tasks), forced=frozenset({TaskId("render/000001")}))
     assert with_verdict(assessments, Verdict.STALE) == ["render/000001"]
@@ -180,7 +178,7 @@ def test_forced_tasks_run_whatever_the_record_says() -> None:
 
 @settings(deadline=None)
 @given(data=st.data())
-def test_whatever_is_damaged_all_that_depends_on_it_and_nothing_else_may_run(data: st.DataObject) -> None:
+def test_whatever_is_damaged_all_that_depends_on_it_and_nothing_else_may_run(data):
     tasks = film(4)
     rows = rows_of(tasks)
     lost = data.draw(st.sets(st.sampled_from(sorted(rows))))
@@ -210,13 +208,11 @@ def test_whatever_is_damaged_all_that_depends_on_it_and_nothing_else_may_run(dat
         ({7}, range(6, 9), "7"),
     ],
 )
-def test_frames_are_named_in_ranges_over_the_frames_that_are_planned(
-    frames: set[int], planned: range, text: str
-) -> None:
+def test_frames_are_named_in_ranges_over_the_frames_that_are_planned(frames, planned, text):
     assert frame_ranges(frames, planned) == text
 
 
-def test_an_estimate_goes_by_what_the_stage_has_taken_before() -> None:
+def test_an_estimate_goes_by_what_the_stage_has_taken_before():
     assessments = assess_film(film(FRAMES), {}).values()
     costs = {"render": StageCost("render", 2.5, 1000.0)}
     assert estimate(assessments, costs) == [
@@ -230,7 +226,7 @@ def test_an_estimate_goes_by_what_the_stage_has_taken_before() -> None:
 
 @settings(deadline=None)
 @given(seed=st.integers(0, 1000))
-def test_makers_come_before_users_in_whatever_order_stages_plan_them(seed: int) -> None:
+def test_makers_come_before_users_in_whatever_order_stages_plan_them(seed):
     tasks = film(FRAMES)
     random.Random(seed).shuffle(tasks)
     ordered = in_order(tasks)
@@ -241,7 +237,7 @@ def test_makers_come_before_users_in_whatever_order_stages_plan_them(seed: int) 
         made.update(task.outputs)
 
 
-def test_tasks_that_do_not_fit_together_are_refused() -> None:
+def test_tasks_that_do_not_fit_together_are_refused():
     simulate, render, movie = film(1)
     with pytest.raises(PlanError, match="two tasks are called simulate"):
         in_order([simulate, simulate])
@@ -250,11 +246,11 @@ def test_tasks_that_do_not_fit_together_are_refused() -> None:
     with pytest.raises(PlanError, match=r"film reads frames/000000.png, which no task makes"):
         in_order([simulate, movie])
     circle = Task(TaskId("circle"), "s", movie.outputs, simulate.outputs, parameter_set("s"))
-    with pytest.raises(PlanError, match="3 tasks wait for each other in a circle, circle among them"):
+    with pytest.raises(PlanError, match=r"in a circle: .*circle"):
         in_order([circle, render, movie])
 
 
-def test_the_real_stages_fit_together(tmp_path: Path) -> None:
+def test_the_real_stages_fit_together(tmp_path):
     fluid = {"name": "water", "block": [{"shape": {"type": "box", "size": [0.2, 0.2, 0.2]}}]}
     job = Job.model_validate({"name": "drop", "frames": 3, "fluid": [fluid]})
     tasks = plan_job(job, JobLayout(tmp_path), STAGES)

@@ -43,7 +43,7 @@ def lines(printed: str) -> list[str]:
     return [re.sub(r"^\[ *[0-9.]+ s\] ", "", line) for line in printed.splitlines()]
 
 
-def test_a_stage_is_counted_by_its_artifacts_and_its_end_is_said() -> None:
+def test_a_stage_is_counted_by_its_artifacts_and_its_end_is_said():
     simulate, first, second, *_ = film(FRAMES)
     observer, printed = observe(
         RunStarted(all_stale()),
@@ -62,7 +62,7 @@ def test_a_stage_is_counted_by_its_artifacts_and_its_end_is_said() -> None:
     assert [line.partition(",")[0] for line in lines(printed)] == [f"simulate {FRAMES}/{FRAMES}"]
 
 
-def test_what_two_attempts_commit_and_what_a_task_found_there_count_once() -> None:
+def test_what_two_attempts_commit_and_what_a_task_found_there_count_once():
     _, first, second, *_ = film(FRAMES)
     observer, _ = observe(
         RunStarted(all_stale()),
@@ -74,7 +74,7 @@ def test_what_two_attempts_commit_and_what_a_task_found_there_count_once() -> No
     assert observer.stages["render"].done == 2
 
 
-def test_the_reasons_are_said_before_a_change_is_run_but_not_for_a_new_job() -> None:
+def test_the_reasons_are_said_before_a_change_is_run_but_not_for_a_new_job():
     simulate, *rest = film(FRAMES)
     reason = Reason("camera.position changed", "camera.position changed")
     changed = [
@@ -89,7 +89,7 @@ def test_the_reasons_are_said_before_a_change_is_run_but_not_for_a_new_job() -> 
     assert observe(RunStarted(all_stale()))[1] == ""
 
 
-def test_failures_and_notices_are_sentences() -> None:
+def test_failures_and_notices_are_sentences():
     printed = observe(
         RunStarted(all_stale()),
         Notice("stopping at once"),
@@ -100,7 +100,7 @@ def test_failures_and_notices_are_sentences() -> None:
     assert printed[0].stages["render"].describe(0.0) == "0/3, 1 failed"
 
 
-def test_rate_and_remaining_time_leave_out_the_start_and_what_was_there_already() -> None:
+def test_rate_and_remaining_time_leave_out_the_start_and_what_was_there_already():
     stage = StageProgress("render", total=100, done=40, at_start=40)
     for now in (10.0, 12.0, 14.0, 16.0):  # the first took long to start: Blender had to be loaded
         stage.advance(1, now)
@@ -109,7 +109,7 @@ def test_rate_and_remaining_time_leave_out_the_start_and_what_was_there_already(
     assert stage.describe(16.0) == "44/100, 0.50/s, 1 min 52 s left"
 
 
-def test_a_terminal_shows_a_bar_for_every_stage() -> None:
+def test_a_terminal_shows_a_bar_for_every_stage():
     stream = io.StringIO()
     display = LiveDisplay(Console(file=stream, force_terminal=True, width=100))
     with ProgressObserver(display) as observer:
@@ -128,7 +128,7 @@ def test_a_terminal_shows_a_bar_for_every_stage() -> None:
     ("seconds", "text"),
     [(0.04, "0.0 s"), (9.94, "9.9 s"), (9.96, "10 s"), (59.4, "59 s"), (59.6, "1 min 0 s"), (7830, "2 h 10 min")],
 )
-def test_durations_read_well(seconds: float, text: str) -> None:
+def test_durations_read_well(seconds, text):
     assert wording.duration(seconds) == text
 
 
@@ -136,17 +136,17 @@ def test_durations_read_well(seconds: float, text: str) -> None:
     ("byte_count", "text"),
     [(0, "0 bytes"), (1023, "1023 bytes"), (1024, "1.0 KiB"), (5 << 20, "5.0 MiB"), (3 << 40, "3072.0 GiB")],
 )
-def test_sizes_read_well(byte_count: int, text: str) -> None:
+def test_sizes_read_well(byte_count, text):
     assert wording.size(byte_count) == text
 
 
-def test_durations_grow_with_their_texts() -> None:
+def test_durations_grow_with_their_texts():
     """No gap and no step back where one way of writing ends and the next begins."""
     texts = [wording.duration(tenths / 10) for tenths in range(0, 40_000)]
     assert len(set(texts)) == len(list(itertools.groupby(texts)))
 
 
-def test_what_takes_minutes_once_is_said_at_once_and_by_one_of_those_who_wait() -> None:
+def test_what_takes_minutes_once_is_said_at_once_and_by_one_of_those_who_wait():
     _, first, second, *_ = film(FRAMES)
     compiling = "compiling Cycles' kernels for NVIDIA H100; minutes, once"
     observer, printed = observe(

@@ -48,29 +48,24 @@ def test_status_shows_the_last_frames_numbers_with_their_units(layout):
     assert "warning" not in text
 
 
-def test_solves_that_hit_their_limit_are_counted_with_their_frames(layout):
-    for frame, count in enumerate([0, 1, 0, 0, 2, 1, 0]):
-        commit(layout, frame, not_converged=float(count))
-    assert "warning: water: 4 solves hit their iteration limit, frames 1, 4-5" in status(layout)
-
-
-def test_one_solve_that_hit_its_limit_is_one(layout):
-    commit(layout, 12, not_converged=1.0)
-    assert "warning: water: 1 solve hit its iteration limit, frame 12\n" in status(layout)
-
-
-def test_what_is_counted_since_the_start_is_not_counted_again_in_every_frame(layout):
-    for frame, total in enumerate([0, 0, 1, 1, 3, 3]):
-        commit(layout, frame, bodies_lost=float(total))
-    assert "warning: water: 3 bodies fell out of sight and were stopped, frames 2, 4\n" in status(layout)
-
-
-def test_crossings_of_cloth_that_were_left_are_a_warning_with_their_frames(layout):
-    for frame, count in enumerate([0, 2, 0, 1]):
-        commit(layout, frame, crossings_left=float(count))
-    text = status(layout)
-    assert "warning: water: 3 crossings of cloth could not be prevented, frames 1, 3\n" in text
-    assert "crossings left 1\n" in text
+@pytest.mark.parametrize(
+    ("name", "counts", "warning"),
+    [
+        ("not_converged", [0, 1, 0, 0, 2, 1, 0], "4 solves hit their iteration limit, frames 1, 4-5"),
+        ("not_converged", [0, 0, 1], "1 solve hit its iteration limit, frame 2"),
+        (
+            "bodies_lost",
+            [0, 0, 1, 1, 3, 3],
+            "3 bodies fell out of sight and were stopped, frames 2, 4",
+        ),
+        ("crossings_left", [0, 2, 0, 1], "3 crossings of cloth could not be prevented, frames 1, 3"),
+    ],
+)
+def test_what_should_not_happen_is_counted_with_its_frames(layout, name, counts, warning):
+    """Lost bodies are told as a total since the start."""
+    for frame, count in enumerate(counts):
+        commit(layout, frame, **{name: float(count)})
+    assert f"warning: water: {warning}\n" in status(layout)
 
 
 def test_status_for_machines_has_all_of_it(layout):

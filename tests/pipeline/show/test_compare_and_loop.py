@@ -62,6 +62,18 @@ def film(
     return folder
 
 
+def compared(folder: Path, *jobs: Path, told: str = "") -> tuple[list[np.ndarray], float]:
+    """Frames and rate of the comparison of jobs, of which a sentence is told."""
+    result = pipeline("compare", *jobs, "-o", folder / "both.mp4")
+    assert result.exit_code == 0, result.output
+    assert told in result.stderr
+    return decode(folder / "both.mp4")
+
+
+def red_and_blue(folder: Path) -> tuple[Path, Path]:
+    return film(folder / "red", (160, 20, 20)), film(folder / "blue", (20, 20, 160))
+
+
 def decode(path: Path) -> tuple[list[np.ndarray], float]:
     with av.open(str(path)) as container:
         rate = float(container.streams.video[0].average_rate)
@@ -73,11 +85,7 @@ def decode(path: Path) -> tuple[list[np.ndarray], float]:
 
 
 def test_films_stand_side_by_side_with_their_names_under_them(tmp_path):
-    red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
-    result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
-    assert result.exit_code == 0, result.output
-    assert result.stdout == f"{tmp_path / 'both.mp4'}: 12 frames\n"
-    frames, rate = decode(tmp_path / "both.mp4")
+    frames, rate = compared(tmp_path, *red_and_blue(tmp_path))
     assert (len(frames), rate) == (12, 60.0)
     for number, frame in enumerate(frames):
         assert frame.shape[1] == 2 * SIZE[0] + 8
@@ -92,21 +100,10 @@ def test_films_stand_side_by_side_with_their_names_under_them(tmp_path):
 def test_films_of_other_rates_show_equal_times_and_end_with_the_shortest(tmp_path):
     fast = film(tmp_path / "fast", (100, 20, 20), frames=12)
     slow = film(tmp_path / "slow", (20, 20, 100), frames=5, fps=30, planned=6, step=20)
-    result = pipeline("compare", fast, slow, "-o", tmp_path / "both.mp4")
-    assert result.exit_code == 0, result.output
-    assert "slow: 5 of 6 frames are there" in result.stderr
-    frames, rate = decode(tmp_path / "both.mp4")
+    frames, rate = compared(tmp_path, fast, slow, told="slow: 5 of 6 frames are there")
     assert (len(frames), rate) == (10, 60.0)
     shown = [round((frame[32, 152, 2] - 100) / 20) for frame in frames]
     assert shown == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
-
-
-def test_a_frame_behind_a_gap_is_not_shown(tmp_path):
-    red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
-    (blue / "frames" / "000007.png").unlink()
-    result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
-    assert result.exit_code == 0, result.output
-    assert len(decode(tmp_path / "both.mp4")[0]) == 7
 
 
 def change(job: Path, frames: int) -> None:
@@ -115,27 +112,21 @@ def change(job: Path, frames: int) -> None:
 
 
 def test_frames_of_an_earlier_version_of_a_job_are_not_compared(tmp_path):
-    red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
+    red, blue = red_and_blue(tmp_path)
     change(blue, 5)
-    result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
-    assert result.exit_code == 0, result.output
-    assert "blue: 5 of 12 frames are there (7 more are of an earlier version of it)" in result.stderr
-    frames, _ = decode(tmp_path / "both.mp4")
+    told = "blue: 5 of 12 frames are there (7 more are of an earlier version of it)"
+    frames, _ = compared(tmp_path, red, blue, told=told)
     assert len(frames) == 5
     for frame in frames:
         assert frame[32, 152].argmax() == 1  # green, as drawn last
 
 
 def test_a_film_that_would_be_made_otherwise_now_is_shown_and_that_is_told(tmp_path):
-    red, blue = film(tmp_path / "red", (160, 20, 20)), film(tmp_path / "blue", (20, 20, 160))
+    red, blue = red_and_blue(tmp_path)
     change(blue, 0)
-    result = pipeline("compare", red, blue, "-o", tmp_path / "both.mp4")
-    assert result.exit_code == 0, result.output
-    assert result.stderr == "blue: its frames are not as the job would be made now; what differs: render\n"
-    assert len(decode(tmp_path / "both.mp4")[0]) == 12
-    result = pipeline("loop", blue, "-o", tmp_path / "blue.webp")
-    assert result.exit_code == 0, result.output
-    assert result.stderr == "blue: its frames are not as the job would be made now; what differs: render\n"
+    told = "blue: its frames are not as the job would be made now; what differs: render\n"
+    assert len(compared(tmp_path, red, blue, told=told)[0]) == 12
+    assert pipeline("loop", blue, "-o", tmp_path / "blue.webp").stderr == told
 
 
 @pytest.mark.parametrize("record", ["gone", "old"])

@@ -88,6 +88,11 @@ def make(layout: JobLayout, stage: str, frames: range) -> None:
                 new.path.write_text(f"{stage} {frame} {job.gravity} {job.render.samples}")
 
 
+def make_all(layout: JobLayout) -> None:
+    for stage in ("simulate", "render"):
+        make(layout, stage, range(FRAMES))
+
+
 def shown(layout: JobLayout) -> tuple[int, int, str]:
     found: PictureSet = picture_set(load_job(layout.job_file), layout)
     return len(found.unbroken), found.earlier, found.remark
@@ -97,15 +102,9 @@ def differing(*subjects: str) -> str:
     return f"its frames are not as the job would be made now; what differs: {', '.join(subjects)}"
 
 
-def test_a_film_without_a_record_is_one_set(layout):
-    make(layout, "simulate", range(FRAMES))
-    make(layout, "render", range(FRAMES))
+def test_a_film_without_a_record_is_one_set_also_when_its_caches_were_deleted(layout):
+    make_all(layout)
     assert shown(layout) == (FRAMES, 0, "")
-
-
-def test_a_film_whose_caches_were_deleted_is_one_set(layout):
-    make(layout, "simulate", range(FRAMES))
-    make(layout, "render", range(FRAMES))
     for frame in range(FRAMES):
         layout.receipt(layout.frame_cache(frame)).unlink()
         layout.path(layout.frame_cache(frame)).unlink()
@@ -113,8 +112,7 @@ def test_a_film_whose_caches_were_deleted_is_one_set(layout):
 
 
 def test_a_film_of_another_simulation_than_the_job_would_have_now_is_one_set_and_told(layout):
-    make(layout, "simulate", range(FRAMES))
-    make(layout, "render", range(FRAMES))
+    make_all(layout)
     write_job(layout, gravity=-20)
     assert shown(layout) == (FRAMES, 0, differing("simulate"))
     make(layout, "simulate", range(3))  # and is simulated anew
@@ -125,8 +123,7 @@ def test_a_film_of_another_simulation_than_the_job_would_have_now_is_one_set_and
 
 @pytest.mark.parametrize("simulated", [3, FRAMES])
 def test_frames_of_a_new_simulation_and_of_the_one_before_are_not_mixed(layout, simulated):
-    make(layout, "simulate", range(FRAMES))
-    make(layout, "render", range(FRAMES))
+    make_all(layout)
     write_job(layout, gravity=-20)
     make(layout, "simulate", range(simulated))
     make(layout, "render", range(3))
@@ -134,8 +131,7 @@ def test_frames_of_a_new_simulation_and_of_the_one_before_are_not_mixed(layout, 
 
 
 def test_frames_that_were_drawn_otherwise_than_the_last_one_are_not_mixed_in(layout):
-    make(layout, "simulate", range(FRAMES))
-    make(layout, "render", range(FRAMES))
+    make_all(layout)
     write_job(layout, samples=16)
     assert shown(layout) == (FRAMES, 0, differing("render"))
     make(layout, "render", range(2))
@@ -145,8 +141,7 @@ def test_frames_that_were_drawn_otherwise_than_the_last_one_are_not_mixed_in(lay
 
 
 def test_a_frame_whose_file_is_not_the_one_of_its_receipt_ends_the_set(layout):
-    make(layout, "simulate", range(FRAMES))
-    make(layout, "render", range(FRAMES))
+    make_all(layout)
     picture = layout.path(layout.picture(4))
     picture.write_text("another")
     os.utime(picture, ns=(1, 1))
@@ -154,8 +149,7 @@ def test_a_frame_whose_file_is_not_the_one_of_its_receipt_ends_the_set(layout):
 
 
 def test_that_the_job_cannot_be_planned_is_told_and_the_frames_are_shown(layout, monkeypatch):
-    make(layout, "simulate", range(FRAMES))
-    make(layout, "render", range(FRAMES))
+    make_all(layout)
     monkeypatch.setattr("pipeline.stages.STAGES", (PictureStage(),))
     count, earlier, remark = shown(layout)
     assert (count, earlier) == (FRAMES, 0)

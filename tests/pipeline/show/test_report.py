@@ -20,8 +20,8 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import FailureKind, Task, TaskId, TaskState
 from pipeline.record.manifest import Manifest
 from pipeline.show.report.chart import BOTTOM, HEIGHT, LEFT, MAX_POINTS, RIGHT, TOP, WIDTH, Axis, Line, line_chart
+from pipeline.show.report.page import write_report
 from pipeline.show.report.panels import JobNumbers, panels_of
-from pipeline.show.report.writing import write_report
 from pipeline.store.cache import FrameNumbers
 
 # --- charts --------------------------------------------------------------------------------------------------------
@@ -38,25 +38,20 @@ def chart(*lines: Line, logarithmic: bool = False) -> str:
     return line_chart(lines, x_label="t", may_be_logarithmic=logarithmic)
 
 
-def test_a_line_from_the_first_to_the_last_tick_fills_the_chart():
-    ((start, end),) = polylines(chart(Line("a", [0.0, 2.0], [0.0, 10.0])))
-    assert start == (LEFT, HEIGHT - BOTTOM)
-    assert end == (WIDTH - RIGHT, TOP)
+def drawn(x: list[float], y: list[float]) -> list[tuple[float, float]]:
+    """Points of a line by itself."""
+    (points,) = polylines(chart(Line("a", x, y)))
+    return points
 
 
-def test_a_quantity_that_hardly_changes_is_not_pressed_flat_against_the_top():
-    ((first, second),) = polylines(chart(Line("a", [0.0, 1.0], [1000.0, 1001.0])))
-    assert first[1] - second[1] > 0.5 * (HEIGHT - BOTTOM - TOP)
-
-
-def test_a_constant_is_drawn_in_the_middle():
-    ((first, second),) = polylines(chart(Line("a", [0.0, 1.0], [-3.0, -3.0])))
-    assert first[1] == second[1]
-    assert TOP < first[1] < HEIGHT - BOTTOM
-
-
-def test_one_frame_alone_is_a_dot():
-    ((first, second),) = polylines(chart(Line("a", [0.5], [2.0])))
+def test_a_line_fills_the_chart_unless_it_is_constant_or_a_dot():
+    assert drawn([0.0, 2.0], [0.0, 10.0]) == [(LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, TOP)]
+    (_, before), (_, after) = drawn([0.0, 1.0], [1000.0, 1001.0])  # not pressed flat against the top
+    assert before - after > 0.5 * (HEIGHT - BOTTOM - TOP)
+    (_, before), (_, after) = drawn([0.0, 1.0], [-3.0, -3.0])
+    assert before == after
+    assert TOP < before < HEIGHT - BOTTOM
+    first, second = drawn([0.5], [2.0])
     assert first == second
 
 
@@ -268,6 +263,12 @@ def read(path: Path) -> tuple[str, Page]:
     return text, Page(text)
 
 
+def report_of(layout: JobLayout) -> tuple[str, Page]:
+    """The report of a job, written anew."""
+    write_report([layout], layout.report)
+    return read(layout.report)
+
+
 def test_the_report_is_one_file_that_needs_no_other(layout, monkeypatch):
     monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES)
     draw_film(layout, frames=1)
@@ -280,8 +281,7 @@ def test_the_report_is_one_file_that_needs_no_other(layout, monkeypatch):
 
 
 def test_the_report_tells_timings_warnings_and_draws_every_kind_of_quantity(layout):
-    write_report([layout], layout.report)
-    text, page = read(layout.report)
+    text, page = report_of(layout)
     assert "<th>simulate</th><td>2</td><td>1</td>" in text  # attempts, of which one failed
     assert "4.0 s</td><td>3.0 s</td><td>5.0 MiB</td>" in text  # all, the longest, the largest
     assert "water: 1 solve hit its iteration limit, frame 2" in text
@@ -292,8 +292,7 @@ def test_the_report_tells_timings_warnings_and_draws_every_kind_of_quantity(layo
 
 def test_the_numbers_are_in_the_page_for_machines(layout):
     commit(layout, 3, kinetic_energy=math.inf, potential_energy=1.0)
-    write_report([layout], layout.report)
-    (job,) = json.loads(read(layout.report)[1].data)["jobs"]
+    (job,) = json.loads(report_of(layout)[1].data)["jobs"]
     assert job["frame"] == [0, 1, 2, 3]
     assert job["solvers"]["water"]["kinetic_energy"] == [0.0, 1.0, 2.0, None]  # JSON knows no infinity
     assert job["solvers"]["water"]["mechanical_energy"][:3] == [2.0, 3.0, 4.0]
@@ -315,11 +314,9 @@ def test_the_facts_have_the_particles_of_each_fluid_of_a_tank(layout):
     with layout.job_file.open("a") as file:
         file.write(water.replace("water", "oil"))
     commit(layout, 3, particle_count=1300.0)
-    write_report([layout], layout.report)
-    assert "<dt>water</dt><dd>WCSPH, 1,300 particles of radius" in layout.report.read_text()
+    assert "<dt>water</dt><dd>WCSPH, 1,300 particles of radius" in report_of(layout)[0]
     commit(layout, 4, particle_count_water=1000.0, particle_count_oil=300.0)
-    write_report([layout], layout.report)
-    text = layout.report.read_text()
+    text, _ = report_of(layout)
     assert "<dt>water</dt><dd>WCSPH, 1,000 particles of radius" in text
     assert "<dt>oil</dt><dd>WCSPH, 300 particles of radius" in text
 
@@ -328,8 +325,7 @@ def test_the_report_warns_of_whitewater_that_had_no_room_or_is_damaged(layout):
     commit_whitewater(layout, 3, commit(layout, 3), not_made=11)
     damaged = commit_whitewater(layout, 4, commit(layout, 4))
     layout.path(damaged.artifact).write_bytes(b"gone")
-    write_report([layout], layout.report)
-    text = layout.report.read_text()
+    text, _ = report_of(layout)
     assert "whitewater of water: 11 particles were not made, as there are max_particles, frame 3" in text
     assert "whitewater of water that cannot be read: frame 4" in text
 
@@ -364,8 +360,7 @@ def test_a_comparison_must_be_told_where_to_go(layout, tmp_path):
 
 def test_a_job_without_frames_has_a_report_too(tmp_path):
     layout = submitted(tmp_path / "tank")
-    write_report([layout], layout.report)
-    text, page = read(layout.report)
+    text, page = report_of(layout)
     assert "No frame has been simulated yet." in text
     assert "svg" not in page.count
 

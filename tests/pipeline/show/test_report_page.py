@@ -19,7 +19,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
 from pipeline.show.report import film
 from pipeline.show.report.job_report import JobReport, gather
-from pipeline.show.report.writing import write_report
+from pipeline.show.report.page import write_report
 from pipeline.store.receipts import Receipt
 
 SIZE = drawing_stages.SIZE

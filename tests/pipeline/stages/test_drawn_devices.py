@@ -13,7 +13,7 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Task, TaskId, TaskState
 from pipeline.record.manifest import Manifest
-from pipeline.show.report.writing import write_report
+from pipeline.show.report.page import write_report
 from pipeline.store.artifacts import committing
 from pipeline.store.origins import origins_of
 from pipeline.store.receipts import Receipt
@@ -31,10 +31,9 @@ def draw(layout: JobLayout, *devices: str) -> list[Receipt]:
         task = Task(TaskId(f"render/{frame:06d}"), "render", (), outputs, parameters, frame=frame)
         tasks.append(task)
         for output in outputs:
-            commit = committing(
+            with committing(
                 layout, output, task=task, attempt=1, fingerprint="p", validate=lambda _: None, device=device
-            )
-            with commit:
+            ) as commit:
                 commit.path.write_bytes(b"a picture")
             receipts.append(commit.receipt)
     with Manifest(layout.manifest) as manifest:
@@ -50,16 +49,15 @@ def layout(tmp_path: Path) -> JobLayout:
     return submitted(tmp_path / "tank")
 
 
-def test_a_film_of_two_devices_is_warned_of_where_its_state_is_asked(layout):
-    draw(layout, GPU, GPU, "CPU")
-    assert f"  warning: {WARNING}pipeline explain" in pipeline("status", layout.root).stdout
-    assert json.loads(pipeline("status", layout.root, "--json").stdout)["drawn_on"] == {"CPU": 1, GPU: 2}
-
-
-def test_a_film_of_one_device_and_what_does_not_say_are_not_warned_of(layout):
-    draw(layout, GPU, "", GPU)
-    assert "warning" not in pipeline("status", layout.root).stdout
-    assert json.loads(pipeline("status", layout.root, "--json").stdout)["drawn_on"] == {GPU: 2}
+@pytest.mark.parametrize(
+    ("devices", "drawn_on"), [((GPU, GPU, "CPU"), {"CPU": 1, GPU: 2}), ((GPU, "", GPU), {GPU: 2})], ids=["two", "one"]
+)
+def test_a_film_of_two_devices_is_warned_of_where_its_state_is_asked(layout, devices, drawn_on):
+    """Those that do not say what they are do not count."""
+    draw(layout, *devices)
+    status = pipeline("status", layout.root).stdout
+    assert (f"  warning: {WARNING}pipeline explain" in status) == ("warning" in status) == (len(drawn_on) > 1)
+    assert json.loads(pipeline("status", layout.root, "--json").stdout)["drawn_on"] == drawn_on
 
 
 def test_frames_that_are_no_part_of_the_film_any_more_do_not_count(layout):

@@ -2,8 +2,7 @@
 
 import math
 
-import numpy as np
-import taichi as ti
+from smoke_scenes import Bytes
 
 from pipeline.kinds.checks.smoke import BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU
 from pipeline.kinds.smoke import SMOKE
@@ -45,37 +44,14 @@ JOB = {
 }
 
 
-def count_bytes_of_cells(monkeypatch) -> list[int]:
-    """Has the fields of at least a value a cell that are made from now on leave their sizes in a list [bytes]."""
-    sizes: list[int] = []
-    make, make_vectors = ti.field, ti.Vector.field
-
-    def note(dtype, shape, count):
-        values = int(np.prod(shape))
-        # Rows of turbulence have half a node a cell, each of five numbers.
-        if values * count >= CELLS**3:
-            sizes.append(values * count * (8 if dtype in (ti.i64, ti.u64, ti.f64) else 4))
-
-    def field(dtype, shape):
-        note(dtype, shape, 1)
-        return make(dtype, shape=shape)
-
-    def vectors(count, dtype, shape):
-        note(dtype, shape, count)
-        return make_vectors(count, dtype, shape=shape)
-
-    monkeypatch.setattr(ti, "field", field)
-    monkeypatch.setattr(ti.Vector, "field", vectors)
-    return sizes
-
-
 def test_check_counts_all_that_smoke_with_everything_in_it_takes(monkeypatch):
     initialize("cpu")
     job = Job.model_validate(JOB, strict=False)
-    sizes = count_bytes_of_cells(monkeypatch)
+    # Rows of turbulence have half a node a cell, each of five numbers.
+    made = Bytes(monkeypatch, least_values=CELLS**3)
     world = build_world(job, frames_per_second=24)
     cells = CELLS**3
-    solver = sum(sizes) / cells
+    solver = made.total / cells
     # Counted alone: the couplings to a fluid and to cloth, of 32 and 24 bytes, are there.
     assert solver > 140.0
     assert solver <= BYTES_PER_CELL_ON_GPU

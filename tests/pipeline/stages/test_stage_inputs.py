@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from planned_jobs import digests
 
 from pipeline.base.errors import MissingInputError
-from pipeline.base.layout import JobLayout
 from pipeline.model.job import Job
-from pipeline.run.plan import plan_job
-from pipeline.stages import STAGES
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 {height}\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 
@@ -21,8 +19,8 @@ def write_mesh(path: Path, *, height: int = 1) -> Path:
     return path
 
 
-def digests(*files: Path) -> dict[str, str]:
-    """Of the simulation and of the bodies' meshes, in a scene with these meshes as a body and as a block of water."""
+def with_meshes(*files: Path) -> dict[str, str]:
+    """Digests of the stages, in a scene with these meshes as a body and as a block of water."""
     body, block = (files * 2)[:2]
     job = Job.model_validate(
         {
@@ -32,72 +30,64 @@ def digests(*files: Path) -> dict[str, str]:
             "fluid": [{"name": "water", "block": [{"shape": {"type": "mesh", "file": str(block)}}]}],
         }
     )
-    tasks = plan_job(job, JobLayout(Path("renders/film")), STAGES)
-    return {task.stage: task.parameters.digest for task in tasks if task.stage in ("simulate", "bodies")}
+    return {stage: digest for stage, digest in digests(job).items() if stage in ("simulate", "bodies")}
 
 
 def test_a_mesh_that_was_moved_is_the_same_mesh(tmp_path: Path) -> None:
     here, there = write_mesh(tmp_path / "here/stone.obj"), write_mesh(tmp_path / "there/rock.OBJ")
-    assert digests(here) == digests(there)
+    assert with_meshes(here) == with_meshes(there)
 
 
 def test_a_mesh_that_was_changed_is_another_mesh(tmp_path: Path) -> None:
-    before = digests(write_mesh(tmp_path / "stone.obj"))
-    after = digests(write_mesh(tmp_path / "stone.obj", height=2))
+    before = with_meshes(write_mesh(tmp_path / "stone.obj"))
+    after = with_meshes(write_mesh(tmp_path / "stone.obj", height=2))
     assert before["simulate"] != after["simulate"]
     assert before["bodies"] != after["bodies"]
 
 
 def test_meshes_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
     body, block = write_mesh(tmp_path / "a/mesh.obj"), write_mesh(tmp_path / "b/mesh.obj", height=2)
-    assert digests(body, block)["simulate"] != digests(block, body)["simulate"]
-    before = digests(body, block)
+    assert with_meshes(body, block)["simulate"] != with_meshes(block, body)["simulate"]
+    before = with_meshes(body, block)
     write_mesh(body, height=3)
-    assert digests(body, block)["bodies"] != before["bodies"]
+    assert with_meshes(body, block)["bodies"] != before["bodies"]
 
 
 def test_a_mesh_that_is_gone_is_named(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError, match=r"cannot read the mesh .*stone\.obj: No such file"):
-        digests(tmp_path / "stone.obj")
+        with_meshes(tmp_path / "stone.obj")
 
 
-def frame_digest(**stage: object) -> str:
-    """Of a frame of a ball on a stage."""
+def frame_digest(**tables: object) -> str:
+    """Of a frame of a ball."""
     ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.1}}
-    job = Job.model_validate({"name": "film", "rigid": [ball], "frames": 1, "set": stage})
-    tasks = plan_job(job, JobLayout(Path("renders/film")), STAGES)
-    return next(task.parameters.digest for task in tasks if task.stage == "render")
+    return digests(Job.model_validate({"name": "film", "rigid": [ball], "frames": 1, **tables}))["render"]
 
 
 def test_a_picture_around_the_scene_counts_by_what_is_in_it(tmp_path: Path) -> None:
     here, there, other = (tmp_path / name for name in ("here.hdr", "there.HDR", "other.hdr"))
     for path, content in ((here, b"noon"), (there, b"noon"), (other, b"dusk")):
         path.write_bytes(content)
-    noon = frame_digest(hdri=str(here))
-    assert noon == frame_digest(hdri=str(there))
-    assert noon == frame_digest(hdri=str(here), name="outdoor")  # its light and sky are not there
+    noon = frame_digest(set={"hdri": str(here)})
+    assert noon == frame_digest(set={"hdri": str(there)})
+    assert noon == frame_digest(set={"hdri": str(here), "name": "outdoor"})  # its light and sky are not there
     others = [
         frame_digest(),
-        frame_digest(hdri=str(other)),
-        frame_digest(hdri=str(here), rotation_deg=30.0),
-        frame_digest(hdri=str(here), ground="stone"),
+        frame_digest(set={"hdri": str(other)}),
+        frame_digest(set={"hdri": str(here), "rotation_deg": 30.0}),
+        frame_digest(set={"hdri": str(here), "ground": "stone"}),
     ]
     assert len({noon, *others}) == 5
 
 
 def test_a_picture_that_is_gone_is_told_when_the_job_is_planned(tmp_path: Path) -> None:
     with pytest.raises(MissingInputError, match=r"cannot read the picture .*gone\.hdr: No such file"):
-        frame_digest(hdri=str(tmp_path / "gone.hdr"))
+        frame_digest(set={"hdri": str(tmp_path / "gone.hdr")})
 
 
 def test_a_material_of_a_file_counts_by_what_is_in_the_file_and_by_its_name(tmp_path: Path) -> None:
     def digest(blend: str) -> str:
-        ball = {"name": "ball", "shape": {"type": "sphere", "radius": 0.1}}
-        job = Job.model_validate(
-            {"name": "film", "rigid": [ball], "frames": 1, "material": {"ball": {"blend": f"{tmp_path}/{blend}"}}}
-        )
-        tasks = plan_job(job, JobLayout(Path("renders/film")), STAGES)
-        return next(task.parameters.digest for task in tasks if task.stage == "render")
+        return frame_digest(material={"ball": {"blend": f"{tmp_path}/{blend}"}})
 
     for name, content in (("a.blend", b"one"), ("b.blend", b"one"), ("c.blend", b"two")):
         (tmp_path / name).write_bytes(content)

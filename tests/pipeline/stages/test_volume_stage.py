@@ -85,7 +85,7 @@ def volume_of(layout: JobLayout, smoke: Snapshot, *, longest_shutter_s: float | 
 def test_a_volume_holds_what_the_cache_holds_where_it_is(layout):
     smoke = puff()
     assert isinstance(volume_of(layout, smoke, longest_shutter_s=1 / 60), Finished)
-    volume = read_volume(layout.path(layout.volume("plume", 1)), SHAPE)
+    volume = read_volume(layout.path(layout.product("volumes", "plume", 1, ".vdb")), SHAPE)
     arrays = smoke.arrays
     # The cache rounds to 11 bits, and so do 16-bit floats, which changes nothing more.
     np.testing.assert_allclose(volume.density, arrays["density"], rtol=2.0**-11)
@@ -106,4 +106,4 @@ def test_values_that_are_not_finite_are_refused_with_frame_field_and_cell(layout
     assert isinstance(failed, Failed)
     cached = layout.path(layout.frame_cache(1))
     assert f'{cached}: smoke "plume": {field} of cell (34, 6, 21) is not finite' in failed.message
-    assert not layout.path(layout.volume("plume", 1)).exists()
+    assert not layout.path(layout.product("volumes", "plume", 1, ".vdb")).exists()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from inline_tasks import run_task
 from places import HELPERS, PROJECT
+from planned_jobs import LAYOUT, concerned, digests, first_of, planned
 
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
@@ -27,7 +28,6 @@ from render.point_clouds import read_point_cloud, validate_point_cloud
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
 
-LAYOUT = JobLayout(Path("renders/tank"))
 FRAMES = 8
 
 TANK = {
@@ -44,15 +44,11 @@ def job(**changes) -> Job:
     return Job.model_validate({**TANK, **changes}, strict=False)
 
 
-def digests(of: Job) -> dict[str, str]:
-    return {task.stage: task.parameters.digest for task in plan_job(of, LAYOUT, STAGES)}
-
-
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_frame_needs_the_one_before_and_the_fluid_at_both():
-    tasks = {task.id: task for task in plan_job(job(), LAYOUT, STAGES)}
+    tasks = planned(job())
     assert tasks["whitewater/water/000000"].inputs == ("cache/000000.h5",)
     assert tasks["whitewater/water/000003"].inputs == (
         "cache/000002.h5",
@@ -64,12 +60,12 @@ def test_a_frame_needs_the_one_before_and_the_fluid_at_both():
 
 def test_without_its_table_there_is_no_task_and_no_change_to_the_pictures():
     without = job(whitewater={})
-    assert not [task for task in plan_job(without, LAYOUT, STAGES) if task.stage == "whitewater"]
+    assert "whitewater" not in digests(without)
     assert not [each for each in render_spec(without, LAYOUT).objects if each.type == "point_sequence"]
 
 
 @pytest.mark.parametrize(
-    ("change", "concerned"),
+    ("change", "stages"),
     [
         ({"whitewater": {"water": {"lifetime_max": 4.0}}}, {"whitewater"}),
         ({"gravity": [0, 0, -1.62]}, {"simulate", "whitewater"}),
@@ -80,9 +76,8 @@ def test_without_its_table_there_is_no_task_and_no_change_to_the_pictures():
     ],
     ids=lambda value: "+".join(sorted(value)) if isinstance(value, set) else str(value),
 )
-def test_a_change_concerns_only_the_stages_that_read_it(change, concerned):
-    before, after = digests(job()), digests(job(**change))
-    assert {stage for stage in before if before[stage] != after[stage]} == concerned
+def test_a_change_concerns_only_the_stages_that_read_it(change, stages):
+    assert concerned(job(), job(**change)) == stages
 
 
 def test_the_memory_claim_counts_the_fluids_and_the_cloud():
@@ -94,7 +89,7 @@ def test_the_memory_claim_counts_the_fluids_and_the_cloud():
             fluid=[{**TANK["fluid"][0], "block": [ball], "max_particles": fluid_particles}],
             whitewater={"water": {"max_particles": cloud}},
         )
-        return next(task for task in plan_job(of, LAYOUT, STAGES) if task.stage == "whitewater").resources.memory_bytes
+        return first_of(of, "whitewater").resources.memory_bytes
 
     # Measured: 160 MB without any particles, 513 MB with a million of fluid, 1189 MB with 2,986,000.
     assert claim(2_986_000, 1) > 1_189_000_000
@@ -180,9 +175,8 @@ shape = { type = "box", size = [0.1, 0.1, 0.1] }
 
 def run(layout: JobLayout, frames: Iterable[int]) -> list[TaskEvent]:
     """Run the tasks of these frames in this process; returns how each ended."""
-    tasks = {task.frame: task for task in plan_job(load_job(layout.job_file), layout, STAGES) if task.subject == "water"
-             and task.stage == "whitewater"}  # fmt: skip
-    return [run_task(tasks[frame], layout, threads=CORES) for frame in frames]
+    tasks = {task.id: task for task in plan_job(load_job(layout.job_file), layout, STAGES)}
+    return [run_task(tasks[f"whitewater/water/{frame:06d}"], layout, threads=CORES) for frame in frames]
 
 
 def contents(layout: JobLayout) -> list[bytes]:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from pipeline.base.errors import InvalidArtifactError, StaleAttemptError
 from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
-from pipeline.store.artifacts import committing, sweep_parts
+from pipeline.store.artifacts import Commit, committing, sweep_parts
 from pipeline.store.receipts import is_committed, read_receipt, verify_artifact
 
 SIMULATE = film(1)[0]
@@ -30,6 +31,10 @@ CHANGED = film(1, viscosity=2.0)[0]
 @pytest.fixture
 def layout(tmp_path: Path) -> JobLayout:
     return JobLayout(tmp_path / "job")
+
+
+def commit_of(layout: JobLayout, *, attempt: int) -> AbstractContextManager[Commit]:
+    return committing(layout, ARTIFACT, task=SIMULATE, attempt=attempt, fingerprint=FINGERPRINT, validate=validate_text)
 
 
 def files_below(folder: Path) -> set[str]:
@@ -53,9 +58,7 @@ def test_a_committed_artifact_lies_with_its_receipt_and_nothing_else(layout: Job
 def test_a_file_that_does_not_decode_is_not_committed(layout: JobLayout) -> None:
     with (
         pytest.raises(InvalidArtifactError, match="truncated"),
-        committing(
-            layout, ARTIFACT, task=SIMULATE, attempt=1, fingerprint=FINGERPRINT, validate=validate_text
-        ) as handle,
+        commit_of(layout, attempt=1) as handle,
     ):
         handle.path.write_text("half of i")
     assert files_below(layout.root) == set()
@@ -64,7 +67,7 @@ def test_a_file_that_does_not_decode_is_not_committed(layout: JobLayout) -> None
 def test_a_block_that_writes_nothing_is_an_error(layout: JobLayout) -> None:
     with (
         pytest.raises(InvalidArtifactError, match="nothing was written"),
-        committing(layout, ARTIFACT, task=SIMULATE, attempt=1, fingerprint=FINGERPRINT, validate=validate_text),
+        commit_of(layout, attempt=1),
     ):
         pass
 
@@ -73,7 +76,7 @@ def test_a_full_disk_keeps_its_errno_and_leaves_the_old_artifact_alone(layout: J
     old = commit(layout, SIMULATE, ARTIFACT, "old")
     with (
         pytest.raises(OSError, match="No space left") as caught,
-        committing(layout, ARTIFACT, task=CHANGED, attempt=2, fingerprint="new", validate=validate_text) as handle,
+        commit_of(layout, attempt=2) as handle,
     ):
         handle.path.symlink_to("/dev/full")  # the kernel's own full disk
         with handle.path.open("wb", buffering=0) as file:
@@ -86,7 +89,7 @@ def test_a_full_disk_keeps_its_errno_and_leaves_the_old_artifact_alone(layout: J
 def test_a_late_writer_of_an_older_attempt_is_fenced_off(layout: JobLayout) -> None:
     with (
         pytest.raises(StaleAttemptError, match="attempt 2 of simulate has committed it; attempt 1 came too late"),
-        committing(layout, ARTIFACT, task=SIMULATE, attempt=1, fingerprint=FINGERPRINT, validate=validate_text) as late,
+        commit_of(layout, attempt=1) as late,
     ):
         late.path.write_text("late END")
         commit(layout, SIMULATE, ARTIFACT, "newer", attempt=2)
@@ -94,20 +97,11 @@ def test_a_late_writer_of_an_older_attempt_is_fenced_off(layout: JobLayout) -> N
     assert files_below(layout.root) == {"cache/000000.h5", ".receipts/cache/000000.h5.json"}
 
 
-def test_a_newer_attempt_replaces_an_older_one(layout: JobLayout) -> None:
-    commit(layout, SIMULATE, ARTIFACT, "older", attempt=1)
-    receipt = commit(layout, SIMULATE, ARTIFACT, "newer", attempt=2)
-    assert read_receipt(layout, ARTIFACT) == receipt
-    assert layout.path(ARTIFACT).read_text() == "newer END"
-
-
 def test_a_file_edited_by_hand_is_kept_aside(layout: JobLayout) -> None:
     commit(layout, SIMULATE, ARTIFACT, "ours", attempt=1)
     for attempt, name in ((2, "cache/000000.h5.edited-1"), (3, "cache/000000.h5.edited-2")):
         layout.path(ARTIFACT).write_text(f"theirs {attempt}")
-        with committing(
-            layout, ARTIFACT, task=SIMULATE, attempt=attempt, fingerprint=FINGERPRINT, validate=validate_text
-        ) as handle:
+        with commit_of(layout, attempt=attempt) as handle:
             handle.path.write_text("ours again END")
         assert handle.kept_aside == name
         assert (layout.root / name).read_text() == f"theirs {attempt}"

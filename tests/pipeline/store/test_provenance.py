@@ -64,7 +64,7 @@ def test_files_of_two_versions_of_the_job_each_tell_of_their_own(layout: JobLayo
 
 def test_explain_says_it_to_people_and_takes_a_file_for_its_task(layout: JobLayout) -> None:
     told = pipeline("explain", layout.root, "double/000003.bin").stdout
-    assert told.startswith("double/000003: succeeded")
+    assert told.startswith("double/000003: done")
     assert "origin  1 file by attempt 1 on " in told
     assert "versions: stage double 1" in told
     assert f"job file: .provenance/jobs/{digest_of(job_text())}.toml" in told
@@ -92,14 +92,18 @@ def maker(artifact: str) -> str:
     return "film" if artifact == "film.bin" else artifact.removesuffix(".bin") if "double" in artifact else "steps"
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_any_flipped_bit_is_found_and_just_its_file_is_made_again(layout: JobLayout, seed: int) -> None:
-    generator = random.Random(seed)
+@pytest.mark.parametrize("first", range(3))
+def test_any_flipped_bit_is_found_and_just_its_file_is_made_again(layout: JobLayout, first: int) -> None:
+    """Over the three runs every file is hit once, and every receipt."""
+    generator = random.Random(first)
     whole = contents(layout.root)
-    artifacts = generator.sample(sorted(whole), 3)
-    for artifact in artifacts[:2]:
+    order = sorted(whole)
+    hit, receipts = order[first::3], order[(first + 1) % 3 :: 3]
+    for artifact in hit:
         flip_a_bit(layout.root / artifact, generator)
-    flip_a_bit(layout.receipt(ArtifactPath(artifacts[2])), generator)
+    for artifact in receipts:
+        flip_a_bit(layout.receipt(ArtifactPath(artifact)), generator)
+    artifacts = hit + receipts
     time.sleep(0.01)  # the file system's clock is coarse, and a mark is another time of modification
     verified = pipeline("verify", layout.root, "--deep", "--json")
     assert verified.exit_code == 1
@@ -134,13 +138,14 @@ def test_a_missing_receipt_is_found_and_its_file_made_again(layout: JobLayout) -
     assert pipeline("verify", layout.root, "--deep").exit_code == 0
 
 
-@pytest.mark.parametrize(("kind", "how"), [("jobs", "written anew"), ("parameters", "written anew")])
-def test_a_damaged_text_of_the_provenance_is_written_anew(layout: JobLayout, kind: str, how: str) -> None:
+@pytest.mark.parametrize("kind", ["jobs", "parameters"])
+def test_a_damaged_text_of_the_provenance_is_written_anew(layout: JobLayout, kind: str) -> None:
     text = sorted((layout.provenance / kind).iterdir())[0]
     flip_a_bit(text, random.Random(1))
     assert read_text(text) is None
     verified = pipeline("verify", layout.root, "--deep")
-    assert (verified.exit_code, f"{kind}/{text.name}: is not what its name says; {how}" in verified.stdout) == (1, True)
+    assert verified.exit_code == 1
+    assert f"{kind}/{text.name}: is not what its name says; written anew" in verified.stdout
     assert read_text(text) is not None
     assert pipeline("verify", layout.root, "--deep").exit_code == 0
 

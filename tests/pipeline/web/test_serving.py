@@ -23,7 +23,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from pipeline.base.errors import PipelineError
-from pipeline.web.serving import address, close_server, config_of, listen, open_server, page_server, remark_of
+from pipeline.web.serving import address, config_of, listen, page_server, remark_of
 
 DROP = """
 name = "drop"
@@ -39,6 +39,11 @@ position = [0.0, 0.0, 1.0]
 def live(folder: Path, *options: object) -> Result:
     (folder / "drop.toml").write_text(DROP)
     return pipeline("live", folder / "drop.toml", *options)
+
+
+def opened(host: str, port: int) -> None:
+    with page_server(host=host, port=port):
+        pass
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +93,7 @@ def test_a_name_that_was_bent_to_this_machine_gets_nothing(server):
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "studio-3", "a..b", "no such host", ""])
 def test_an_address_that_others_reach_is_refused_and_ssh_is_named(host):
     with pytest.raises(PipelineError, match=f"--host {host}: others would reach the page.*ssh -L 8123:127.0.0.1:8123 "):
-        open_server(host, 8123)
+        opened(host, 8123)
 
 
 def test_live_says_so_before_it_builds_anything(tmp_path):
@@ -109,10 +114,9 @@ def test_nobody_opens_a_tunnel(server):
 
 def test_opening_a_page_prints_nothing_and_leaves_the_library_of_websockets_as_it_was(capsys):
     plain = websockets.asyncio.server.serve
-    server = open_server("127.0.0.1", 0)
-    assert websockets.asyncio.server.serve is plain
-    assert address(server) == f"http://localhost:{server.get_port()}/"
-    close_server(server)
+    with page_server() as server:
+        assert websockets.asyncio.server.serve is plain
+        assert address(server) == f"http://localhost:{server.get_port()}/"
     assert capsys.readouterr().out == ""
 
 
@@ -128,7 +132,7 @@ def test_an_address_of_ipv6_is_printed_in_brackets():
         assert address(server) == f"http://[::1]:{server.get_port()}/"
 
 
-@pytest.mark.parametrize("opens", [listen, open_server])
+@pytest.mark.parametrize("opens", [listen, opened])
 def test_a_port_that_is_taken_is_told_and_a_free_one_named(opens):
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]

@@ -78,8 +78,14 @@ TABLE = {"shape": {"type": "box", "size": (0.6, 0.6, 0.1)}, "position": (0.0, 0.
 def test_a_heavy_body_rests_on_cloth_and_not_on_what_is_below(shape, lowest, table):
     """8 and 33 kg on nodes of 0.25 g each: the body stands a thickness over the floor, and squeezes nothing out."""
     thickness, top = 3e-3, 0.35 if table else 0.0
-    sheet = {"shape": rectangle((0.4, 0.4), (17, 17)), "position": (0.0, 0.0, top + 2e-3), "thickness": thickness,
-             "mass_per_area": 0.4, "stretch_stiffness": 4000.0, "shear_stiffness": 400.0}  # fmt: skip
+    sheet = {
+        "shape": rectangle((0.4, 0.4), (17, 17)),
+        "position": (0.0, 0.0, top + 2e-3),
+        "thickness": thickness,
+        "mass_per_area": 0.4,
+        "stretch_stiffness": 4000.0,
+        "shear_stiffness": 400.0,
+    }
     body = {"kind": "dynamic", "density": 7800.0, "shape": shape, "position": (0.0, 0.0, top + lowest + 0.02)}
     world = world_of(sheet, bodies=[body, *([table] if table else [])])
     strains = []
@@ -110,8 +116,12 @@ def collision(integrator, density=1000.0, substeps=None):
         "velocity": (0.3, 0.0, -3.0),
         "angular_velocity": (0.0, 20.0, 5.0),
     }
-    sheet = {"shape": rectangle((0.3, 0.3), (11, 11)), "thickness": 2e-3, "integrator": integrator,
-             "self_collision": False}  # fmt: skip
+    sheet = {
+        "shape": rectangle((0.3, 0.3), (11, 11)),
+        "thickness": 2e-3,
+        "integrator": integrator,
+        "self_collision": False,
+    }
     return world_of({**SOFT, **sheet, "substeps": substeps}, bodies=[ball], domain=SPACE, gravity=WEIGHTLESS)
 
 
@@ -191,10 +201,19 @@ def test_forces_on_both_sides_are_opposite_in_every_substep():
 
 def test_a_ball_smaller_than_a_cell_of_the_sheet_does_not_fall_through_it():
     """Onto the middle of a cell, with a radius of 0.6 edges: no vertex is nearer than 0.7."""
-    ball = {"kind": "dynamic", "density": 100.0, "shape": {"type": "sphere", "radius": 0.03},
-            "position": (0.025, 0.025, 0.535), "velocity": (0.0, 0.0, -0.5)}  # fmt: skip
-    sheet = {"shape": rectangle((0.2, 0.2), (5, 5)), "thickness": 1e-3, "position": (0.0, 0.0, 0.5),
-             "pin": [{"edge": edge} for edge in ("x-", "x+", "y-", "y+")]}  # fmt: skip
+    ball = {
+        "kind": "dynamic",
+        "density": 100.0,
+        "shape": {"type": "sphere", "radius": 0.03},
+        "position": (0.025, 0.025, 0.535),
+        "velocity": (0.0, 0.0, -0.5),
+    }
+    sheet = {
+        "shape": rectangle((0.2, 0.2), (5, 5)),
+        "thickness": 1e-3,
+        "position": (0.0, 0.0, 0.5),
+        "pin": [{"edge": edge} for edge in ("x-", "x+", "y-", "y+")],
+    }
     world = world_of(sheet, bodies=[ball])
     for _ in range(20):
         world.advance_frame()
@@ -203,10 +222,18 @@ def test_a_ball_smaller_than_a_cell_of_the_sheet_does_not_fall_through_it():
 
 def test_a_ball_held_between_the_nodes_of_a_sheet_is_held_beside_a_finer_sheet_too():
     """What counts as small is measured by the coarse sheet, not by the mean over all edges."""
-    ball = {"kind": "dynamic", "density": 100.0, "shape": {"type": "sphere", "radius": 0.03},
-            "position": (0.025, 0.025, 0.535), "velocity": (0.0, 0.0, -0.5)}  # fmt: skip
-    coarse = {"shape": rectangle((0.2, 0.2), (5, 5)), "position": (0.0, 0.0, 0.5),
-              "pin": [{"edge": edge} for edge in ("x-", "x+", "y-", "y+")]}  # fmt: skip
+    ball = {
+        "kind": "dynamic",
+        "density": 100.0,
+        "shape": {"type": "sphere", "radius": 0.03},
+        "position": (0.025, 0.025, 0.535),
+        "velocity": (0.0, 0.0, -0.5),
+    }
+    coarse = {
+        "shape": rectangle((0.2, 0.2), (5, 5)),
+        "position": (0.0, 0.0, 0.5),
+        "pin": [{"edge": edge} for edge in ("x-", "x+", "y-", "y+")],
+    }
     fine = {"shape": rectangle((0.2, 0.2), (41, 41)), "position": (0.0, 0.4, 0.5), "pin": [{"edge": "x-"}]}
     for cloths in ((coarse,), (coarse, fine)):
         world = world_of(*cloths, bodies=[ball])
@@ -246,9 +273,13 @@ def test_a_fast_heavy_body_does_not_pass_through_a_sheet(shape):
 def test_a_pinned_sheet_catches_a_heavy_ball():
     corners = [{"corner": corner} for corner in ("x-y-", "x+y-", "x-y+", "x+y+")]
     sheet = {
-        "shape": rectangle((0.3, 0.3), (13, 13)), "thickness": 2e-3, "position": (0.0, 0.0, 0.5), "pin": corners,
-        "material": "rubber", "damping": 5e-3,
-    }  # fmt: skip
+        "shape": rectangle((0.3, 0.3), (13, 13)),
+        "thickness": 2e-3,
+        "position": (0.0, 0.0, 0.5),
+        "pin": corners,
+        "material": "rubber",
+        "damping": 5e-3,
+    }
     ball = {"kind": "dynamic", "density": 1500.0, "shape": BALL, "position": (0.02, 0.01, 0.7)}
     world = world_of(sheet, bodies=[ball])
     for _ in range(40):
@@ -292,8 +323,11 @@ def slide(slope, friction, frames=12):
     """Speed and way of a sheet on the floor when gravity leans, and the time [s]."""
     gravity = (GRAVITY * np.sin(slope), 0.0, -GRAVITY * np.cos(slope))
     sheet = {
-        "shape": rectangle((0.1, 0.1), (5, 5)), "thickness": 2e-3, "friction": friction, "position": (-0.5, 0.0, 1e-3)
-    }  # fmt: skip
+        "shape": rectangle((0.1, 0.1), (5, 5)),
+        "thickness": 2e-3,
+        "friction": friction,
+        "position": (-0.5, 0.0, 1e-3),
+    }
     world = world_of(sheet, gravity=gravity)
     for _ in range(frames):
         world.advance_frame()
@@ -317,8 +351,12 @@ def test_a_sheet_on_a_slope_slides_with_what_friction_leaves():
 
 
 def test_a_moving_body_takes_cloth_along_by_friction():
-    table = {"kind": "kinematic", "shape": {"type": "box", "size": (0.4, 0.4, 0.1)}, "position": (0, 0, 0.1),
-             "velocity": (0.2, 0.0, 0.0)}  # fmt: skip
+    table = {
+        "kind": "kinematic",
+        "shape": {"type": "box", "size": (0.4, 0.4, 0.1)},
+        "position": (0, 0, 0.1),
+        "velocity": (0.2, 0.0, 0.0),
+    }
     sheet = {"shape": rectangle((0.1, 0.1), (5, 5)), "thickness": 2e-3, "friction": 0.5, "position": (0, 0, 0.152)}
     world = world_of(sheet, bodies=[table])
     for _ in range(12):

@@ -52,10 +52,12 @@ def test_pins_hold_the_nodes_that_they_name_and_all_others_fall(pin, nodes):
     ("pin", "message"),
     [
         ({"index": [12]}, r'cloth "sheet": pin\[0\]: index 12 does not exist; the sheet has nodes 0 to 11'),
-        ({"region": {"type": "sphere", "position": (5, 0, 0), "radius": 1}},
-         r"no node starts in its region; the cloth spans x -0.3..0.3 y -0.2..0.2 z 0..0 m"),
+        (
+            {"region": {"type": "sphere", "position": (5, 0, 0), "radius": 1}},
+            r"no node starts in its region; the cloth spans x -0.3..0.3 y -0.2..0.2 z 0..0 m",
+        ),
     ],
-)  # fmt: skip
+)
 def test_pins_that_hold_nothing_are_refused(pin, message):
     with pytest.raises(ValueError, match=message):
         solver_of(cloth(shape=rectangle((0.6, 0.4), (4, 3)), pin=[pin]))
@@ -107,8 +109,15 @@ def test_a_pin_lets_go_at_its_time_with_the_speed_that_it_had():
 
 
 def test_changed_parameters_are_those_of_a_cloth_that_was_built_with_them():
-    changes = {"stretch_stiffness": 900.0, "mass_per_area": 0.5, "wind": (0.0, 9.0, 0.0), "bend_stiffness": 1e-4,
-               "damping": 2e-3, "friction": 0.1, "thickness": 0.002}  # fmt: skip
+    changes = {
+        "stretch_stiffness": 900.0,
+        "mass_per_area": 0.5,
+        "wind": (0.0, 9.0, 0.0),
+        "bend_stiffness": 1e-4,
+        "damping": 2e-3,
+        "friction": 0.1,
+        "thickness": 0.002,
+    }
     changed, built = solver_of(cloth(**FLAG)), solver_of(cloth(**{**FLAG, **changes}))
     changed.change("sheet", **changes)
     changed.gravity = built.gravity = (0.0, 0.0, -3.0)

@@ -197,11 +197,14 @@ def test_triangles_that_face_away_are_turned():
     [
         ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.zeros((0, 3)), "has no triangles"),
         ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], [[0, 1, 2], [0, 1, 3]], "1 triangles .* have no area"),
-        ([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]], [[0, 1, 2], [1, 0, 3], [0, 1, 4]],
-         r"1 edges .* three triangles or more, the first at \(0.5, 0, 0\) m"),
+        (
+            [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]],
+            [[0, 1, 2], [1, 0, 3], [0, 1, 4]],
+            r"1 edges .* three triangles or more, the first at \(0.5, 0, 0\) m",
+        ),
         ([[0, 0, 0], [1, 0, np.inf], [0, 1, 0]], [[0, 1, 2]], "vertex 1 .* is not finite"),
     ],
-)  # fmt: skip
+)
 def test_meshes_that_are_no_sheet_are_refused_and_it_is_said_where(vertices, triangles, message):
     with pytest.raises(ShapeError, match=message):
         sheet_of_triangles(np.array(vertices, dtype=float), np.array(triangles, dtype=int), label="bad")

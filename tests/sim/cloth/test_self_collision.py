@@ -121,9 +121,11 @@ def test_layers_do_not_pass_through_each_other_however_fast():
     """A sheet that covers twenty thicknesses in one substep, on to another one."""
     sheet = {"shape": rectangle((0.2, 0.2), (7, 7)), "thickness": 2e-3}
     world = world_of(
-        {**sheet, "position": (0.003, 0.005, 0.03)}, {**sheet, "rotation_deg": (0, 0, 20)}, domain=SPACE,
+        {**sheet, "position": (0.003, 0.005, 0.03)},
+        {**sheet, "rotation_deg": (0, 0, 20)},
+        domain=SPACE,
         gravity=WEIGHTLESS,
-    )  # fmt: skip
+    )
     solver = cloth_of(world)
     thrown = np.zeros((98, 3))
     thrown[:49, 2] = -0.04

@@ -27,8 +27,11 @@ def nodes_that_left(folder) -> int:
     write_bowl(folder / "bowl.ply")
     sheet = {
         "shape": {"type": "rectangle", "size": (0.2, 0.2), "counts": (17, 17)},
-        "position": (0.01, 0.02, 0.1), "velocity": (0.0, 0.0, -3.0), "thickness": 0.001, "mass_per_area": 0.4,
-    }  # fmt: skip
+        "position": (0.01, 0.02, 0.1),
+        "velocity": (0.0, 0.0, -3.0),
+        "thickness": 0.001,
+        "mass_per_area": 0.4,
+    }
     bowl = {"shape": {"type": "mesh", "file": str(folder / "bowl.ply")}, "position": (0.0, 0.0, -0.5 * RADIUS)}
     world = world_of(sheet, bodies=[bowl], domain=SPACE, gravity=EARTH)
     for _ in range(10):

@@ -107,3 +107,38 @@ def test_a_field_that_a_bundle_lacks_is_named(taichi_cpu):
 def test_a_bundle_of_another_type_is_refused(taichi_cpu):
     with pytest.raises(TypeError, match="total_mass takes a Particles, got a Step"):
         total_mass(Step(0.01, GRAVITY), 1)
+
+
+@bundle
+class Both(NamedTuple):
+    first: Floats
+    second: Floats
+
+
+@kernel
+def copy_one(both: Both, of_second: ti.template(), out: Floats):
+    for i in range(out.shape[0]):
+        if ti.static(of_second):
+            out[i] = both.second[i]
+        else:
+            out[i] = both.first[i]
+
+
+def test_fields_that_a_kernel_does_not_read_are_passed_to_none_of_its_launches(taichi_cpu):
+    def filled(value: float) -> ti.Ndarray:
+        array = ti.ndarray(ti.f32, 4)
+        array.fill(value)
+        return array
+
+    first, second, out = filled(1.0), filled(2.0), filled(0.0)
+    for _ in range(2):
+        copy_one(Both(first, second), False, out)
+        np.testing.assert_array_equal(out.to_numpy(), 1.0)
+    copy_one(Both(first, filled(3.0)), False, out)  # another array where none is read
+    assert len(copy_one._launches) == 1
+    # Compiled to read the other field, it is passed both from now on.
+    for _ in range(2):
+        copy_one(Both(first, second), True, out)
+        np.testing.assert_array_equal(out.to_numpy(), 2.0)
+        copy_one(Both(second, first), False, out)
+        np.testing.assert_array_equal(out.to_numpy(), 2.0)

@@ -102,6 +102,20 @@ def test_an_array_of_the_wrong_type_is_refused_after_a_right_one_too(taichi_cpu)
         refuse_doubles(ti.ndarray(ti.f64, 4))
 
 
+def test_the_first_call_returns_what_later_ones_do(taichi_cpu):
+    @fast_launch
+    @ti.kernel
+    def both(numbers: Floats) -> Pair:
+        return Pair(numbers[0], numbers[1])
+
+    numbers = ti.ndarray(ti.f32, 2)
+    numbers.fill(0.1)
+    for _ in range(2):
+        returned = both(numbers)
+        assert returned == [float(np.float32(0.1))] * 2
+        assert {type(number) for number in returned} == {float}  # an artifact has 4 or 8 bytes of it
+
+
 def test_a_number_of_the_wrong_type_is_refused(taichi_cpu):
     numbers = ti.ndarray(ti.f32, 4)
     assert list(ends(numbers, 4)) == [0.0, 0.0]

@@ -31,22 +31,6 @@ def test_numbers_do_not_depend_on_what_is_drawn_beside_them():
     np.testing.assert_array_equal(together[:, 42:43], alone)
 
 
-def test_every_part_of_counter_and_key_matters():
-    draws = {
-        tuple(uniforms(counter, key)[:, 0])
-        for counter, key in [
-            ((0, 0, 0, 0), (0, 0)),
-            ((1, 0, 0, 0), (0, 0)),
-            ((0, 1, 0, 0), (0, 0)),
-            ((0, 0, 1, 0), (0, 0)),
-            ((0, 0, 0, 1), (0, 0)),
-            ((0, 0, 0, 0), (1, 0)),
-            ((0, 0, 0, 0), (0, 1)),
-        ]
-    }
-    assert len(draws) == 7
-
-
 def test_they_are_uniform_and_below_one():
     numbers = uniforms((np.arange(100_000), 0, 0, 0), (1, 2))
     assert numbers.min() >= 0.0

@@ -1,28 +1,17 @@
 import json
 import os
+import pickle
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+from fresh_python import run_python
 from places import PROJECT
 
 from sim.core import runtime
-from sim.core.domain import DomainParameters
-from sim.core.runtime import DeviceUnavailableError, available_devices, initialize
-from sim.smoke.parameters import SmokeParameters
-from sim.smoke.solver import SmokeSolver
-
-
-def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": str(PROJECT), **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+from sim.core.runtime import DeviceUnavailableError, available_devices, initialize, resolve_device
 
 
 def test_second_initialization_on_the_same_device_changes_nothing(taichi_cpu):
@@ -30,33 +19,20 @@ def test_second_initialization_on_the_same_device_changes_nothing(taichi_cpu):
     assert initialize("auto") == "cpu"
 
 
-def test_second_initialization_on_another_device_is_refused(taichi_cpu):
-    with pytest.raises(RuntimeError, match='runs on "cpu" in this process already'):
-        initialize("vulkan")
+@pytest.mark.parametrize(("device", "threads"), [("vulkan", None), ("cpu", 977)])
+def test_second_initialization_with_something_else_is_refused(taichi_cpu, device, threads):
+    with pytest.raises(RuntimeError, match=r'runs on "cpu" with .* threads in this process already'):
+        initialize(device, threads=threads)
 
 
-def test_second_initialization_with_other_threads_is_refused(taichi_cpu):
-    with pytest.raises(RuntimeError, match="threads in this process already"):
-        initialize("cpu", threads=977)
-
-
-def test_importing_runtime_does_not_load_taichi():
-    assert run_python("import sys, sim.core.runtime; print('taichi' in sys.modules)").stdout.strip() == "False"
-
-
-def test_starting_on_the_cpu_prints_nothing():
-    started = run_python("import sim.core.runtime as r; r.initialize('cpu')")
-    assert (started.returncode, started.stdout, started.stderr) == (0, "", "")
-
-
-def test_more_groups_of_fields_than_taichi_holds_are_refused_before_they_break_it(taichi_cpu, monkeypatch):
-    runtime.require_room_for_fields()
-    monkeypatch.setattr(runtime, "MOST_FIELD_TREES", 5)
-    domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(1.0, 1.0, 1.0))
-    source = {"shape": {"type": "sphere", "radius": 0.2}, "position": (0.5, 0.5, 0.5)}
-    fog = SmokeParameters.model_validate({"name": "fog", "cell_size": 0.1, "source": [source]})
-    with pytest.raises(RuntimeError, match="build further scenes in another process"):
-        SmokeSolver(fog, domain=domain, gravity=(0.0, 0.0, -9.81))
+def test_importing_runtime_does_not_load_taichi_and_starting_it_prints_nothing():
+    code = """
+    import sys, sim.core.runtime
+    assert "taichi" not in sys.modules
+    sys.stderr = sys.stdout
+    sim.core.runtime.initialize("cpu")
+    """
+    assert run_python(code) == ""
 
 
 def test_probe_answers_by_exit_code():
@@ -99,45 +75,25 @@ def test_unreadable_memory_of_devices_counts_as_none(tmp_path, content):
     assert runtime._read_answers(path, "key") is None
 
 
-def test_device_that_does_not_work_is_refused_with_its_reason():
-    code = """
-import sys
-import sim.core.runtime as r
-r.available_devices = lambda: {"cuda": "no driver"}
-try:
-    r.initialize("cuda")
-except r.DeviceUnavailableError as error:
-    print(error)
-"""
-    assert run_python(code).stdout.strip() == (
-        'device "cuda" is not available: no driver; use device = "auto" or "cpu"'
-    )
+def test_device_that_does_not_work_is_refused_with_its_reason_and_not_taken_by_auto(monkeypatch):
+    monkeypatch.setattr(runtime, "available_devices", lambda: {"cuda": "no driver", "cpu": "ok"})
+    with pytest.raises(
+        DeviceUnavailableError, match='"cuda" is not available: no driver; use device = "auto" or "cpu"'
+    ):
+        resolve_device("cuda")
+    assert resolve_device("auto") == "cpu"
 
 
-def test_auto_takes_the_cpu_where_nothing_else_works():
-    code = """
-import sim.core.runtime as r
-r.available_devices = lambda: {"cuda": "no driver", "metal": "no", "vulkan": "no", "cpu": "ok"}
-print(r.initialize("auto"))
-"""
-    assert run_python(code).stdout.strip() == "cpu"
+def test_missing_x11_library_is_named_with_the_remedy(monkeypatch):
+    class Refuse:
+        def find_spec(self, name, *_):
+            if name == "taichi":
+                raise ImportError("libX11.so.6: cannot open shared object file: No such file or directory")
 
-
-def test_missing_x11_library_is_named_with_the_remedy():
-    code = """
-import sys, types
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        if name == "taichi":
-            raise ImportError("libX11.so.6: cannot open shared object file: No such file or directory")
-sys.meta_path.insert(0, Refuse())
-import sim.core.runtime as r
-try:
-    r.initialize("cpu")
-except r.DeviceUnavailableError as error:
-    print(error)
-"""
-    assert run_python(code).stdout.strip().endswith("install it with: apt-get install libx11-6")
+    monkeypatch.delitem(sys.modules, "taichi", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Refuse(), *sys.meta_path])
+    with pytest.raises(DeviceUnavailableError, match="install it with: apt-get install libx11-6"):
+        runtime.import_taichi()
 
 
 def test_stale_lock_of_the_kernel_cache_is_removed_and_a_live_one_kept(tmp_path):
@@ -168,7 +124,5 @@ def test_processes_that_fill_a_new_kernel_cache_at_the_same_time_do_no_harm(tmp_
 
 
 def test_device_error_survives_pickling():
-    import pickle
-
     error = DeviceUnavailableError("cuda", "no driver")
     assert str(pickle.loads(pickle.dumps(error))) == str(error)

@@ -89,11 +89,6 @@ def test_frames_land_exactly_whatever_the_step(dt):
     assert world.time_s == 1.0
 
 
-def test_a_step_that_divides_the_frame_is_taken_exactly_so_often():
-    world = World([Oscillator("a", 1 / 240)], frames_per_second=60)
-    assert world.advance_frame().substeps == {"a": 4}
-
-
 def test_coupled_solvers_share_substeps_and_others_keep_their_own():
     spring = Spring("fine", "coarse")
     solvers = [Oscillator("alone", 1 / 60), Oscillator("fine", 1 / 600), Oscillator("coarse", 1 / 120)]

@@ -4,7 +4,8 @@ import itertools
 
 import numpy as np
 import pytest
-from coupled_tanks import EVERY_FACE, WEIGHTLESS, Tank
+from coupled_tanks import WEIGHTLESS, Tank
+from small_fluids import EVERY_FACE
 
 from sim.core.domain import DomainParameters
 from sim.fluid.kernels import evaluate_slope

@@ -7,6 +7,7 @@ from coupled_tanks import EARTH, SPACING, Tank
 from sim.build import build_world
 from sim.core.domain import DomainParameters
 from sim.coupling.body_speed import expected_body_speed
+from sim.fluid.boundary import BodyStates
 from sim.rigid.parameters import RigidBodyParameters
 from sim.scene import SceneParameters
 from sim.shapes.body_geometry import BodyGeometry
@@ -87,7 +88,8 @@ def test_fluid_finds_a_body_that_started_and_stopped_within_a_step(taichi_cpu):
         tank.fluid.snapshots()  # it knows its neighbours now
         lowered = tank.rigid.bodies.position - (0.0, 0.0, 0.13)
         at_rest = np.zeros((1, 3))
-        tank.fluid.tank.move_bodies(lowered, tank.rigid.bodies.rotation(), at_rest, at_rest, elapsed_s=elapsed_s)
+        states = BodyStates(lowered, tank.rigid.bodies.rotation(), at_rest, at_rest)
+        tank.fluid.tank.move_bodies(states, elapsed_s=elapsed_s)
         densities[elapsed_s] = tank.fluid.snapshots()["water"].arrays["density"]
     np.testing.assert_array_equal(densities[1.0e-3], densities[0.0])
     # The box has a part in them: it stands on the fluid, half a spacing above the top layer.

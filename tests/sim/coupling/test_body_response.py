@@ -54,12 +54,12 @@ def test_the_diagonal_bounds_what_bodies_add_to_the_pressure_matrix(taichi_cpu):
     tank = two_light_bodies()
     fluid = tank.fluid
     fluid.compute_density()
-    with_bodies = fluid.pressure.system.inverse_diagonal.to_numpy()[: fluid.particle_count].astype(np.float64)
+    with_bodies = fluid.system.inverse_diagonal.to_numpy()[: fluid.particle_count].astype(np.float64)
     response, fluid.body_forces.response = fluid.body_forces.response, None
     fluid.compute_density()
-    without = fluid.pressure.system.inverse_diagonal.to_numpy()[: fluid.particle_count].astype(np.float64)
+    without = fluid.system.inverse_diagonal.to_numpy()[: fluid.particle_count].astype(np.float64)
     fluid.body_forces.response = response
-    bound = (1.0 / with_bodies - 1.0 / without) / fluid.pressure.relaxation
+    bound = (1.0 / with_bodies - 1.0 / without) / fluid.relaxation
     n, mobility = wrenches(tank)
     matrix = fluid.particle_volume * np.einsum("bia,bac,bjc->ij", n, mobility, n)
     eigenvalues = np.linalg.eigvalsh(np.diag(bound) - matrix)
@@ -74,9 +74,9 @@ def test_samples_answer_to_a_pressure_as_the_bodies_would(taichi_cpu):
     fluid, bodies = tank.fluid, tank.rigid.bodies
     fluid.compute_density()
     pressure = np.random.default_rng(1).uniform(0.0, 1000.0, fluid.particles.capacity).astype(np.float32)
-    fluid.pressure.next_pressure.from_numpy(pressure)
-    fluid.pressure.accelerate_by(fluid.pressure.next_pressure)
-    found = fluid.pressure.boundary_response.to_numpy()[: fluid.boundary.count]
+    fluid.next_pressure.from_numpy(pressure)
+    fluid.accelerate_by(fluid.next_pressure)
+    found = fluid.boundary_response.to_numpy()[: fluid.boundary.count]
     n, mobility = wrenches(tank)
     count = fluid.particle_count
     for body, (start, stop) in enumerate(

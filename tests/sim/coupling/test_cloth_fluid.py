@@ -123,13 +123,15 @@ def test_light_cloth_rises_and_heavy_cloth_sinks(taichi_cpu, density, sign):
     thickness = 0.005
     tank = ClothTank(
         cloth={
-            "shape": rectangle(0.16, 9), "position": (0.0, 0.0, 0.2), "thickness": thickness,
+            "shape": rectangle(0.16, 9),
+            "position": (0.0, 0.0, 0.2),
+            "thickness": thickness,
             "mass_per_area": density * thickness,
         },
         water=((-0.14, -0.14, 0.0), (0.14, 0.14, 0.4)),
         domain={"min": (-0.14, -0.14, 0.0), "max": (0.14, 0.14, 0.6)},
         solver="dfsph",
-    )  # fmt: skip
+    )
     tank.run(0.8)
     # Where it starts the water closes its gaps, which moves the sheet by half a spacing.
     assert sign * (tank.nodes()[0][:, 2].mean() - 0.2) > SPACING

@@ -144,15 +144,11 @@ def test_cells_whose_centres_are_in_a_body_are_solid_and_have_its_velocity():
     smoke, rigid = smoke_of(world), world.solvers["rigid"]
     grid, state = smoke.grid, rigid.bodies
     centres = grid.cell_centres()
-    kind = grid.trim(smoke.obstacles.state.to_numpy(), grid.cells).ravel()
+    kind = grid.trim(smoke.obstacles.solids.state.to_numpy(), grid.cells).ravel()
     assert np.array_equal(kind == STATIC, grid.solid.ravel())
     solid = kind != AIR
     velocity = np.stack(
-        [
-            grid.trim(field.to_numpy(), grid.cells).ravel()
-            for field in (smoke.obstacles.velocity_x, smoke.obstacles.velocity_y, smoke.obstacles.velocity_z)
-        ],
-        axis=1,
+        [grid.trim(array.to_numpy(), grid.cells).ravel() for array in smoke.obstacles.solids.velocity], axis=1
     )
     covered = np.zeros(len(centres), bool)
     for number, geometry in enumerate(rigid.solids):
@@ -258,9 +254,14 @@ def velocity_ahead_of_a_sphere(cells: int) -> np.ndarray:
     ball = {"name": "ball", "kind": "kinematic", "shape": {"type": "sphere", "radius": 0.125}}
     ball |= {"position": (0.5 - speed / FPS, 0.5, 0.5), "velocity": (speed, 0.0, 0.0)}
     world = build(
-        [ball], cells=cells, size=(1.0, 1.0, 1.0), open_faces=(), buoyancy_temperature=0.0, buoyancy_density=0.0,
+        [ball],
+        cells=cells,
+        size=(1.0, 1.0, 1.0),
+        open_faces=(),
+        buoyancy_temperature=0.0,
+        buoyancy_density=0.0,
         vorticity_confinement=0.0,
-    )  # fmt: skip
+    )
     numbers = world.advance_frame().diagnostics["air"]
     assert numbers["residual"] <= TOLERANCE
     u, v, w = (face / speed for face in face_velocities(smoke_of(world)))

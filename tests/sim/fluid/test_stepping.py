@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from sim.fluid.box import Box
-from sim.fluid.stepping import MotionSummary, ParticleStepper
+from sim.fluid.stepping import Box, MotionSummary, ParticleStepper
 
 FAR = 1.0e30
 DT = 1.0e-3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from scipy.spatial import ConvexHull
-from small_fluids import EVERY_FACE, lattice, make_fluid
+from small_fluids import EVERY_FACE, lattice, make_fluid, run
 
 from sim.core.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
@@ -28,15 +28,6 @@ def drop(particles, **parameters):
         surface_tension_model="akinci2013",
         **options,
     )
-
-
-def run(fluid, seconds: float) -> None:
-    time = 0.0
-    while time < seconds:
-        dt = fluid.stable_dt()
-        fluid.substep(dt)
-        time += dt
-        assert fluid.first_bad_quantity() is None
 
 
 def position(fluid) -> np.ndarray:

@@ -6,6 +6,7 @@ from scipy.special import jv
 from small_fluids import EVERY_FACE, lattice, make_fluid
 
 from sim.core.domain import DomainParameters
+from sim.fluid.parameters import FluidParameters
 from sim.fluid.viscosity_implicit import TOLERANCE, is_implicit
 
 OPEN_SPACE = DomainParameters(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5), open_faces=EVERY_FACE)
@@ -172,7 +173,9 @@ def test_a_stiff_fluid_continues_from_a_checkpoint_bit_for_bit(dam_break):
     ],
 )
 def test_viscosity_is_solved_for_where_it_would_shorten_the_step(solver, viscosity, dt, expected):
-    assert is_implicit(solver, viscosity=viscosity, spacing=0.02, speed=30.0, dt=dt, cfl=1.0) is expected
+    block = {"shape": {"type": "sphere", "radius": 1.0}}
+    parameters = FluidParameters(name="water", block=[block], viscosity_solver=solver, dt=dt, particle_radius=0.01)
+    assert is_implicit(parameters, viscosity, speed=30.0) is expected
 
 
 @pytest.mark.parametrize("solver", ["explicit", "implicit"])

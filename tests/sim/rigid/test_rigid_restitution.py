@@ -2,17 +2,13 @@
 
 import numpy as np
 import pytest
-from rigid_scenes import SPACE, advance, ball, body, cube, in_room, in_space, totals
+from rigid_scenes import SPACE, advance, ball, body, cube, energy, in_room, in_space, totals
 
 from sim.rigid.solver import RigidSolver
 
 BRICK = {"type": "box", "size": (0.4, 0.2, 0.05)}
 ROUNDING = 1e-5
 """Of the energy: a fast tumbling body's free rotation errs by so much in a second (3e-6 measured); impacts add none."""
-
-
-def energy(solver: RigidSolver) -> float:
-    return sum(solver.diagnostics()[kind] for kind in ("kinetic_energy", "potential_energy"))
 
 
 def thrown(seed: int, shape: dict, restitution: float, friction: float) -> RigidSolver:

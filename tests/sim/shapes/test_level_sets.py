@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from sim.shapes import LevelSet, ShapeError, build_solid
+from sim.shapes.level_set import LevelSet
 from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
+from sim.shapes.solid import ShapeError
 
 BALL = build_solid(Placement(shape={"type": "sphere", "radius": 0.25}, position=(0.1, 0.2, 0.3)))
 

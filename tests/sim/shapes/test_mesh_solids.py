@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from sim.shapes import ShapeError
+from sim.shapes.mass_properties import integrate_moments
 from sim.shapes.mesh_repair import boundary_edges, boundary_loops, cap_holes
 from sim.shapes.mesh_solid import solid_from_triangles
-from sim.shapes.moments import integrate_moments
+from sim.shapes.solid import ShapeError
 
 SPHERE = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
 VERTICES, FACES = np.array(SPHERE.vertices), np.array(SPHERE.faces)
@@ -147,21 +147,22 @@ def test_mesh_without_a_clear_inside_is_refused(vertices, faces):
         solid_from_triangles(vertices, faces, label="thing.obj")
 
 
-def test_flat_sheet_is_refused():
-    with pytest.raises(ShapeError, match=r"thing is flat: its extent is 1 x 1 x 0 m; a solid needs thickness"):
-        solid_from_triangles([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], label="thing")
-
-
-def test_collapsed_mesh_is_refused():
-    with pytest.raises(ShapeError, match="thing has no extent: all of its vertices are in one place"):
-        solid_from_triangles(np.ones((3, 3)), [[0, 1, 2]], label="thing")
-
-
-def test_vertices_that_are_not_finite_are_refused():
-    vertices = VERTICES.copy()
-    vertices[[3, 5], 1] = np.nan, np.inf
-    with pytest.raises(ShapeError, match="thing has 2 vertices that are not finite numbers"):
-        solid_from_triangles(vertices, FACES, label="thing")
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        ([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], "is flat: its extent is 1 x 1 x 0 m; "),
+        (np.ones((3, 3)), [[0, 1, 2]], "has no extent: all of its vertices are in one place"),
+        (
+            np.where(np.arange(len(VERTICES))[:, None] < 2, np.nan, VERTICES),
+            FACES,
+            "has 2 vertices that are not finite",
+        ),
+    ],
+    ids=["flat", "collapsed", "not finite"],
+)
+def test_mesh_that_encloses_nothing_is_refused(vertices, faces, message):
+    with pytest.raises(ShapeError, match=f"thing {message}"):
+        solid_from_triangles(vertices, faces, label="thing")
 
 
 def test_loops_meeting_in_one_vertex_are_told_apart_and_capped():

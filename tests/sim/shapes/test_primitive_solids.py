@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from sim.shapes import ShapeError, build_solid
 from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
+from sim.shapes.solid import ShapeError
 
 PRIMITIVES = {
     "box": {"type": "box", "size": (0.3, 0.2, 0.1)},

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
-from sim.shapes import build_solid
 from sim.shapes.mass_properties import mass_properties_of_mesh
 from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
 from sim.shapes.tessellation import cut_along
 
 LENGTH = 0.2

@@ -5,8 +5,10 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from sim.shapes import ShapeError, build_solid, fill_with_particles, sample_surface
 from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
+from sim.shapes.sampling import fill_with_particles, sample_surface
+from sim.shapes.solid import ShapeError
 
 BALL = build_solid(Placement(shape={"type": "sphere", "radius": 0.25}))
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from sim.shapes.distance_grids import local_thickness, wall_thickness
 from sim.shapes.mesh_solid import solid_from_triangles
-from sim.shapes.thickness import local_thickness, wall_thickness
 
 
 def solid_of(mesh: trimesh.Trimesh):

@@ -1,29 +1,22 @@
 import numpy as np
 import pytest
-import taichi as ti
 from smoke_scenes import CLOSED_BOX, get_faces, set_faces, unit_grid
 
 from sim.smoke.advection import Advection
+from sim.smoke.arrays import new_floats, new_state
 from sim.smoke.grid import SmokeGrid
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
 
 class Laboratory:
-    """Fields on a grid with nothing but their advection."""
+    """Arrays on a grid with nothing but their advection."""
 
     def __init__(self, grid: SmokeGrid, *, maccormack: bool) -> None:
         self.grid, self.maccormack = grid, maccormack
-        self.velocity = tuple(ti.field(ti.f32, shape=grid.size) for _ in range(3))
-        self.density, self.excess = (ti.field(ti.f32, shape=grid.size) for _ in range(2))
-        work = tuple(ti.field(ti.f32, shape=grid.size) for _ in range(6))
-        self.advection = Advection(
-            grid,
-            velocity=self.velocity,
-            cell_fields=(self.density, self.excess),
-            work=work,
-            maccormack=maccormack,
-        )
+        self.velocity, self.density, self.excess = state = new_state(grid.size)
+        work = tuple(new_floats(grid.size) for _ in range(6))
+        self.advection = Advection(grid, state, work, maccormack=maccormack)
 
     def set_cells(self, field, values) -> None:
         field.from_numpy(self.grid.pad(values.reshape(self.grid.cells).astype(np.float32)).ravel())

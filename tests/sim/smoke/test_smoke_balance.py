@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-import taichi as ti
 from smoke_scenes import CLOSED_BOX, OPEN_BOX, unit_grid
 
 from sim.core.domain import DomainParameters
+from sim.smoke.arrays import new_faces, new_floats
 from sim.smoke.balance import CorrectionBalance
 from sim.smoke.obstacles import Obstacles
 from sim.smoke.parameters import SmokeParameters
@@ -15,14 +15,15 @@ SOURCE = {"shape": {"type": "sphere", "radius": 0.15}, "position": (0.5, 0.5, 0.
 
 
 class Bench:
-    """Fields of one step on a grid: before it, predicted and corrected, with uniform velocities on all faces."""
+    """Arrays of one step on a grid: before it, predicted and corrected, with uniform velocities on all faces."""
 
     def __init__(self, grid, velocity=(0.0, 0.0, 0.0)) -> None:
         self.grid = grid
-        self.before, self.predicted, self.corrected, *faces = (ti.field(ti.f32, shape=grid.size) for _ in range(6))
-        for field, speed in zip(faces, velocity, strict=True):
-            field.fill(speed)
-        self.balance = CorrectionBalance(Obstacles(grid), tuple(faces))
+        self.before, self.predicted, self.corrected = (new_floats(grid.size) for _ in range(3))
+        faces = new_faces(grid.size)
+        for array, speed in zip(faces, velocity, strict=True):
+            array.fill(speed)
+        self.balance = CorrectionBalance(Obstacles(grid), faces)
 
     def restore(self, before, predicted, corrected, *, step: float = 0.0) -> np.ndarray:
         fields = (self.before, self.predicted, self.corrected)

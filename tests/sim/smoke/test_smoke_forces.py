@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-import taichi as ti
-from smoke_scenes import CLOSED_BOX, OPEN_BOX, get_faces, set_faces, unit_grid
+from smoke_scenes import CLOSED_BOX, OPEN_BOX, get_faces, openness_of, set_faces, unit_grid
 
+from sim.smoke.arrays import new_floats, new_state
 from sim.smoke.forces import Forces, upward
 from sim.smoke.obstacles import Obstacles
 
@@ -10,22 +10,18 @@ pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
 
 def build(grid, *, confinement: float, gravity=(0.0, 0.0, -9.81)):
-    fields = [ti.field(ti.f32, shape=grid.size) for _ in range(12)]
-    openness, velocity, cell_fields, work = fields[:3], fields[3:6], fields[6:8], fields[8:]
-    for axis, field in enumerate(openness):
-        field.from_numpy(grid.pad(grid.open_area[axis].astype(np.float32)).ravel())
+    state = new_state(grid.size)
     forces = Forces(
         Obstacles(grid),
-        openness=tuple(openness),
-        velocity=tuple(velocity),
-        cell_fields=tuple(cell_fields),
-        work=tuple(work),
+        openness_of(grid),
+        state,
+        tuple(new_floats(grid.size) for _ in range(4)),
         gravity=gravity,
         buoyancy_density=0.5,
         buoyancy_temperature=0.03,
         confinement=confinement,
     )
-    return forces, velocity, cell_fields
+    return forces, state.velocity, (state.density, state.excess)
 
 
 def test_confinement_spins_a_lone_vortex_up_by_what_the_formula_says():

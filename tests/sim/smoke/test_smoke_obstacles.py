@@ -174,12 +174,14 @@ def test_coefficients_that_followed_obstacles_equal_those_of_static_ones(box):
         box.move_obstacles()
     followed = box._projection.multigrid
     static = Coefficients(Obstacles(SmokeGrid(box.grid.origin, CELL_SIZE, CELLS, frozenset(), solid)))
-    for mine, other in zip(followed.coefficients.fields, static.fields, strict=True):
-        assert np.array_equal(mine.to_numpy(), other.to_numpy())
-    assert np.array_equal(followed.coefficients.inverse_diagonal.to_numpy(), static.inverse_diagonal.to_numpy())
+    mine, other = (
+        [array.to_numpy() for array in (*operator.faces, operator.inverse_diagonal)]
+        for operator in (followed.coefficients.operator, static.operator)
+    )
+    assert all(map(np.array_equal, mine, other))
     assert np.array_equal(followed._coarsest_conductance, static.coarsest_conductance())
     # Many cells are shut in alone, and have no equation.
-    assert (static.inverse_diagonal.to_numpy()[: box.grid.size] == 0.0).sum() > 0
+    assert (static.operator.inverse_diagonal.to_numpy()[: box.grid.size] == 0.0).sum() > 0
 
 
 @pytest.mark.parametrize("open_faces", [(), OPEN_BOX, ("z-", "y+")], ids=["closed", "open", "two open sides"])
@@ -193,7 +195,7 @@ def test_closed_regions_are_the_connected_components_that_touch_no_open_side(ope
     for share in (0.75, 0.33, 0.6, 0.0):
         solid = random.random(grid.cells) < share
         mark(obstacles, solid, (0.0, 0.0, 0.0))
-        obstacles.commit(obstacles.velocity_x)
+        obstacles.commit(obstacles.marks.velocity.x)
         regions.find()
         labels, count = ndimage.label(~solid)
         outside = {0}

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-import taichi as ti
 from smoke_scenes import CLOSED_BOX, OPEN_BOX, get_faces, rough_velocity, set_faces, unit_grid
 
+from sim.smoke.arrays import new_faces
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.multigrid_levels import Coefficients, operator_matrix, plan_levels
 from sim.smoke.obstacles import Obstacles
@@ -15,7 +15,7 @@ TOLERANCE = 1.0e-5
 
 
 def build(grid: SmokeGrid, *, tolerance: float = TOLERANCE):
-    velocity = tuple(ti.field(ti.f32, shape=grid.size) for _ in range(3))
+    velocity = new_faces(grid.size)
     return velocity, PressureProjection(Obstacles(grid), velocity, tolerance=tolerance, max_iterations=50)
 
 

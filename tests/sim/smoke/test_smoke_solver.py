@@ -3,15 +3,13 @@ import math
 
 import numpy as np
 import pytest
-import taichi as ti
-from smoke_scenes import OPEN_BOX
+from smoke_scenes import OPEN_BOX, Bytes
 from thread_counts import outputs_by_threads
 
 from sim.core import scheduling
 from sim.core.domain import DomainParameters
-from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
-from sim.smoke import lanes
+from sim.shapes.placement import build_solid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
@@ -260,8 +258,7 @@ import hashlib, sys
 from sim.core.runtime import initialize
 initialize("cpu", threads=int(sys.argv[1]))
 from sim.core import scheduling
-from sim.smoke import lanes
-scheduling.LONGEST_NS, lanes.LEAST_CELLS_IN_RUNS = map(float, sys.argv[2:])
+scheduling.LONGEST_NS = float(sys.argv[2])
 from test_smoke_solver import advance, build_plume, digest
 solver = build_plume()
 advance(solver, 6)
@@ -274,52 +271,31 @@ def digest(solver: SmokeSolver) -> str:
     return hashlib.sha256(b"".join(state[name].tobytes() for name in sorted(state))).hexdigest()
 
 
-def count_values(module, monkeypatch) -> list[int]:
-    """Has the fields that a module makes from now on leave their sizes in a list [4-byte values]."""
-    sizes: list[int] = []
-    make, make_vectors = ti.field, ti.Vector.field
-
-    def field(dtype, shape):
-        sizes.append(int(np.prod(shape)))
-        return make(dtype, shape=shape)
-
-    def vectors(count, dtype, shape):
-        sizes.append(count * int(np.prod(shape)))
-        return make_vectors(count, dtype, shape=shape)
-
-    monkeypatch.setattr(module, "field", field)
-    monkeypatch.setattr(module.Vector, "field", vectors)
-    return sizes
-
-
 @pytest.mark.parametrize("moving", [False, True])
 def test_memory_that_it_tells_is_what_it_allocates(monkeypatch, moving):
-    sizes = count_values(ti, monkeypatch)
+    made = Bytes(monkeypatch)
     ball = build_solid(Placement(**BALL, position=(0.0, 0.0, 0.7)))
     gusts = {"strength": 1.0, "size": 0.2}
     solver = SmokeSolver(plume(turbulence=gusts), domain=DOMAIN, gravity=GRAVITY, solids=[ball], moving=moving)
     # Not counted: numbers of the conjugate gradients, distances of centres, the inverse of the coarsest grid.
-    allocated = 4 * sum(sizes)
-    assert solver.device_bytes <= allocated
-    assert allocated - solver.device_bytes < 4 * (64**2 + 2000)
+    assert solver.device_bytes <= made.total
+    assert made.total - solver.device_bytes < 4 * (64**2 + 2000)
 
 
 def test_a_plain_box_takes_less_than_120_bytes_a_cell(monkeypatch):
-    sizes = count_values(ti, monkeypatch)
+    made = Bytes(monkeypatch)
     solver = SmokeSolver(plume(cell_size=1 / 48), domain=DOMAIN, gravity=GRAVITY)  # a GPU sums over 32,768 lanes
     cells = math.prod(solver.grid.cells)
     # Required of the solver. What it tells leaves out a few numbers, so what it allocates is looked at as well.
     assert solver.device_bytes < 120 * cells
-    assert 4 * sum(sizes) < 120 * cells
+    assert made.total < 120 * cells
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("longest_ns", "least_cells"),
-    [(scheduling.LONGEST_NS, lanes.LEAST_CELLS_IN_RUNS), (2.0e4, 0.0)],
-    ids=["as a small grid", "as a large one: runs of cells, and coarse levels alone by one thread"],
+    "longest_ns", [scheduling.LONGEST_NS, 2.0e4], ids=["as a small grid", "as a large one: coarse levels by one thread"]
 )
-def test_one_thread_and_two_give_the_same_bits(longest_ns, least_cells):
-    digests = outputs_by_threads(CHILD, repr(longest_ns), repr(least_cells), beside=__file__)
+def test_one_thread_and_two_give_the_same_bits(longest_ns):
+    digests = outputs_by_threads(CHILD, repr(longest_ns), beside=__file__)
     assert len(digests[0].split()[-1]) == 64
     assert digests[0] == digests[1]

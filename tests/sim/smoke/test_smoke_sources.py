@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 import trimesh
+from smoke_scenes import openness_of
 
 from sim.core.domain import DomainParameters
-from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
+from sim.smoke.arrays import new_state
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.obstacles import Obstacles
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
@@ -33,17 +34,14 @@ class Emission:
 
     def __init__(self, source: dict) -> None:
         self.grid = SmokeGrid.build(SmokeParameters(name="trail", cell_size=CELL, source=[source]), DOMAIN)
-        self.fields = [ti.field(ti.f32, shape=self.grid.size) for _ in range(5)]
-        openness = [ti.field(ti.f32, shape=self.grid.size) for _ in range(3)]
-        for axis, field in enumerate(openness):
-            field.from_numpy(self.grid.pad(self.grid.open_area[axis].astype(np.float32)).ravel())
+        state = new_state(self.grid.size)
+        self.arrays = [*state.velocity, state.density, state.excess]
         self.source = Source(
             SmokeSourceParameters(**source),
             Obstacles(self.grid),
             ambient_temperature=293.0,
-            openness=tuple(openness),
-            velocity=tuple(self.fields[:3]),
-            cell_fields=tuple(self.fields[3:]),
+            openness=openness_of(self.grid),
+            state=state,
         )
         self.emitted = 0.0
 
@@ -56,14 +54,14 @@ class Emission:
         return self.cells(3)
 
     def clear(self) -> None:
-        for field in self.fields:
-            field.fill(0.0)
+        for array in self.arrays:
+            array.fill(0.0)
 
     def cells(self, number: int) -> np.ndarray:
-        return self.grid.trim(self.fields[number].to_numpy(), self.grid.cells)
+        return self.grid.trim(self.arrays[number].to_numpy(), self.grid.cells)
 
     def faces(self, axis: int) -> np.ndarray:
-        return self.grid.trim(self.fields[axis].to_numpy(), self.grid.face_shape(axis))
+        return self.grid.trim(self.arrays[axis].to_numpy(), self.grid.face_shape(axis))
 
 
 def test_a_moving_source_leaves_its_swept_volume_behind_whatever_the_steps():
@@ -132,7 +130,7 @@ def test_what_a_step_emits_depends_on_its_time_alone():
     whole.clear()
     whole.run(4, 0.5, 1.0)
     resumed.run(4, 0.5, 1.0)
-    for mine, other in zip(resumed.fields, whole.fields, strict=True):
+    for mine, other in zip(resumed.arrays, whole.arrays, strict=True):
         assert mine.to_numpy().any()
         assert np.array_equal(mine.to_numpy(), other.to_numpy())
 

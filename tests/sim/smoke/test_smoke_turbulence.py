@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-import taichi as ti
+from smoke_scenes import get_faces, openness_of
 from thread_counts import outputs_by_threads
 
 from sim.core.domain import DomainParameters
+from sim.smoke.arrays import new_faces
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters, TurbulenceParameters
 from sim.smoke.turbulence import Turbulence
@@ -24,24 +25,16 @@ class Gusts:
     def __init__(self, *, low_x: float = 0.0, wind: tuple[float, float, float] = (0.0, 0.0, 0.0), **changes) -> None:
         box = SmokeParameters(name="air", cell_size=CELL, source=[SOURCE], open_faces=ALL_OPEN, min=(low_x, 0.0, 0.0))
         self.grid = SmokeGrid.build(box, DOMAIN)
-        self.fields = [ti.field(ti.f32, shape=self.grid.size) for _ in range(3)]
-        openness = [ti.field(ti.f32, shape=self.grid.size) for _ in range(3)]
-        for axis, field in enumerate(openness):
-            field.from_numpy(self.grid.pad(self.grid.open_area[axis].astype(np.float32)).ravel())
+        self.velocity = new_faces(self.grid.size)
         parameters = TurbulenceParameters(**{"strength": 2.0, "size": 0.2, "rate": 4.0, **changes})
-        self.turbulence = Turbulence(
-            self.grid, parameters, wind=wind, openness=tuple(openness), velocity=tuple(self.fields)
-        )
+        self.turbulence = Turbulence(self.grid, parameters, wind, openness_of(self.grid), self.velocity)
 
     def at(self, time_s: float) -> list[np.ndarray]:
         """The acceleration by axis [m/s²], in the shape of the faces."""
-        for field in self.fields:
-            field.fill(0.0)
+        for array in self.velocity:
+            array.fill(0.0)
         self.turbulence.accelerate(time_s, 1.0)
-        return [
-            self.grid.trim(field.to_numpy(), self.grid.face_shape(axis)).astype(np.float64)
-            for axis, field in enumerate(self.fields)
-        ]
+        return [face.astype(np.float64) for face in get_faces(self.grid, self.velocity)]
 
 
 def test_its_acceleration_is_as_strong_as_asked_for_and_has_no_divergence():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sim.core.domain import DomainParameters
-from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
 

@@ -6,8 +6,8 @@ import trimesh
 from scipy import ndimage
 
 from sim.core.domain import DomainParameters
-from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.thin_walls import PROBES, thin_walls, thin_walls_on_the_way

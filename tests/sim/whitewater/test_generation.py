@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from whitewater_scenes import RADIUS, fluid
 
 from sim.whitewater.cloud import WhitewaterCloud
-from sim.whitewater.generation import Moment, clamp_potential, generate, generation_rate
+from sim.whitewater.generation import clamp_potential, generate, generation_rate
 from sim.whitewater.parameters import WhitewaterParameters
 
 PARAMETERS = WhitewaterParameters()
@@ -24,7 +24,7 @@ def generated(rate: float, *, count: int = 20_000, room: int = 10**7, parameters
         DT,
         particle_radius=RADIUS,
         room=room,
-        moment=Moment(3, substep),
+        moment=(3, substep),
         parameters=parameters,
     )
 
@@ -81,7 +81,7 @@ def test_without_spread_they_have_the_fluids_velocity():
 def test_without_room_they_are_thinned_evenly():
     state = fluid(np.outer(np.arange(1000), [1.0, 0, 0]), tuple(VELOCITY))
     born, missed = generate(
-        state, np.full(1000, 4.0 / DT), DT, particle_radius=RADIUS, room=500, moment=Moment(1, 0), parameters=PARAMETERS
+        state, np.full(1000, 4.0 / DT), DT, particle_radius=RADIUS, room=500, moment=(1, 0), parameters=PARAMETERS
     )
     assert (len(born), missed) == (500, 3500)
     assert np.histogram(born.position[:, 0], bins=10, range=(-0.5, 999.5))[0].min() >= 45

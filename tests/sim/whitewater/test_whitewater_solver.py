@@ -5,7 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from thread_counts import outputs_by_threads
-from whitewater_scenes import ALL_FACES, FPS, GRAVITY, NO_FLUID, RADIUS, SPACING, cloud, fluid, jets, lattice, solver
+from whitewater_scenes import (
+    ALL_FACES,
+    BOX,
+    FPS,
+    GRAVITY,
+    NO_FLUID,
+    RADIUS,
+    SPACING,
+    cloud,
+    fluid,
+    jets,
+    lattice,
+    solver,
+)
 
 from sim.core.domain import DomainParameters
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
@@ -19,6 +32,12 @@ DT = 1.0 / FPS
 
 def advance(cloud_now, begin, end, *, frame=1, using=None, **options):
     return (using or solver()).advance_frame(cloud_now, begin, end, frame=frame, particle_radius=RADIUS, **options)[0]
+
+
+def made(begin, end, parameters: WhitewaterParameters | None = None, *, frame=1, domain=BOX, **options):
+    """What two frames of fluid make of an empty cloud, and the report."""
+    using = solver(parameters or WhitewaterParameters(), domain=domain)
+    return using.advance_frame(WhitewaterCloud.empty(), begin, end, frame=frame, particle_radius=RADIUS, **options)
 
 
 def test_spray_flies_on_a_parabola(taichi_cpu):
@@ -119,27 +138,15 @@ def test_a_still_tank_makes_nothing(taichi_cpu, speed):
     random = np.random.default_rng(1)
     direction = random.normal(size=rest.shape)
     trembling = fluid(rest, speed * direction / np.linalg.norm(direction, axis=1, keepdims=True))
-    after, report = solver(WhitewaterParameters()).advance_frame(
-        WhitewaterCloud.empty(), trembling, trembling, frame=1, particle_radius=RADIUS
-    )
+    after, report = made(trembling, trembling)
     assert (len(after), report.generated, report.not_generated) == (0, 0, 0)
-
-
-def test_a_fluid_that_moves_as_a_whole_traps_no_air(taichi_cpu):
-    block = fluid(lattice((-0.2, -0.2, 0.2), (0.2, 0.2, 0.4)), (3.0, 0.0, 0.0))
-    field = FluidField(FluidMotion(block, block, DT).bounds(), RADIUS, len(block.position))
-    field.update(block)
-    trapped_air, _ = field.potentials(0.6)
-    assert trapped_air.max() == 0.0
 
 
 def test_as_many_are_made_as_the_potentials_say(taichi_cpu):
     begin, end = jets()
     parameters = WhitewaterParameters(max_speed=2.5)
     wide = DomainParameters(min=(-2.0, -2.0, -2.0), max=(2.0, 2.0, 2.0))
-    after, report = solver(parameters, domain=wide).advance_frame(
-        WhitewaterCloud.empty(), begin, end, frame=7, particle_radius=RADIUS
-    )
+    after, report = made(begin, end, parameters, frame=7, domain=wide)
     motion = FluidMotion(begin, end, DT)
     field = FluidField(motion.bounds(), RADIUS, len(begin.position))
     expected = rounding_variance = 0.0
@@ -159,27 +166,19 @@ def test_as_many_are_made_as_the_potentials_say(taichi_cpu):
 
 def test_the_cap_holds_and_what_had_no_room_is_counted(taichi_cpu):
     begin, end = jets()
-    free = solver(WhitewaterParameters()).advance_frame(
-        WhitewaterCloud.empty(), begin, end, frame=1, particle_radius=RADIUS
-    )
-    capped = solver(WhitewaterParameters(max_particles=100)).advance_frame(
-        WhitewaterCloud.empty(), begin, end, frame=1, particle_radius=RADIUS
-    )
-    assert len(capped[0]) == 100
-    assert capped[1].generated + capped[1].not_generated == free[1].generated
+    _, free = made(begin, end)
+    cloud_then, capped = made(begin, end, WhitewaterParameters(max_particles=100))
+    assert len(cloud_then) == 100
+    assert capped.generated + capped.not_generated == free.generated
 
 
 def test_two_fluids_of_a_tank_share_out_what_the_tank_makes(taichi_cpu):
     """Each feels the other, so the halves are those of the whole, particle by particle."""
     begin, end = jets()
     half = len(begin.particle_id) // 2
-    made = [
-        solver(WhitewaterParameters()).advance_frame(
-            WhitewaterCloud.empty(), begin, end, frame=1, particle_radius=RADIUS, sources=sources
-        )
-        for sources in (None, begin.particle_id[:half], begin.particle_id[half:])
-    ]
-    (whole, report), (left, of_left), (right, of_right) = made
+    (whole, report), (left, of_left), (right, of_right) = (
+        made(begin, end, sources=sources) for sources in (None, begin.particle_id[:half], begin.particle_id[half:])
+    )
     assert min(of_left.generated, of_right.generated) > 20
     assert of_left.generated + of_right.generated == report.generated
     both = np.concatenate([left.position, right.position])
@@ -188,15 +187,13 @@ def test_two_fluids_of_a_tank_share_out_what_the_tank_makes(taichi_cpu):
 
 def test_the_same_frame_gives_the_same_bits_and_another_seed_does_not(taichi_cpu):
     begin, end = jets()
-
-    def run(seed: int, frame: int) -> WhitewaterCloud:
-        using = solver(WhitewaterParameters(seed=seed))
-        return advance(WhitewaterCloud.empty(), begin, end, frame=frame, using=using)
-
-    first, again = run(0, 1), run(0, 1)
+    first, again, *others = (
+        made(begin, end, WhitewaterParameters(seed=seed), frame=frame)[0]
+        for seed, frame in ((0, 1), (0, 1), (1, 1), (0, 2))
+    )
     for name in ("position", "velocity", "radius", "lifetime", "kind"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
-    for other in (run(1, 1), run(0, 2)):
+    for other in others:
         shared = min(len(first), len(other))
         assert not np.array_equal(first.position[:shared], other.position[:shared])
 

@@ -4,7 +4,7 @@ import re
 
 import pytest
 import trimesh
-from checked_jobs import checked
+from checked_jobs import BALL, PLUME, WATER, checked, says
 
 from pipeline.base.errors import JobFileError
 from pipeline.job.loading import read_job
@@ -12,28 +12,6 @@ from pipeline.job.starter import TEMPLATES, starter
 from pipeline.run.checked_job import check_job, load_checked_job
 
 HEAD = 'name = "dam"\nframes = 10\n'
-WATER = """
-[[fluid]]
-name = "water"
-particle_radius = 0.02
-[[fluid.block]]
-shape = { type = "box", size = [0.4, 0.4, 0.4] }
-position = [0.0, 0.0, 0.5]
-"""
-PLUME = """
-[[smoke]]
-name = "plume"
-cell_size = 0.05
-[[smoke.source]]
-shape = { type = "sphere", radius = 0.1 }
-position = [0.0, 0.0, 0.2]
-"""
-BALL = """
-[[rigid]]
-name = "ball"
-shape = { type = "sphere", radius = 0.1 }
-position = [0.0, 0.0, 0.1]
-"""
 
 
 @pytest.mark.parametrize("template", TEMPLATES)
@@ -49,154 +27,79 @@ def test_starter_passes_every_check_without_a_warning(template, preview, tmp_pat
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
+        (WATER.replace("0.5]", "5e30]"), "9 fluid[0].block[0].position[2]: must be within ±1e+06 m, got 5e+30"),
+        (WATER.replace("radius = 0.02", "radius = 1e-30"), "6 fluid[0].particle_radius: must be at least 1e-06 m"),
+        (BALL + WATER.replace('"water"', '"Ball"'), '10 fluid[0].name: "Ball" is taken by rigid[0]'),
+        (WATER + '[material.watr]\nlook = "water"', '10 material.watr: ... "watr"; did you mean "water"?'),
+        (WATER + '[material.stone]\nlook = "stone"', '10 material.stone: ... "stone"; bodies are water'),
+        (WATER + '[material.water]\nlook = "smoke"', '11 material.water.look: "smoke" is ... [[smoke]] ... [[fluid]]'),
+        (PLUME + '[material.plume]\nlook = "metal"', '11 material.plume.look: ... "smoke" or "fire", got "metal"'),
+        (WATER + "[render]\nresolution = [481, 270]", "11 render.resolution: ... got 481 x 270; use 482 x 270"),
+        (WATER + '[render]\nblender = "/nowhere/blender"', "11 render.blender: no such file: /nowhere/blender"),
+        (WATER + BALL + "[camera]\nposition = [0.0, 0.05, 0.1]", '16 camera.position: is inside "ball"'),
         (
-            HEAD + WATER.replace("0.5]", "5e30]"),
-            "dam.toml:9 fluid[0].block[0].position[2]: must be within ±1e+06 m, got 5e+30; units are SI",
+            WATER + "[camera]\nposition = [2, 2, 2]\nlook_at = [2, 2, 2]",
+            "12 camera.look_at: is where the camera",
+        ),
+        (BALL.replace("0.1]", "5.0]"), "4 rigid[0]: is wholly outside ... z 4.9..5.1 m, not x -0.5..0.5 ... z 0..1 m"),
+        (WATER.replace("0.5]", "-0.5]"), "7 fluid[0].block[0]: is wholly outside ... z -0.7..-0.3 m ... z 0..1 m"),
+        (
+            WATER + BALL.replace("radius = 0.1", "radius = 0.45").replace("0.1]", "0.5]"),
+            "7 fluid[0].block[0]: lies wholly inside solid bodies",
         ),
         (
-            HEAD + WATER.replace("radius = 0.02", "radius = 1e-30"),
-            "dam.toml:6 fluid[0].particle_radius: must be at least 1e-06 m, got 1e-30; units are SI",
+            WATER.replace("[0.4, 0.4, 0.4]", "[0.4, 0.4, 0.01]"),
+            "7 fluid[0].block[0]: holds no particle ... 0.01 m thin ... 0.04 m apart",
         ),
-        (HEAD, "dam.toml: has no body; add [[rigid]], [[fluid]], [[cloth]] or [[smoke]]"),
-        (
-            HEAD + BALL + WATER.replace('"water"', '"Ball"'),
-            'dam.toml:10 fluid[0].name: "Ball" is taken by rigid[0]; names are unique in a job',
-        ),
-        (
-            HEAD + WATER + '[material.watr]\nlook = "water"',
-            'dam.toml:10 material.watr: no body is named "watr"; did you mean "water"?',
-        ),
-        (
-            HEAD + WATER + '[material.stone]\nlook = "stone"',
-            'dam.toml:10 material.stone: no body is named "stone"; bodies are water',
-        ),
-        (
-            HEAD + WATER + '[material.water]\nlook = "smoke"',
-            'dam.toml:11 material.water.look: "smoke" is a look for [[smoke]]; "water" is in [[fluid]]',
-        ),
-        (
-            HEAD + PLUME + '[material.plume]\nlook = "metal"',
-            'dam.toml:11 material.plume.look: smoke can only look like "smoke" or "fire", got "metal"',
-        ),
-        (
-            HEAD + WATER + '[domain]\nopen_faces = ["z+", "x-", "z+"]',
-            'dam.toml:11 domain.open_faces: names "z+" more than once',
-        ),
-        (
-            HEAD + WATER + "[render]\nresolution = [481, 270]",
-            "dam.toml:11 render.resolution: must be even numbers, as video needs them, got 481 x 270; use 482 x 270",
-        ),
-        (
-            HEAD + WATER + '[render]\nblender = "/nowhere/blender"',
-            "dam.toml:11 render.blender: no such file: /nowhere/blender; omit it to use the bpy module",
-        ),
-        (
-            HEAD + WATER + BALL + "[camera]\nposition = [0.0, 0.05, 0.1]",
-            'dam.toml:16 camera.position: is inside "ball"; move it out',
-        ),
-        (
-            HEAD + WATER + "[camera]\nposition = [2, 2, 2]\nlook_at = [2, 2, 2]",
-            "dam.toml:12 camera.look_at: is where the camera stands; it must be somewhere else",
-        ),
-        (
-            HEAD + BALL.replace("0.1]", "5.0]"),
-            "dam.toml:4 rigid[0]: is wholly outside the domain: it spans x -0.1..0.1 y -0.1..0.1 z 4.9..5.1 m, "
-            "not x -0.5..0.5 y -0.5..0.5 z 0..1 m",
-        ),
-        (
-            HEAD + WATER.replace("0.5]", "-0.5]"),
-            "dam.toml:7 fluid[0].block[0]: is wholly outside the domain: it spans x -0.2..0.2 y -0.2..0.2 "
-            "z -0.7..-0.3 m, not x -0.5..0.5 y -0.5..0.5 z 0..1 m",
-        ),
-        (
-            HEAD + WATER + BALL.replace("radius = 0.1", "radius = 0.45").replace("0.1]", "0.5]"),
-            "dam.toml:7 fluid[0].block[0]: lies wholly inside solid bodies, so it holds no particle; move it",
-        ),
-        (
-            HEAD + WATER.replace("[0.4, 0.4, 0.4]", "[0.4, 0.4, 0.01]"),
-            "dam.toml:7 fluid[0].block[0]: holds no particle: it is 0.01 m thin and particles are 0.04 m apart; "
-            "enlarge it or use a smaller particle_radius",
-        ),
-        (
-            HEAD + PLUME.replace("0.2]", "3.0]"),
-            "dam.toml:7 smoke[0].source[0]: is wholly outside the smoke's grid: it spans x -0.1..0.1 y -0.1..0.1 "
-            "z 2.9..3.1 m, not x -0.5..0.5 y -0.5..0.5 z 0..1 m",
-        ),
-        (
-            HEAD + PLUME.replace("cell_size = 0.05", "max = [0.5, 0.5, -1.0]"),
-            "dam.toml:6 smoke[0].max: max must be above min on every axis, got x -0.5..0.5 y -0.5..0.5 z 0..-1 m",
-        ),
-        (
-            HEAD + PLUME.replace("cell_size = 0.05", "cell_size = 0.4"),
-            "dam.toml:6 smoke[0].cell_size: 0.4 m leaves fewer than 4 cells along an edge of 1 m; use 0.25 m or less",
-        ),
+        (PLUME.replace("cell_size = 0.05", "max = [0.5, 0.5, -1.0]"), "6 smoke[0].max: ... z 0..-1 m"),
+        (PLUME.replace("0.05", "0.4"), "6 smoke[0].cell_size: 0.4 m ... fewer than 4 cells ... of 1 m; use 0.25 m"),
     ],
 )
-def test_job_that_cannot_be_meant_is_refused_with_this_line(text, expected, tmp_path):
-    errors = checked(text, tmp_path / "dam.toml").errors
-    assert expected in errors
-    with pytest.raises(JobFileError, match=re.escape(expected)):
+def test_job_that_cannot_be_meant_is_refused_at_its_place(text, expected, tmp_path):
+    errors = checked(HEAD + text, tmp_path / "dam.toml").errors
+    assert any(says(error, f"dam.toml:{expected}") for error in errors), errors
+    with pytest.raises(JobFileError) as refused:
         load_checked_job(tmp_path / "dam.toml")
+    assert refused.value.problems == errors
+
+
+def test_a_job_without_a_body_is_refused(tmp_path):
+    assert checked(HEAD, tmp_path / "dam.toml").errors == [
+        "dam.toml: has no body; add [[rigid]], [[fluid]], [[cloth]] or [[smoke]]"
+    ]
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (HEAD + BALL, "dam.toml: has neither fluid nor cloth nor smoke, so nothing will move"),
+        (BALL, ": has neither fluid nor cloth nor smoke, so nothing will move"),
+        (WATER.replace("0.5]", "0.0]"), ":7 fluid[0].block[0]: 50 % of it are outside the domain"),
+        (WATER.replace("particle_radius", "dt = 0.01\nparticle_radius"), ":6 fluid[0].dt: 0.01 s ... 0.00025 s"),
         (
-            HEAD + WATER.replace("0.5]", "0.0]"),
-            "dam.toml:7 fluid[0].block[0]: 50 % of it are outside the domain and are clipped",
+            WATER + PLUME.replace("0.2]", "0.5]"),
+            ":14 smoke[0].source[0]: lies wholly inside fluid[0].block[0] at the start",
         ),
         (
-            HEAD + WATER.replace("particle_radius", "dt = 0.01\nparticle_radius"),
-            "dam.toml:6 fluid[0].dt: 0.01 s is above the stable step of about 0.00025 s and may blow up; "
-            'use "adaptive"',
+            PLUME + BALL.replace("0.1 }", "0.3 }") + 'kind = "kinematic"',
+            ":7 smoke[0].source[0]: lies wholly inside rigid[0] at the start",
         ),
-        (
-            HEAD + PLUME + "start_s = 5.0",
-            "dam.toml:10 smoke[0].source[0].start_s: starts at 5 s, after the film's end at 0.166667 s",
-        ),
-        (
-            HEAD + WATER + PLUME.replace("0.2]", "0.5]"),
-            "dam.toml:14 smoke[0].source[0]: lies wholly inside fluid[0].block[0] at the start, and emits nothing "
-            "until that has moved off",
-        ),
-        (
-            HEAD + PLUME + BALL.replace("0.1 }", "0.3 }") + 'kind = "kinematic"',
-            "dam.toml:7 smoke[0].source[0]: lies wholly inside rigid[0] at the start, and emits nothing "
-            "until that has moved off",
-        ),
-        (
-            HEAD + WATER + '[material.water]\nlook = "milk"\ncaustics = true',
-            'dam.toml:12 material.water.caustics: has no effect on the look "milk"',
-        ),
-        (
-            HEAD + WATER + '[material.water]\nlook = "wood"',
-            'dam.toml:11 material.water.look: is "wood", whose texture hangs on nothing in [[fluid]]: it swims',
-        ),
-        (
-            HEAD + WATER + BALL + '[material.ball]\nlook = "metal"\ndensity = 2.0',
-            'dam.toml:17 material.ball.density: has no effect on the look "metal"',
-        ),
-        (
-            HEAD + PLUME + '[material.plume]\nlook = "smoke"\nroughness = 0.5',
-            'dam.toml:12 material.plume.roughness: has no effect on the look "smoke"',
-        ),
+        (WATER + '[material.water]\nlook = "milk"\ncaustics = true', ':12 material.water.caustics: ... look "milk"'),
+        (WATER + '[material.water]\nlook = "wood"', ':11 material.water.look: is "wood" ... [[fluid]]: it swims'),
+        (WATER + BALL + '[material.ball]\nlook = "metal"\ndensity = 2.0', ':17 material.ball.density: ... "metal"'),
+        (PLUME + '[material.plume]\nlook = "smoke"\nroughness = 0.5', ':12 material.plume.roughness: ... "smoke"'),
     ],
 )
-def test_job_that_may_be_unintended_is_allowed_with_this_warning(text, expected, tmp_path):
-    errors, warnings, _ = checked(text, tmp_path / "dam.toml")
+def test_job_that_may_be_unintended_is_allowed_with_a_warning(text, expected, tmp_path):
+    errors, warnings, _ = checked(HEAD + text, tmp_path / "dam.toml")
     assert errors == []
-    assert expected in warnings
+    assert any(says(warning, f"dam.toml{expected}") for warning in warnings), warnings
 
 
 def test_a_body_too_thin_for_the_cells_of_smoke_is_refused_where_it_can_come_there(tmp_path):
     plate = BALL.replace('"sphere", radius = 0.1', '"box", size = [0.3, 0.3, 0.02]') + 'kind = "kinematic"\n'
     errors = checked(HEAD + PLUME + plate, tmp_path / "dam.toml").errors
-    assert errors == [
-        'dam.toml:11 rigid[0]: is 0.02 m thin and would fall between the cells of smoke "plume", 0.05 m, into whose '
-        "box it can come; use a smaller cell_size or a thicker body"
-    ]
+    assert len(errors) == 1
+    assert says(errors[0], 'dam.toml:11 rigid[0]: is 0.02 m thin ... between the cells of smoke "plume", 0.05 m')
     fog = PLUME.replace("cell_size", "min = [-0.5, -0.5, 0.4]\ncell_size").replace("0.2]", "0.7]")
     assert checked(HEAD + fog + plate, tmp_path / "dam.toml").errors == []
 
@@ -236,13 +139,6 @@ def test_domain_too_large_for_its_particles_is_refused_with_a_radius_that_fits(t
     radius = re.search(r"particle_radius ([\d.]+) m$", errors[0]).group(1)
     text = text.replace("particle_radius = 0.02", f"particle_radius = {radius}").replace("0.4, 0.4, 0.4", "9, 9, 9")
     assert checked(text, tmp_path / "dam.toml", memory_bytes=10**9).errors == []
-
-
-def test_smoke_that_does_not_fit_into_memory_is_refused_with_a_cell_size_that_fits(tmp_path):
-    errors = checked(HEAD + PLUME, tmp_path / "dam.toml", memory_bytes=1_000_000).errors
-    size = float(re.search(r"use ([\d.]+) m or more", errors[0]).group(1))
-    text = (HEAD + PLUME).replace("cell_size = 0.05", f"cell_size = {size}")
-    assert checked(text, tmp_path / "dam.toml", memory_bytes=1_000_000).errors == []
 
 
 def test_large_fluid_is_counted_on_a_coarser_lattice(tmp_path):

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from checked_jobs import checked
+from checked_jobs import PLUME, checked, says
 from cloth_jobs import BALL, SHEET, errors, warnings
 
 from pipeline.base.errors import JobFileError
-from pipeline.kinds.checks.cloth import BYTES_PER_NODE, MANY_SUBSTEPS
+from pipeline.kinds.checks.cloth import MANY_SUBSTEPS
+from pipeline.kinds.checks.cloth_start import BYTES_PER_NODE
 from sim.core.world import MAX_SUBSTEPS_PER_FRAME
 
 SECOND = """
@@ -27,131 +28,89 @@ def test_a_cloth_over_a_ball_is_fine_and_its_nodes_are_counted(tmp_path):
     assert findings.elements["cloth"] == 81
 
 
+KEYFRAMES = "keyframe = [{ time_s = 0.0 }, { time_s = 1.0, offset = [0.1, 0.0, 0.0] }]"
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (
-            SHEET.replace("0.5]", "9.5]"),
-            "drape.toml:4 cloth[0]: is wholly outside the domain: it spans x -0.2..0.2 y -0.2..0.2 z 9.5..9.5 m, "
-            "not x -0.5..0.5 y -0.5..0.5 z 0..1 m",
-        ),
+        (SHEET.replace("0.5]", "9.5]"), "4 cloth[0]: is wholly outside ... z 9.5..9.5 m, not ... z 0..1 m"),
         (
             SHEET.replace('"x-", ', "").replace("[0.0,", "[-0.4,"),
-            "drape.toml:4 cloth[0]: passes through the wall x-, as at (-0.6, -0.2, 0.5) m; "
-            "move it, or name the face in domain.open_faces",
+            "4 cloth[0]: passes through the wall x-, as at (-0.6, -0.2, 0.5) m ... domain.open_faces",
         ),
-        (
-            SHEET + BALL.replace("0.3]", "0.45]"),
-            'drape.toml:4 cloth[0]: starts inside "ball", as at (-0.05, -0.05, 0.5) m; move one of them',
-        ),
+        (SHEET + BALL.replace("0.3]", "0.45]"), '4 cloth[0]: starts inside "ball", as at (-0.05, -0.05, 0.5) m'),
         (
             # Smaller than a cell of the sheet: no node is inside, but the middle of a triangle is.
             SHEET + BALL.replace("radius = 0.1", "radius = 0.01").replace("0.0, 0.0, 0.3]", "0.0335, 0.0165, 0.5]"),
-            'drape.toml:4 cloth[0]: starts inside "ball", as at (0.03333, 0.01667, 0.5) m; move one of them',
+            '4 cloth[0]: starts inside "ball", as at (0.03333, 0.01667, 0.5) m',
         ),
         (
             SHEET + SECOND + "rotation_deg = [0.0, 90.0, 0.0]",
-            'drape.toml:9 cloth[1]: passes through or touches cloth "sheet" at (0.03, -0.15, 0.5) m; '
-            "move one of them, 0.0005 m or more apart",
+            '9 cloth[1]: passes through or touches cloth "sheet" at (0.03, -0.15, 0.5) m ... 0.0005 m or more apart',
         ),
         (
             # Nothing passes through anything, and contacts would not know which of the two is above.
             SHEET + SECOND + "rotation_deg = [0.0, 0.0, 27.0]\nthickness = 2e-3",
-            'drape.toml:9 cloth[1]: passes through or touches cloth "sheet" at (0.008998, -0.1791, 0.5) m; '
-            "move one of them, 0.002 m or more apart",
+            '9 cloth[1]: passes through or touches cloth "sheet" at (0.008998, -0.1791, 0.5) m ... 0.002 m or more',
         ),
-        (
-            SHEET + "[[cloth.pin]]\nindex = [3, 81]",
-            "drape.toml:8 cloth[0].pin[0]: index 81 does not exist; the sheet has nodes 0 to 80",
-        ),
+        (SHEET + "[[cloth.pin]]\nindex = [3, 81]", "8 cloth[0].pin[0]: index 81 does not exist ... 0 to 80"),
         (
             SHEET + '[[cloth.pin]]\nregion = { type = "sphere", position = [0.0, 0.0, 0.9], radius = 0.1 }',
-            "drape.toml:8 cloth[0].pin[0]: no node starts in its region; "
-            "the cloth spans x -0.2..0.2 y -0.2..0.2 z 0.5..0.5 m",
+            "8 cloth[0].pin[0]: no node starts in its region ... x -0.2..0.2 y -0.2..0.2 z 0.5..0.5 m",
         ),
         (
-            SHEET + '[[cloth.pin]]\nedge = "x-"\n[[cloth.pin]]\ncorner = "x-y-"\n'
-            "keyframe = [{ time_s = 0.0 }, { time_s = 1.0, offset = [0.1, 0.0, 0.0] }]",
-            "drape.toml:10 cloth[0].pin[1]: shares a node with pin[0], and one of them moves; pin each node once",
+            SHEET + '[[cloth.pin]]\nedge = "x-"\n[[cloth.pin]]\ncorner = "x-y-"\n' + KEYFRAMES,
+            "10 cloth[0].pin[1]: shares a node with pin[0], and one of them moves",
         ),
         (
             SHEET + SECOND.replace("0.5]", "0.7]") + "substeps = 40",
-            'drape.toml:13 cloth[1].substeps: is 40, but omitted in cloth[0] "sheet"; all cloths share it',
+            "13 cloth[1].substeps: is 40 ... in cloth[0]",
         ),
         (
             SHEET.replace('"rectangle", size = [0.4, 0.4], counts = [9, 9]', '"mesh", file = "shawl.ply"'),
-            "drape.toml:6 cloth[0].shape.file: no such file: FOLDER/shawl.ply",
+            "6 cloth[0].shape.file: no such file: FOLDER/shawl.ply",
         ),
-        (
-            SHEET + '[material.sheet]\nlook = "smoke"',
-            'drape.toml:9 material.sheet.look: "smoke" is a look for [[smoke]]; "sheet" is in [[cloth]]',
-        ),
-        (
-            SHEET + BALL + '[material.ball]\nlook = "denim"',
-            'drape.toml:14 material.ball.look: "denim" is a look for [[cloth]]; "ball" is in [[rigid]]',
-        ),
+        (SHEET + '[material.sheet]\nlook = "smoke"', '9 material.sheet.look: "smoke" is a look for [[smoke]]'),
+        (SHEET + BALL + '[material.ball]\nlook = "denim"', '14 material.ball.look: "denim" is a look for [[cloth]]'),
         (
             SHEET + '[[smoke]]\nname = "cloth"\n[[smoke.source]]\nshape = { type = "sphere", radius = 0.2 }',
-            'drape.toml:9 smoke[0].name: "cloth" is what all cloths are called together; take another',
+            '9 smoke[0].name: "cloth" is what the solver of all [[cloth]] is called',
         ),
-        (
-            SHEET + BALL.replace('"ball"', '"sheet"'),
-            'drape.toml:5 cloth[0].name: "sheet" is taken by rigid[0]; names are unique in a job',
-        ),
+        (SHEET + BALL.replace('"ball"', '"sheet"'), '5 cloth[0].name: "sheet" is taken by rigid[0]'),
     ],
-    ids=["outside", "wall", "inside", "inside a cell", "crossing", "in one plane", "pin index", "pin region",
-         "moving pins", "shared", "file", "smoke look", "woven look", "name of the solver", "name of a body"],
-)  # fmt: skip
+)
 def test_what_cannot_start_is_refused_with_its_place(text, expected, tmp_path):
-    assert expected.replace("FOLDER", str(tmp_path)) in errors(text, tmp_path)
+    found = errors(text, tmp_path)
+    assert any(says(error, f"drape.toml:{expected.replace('FOLDER', str(tmp_path))}") for error in found), found
 
 
 def test_more_nodes_than_memory_holds_are_refused_with_the_number_that_fits(tmp_path):
     text = SHEET.replace("[9, 9]", "[2000, 2000]")
     (problem,) = errors(text, tmp_path, memory_bytes=10**9)
-    assert re.fullmatch(
-        r"drape\.toml:6 cloth\[0\]\.shape\.counts: 4 million nodes need \d+ GB, this machine has 1 GB; "
-        r"at most \d+ fit: divide it less finely",
-        problem,
-    )
+    assert says(problem, "drape.toml:6 cloth[0].shape.counts: 4 million nodes need ... has 1 GB; at most ... fit")
 
 
 def test_cloths_that_fit_one_by_one_but_not_together_are_refused(tmp_path):
     text = SHEET + SECOND.replace("0.5]", "0.7]")
     assert errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * (81 + 49)) == []
     (problem,) = errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * (81 + 49) - 1)
-    assert problem == (
-        "drape.toml:11 cloth[1].shape.counts: 49 nodes and 81 of the cloths before it need 0.00078 GB, "
-        "this machine has 0.00078 GB; at most 48 fit: divide it less finely"
-    )
-
-
-PLUME = """
-[[smoke]]
-name = "plume"
-cell_size = 0.05
-[[smoke.source]]
-shape = { type = "sphere", radius = 0.2 }
-position = [0.0, 0.0, 0.3]
-"""
+    assert says(problem, "drape.toml:11 cloth[1].shape.counts: 49 nodes and 81 of ... 0.00078 GB ... at most 48 fit")
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
+        (SHEET + "thickness = 0.06", "8 cloth[0].thickness: 0.06 m is more than the 0.05 m"),
+        (SHEET + "wind = [1.0, 0.0, 0.0]\n" + PLUME, '8 cloth[0].wind: does not blow in the box of smoke "plume"'),
         (
-            SHEET + "thickness = 0.06",
-            "drape.toml:8 cloth[0].thickness: 0.06 m is more than the 0.05 m between neighbouring nodes",
+            SHEET + '[material.sheet]\nlook = "plastic"\nthread_spacing = 0.001',
+            '10 material.sheet.thread_spacing: has no effect on the look "plastic"',
         ),
-        (SHEET + "wind = [1.0, 0.0, 0.0]\n" + PLUME,
-         'drape.toml:8 cloth[0].wind: does not blow in the box of smoke "plume", where the cloth starts'),
-        (SHEET + '[material.sheet]\nlook = "plastic"\nthread_spacing = 0.001',
-         'drape.toml:10 material.sheet.thread_spacing: has no effect on the look "plastic"'),
     ],
-    ids=["thickness", "wind in smoke", "threads of plastic"],
-)  # fmt: skip
+)
 def test_what_is_worth_a_look_is_said(text, expected, tmp_path):
-    assert any(line.startswith(expected) for line in warnings(text, tmp_path))
+    assert any(line.startswith(f"drape.toml:{expected}") for line in warnings(text, tmp_path))
 
 
 def test_cloth_beside_smokes_whose_boxes_overlap_is_refused(tmp_path):
@@ -192,36 +151,19 @@ def mesh_job(vertices, faces, folder: Path, suffix: str = "") -> str:
 SQUARE = [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, 0.0], [0.0, 0.2, 0.0]]
 
 
-def test_a_mesh_that_is_no_sheet_is_refused(tmp_path):
-    (problem,) = errors(mesh_job([*SQUARE, [0.1, 0.1, 0.1]], [[0, 1, 2], [0, 2, 3], [0, 2, 4]], tmp_path), tmp_path)
-    assert problem.startswith('drape.toml:6 cloth[0].shape: shape.file: 1 edges of "shawl.ply" have three triangles')
-
-
 def test_a_mesh_of_more_nodes_than_memory_holds_is_refused(tmp_path):
     text = mesh_job(SQUARE, [[0, 1, 2], [0, 2, 3]], tmp_path)
     assert errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * 4) == []
     (problem,) = errors(text, tmp_path, memory_bytes=BYTES_PER_NODE * 3)
-    assert problem == (
-        "drape.toml:6 cloth[0].shape.file: 4 nodes need 2.4e-05 GB, this machine has 1.8e-05 GB; "
-        "at most 3 fit: take a coarser mesh"
-    )
+    assert says(problem, "drape.toml:6 cloth[0].shape.file: 4 nodes need 2.4e-05 GB ... 1.8e-05 GB; at most 3 fit")
 
 
 def test_a_mesh_that_passes_through_itself_is_refused_unless_it_need_not_collide_with_itself(tmp_path):
     spike = [[0.05, 0.1, -0.1], [0.15, 0.1, -0.1], [0.1, 0.1, 0.1]]
     text = mesh_job([*SQUARE, *spike], [[0, 1, 2], [0, 2, 3], [4, 5, 6]], tmp_path)
     (problem,) = errors(text, tmp_path)
-    assert problem == (
-        "drape.toml:6 cloth[0].shape: passes through or touches itself at (0, 0, 0.5) m; "
-        "take it apart by its thickness, or use self_collision = false"
-    )
+    assert says(problem, "drape.toml:6 cloth[0].shape: passes through or touches itself at (0, 0, 0.5) m")
     assert errors(text + "self_collision = false", tmp_path) == []
-
-
-def test_what_was_repaired_in_a_mesh_is_said(tmp_path):
-    split = [*SQUARE[:3], SQUARE[0], SQUARE[2], SQUARE[3]]
-    (warning,) = warnings(mesh_job(split, [[0, 1, 2], [3, 4, 5]], tmp_path), tmp_path)
-    assert warning == 'drape.toml:6 cloth[0].shape: "shawl.ply": merged 2 split or unused vertices'
 
 
 def test_too_few_substeps_for_explicit_springs_are_refused_with_a_number_that_is_accepted(tmp_path):
@@ -315,12 +257,27 @@ keyframe = [
         ('edge = "x-"\n', ROD + 'kind = "dynamic"\ndensity = 600.0\n', True),
         ("index = [36, 27]\n", ROD, True),  # two nodes in the middle of the edge
         ("index = [0, 72]\n", ROD, True),  # its two ends
-        ('edge = "x-"\n', ROD.replace('"cylinder", radius = 0.02, height = 0.5', '"box", size = [0.5, 0.5, 0.04]')
-         .replace("-0.2, 0.0, 0.475", "0.0, 0.0, 0.475").replace("[90.0, 0.0", "[0.0, 0.0"), True),
+        (
+            'edge = "x-"\n',
+            ROD.replace('"cylinder", radius = 0.02, height = 0.5', '"box", size = [0.5, 0.5, 0.04]')
+            .replace("-0.2, 0.0, 0.475", "0.0, 0.0, 0.475")
+            .replace("[90.0, 0.0", "[0.0, 0.0"),
+            True,
+        ),
     ],
-    ids=["both move alike", "the pin leaves", "it lets go before", "the rod leaves", "it sweeps", "it rests",
-         "it falls", "two neighbours", "two ends", "a plate"],
-)  # fmt: skip
+    ids=[
+        "both move alike",
+        "the pin leaves",
+        "it lets go before",
+        "the rod leaves",
+        "it sweeps",
+        "it rests",
+        "it falls",
+        "two neighbours",
+        "two ends",
+        "a plate",
+    ],
+)
 def test_only_a_rod_that_stays_along_a_pin_may_be_thin(pin, body, is_told, tmp_path):
     told = [line for line in warnings(f"{SHEET}[[cloth.pin]]\n{pin}{body}", tmp_path) if "may show or pass" in line]
     assert len(told) == is_told

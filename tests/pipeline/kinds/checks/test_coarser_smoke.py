@@ -62,7 +62,7 @@ def preview(text, folder):
         # Four cells high, at least.
         (PLUME.replace("[[smoke.source]]", "min = [-0.5, -0.5, 0.1]\nmax = [0.5, 0.5, 0.25]\n[[smoke.source]]"), 0.035),
     ],
-)  # fmt: skip
+)
 def test_cells_of_a_preview_are_as_large_as_sources_and_bodies_allow(text, cell_size, tmp_path):
     assert preview(text, tmp_path) == pytest.approx(cell_size)
 

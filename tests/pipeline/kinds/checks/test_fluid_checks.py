@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from checked_jobs import checked
+from checked_jobs import checked, says
 
 from pipeline.job.loading import read_job
-from pipeline.kinds.checks.fluid import MOST_CELLS, particle_room
-from pipeline.kinds.checks.jets import _longest_flight, check_jets
+from pipeline.kinds.checks.fluid_size import MOST_CELLS, particle_room
+from pipeline.kinds.checks.jets import check_jets
 from pipeline.model.problems import Findings
 from sim.fluid.opening import Opening
-from sim.shapes import build_solid
-from sim.shapes.placement import PlacedSolid
+from sim.shapes.parameters import Placement
+from sim.shapes.placement import PlacedSolid, build_solid
 
 HEAD = 'name = "tank"\nframes = 60\n'
 WATER = """
@@ -54,60 +54,35 @@ def test_fluids_that_go_together_pass_without_a_word(text, tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
+        (WATER + OIL.replace("0.02", "0.01"), '13 fluid[1].particle_radius: is 0.01, but 0.02 in fluid[0] "water"'),
+        (WATER + OIL.replace("900.0", "50.0"), "14 fluid[1].rest_density: is 50 kg/m³, and 1000 kg/m³ in fluid[0]"),
         (
-            HEAD + WATER + OIL.replace("0.02", "0.01"),
-            'tank.toml:13 fluid[1].particle_radius: is 0.01, but 0.02 in fluid[0] "water"; '
-            "all fluids of a tank share it",
+            JET.replace("0.0, -1.0", "0.0, 1.0").replace("0.9]", "1.0]"),
+            "7 fluid[0].emitter[0]: 21 of the 21 places of its opening are outside the domain",
         ),
+        (JET.replace("radius = 0.1", "radius = 0.01"), "8 fluid[0].emitter[0].shape: is too narrow ... 0.04 m apart"),
         (
-            HEAD + WATER + OIL.replace("900.0", "50.0"),
-            'tank.toml:14 fluid[1].rest_density: is 50 kg/m³, and 1000 kg/m³ in fluid[0] "water"; '
-            "densities in a tank may differ by a factor of 10 at most",
-        ),
-        (
-            HEAD + JET.replace("0.0, -1.0", "0.0, 1.0").replace("0.9]", "1.0]"),
-            "tank.toml:7 fluid[0].emitter[0]: 21 of the 21 places of its opening are outside the domain; "
-            "move it in, or let it point inwards",
-        ),
-        (
-            HEAD + JET.replace("radius = 0.1", "radius = 0.01"),
-            "tank.toml:8 fluid[0].emitter[0].shape: is too narrow for particles 0.04 m apart; "
-            "enlarge it or use a smaller particle_radius",
-        ),
-        (
-            HEAD + WATER + "[domain]\nmin = [-40, -40, 0]\nmax = [40, 40, 100]",
-            "tank.toml:10 domain: has 9.47e+08 cells for the search of neighbours of 0.02 m particles, "
-            "more than 2.68e+08; make it smaller, or particle_radius 0.032 m",
+            WATER + "[domain]\nmin = [-40, -40, 0]\nmax = [40, 40, 100]",
+            "10 domain: has 9.47e+08 cells ... 0.02 m particles, more than 2.68e+08 ... particle_radius 0.032 m",
         ),
     ],
 )
 def test_what_cannot_be_is_refused_with_a_remedy(text, expected, tmp_path):
-    errors, _, _ = checked(text, tmp_path / "tank.toml", memory_bytes=10**15)
-    assert expected in errors
+    errors, _, _ = checked(HEAD + text, tmp_path / "tank.toml", memory_bytes=10**15)
+    assert any(says(error, f"tank.toml:{expected}") for error in errors), errors
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (
-            HEAD + WATER + OIL.replace("0.3]", "0.22]"),
-            "tank.toml:15 fluid[1].block[0]: shares 40 % of its volume with fluid[0].block[0]; "
-            'that belongs to "water", the first of the two',
-        ),
-        (
-            HEAD + JET + "start_s = 3.0",
-            "tank.toml:12 fluid[0].emitter[0].start_s: starts at 3 s, after the film's end at 1 s",
-        ),
-        (
-            HEAD + JET.replace("speed = 1.0", "speed = 1000.0"),
-            "tank.toml:11 fluid[0].emitter[0].speed: 1000 m/s crosses the whole domain within a frame; "
-            "the time steps will be very short",
-        ),
+        (WATER + OIL.replace("0.3]", "0.22]"), '15 fluid[1].block[0]: shares 40 % ... fluid[0].block[0] ... "water"'),
+        (JET + "start_s = 3.0", "12 fluid[0].emitter[0].start_s: starts at 3 s, after the film's end at 1 s"),
+        (JET.replace("speed = 1.0", "speed = 1000.0"), "11 fluid[0].emitter[0].speed: 1000 m/s crosses"),
     ],
 )
 def test_what_is_hardly_meant_is_warned_of(text, expected, tmp_path):
-    _, warnings, _ = checked(text, tmp_path / "tank.toml")
-    assert expected in warnings
+    _, warnings, _ = checked(HEAD + text, tmp_path / "tank.toml")
+    assert any(says(warning, f"tank.toml:{expected}") for warning in warnings), warnings
 
 
 def test_an_emitter_in_a_solid_body_is_refused(tmp_path):
@@ -175,47 +150,31 @@ def test_a_jet_that_runs_into_another_nozzle_is_warned_of(text, arrival, tmp_pat
     [
         emitter("[-0.2, 0.0, 0.9]", "[0, 0, -1]") + emitter("[0.2, 0.0, 0.9]", "[0, 0, -1]"),
         # It would meet the other one without the pool between, or without the post.
-        emitter("[0.1, 0.0, 0.1]", "[0, 0, 1]") + emitter("[0.1, 0.0, 0.9]", "[0, 0, -1]") + WATER.replace(
-            "0.1]", "0.35]").replace('name = "water"', 'name = "pool"'),
-        emitter("[0.45, 0.0, 0.5]", "[-1, 0, 0]") + emitter("[-0.45, 0.0, 0.5]", "[1, 0, 0]")
+        emitter("[0.1, 0.0, 0.1]", "[0, 0, 1]")
+        + emitter("[0.1, 0.0, 0.9]", "[0, 0, -1]")
+        + WATER.replace("0.1]", "0.35]").replace('name = "water"', 'name = "pool"'),
+        emitter("[0.45, 0.0, 0.5]", "[-1, 0, 0]")
+        + emitter("[-0.45, 0.0, 0.5]", "[1, 0, 0]")
         + '[[rigid]]\nname = "post"\nshape = { type = "box", size = [0.1, 0.4, 0.9] }\nposition = [0, 0, 0.5]\n',
         # It falls below the other one before it is there.
         emitter("[0.4, 0.0, 0.6]", "[-1, 0, 0]", more="start_s = 0.9")
         + emitter("[-0.4, 0.0, 0.6]", "[1, 0, 0]", speed=1.0),
     ],
     ids=["side by side", "pool between", "post between", "too slow"],
-)  # fmt: skip
+)
 def test_jets_that_meet_something_else_first_pass_without_a_word(text, tmp_path):
     errors, warnings, _ = checked(HEAD + JETS + text, tmp_path / "tank.toml")
     assert errors == []
     assert not [warning for warning in warnings if "its jet" in warning or "before its opening" in warning]
 
 
-@pytest.mark.parametrize("gravity", [0.0, 1e-9, 1.62, 9.81])
-@pytest.mark.parametrize("speed", [0.5, 3.0, 6.0])
-def test_a_jet_is_followed_until_it_has_left_whatever_its_direction_and_hardly_longer(speed, gravity):
-    """Through a distance of 1.1 m, in directions from straight down to straight up, of which the last takes longest."""
-    end_s = _longest_flight(speed, gravity, 1.1)
-    up = np.linspace(-1.0, 1.0, 41)[:, None]
-    t = np.linspace(0.0, end_s, 5001)
-    across = np.sqrt(1.0 - up**2) * speed * t
-    away = np.hypot(across, up * speed * t - 0.5 * gravity * t**2)
-    # The last step alone is as short as 0.02 % of the way.
-    assert (away.max(axis=1) >= 1.1 * (1.0 - 1e-9)).all()
-    assert away[-1, :-1].max() < 1.1
-
-
 def test_a_body_out_of_a_jets_way_is_not_asked_for_distances(tmp_path, monkeypatch):
     """Those of a mesh take long, and thousands of places are looked at."""
-    bodies = {"plate": "[0.0, 0.0, 0.3]", "far": "[0.4, 0.4, 0.5]"}
-    text = "".join(
-        f'[[rigid]]\nname = "{name}"\nshape = {{ type = "box", size = [0.1, 0.1, 0.1] }}\nposition = {position}\n'
-        for name, position in bodies.items()
-    )
     path = tmp_path / "tank.toml"
-    path.write_text(HEAD + JET + text)
+    path.write_text(HEAD + JET)
     job = read_job(path).job
-    solids = {("rigid", index): build_solid(body) for index, body in enumerate(job.rigid)}
+    box = {"shape": {"type": "box", "size": (0.1, 0.1, 0.1)}}
+    below, far = (build_solid(Placement(**box, position=each)) for each in ((0.0, 0.0, 0.3), (0.4, 0.4, 0.5)))
     asked = []
     distance = PlacedSolid.signed_distance
 
@@ -225,8 +184,9 @@ def test_a_body_out_of_a_jets_way_is_not_asked_for_distances(tmp_path, monkeypat
 
     monkeypatch.setattr(PlacedSolid, "signed_distance", record)
     opening = Opening.of(job.fluid[0].emitter[0], 0.04, 0.04**3, 2.0)
+    solids = {("rigid", 0): below, ("rigid", 1): far}
     check_jets(job, solids, {("fluid", 0, "emitter", 0): opening}, 0.04, Findings())
-    assert {id(solid) for solid in asked} == {id(solids["rigid", 0])}
+    assert set(map(id, asked)) == {id(below)}
 
 
 PLATE = '[[rigid]]\nname = "plate"\nshape = {{ type = "box", size = [0.5, 0.5, 0.02] }}\nposition = [0, 0, {height}]\n'
@@ -267,14 +227,9 @@ def test_an_opening_with_room_before_it_passes_without_a_word(text, tmp_path):
 
 def test_memory_counts_what_emitters_may_add(tmp_path):
     # The domain of 1 m³ holds 15,625 particles of 4 cm, and an endless jet may fill it.
-    endless, _, _ = checked(HEAD + JET, tmp_path / "tank.toml", memory_bytes=8_000_000)
-    assert any("or give emitters an end_s, or the fluid max_particles" in error for error in endless)
-    capped, _, _ = checked(
-        HEAD + JET.replace("[[fluid.e", "max_particles = 3000\n[[fluid.e"),
-        tmp_path / "tank.toml",
-        memory_bytes=8_000_000,
-    )
-    assert capped == []
+    for text, is_refused in ((JET, True), (JET.replace("[[fluid.e", "max_particles = 3000\n[[fluid.e"), False)):
+        errors, _, _ = checked(HEAD + text, tmp_path / "tank.toml", memory_bytes=8_000_000)
+        assert any("or give emitters an end_s, or the fluid max_particles" in error for error in errors) == is_refused
 
 
 def test_the_room_is_that_of_the_simulation(tmp_path):

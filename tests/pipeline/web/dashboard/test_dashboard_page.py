@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from pathlib import Path
-
 import av
 import numpy as np
 import pytest
-from browser import needs_browser, open_page
+from browser import PATIENCE_S, needs_browser, open_page
+from browser import until as wait_for
 from dashboards import dashboard, draw_frame, frame_job
 from farm_processes import Farm, wait_until
 from playwright.sync_api import Page
@@ -19,22 +16,12 @@ from pipeline.record.manifest import Manifest
 from pipeline.show.report.film import ReportFilm
 
 pytestmark = needs_browser
-PATIENCE_MS = 60_000
-
-
-@pytest.fixture
-def farm(tmp_path: Path) -> Iterator[Farm]:
-    farm = Farm(tmp_path)
-    yield farm
-    farm.close()
+PATIENCE_MS = 1000 * PATIENCE_S
 
 
 def until(page: Page, condition: str) -> None:
     """Wait for a condition; Playwright's own way to wait needs `eval`, which our pages may not."""
-    end = time.monotonic() + PATIENCE_MS / 1000
-    while not page.evaluate(condition):
-        assert time.monotonic() < end, condition
-        page.wait_for_timeout(50)
+    wait_for(lambda: page.evaluate(condition), condition, wait=lambda seconds: page.wait_for_timeout(1000 * seconds))
 
 
 def test_a_queued_job_is_paused_and_cancelled_by_its_buttons(farm: Farm) -> None:

@@ -20,14 +20,14 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.lease import LeaseHolder
 from pipeline.base.task import FailureKind, TaskId, TaskState
 from pipeline.queue.job_queue import JobQueue
+from pipeline.queue.states import JobState
 from pipeline.record.glance import glance
 from pipeline.record.manifest import Manifest
-from pipeline.record.pages import StagePace
-from pipeline.record.reader import ManifestReader, StageSummary
+from pipeline.record.reader import ManifestReader, StagePace, StageSummary
 from pipeline.record.reconcile import rebuild_manifest
 from pipeline.web.dashboard.actions import Queue, actions_of
 from pipeline.web.dashboard.estimates import LongTask, remaining, stage_rows
-from pipeline.web.dashboard.farm_view import SETTLED_S, FarmView, JobState, Kept, read_record
+from pipeline.web.dashboard.farm_view import SETTLED_S, FarmView, Kept, read_record
 from pipeline.web.dashboard.machine import Machine
 from pipeline.web.dashboard.places import NotThereError, Places
 from pipeline.web.dashboard.thumbnails import Thumbnails
@@ -170,37 +170,26 @@ def test_an_unchanged_farm_costs_no_reading_of_records(tmp_path: Path, monkeypat
     assert looks(1) == ["two"]
 
 
-def test_a_job_that_never_ran_has_not_started_and_one_with_a_lost_record_was_interrupted(tmp_path: Path) -> None:
-    (tmp_path / "new").mkdir()
-    Manifest(JobLayout(tmp_path / "new").manifest).close()
-    film = JobLayout(tmp_path / "film")
-    tasks = frame_job(film, 3)
-    with Manifest(film.manifest) as manifest:
-        draw_frame(film, manifest, tasks[0])
-    rebuild_manifest(film)
-    view = FarmView(Places(tmp_path), JobQueue(tmp_path))
-    assert {card.name: card.state for card in view.glance().jobs} == {
-        "new": JobState.NOT_STARTED,
-        "film": JobState.INTERRUPTED,
-    }
-    assert [action.label for action in actions_of(view.job("new"), has_runner=False)] == ["Start"]
-
-
-def test_a_job_without_record_that_has_frames_was_interrupted_and_so_was_a_take_that_crashed(tmp_path: Path) -> None:
-    for name in ("film", "take", "new"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "job.toml").touch()
-    film, take = JobLayout(tmp_path / "film"), JobLayout(tmp_path / "take")
-    Manifest(take.manifest).close()
+def test_a_job_that_never_ran_has_not_started_and_one_that_lost_its_record_was_interrupted(tmp_path: Path) -> None:
+    names = ("new", "unrecorded", "rebuilt", "film", "take")
+    new, unrecorded, rebuilt, film, take = (JobLayout(tmp_path / name) for name in names)
+    [task, *_] = frame_job(rebuilt, 3)
+    with Manifest(rebuilt.manifest) as manifest:
+        draw_frame(rebuilt, manifest, task)
+    rebuild_manifest(rebuilt)
+    for layout in (new, unrecorded, film, take):
+        layout.root.mkdir()
+        layout.job_file.touch()
+    for layout in (new, take):  # the record of a recording that crashed is empty
+        Manifest(layout.manifest).close()
     for made in (film.path(film.picture(0)), film.path(film.movie()), take.path(take.frame_cache(0))):
         made.parent.mkdir(exist_ok=True)
         made.touch()
     view = FarmView(Places(tmp_path), JobQueue(tmp_path))
-    assert {card.name: card.state for card in view.glance().jobs} == {
-        "film": JobState.INTERRUPTED,
-        "take": JobState.INTERRUPTED,
-        "new": JobState.NOT_STARTED,
-    }
+    not_started = dict.fromkeys(("new", "unrecorded"), JobState.NOT_STARTED)
+    interrupted = dict.fromkeys(("rebuilt", "film", "take"), JobState.INTERRUPTED)
+    assert {card.name: card.state for card in view.glance().jobs} == not_started | interrupted
+    assert [action.label for action in actions_of(view.job("new"), has_runner=False)] == ["Start"]
 
 
 # --- estimates ---
@@ -249,11 +238,8 @@ def test_a_long_task_is_known_by_the_record_of_its_job(layout: JobLayout) -> Non
         assert manifest.frame_count() == 10
         record = read_record(manifest, runs=True)
     assert sum(stage.running for stage in record.stages) == len(record.running) == 8
-    assert all(stage.running == 0 for stage in read_record_at_rest(layout))
-
-
-def read_record_at_rest(layout: JobLayout) -> tuple:
-    return glance(layout.manifest, lambda manifest: read_record(manifest, runs=False)).stages
+    at_rest = glance(layout.manifest, lambda manifest: read_record(manifest, runs=False))
+    assert all(stage.running == 0 for stage in at_rest.stages)
 
 
 def test_many_who_ask_at_once_find_out_once() -> None:
@@ -358,20 +344,17 @@ def test_the_end_of_a_log_begins_with_a_line(tmp_path: Path) -> None:
 
 
 # --- small pictures ---
-def test_small_pictures_are_kept_up_to_a_limit(layout: JobLayout, monkeypatch: pytest.MonkeyPatch) -> None:
-    tasks = frame_job(layout, 4)
+def test_a_small_picture_is_made_once_and_none_of_a_picture_that_is_too_large(
+    layout: JobLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    [task] = frame_job(layout, 1)
     with Manifest(layout.manifest) as manifest:
-        paths = [draw_frame(layout, manifest, task) for task in tasks]
-    thumbnails = Thumbnails(kept_bytes=1)
-    first = thumbnails.get(paths[0], "small")
-    assert thumbnails.get(paths[0], "small") is first  # the last one stays
-    for path in paths:
-        thumbnails.get(path, "small")
-    assert len(thumbnails._kept) == 1
-    assert thumbnails.get(paths[0], "small") is not first
+        path = draw_frame(layout, manifest, task)
+    thumbnails = Thumbnails()
+    assert thumbnails.get(path, "small") is thumbnails.get(path, "small")
     monkeypatch.setattr("pipeline.web.dashboard.thumbnails.MOST_PIXELS", 1000)
     with pytest.raises(NotThereError, match="too large"):
-        thumbnails.get(paths[0], "large")
+        thumbnails.get(path, "large")
 
 
 def test_a_picture_that_claims_to_be_vast_is_not_shown(tmp_path: Path) -> None:

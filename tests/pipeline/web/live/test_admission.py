@@ -1,19 +1,25 @@
 """Which jobs run live, and what the others are told."""
 
 import pytest
-from click.testing import CliRunner
-from live_jobs import BALL_OVER_SHEET, loaded
+from command_line import pipeline
+from live_jobs import BALL_OVER_SHEET, live, loaded
 from places import PROJECT
 
 from pipeline.base.errors import PipelineError
-from pipeline.cli.main import main
 from pipeline.job.loading import load_job
 from pipeline.job.starter import write_starter
-from pipeline.web.live.admission import live_job, require_small
+from pipeline.web.live.admission import (
+    FEWEST_SUBSTEPS,
+    FLUENT_FRAME_S,
+    fluent,
+    fluent_frame_s,
+    live_job,
+    require_small,
+    told_changes,
+)
 from pipeline.web.live.frame_cost import cloth_frame_s, fewest_for_bodies, fluid_frame_s, steps_a_frame
 from pipeline.web.live.parameters import parameters_of
 from pipeline.web.live.saving import save_job
-from pipeline.web.live.step_size import FEWEST_SUBSTEPS, FLUENT_FRAME_S, fluent, fluent_frame_s, told_changes
 
 JOBS = PROJECT / "jobs"
 
@@ -29,7 +35,7 @@ def told_of(monkeypatch, *arguments: str) -> str:
     """What the command says of a job on two cores, without running it."""
     monkeypatch.setattr("pipeline.web.live.running.show_live", lambda *_, **__: None)
     monkeypatch.setattr("sim.core.runtime.resolve_device", lambda _: "cpu")
-    return CliRunner().invoke(main, ["live", *arguments, "--cores", "2"]).output
+    return pipeline("live", *arguments, "--cores", 2).output
 
 
 def test_the_drop_to_start_from_is_let_in(tmp_path, monkeypatch):
@@ -174,8 +180,7 @@ position = [0.0, 0.0, 0.2]
 
 
 def test_substeps_of_ones_own_and_those_of_the_job_are_not_had_at_once(tmp_path):
-    (tmp_path / "drape.toml").write_text(BALL_OVER_SHEET, encoding="utf-8")
-    outcome = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml"), "--as-written", "--substeps", "6"])
+    outcome = live(tmp_path, "--as-written", "--substeps", 6)
     assert outcome.exit_code == 2
     assert "give one of them" in outcome.output
 

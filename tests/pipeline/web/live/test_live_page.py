@@ -14,7 +14,7 @@ from browser import PATIENCE_S, needs_browser, open_page, until
 from live_jobs import BALL_OVER_SHEET, served
 from PIL import Image
 
-from pipeline.web.live.loop import run
+from pipeline.web.live.running import run
 from pipeline.web.live.session import Session
 
 LOOKED_AT = (

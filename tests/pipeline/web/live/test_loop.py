@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.web.live import loop
+from pipeline.web.live import running as loop
 
 
 class Clock:

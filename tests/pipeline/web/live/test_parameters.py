@@ -12,8 +12,15 @@ from pipeline.web.live.scene import LiveScene
 from pipeline.web.live.session import Session
 from pipeline.web.serving import page_server
 
-ODD = ("stretch_stiffness = 3e5", "bend_stiffness = 2e-9", "bend_stiffness = 0.0", "friction = 3.0", "damping = 0.7",
-       "wind = [0.0, -55.0, 1.0]", "mass_per_area = 1e-3")  # fmt: skip
+ODD = (
+    "stretch_stiffness = 3e5",
+    "bend_stiffness = 2e-9",
+    "bend_stiffness = 0.0",
+    "friction = 3.0",
+    "damping = 0.7",
+    "wind = [0.0, -55.0, 1.0]",
+    "mass_per_area = 1e-3",
+)
 
 
 @pytest.mark.parametrize("odd", ODD)
@@ -47,6 +54,19 @@ shape = { type = "box", size = [0.1, 0.1, 0.1] }
 position = [0.0, 0.0, 0.05]
 """
 
+POOL = """
+name = "pool"
+[domain]
+min = [0.0, 0.0, 0.0]
+max = [0.4, 0.2, 0.4]
+[[fluid]]
+name = "water"
+particle_radius = 0.02
+[[fluid.block]]
+shape = { type = "box", size = [0.16, 0.16, 0.2] }
+position = [0.1, 0.1, 0.12]
+"""
+
 
 @pytest.mark.usefixtures("taichi")
 def test_bodies_alone_have_their_surfaces_as_knobs_and_a_saved_job_has_them(tmp_path):
@@ -59,7 +79,7 @@ def test_bodies_alone_have_their_surfaces_as_knobs_and_a_saved_job_has_them(tmp_
     with pytest.raises(ValueError, match="between 0 and 1"):
         session.set("rigid.ball.restitution", 1.5)
     session.reset()
-    assert session.world.solvers["rigid"].friction.tolist() == [0.75, 0.75]
+    assert session.world.solvers["rigid"].surfaces.friction.tolist() == [0.75, 0.75]
     session.advance()
     saved = load_job(save_job(read, session.values, tmp_path)[0])
     assert [(body.friction, body.restitution) for body in saved.rigid] == [(0.75, 0.75)] * 2
@@ -97,6 +117,22 @@ def test_a_fluid_alone_has_viscosity_and_steps_and_a_saved_job_has_them(tmp_path
     assert (saved.fluid[0].viscosity, saved.fluid[0].cfl) == (1.0e-4, 0.5)
     fixed = loaded(tmp_path, WATER.replace("particle_radius", "dt = 1e-3\nparticle_radius")).job
     assert [knob.name for knob in parameters_of(fixed)] == ["fluid.water.viscosity"]
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_small_fluid_runs_and_is_drawn(tmp_path):
+    read = loaded(tmp_path, POOL)
+    session = Session(live_job(read.job))
+    with page_server() as server:
+        page = page_of(server, read, session, tmp_path)
+        for _ in range(20):
+            session.advance()
+        page.show()
+        page.tell(session.status())
+        assert "substeps: water" in page._state.content
+        water = session.bodies()["water"].arrays["position"]
+        assert server.scene.get_handle_by_name("/fluid/water").points.shape == water.shape
+    assert water[:, 0].max() > 0.2  # it has run out over the floor
 
 
 @pytest.mark.usefixtures("taichi")

@@ -10,20 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from live_jobs import BALL_OVER_SHEET, loaded, recording
+from command_line import pipeline
+from live_jobs import BALL_OVER_SHEET, live, loaded, recording
 
 from pipeline.base.errors import JobBusyError, LeaseLostError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
 from pipeline.base.resources import machine_capacity
-from pipeline.cli.main import main
 from pipeline.job.loading import load_job, read_job
 from pipeline.queue.changes import continuation
 from pipeline.queue.job_queue import JobQueue
-from pipeline.record.interrupted_recording import complete_crashed_take, frames_of_crashed_take
+from pipeline.record.interrupted_recording import complete_interrupted_recording, frames_of_interrupted_recording
 from pipeline.run.checked_job import load_checked_job
-from pipeline.run.single_stage import run_stage
+from pipeline.run.single_stage import StageOutcome, run_stage
 from pipeline.store.cache import read_frame
 from pipeline.web.dashboard.actions import Queue, actions_of
 from pipeline.web.dashboard.farm_view import FarmView
@@ -36,7 +35,18 @@ from pipeline.web.live.session import Session
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
-STAGES = "pipeline.stages:STAGES"
+
+def stage_run(layout: JobLayout, stage: str) -> StageOutcome:
+    """One stage of a recording's job, run."""
+    return run_stage(
+        load_job(layout.job_file),
+        layout,
+        stage,
+        capacity=machine_capacity(),
+        stages="pipeline.stages:STAGES",
+        stop_requested=lambda: False,
+        tell=lambda _share, _sentence: None,
+    )
 
 
 def test_a_saved_job_has_the_values_and_all_remarks_and_passes_the_check(tmp_path):
@@ -83,20 +93,14 @@ def test_a_recording_is_a_job_whose_frames_are_there_and_are_never_simulated_aga
     for name, snapshot in expected.items():
         np.testing.assert_array_equal(frame.bodies[name].arrays["position"], snapshot.arrays["position"])
 
-    def run(stage: str):
-        return run_stage(
-            job, layout, stage, capacity=machine_capacity(), stages=STAGES, stop_requested=lambda: False,
-            tell=lambda _share, _sentence: None,
-        )  # fmt: skip
-
-    assert run("simulate").up_to_date == 1
-    assert run("cloth").ran == 4
+    assert stage_run(layout, "simulate").up_to_date == 1
+    assert stage_run(layout, "cloth").ran == 4
     layout.path(layout.frame_cache(2)).unlink()
-    (failed,) = run("simulate").failures
+    (failed,) = stage_run(layout, "simulate").failures
     assert "no computation can make it anew" in failed.message
     assert "in a copy of the job file under another name" in failed.message
     assert not layout.path(layout.frame_cache(2)).exists()
-    again = CliRunner().invoke(main, ["rerun", str(folder), "--stage", "simulate"])
+    again = pipeline("rerun", folder, "--stage", "simulate")
     assert again.exit_code == 1
     assert "it cannot be simulated again" in again.output
 
@@ -134,11 +138,11 @@ def test_nobody_runs_a_recording_while_it_is_recorded_and_then_it_waits_to_be_st
     layout = spool.layout("drape-take")
     assert card() == ("running", [])
     for command in (
-        ["submit", str(layout.job_file)],
-        ["resume", str(layout.root)],
-        ["clean", str(layout.root), "--all"],
+        ["submit", layout.job_file],
+        ["resume", layout.root],
+        ["clean", layout.root, "--all"],
     ):
-        refused = CliRunner().invoke(main, command)
+        refused = pipeline(*command)
         assert refused.exit_code != 0, command
         assert "is being run already, by process" in refused.output
     with pytest.raises(JobBusyError):
@@ -146,7 +150,7 @@ def test_nobody_runs_a_recording_while_it_is_recorded_and_then_it_waits_to_be_st
     assert spool.find("drape-take") is None
     recorder.stop()
     assert card() == ("recorded", ["Start"])
-    assert continuation(spool, "drape-take").entry.name == "drape-take"
+    assert continuation(spool, "drape-take")[0].name == "drape-take"
 
 
 def wait_for_frames(recorder: Recorder, count: int) -> None:
@@ -192,13 +196,13 @@ def test_a_recording_whose_folder_another_process_has_taken_over_writes_nothing_
 
 def activity(layout: JobLayout) -> str:
     """What `status` says of a job behind the path of its folder."""
-    root, _, told = CliRunner().invoke(main, ["status", str(layout.root)]).output.splitlines()[0].partition(": ")
+    root, _, told = pipeline("status", layout.root).output.splitlines()[0].partition(": ")
     assert root == str(layout.root)
     return told
 
 
 def simulation_verdict(job_file: Path | str) -> str:
-    planned = CliRunner().invoke(main, ["plan", str(job_file), "--json"])
+    planned = pipeline("plan", job_file, "--json")
     assert planned.exit_code == 0, planned.output
     return {each["task"]: each["verdict"] for each in json.loads(planned.output)}["simulate"]
 
@@ -232,7 +236,7 @@ def test_a_recording_whose_process_was_killed_has_all_its_frames_again_once_it_i
     assert_told(activity(layout), "cut short", "3 frames", f"submitting {layout.job_file}")
     submitted = []
     monkeypatch.setattr("pipeline.cli.make.run", lambda job, *_, **__: submitted.append(job.frame_count))
-    ended = CliRunner().invoke(main, ["submit", str(layout.job_file)])
+    ended = pipeline("submit", layout.job_file)
     assert ended.exit_code == 0, ended.output
     assert_told(ended.output, "drape-take was cut short", "3 frames")
     assert submitted == [3]
@@ -260,22 +264,22 @@ def test_frames_behind_one_that_is_damaged_are_told_of_and_taken_over_once_that_
     aside = damaged.rename(damaged.with_name("aside"))
     flaw = "cut short", "2 frames", "frame 2 is missing or damaged", "2 more lie behind it"
     assert_told(activity(layout), *flaw, f"submitting {layout.job_file}")
-    assert_told(complete_crashed_take(layout), "drape-take", *flaw)
+    assert_told(complete_interrupted_recording(layout), "drape-take", *flaw)
     assert load_job(layout.job_file).frame_count == 2
-    assert_told(complete_crashed_take(layout), "drape-take", *flaw)
+    assert_told(complete_interrupted_recording(layout), "drape-take", *flaw)
     aside.rename(damaged)
-    completed = complete_crashed_take(layout)
+    completed = complete_interrupted_recording(layout)
     assert_told(completed, "cut short", "5 frames")
     assert "damaged" not in completed
     assert load_job(layout.job_file).frame_count == 5
-    assert complete_crashed_take(layout) == ""
+    assert complete_interrupted_recording(layout) == ""
 
 
 def test_a_recording_whose_first_frame_is_damaged_is_left_as_it_is_and_told_of(tmp_path, monkeypatch):
     _, layout = crashed(tmp_path, monkeypatch, frames=2)
     layout.path(layout.frame_cache(0)).write_bytes(b"")
     flaw = "cut short", "frame 0 is missing or damaged", "1 more lies behind it"
-    assert_told(complete_crashed_take(layout), "drape-take", *flaw)
+    assert_told(complete_interrupted_recording(layout), "drape-take", *flaw)
     assert load_job(layout.job_file).frame_count == 1
     assert_told(activity(layout), *flaw)
     assert "submitting" not in activity(layout)
@@ -286,19 +290,19 @@ def test_status_promises_no_film_of_a_recording_whose_folder_has_another_job(tmp
     text = layout.job_file.read_text()
     layout.job_file.write_text("".join(line for line in text.splitlines(True) if not line.startswith("recorded")))
     assert_told(activity(layout), f"{layout.job_file} is not its job", "no film")
-    layout.take_story.unlink()
-    assert activity(layout).startswith("not running; its record")
+    layout.recording_story.unlink()
+    assert "its record holds no tasks" in activity(layout)
 
 
 def test_a_length_that_was_chosen_for_a_killed_recording_stays(tmp_path, monkeypatch):
     _, layout = crashed(tmp_path, monkeypatch)
-    found = frames_of_crashed_take(layout)
+    found = frames_of_interrupted_recording(layout)
     assert found is not None
     assert (found.whole, found.flaw) == (3, "")
     layout.job_file.write_text(layout.job_file.read_text().replace("frames = 1", "frames = 7"))
-    complete_crashed_take(layout)
+    complete_interrupted_recording(layout)
     assert load_job(layout.job_file).frame_count == 7
-    assert (frames_of_crashed_take(layout), complete_crashed_take(layout)) == (None, "")
+    assert (frames_of_interrupted_recording(layout), complete_interrupted_recording(layout)) == (None, "")
 
 
 def test_a_recording_whose_lease_did_not_answer_but_is_its_own_still_becomes_a_film_of_all_its_frames(tmp_path):
@@ -367,31 +371,27 @@ def test_what_is_printed_of_a_recording_works_from_anywhere(tmp_path, monkeypatc
     _, _, printed = session.message.partition("pipeline submit ")
     (job_file,) = shlex.split(printed)
     assert simulation_verdict(job_file) == "up to date"
-    found = CliRunner().invoke(main, ["status", job_file])  # by its file alone, as `submit` finds it
+    found = pipeline("status", job_file)  # by its file alone, as `submit` finds it
     assert (found.exit_code, found.output.partition(":")[0]) == (0, str(layout.root))
 
 
 def test_no_cleaning_but_of_everything_removes_the_frames_of_a_recording(tmp_path):
     _, _, layout = take_of(tmp_path)
     job = load_job(layout.job_file)
-    refused = CliRunner().invoke(main, ["clean", str(layout.root), "--stage", "simulate", "--yes"])
+    refused = pipeline("clean", layout.root, "--stage", "simulate", "--yes")
     assert refused.exit_code == 1
     assert_told(refused.output, "drape-take", str(job.recorded), "nothing can make its frames anew", "--all")
     layout.job_file.write_text(layout.job_file.read_text().replace("frames = 3", "frames = 1"))
-    assert CliRunner().invoke(main, ["clean", str(layout.root), "--superseded", "--yes"]).exit_code == 0
+    assert pipeline("clean", layout.root, "--superseded", "--yes").exit_code == 0
     assert len(list((layout.root / "cache").glob("[0-9]*.h5"))) == 3
-    assert CliRunner().invoke(main, ["clean", str(layout.root), "--all", "--yes"]).exit_code == 0
+    assert pipeline("clean", layout.root, "--all", "--yes").exit_code == 0
     assert not layout.root.exists()
 
 
 def test_another_rate_of_frames_of_a_recording_is_told_as_such(tmp_path):
     _, _, layout = take_of(tmp_path)
     layout.job_file.write_text("fps = 24\n" + layout.job_file.read_text())
-    outcome = run_stage(
-        load_job(layout.job_file), layout, "simulate", capacity=machine_capacity(), stages=STAGES,
-        stop_requested=lambda: False, tell=lambda _share, _sentence: None,
-    )  # fmt: skip
-    (failed,) = outcome.failures
+    (failed,) = stage_run(layout, "simulate").failures
     assert "recorded at 60 frames a second, and the job asks for 24: write fps = 60 again" in failed.message
 
 
@@ -439,10 +439,8 @@ def test_ctrl_c_ends_a_recording_tells_what_became_of_it_and_leaves_signals_as_t
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(running, "Recorder", Interrupted)
-    loaded(tmp_path)
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    options = ["--port", "0", "--output", str(tmp_path)]
-    ended = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml"), *options])
+    ended = live(tmp_path)
     assert ended.exit_code == 0
     assert f"1 frame: pipeline submit {tmp_path / 'drape-take' / 'job.toml'}\n" in ended.output
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
@@ -467,8 +465,7 @@ def test_where_live_cannot_go_on_the_terminal_tells_what_became_of_the_recording
 
     monkeypatch.setattr(running, "Recorder", Recording)
     monkeypatch.setattr(running, "run", fails)
-    loaded(tmp_path)
-    ended = CliRunner().invoke(main, ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path)])
+    ended = live(tmp_path)
     assert ended.exit_code == 1
     became = f"; 1 frame: pipeline submit {tmp_path / 'drape-take' / 'job.toml'}"
     (told,) = (line for line in ended.output.splitlines() if line.startswith("error: "))

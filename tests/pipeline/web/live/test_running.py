@@ -3,12 +3,10 @@
 import math
 
 import pytest
-from click.testing import CliRunner
-from live_jobs import loaded
+from live_jobs import live
 
-from pipeline.cli.main import main
 from pipeline.web.live import running
-from pipeline.web.live.frame_timer import LONGEST_FRAME_S
+from pipeline.web.live.soundness import LONGEST_FRAME_S
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -19,9 +17,7 @@ def test_a_frame_may_take_long_only_anyway_and_the_end_does_not_wait_for_it(tmp_
     monkeypatch.setattr(
         running, "run", lambda session, _page, *, ends: found.append((session._timer.longest_s, session.ends is ends))
     )
-    loaded(tmp_path)
-    arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path), *options]
-    assert CliRunner().invoke(main, arguments).exit_code == 0
+    assert live(tmp_path, *options).exit_code == 0
     assert found == [(longest_s, True)]
 
 
@@ -32,9 +28,7 @@ def test_live_ends_with_a_line_where_no_memory_is_left(tmp_path, monkeypatch, wh
         raise error
 
     monkeypatch.setattr(running, where, fails)
-    loaded(tmp_path)
-    arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path)]
-    ended = CliRunner().invoke(main, arguments)
+    ended = live(tmp_path)
     assert ended.exit_code == 1
     told = f"error: drape cannot go on, as no memory is left: {type(error).__name__}: {error}"
     assert told in ended.output.splitlines()
@@ -45,6 +39,5 @@ def test_errors_of_the_program_keep_their_traceback(tmp_path, monkeypatch):
         raise RuntimeError("Event loop is closed")
 
     monkeypatch.setattr(running, "run", fails)
-    loaded(tmp_path)
-    arguments = ["live", str(tmp_path / "drape.toml"), "--port", "0", "--output", str(tmp_path)]
-    assert isinstance(CliRunner().invoke(main, arguments).exception, RuntimeError)
+    with pytest.raises(RuntimeError, match="Event loop is closed"):
+        live(tmp_path)

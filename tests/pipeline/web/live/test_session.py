@@ -13,9 +13,9 @@ import sim.build
 from pipeline.model.job import Job
 from pipeline.run.executors.failures import describe
 from pipeline.web.live.admission import live_job
-from pipeline.web.live.checkpoints import FRAMES_TO_TRUST, Checkpoint
 from pipeline.web.live.requests import CannotGoOnError
 from pipeline.web.live.session import FASTER, FIRST, Session
+from pipeline.web.live.soundness import FRAMES_TO_TRUST, Checkpoint
 from sim.core.world import World
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -32,6 +32,11 @@ def run(session: Session, frames: int) -> None:
 def blow_up(session: Session) -> None:
     session.world.solvers["rigid"].bodies.velocity[0] = (np.nan, 0.0, 0.0)
     run(session, 1)
+
+
+def old_checkpoint(session: Session) -> Checkpoint:
+    """The state now as if it could be trusted at frame 1."""
+    return replace(Checkpoint.of(session.world, session.values), frame=1 - FRAMES_TO_TRUST)
 
 
 def lowest(session: Session) -> float:
@@ -156,8 +161,7 @@ def test_after_a_blow_up_live_does_not_take_for_its_own_what_was_turned_long_ago
     session = Session(live_job(written), written=written)
     session.set("cloth.substeps", substeps)
     run(session, 1)
-    old = replace(Checkpoint.of(session.world, session.values), frame=1 - FRAMES_TO_TRUST)
-    session._checkpoints.append(old)
+    session._checkpoints.append(old_checkpoint(session))
     session._changes.clear()
     blow_up(session)
     assert session.values["cloth.substeps"] == substeps
@@ -332,10 +336,12 @@ def test_a_reset_and_the_end_do_not_wait_for_the_frame(tmp_path, is_over):
 
 
 def raises(error: BaseException) -> Callable[[], None]:
-    def advance_frame() -> None:
-        raise error
+    """Raises an error anew, without what it was raised from before."""
 
-    return advance_frame
+    def fails() -> None:
+        raise type(error)(*error.args)
+
+    return fails
 
 
 @pytest.mark.parametrize(
@@ -392,38 +398,29 @@ def test_the_old_scene_is_gone_before_one_is_built_after_too_little_memory(tmp_p
     assert session.world.frame == 1
 
 
-def raises_anew(error: BaseException) -> Callable[[], None]:
-    """As `raises`, without what the error was raised from before."""
-
-    def fails() -> None:
-        raise type(error)(*error.args)
-
-    return fails
-
-
 @pytest.mark.parametrize("error", [MemoryError("no 9 GiB"), RuntimeError("[cuda] out of memory")])
 def test_a_state_that_there_is_no_memory_to_keep_or_to_record_leads_back(tmp_path, monkeypatch, error):
     session = session_of(tmp_path)
-    run(session, 30)
-    session.world.checkpoint = raises_anew(error)
+    session.world.checkpoint = raises(error)
     run(session, 29)
     session.advance()
     assert (session.message.partition(":")[0], session.world.frame) == ("No memory was left", 0)
     assert describe(error) in session.message
     session.on_frame = lambda _report, _bodies: None
-    session.world.snapshots = raises_anew(error)
+    session.world.snapshots = raises(error)
     session.advance()
     assert (session.message.partition(":")[0], session.world.frame) == ("No memory was left", 0)
 
 
 def test_a_scene_goes_back_where_there_is_no_memory_to_show_it(tmp_path, monkeypatch):
     session = session_of(tmp_path)
-    run(session, 91)
+    run(session, 1)
+    session._checkpoints.append(old_checkpoint(session))
     kept = built(monkeypatch, session, None)
     session.free_memory("MemoryError: no 9 GiB")
     assert kept == [False]
     assert session.message.startswith("No memory was left: MemoryError: no 9 GiB. Nothing had been changed.")
-    assert (session.world.frame, session.is_paused) == (30, False)
+    assert (session.world.frame, session.is_paused) == (1 - FRAMES_TO_TRUST, False)
 
 
 @pytest.mark.parametrize("error", [MemoryError("no 9 GiB"), RuntimeError("CUDA: out of memory"), ValueError("no mesh")])

@@ -106,8 +106,16 @@ def test_a_job_is_drawn_scrubbed_and_played_in_two_pages(tmp_path: Path, window:
         browser.on("pageerror", lambda error: complaints.append(str(error)))
         wait_for(lambda: view.page.frame == 0, "frame 0", browser)
         first = drawn(browser)
-        assert {"/fluid/water", "/rigid/ball/body", "/cloth/flag", "/pin/flag", "/smoke/plume", "/domain", "/camera",
-                "/whitewater/water"} == view.page.things  # fmt: skip
+        assert {
+            "/fluid/water",
+            "/rigid/ball/body",
+            "/cloth/flag",
+            "/pin/flag",
+            "/smoke/plume",
+            "/domain",
+            "/camera",
+            "/whitewater/water",
+        } == view.page.canvas.names
         assert browser.get_by_text("500 of 1,000 particles are drawn").is_visible()
 
         track = browser.locator(".mantine-Slider-track").first.bounding_box()
@@ -116,7 +124,7 @@ def test_a_job_is_drawn_scrubbed_and_played_in_two_pages(tmp_path: Path, window:
         wait_for(lambda: view.page.frame == 4, "the slider's frame", browser)
         browser.get_by_text("frame 4 · 0.133 s").wait_for()
         wait_for(lambda: changed(first, picture(browser)) > 0.01, "another picture", browser)
-        assert "/pin/flag" not in view.page.things  # let go at 0.1 s
+        assert "/pin/flag" not in view.page.canvas.names  # let go at 0.1 s
 
         with opened(window, view) as other:
             other.get_by_text("frame 4 · 0.133 s").wait_for()
@@ -148,7 +156,7 @@ def test_frames_of_a_running_job_appear_and_a_spoilt_one_is_a_line(tmp_path: Pat
         browser.get_by_role("checkbox", name="Surfaces").click()
         browser.get_by_text("frame 1 has no surface yet").wait_for()
         viewed_job.commit_surface(layout, receipt, 1)
-        wait_for(lambda: "/surface/water" in view.page.things, "the surface", browser)
+        wait_for(lambda: "/surface/water" in view.page.canvas.names, "the surface", browser)
 
         viewed_job.commit(layout, 2)
         layout.path(layout.frame_cache(2)).write_bytes(b"nothing")
@@ -156,4 +164,4 @@ def test_frames_of_a_running_job_appear_and_a_spoilt_one_is_a_line(tmp_path: Pat
         browser.get_by_text("frame 2 cannot be read").wait_for()
         browser.get_by_role("button", name="first").click()
         wait_for(lambda: view.page.frame == 0, "a frame that can be read", browser)
-        assert "/fluid/water" in view.page.things
+        assert "/fluid/water" in view.page.canvas.names

@@ -1,4 +1,4 @@
-"""Air that cannot get out of its box, told with their lines."""
+"""What presses on the air of closed boxes of smoke is told with its line."""
 
 import pytest
 import trimesh
@@ -31,24 +31,18 @@ speed = 1.5
     [
         (
             CLOSED + PISTON + "position = [-0.76, 0.0, 0.5]\nvelocity = [0.5, 0.0, 0.0]\n",
-            'rigid[0]: comes into the box of smoke "plume", of which it takes about 12 %, and no side of that is open: '
-            "as much air must flow out, for air of constant density cannot be compressed; add a side to its open_faces",
+            ("rigid[0]: comes into", '"plume"', "about 12 %", "must flow out", "open_faces"),
         ),
         (
             CLOSED + PISTON + "position = [-0.24, 0.0, 0.5]\nvelocity = [-0.52, 0.0, 0.0]\n",
-            'rigid[0]: leaves the box of smoke "plume", of which it takes about 12 %, and no side of that is open: '
-            "as much air must flow in, for air of constant density cannot be compressed; add a side to its open_faces",
+            ("rigid[0]: leaves", '"plume"', "about 12 %", "must flow in", "open_faces"),
         ),
-        (
-            CLOSED + INFLOW,
-            'fluid[0].emitter[0]: fills about 1.2 % of the box of smoke "plume", and no side of that is open: '
-            "as much air must flow out, for air of constant density cannot be compressed; add a side to its open_faces",
-        ),
+        (CLOSED + INFLOW, ("fluid[0].emitter[0]: fills", '"plume"', "about 1.2 %", "must flow out", "open_faces")),
     ],
 )
-def test_what_presses_on_air_that_is_shut_in_is_told_with_this_line(text, expected, tmp_path):
+def test_what_presses_on_the_air_of_a_closed_box_is_told(text, expected, tmp_path):
     (warning,) = checked(text, tmp_path / "closed.toml").warnings
-    assert warning.endswith(expected)
+    assert all(part in warning for part in expected)
 
 
 @pytest.mark.parametrize(
@@ -81,13 +75,19 @@ def test_air_that_keeps_its_room_passes_without_a_word(text, tmp_path):
         ("position = [-0.8, 0.0, 0.5]\nvelocity = [0.6, 0.0, 0.0]\nangular_velocity = [1.6, 0.0, 0.0]\n", "6.4 %"),
     ],
 )
-def test_all_of_a_mesh_is_not_looked_at_in_each_moment(motion, share, tmp_path, monkeypatch):
-    trimesh.creation.box((0.4, 0.4, 0.4)).export(tmp_path / "block.obj")
+def test_of_a_mesh_only_the_hull_is_looked_at_in_each_moment(motion, share, tmp_path, monkeypatch):
+    fine = trimesh.creation.box((0.4, 0.4, 0.4)).subdivide().subdivide().subdivide().subdivide()
+    fine.export(tmp_path / "block.obj")
     looks, support = [], MeshSolid.support
-    monkeypatch.setattr(MeshSolid, "support", lambda solid, axes: looks.append(axes) or support(solid, axes))
+
+    def counted(solid, axes):
+        looks.append(len(solid.mesh.vertices))
+        return support(solid, axes)
+
+    monkeypatch.setattr(MeshSolid, "support", counted)
     block = PISTON.replace('{ type = "box", size = [0.5, 0.5, 0.5] }', '{ type = "mesh", file = "block.obj" }')
     path = tmp_path / "closed.toml"
     told = [each for each in checked(CLOSED + block + motion, path).warnings if "comes into the box" in each]
     assert len(told) == (share is not None)
     assert all(f"about {share}" in each for each in told)
-    assert len(looks) < 50
+    assert sum(looks) < 50 * len(fine.vertices)

@@ -1,0 +1,82 @@
+"""Checks of shapes: files that are there, solids that can be built, walls that a grid of distances can show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.model.positions import KeyPath
+from pipeline.model.problems import Findings, suggestion
+from sim.shapes.parameters import MeshShape, Placement
+
+if TYPE_CHECKING:
+    from pipeline.kinds.base import Solids
+    from sim.shapes.placement import PlacedSolid
+
+
+def build_solids(placements: Iterable[tuple[KeyPath, Placement]], findings: Findings) -> Solids:
+    """Every shape that can be built, by its path; notes what is wrong with the others."""
+    from sim.shapes.placement import build_solid
+    from sim.shapes.solid import ShapeError
+
+    solids = {}
+    for path, placement in placements:
+        if not mesh_exists(placement.shape, path, findings):
+            continue
+        try:
+            solids[path] = build_solid(placement)
+        except ShapeError as error:
+            findings.error((*path, "shape"), str(error))
+            continue
+        for warning in solids[path].warnings:
+            findings.warn((*path, "shape"), warning)
+    return solids
+
+
+def mesh_exists(shape: object, path: KeyPath, findings: Findings) -> bool:
+    """Whether the shape of a table needs no file, or its file is there; notes what is wrong."""
+    return not isinstance(shape, MeshShape) or file_exists(shape.file, "mesh", (*path, "shape", "file"), findings)
+
+
+def file_exists(name: str, kind: str, key: KeyPath, findings: Findings) -> bool:
+    """Whether a file is there; notes what is wrong, and the name that may be meant.
+
+    Args:
+        name: its absolute path.
+        kind: what it is, for messages: "mesh".
+        key: that names it.
+        findings: where errors go.
+    """
+    file = Path(name)
+    if file.is_file():
+        return True
+    if file.is_dir():
+        findings.error(key, f"{file} is a folder, not a {kind}")
+    elif not file.parent.is_dir():
+        findings.error(key, f"no such file: {file}; there is no folder {file.parent}")
+    else:
+        neighbours = [each.name for each in file.parent.iterdir()]
+        findings.error(key, f"no such file: {file}{suggestion(file.name, neighbours)}")
+    return False
+
+
+def thin_wall_problem(solid: PlacedSolid, *, who: str, what: str) -> str | None:
+    """Reason why walls of a body are too thin for the finest grid of its distances; None if they are not.
+
+    Args:
+        solid: the body; primitives need no grid.
+        who: meets it by that grid.
+        what: may pass through the walls then.
+    """
+    from sim.shapes.distance_grids import CELLS_PER_WALL, THIN_SHARE, grid_spacing, thin_wall
+
+    wall = thin_wall(solid)
+    cell = grid_spacing(solid, wall)
+    if wall >= CELLS_PER_WALL * cell:
+        return None
+    return (
+        f"{THIN_SHARE:.0%} of its surface or more is on walls of {wall:.3g} m or thinner; the finest grid that {who} "
+        f"may meet it by has cells of {cell:.3g} m and feels walls of {CELLS_PER_WALL:g}: {what} may pass through "
+        "them; make them thicker, or build the body of several"
+    )
