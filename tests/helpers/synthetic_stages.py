@@ -159,7 +159,9 @@ STAGES = (StepsStage(), DoubleStage(), FilmStage())
 
 def write_faults(root: Path, faults: dict[str, list[str]], *, pause_s: float = 0.0) -> None:
     root.mkdir(parents=True, exist_ok=True)
-    (root / "faults.json").write_text(json.dumps({"faults": faults, "pause_s": pause_s}))
+    part = root / "faults.json.new"
+    part.write_text(json.dumps({"faults": faults, "pause_s": pause_s}))
+    part.replace(root / "faults.json")  # workers may be reading it
 
 
 def pause_s(context: TaskContext) -> float:
