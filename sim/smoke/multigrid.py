@@ -101,13 +101,13 @@ class MultigridVCycle:
     def apply(self) -> None:
         """Set the solution to the V-cycle's answer for the right-hand side."""
         boxes = self.coefficients.boxes
+        if boxes[0].lanes > 1:
+            _cycle(self.equation, self._grids, len(boxes), boxes[0].lanes)
+            return
         descents = list(pairwise(boxes))[: self._first_short]
         for fine, coarse in descents:
             _descend(self.equation, fine, coarse)
-        if self._first_short is None:
-            _solve_coarsest(self.equation, boxes[-1])
-        else:
-            _cycle_short(self.equation, self._grids, self._first_short, len(boxes) - 1)
+        _cycle_short(self.equation, self._grids, len(descents), len(boxes) - 1)
         for fine, coarse in reversed(descents):
             _ascend(self.equation, fine, coarse)
 
@@ -129,9 +129,17 @@ def _ascend(eq: Equation, fine: Grid, coarse: Grid):
 
 
 @kernel
-def _solve_coarsest(eq: Equation, box: Grid):
+def _cycle(eq: Equation, grids: Integers, levels: ti.template(), lanes: ti.template()):
+    """The whole cycle as one launch: on a GPU a launch takes longer than the loops of a coarse level."""
+    for level in ti.static(range(levels - 1)):
+        fine, coarse = ti.static(_level(grids, level, lanes), _level(grids, level + 1, lanes))
+        _descend_one(eq, fine, coarse)
+    coarsest = ti.static(_level(grids, levels - 1, lanes))
     for cell in range(eq.coarsest_count):
-        _solve_coarsest_cell(eq, box, cell)
+        _solve_coarsest_cell(eq, coarsest, cell)
+    for level in ti.static(range(levels - 2, -1, -1)):
+        fine, coarse = ti.static(_level(grids, level, lanes), _level(grids, level + 1, lanes))
+        _ascend_one(eq, fine, coarse)
 
 
 @kernel
@@ -146,21 +154,20 @@ def _cycle_short(eq: Equation, grids: Integers, first: ti.i32, last: ti.i32):
     ti.loop_config(serialize=True)
     for _ in range(1):
         for level in range(first, last):
-            fine = ti.static(_short_level(*_grid(grids, level)))
-            coarse = ti.static(_short_level(*_grid(grids, level + 1)))
+            fine, coarse = ti.static(_level(grids, level, 1), _level(grids, level + 1, 1))
             _descend_one(eq, fine, coarse)
-        coarsest = ti.static(_short_level(*_grid(grids, last)))
+        coarsest = ti.static(_level(grids, last, 1))
         for cell in range(eq.coarsest_count):
             _solve_coarsest_cell(eq, coarsest, cell)
         for finer in range(last - first):
-            fine = ti.static(_short_level(*_grid(grids, last - 1 - finer)))
-            coarse = ti.static(_short_level(*_grid(grids, last - finer)))
+            fine, coarse = ti.static(_level(grids, last - 1 - finer, 1), _level(grids, last - finer, 1))
             _ascend_one(eq, fine, coarse)
 
 
-def _short_level(offset: Any, nx: Any, ny: Any, nz: Any) -> Grid:
-    """A level in a kernel, whose numbers are not known before; one thread has all of a row."""
-    return Grid(offset, nx, ny, nz, (ny + 2) * (nz + 2), nz + 2, 1)
+def _level(grids: Any, level: Any, lanes: int) -> Grid:
+    """A level in a kernel, whose numbers are not known before."""
+    offset, nx, ny, nz = _grid(grids, level)
+    return Grid(offset, nx, ny, nz, (ny + 2) * (nz + 2), nz + 2, lanes)
 
 
 @func
