@@ -315,13 +315,13 @@ def _activity_of_recording(layout: JobLayout) -> str:
     film = f"submitting {layout.job_file} makes the film"
     try:
         if not is_job_of_recording(layout):
-            return f"a take, but {layout.job_file} is not its job: submitting that makes no film of its frames"
+            return f"a recording, but {layout.job_file} is not its job: submitting that makes no film of its frames"
     except JobFileError:
-        return f"a take, whose job file is damaged; see: pipeline check {layout.job_file}"
+        return f"a recording, whose job file is damaged; see: pipeline check {layout.job_file}"
     found = frames_of_interrupted_recording(layout)
     if found is None:
-        return f"a take; {film}"
-    short = "a take that was cut short"
+        return f"a recording; {film}"
+    short = "a recording that was cut short"
     if not found.whole:
         return f"{short}: {found.flaw}" if found.is_cut else f"{short} before its first frame"
     short += f" with {wording.counted(found.whole, 'frame')}"

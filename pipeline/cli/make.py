@@ -216,7 +216,7 @@ def rerun(
     selection = Selection(frozenset(stages), None if frames is None else parse_frames(frames))
     submitted = load_job(layout.job_file)
     if submitted.recorded is not None and "simulate" in stages:
-        raise PipelineError(f"{submitted.name} is a live take ({submitted.recorded}): it cannot be simulated again")
+        raise PipelineError(f"{submitted.name} is a recording ({submitted.recorded}): it cannot be simulated again")
     until = read_goal(layout)
     tasks = plan_job(submitted, layout, STAGES, until)
     selection.of(tasks)  # refuses now what is not in the plan, not when its turn comes

@@ -39,7 +39,7 @@ class Job(SceneParameters):
     )
     recorded: Annotated[str, Field(pattern=NAME_PATTERN)] | None = Field(
         default=None,
-        description="The live take that its simulated frames are, as `pipeline live` writes it: nothing can compute "
+        description="The recording that its simulated frames are, as `pipeline live` writes it: nothing can compute "
         "them anew, and nothing tries.",
     )
     whitewater: dict[str, WhitewaterParameters] = Field(

@@ -69,7 +69,7 @@ def another_try(queue: JobQueue, name: str, *, background: bool) -> QueuedJob:
 def continuation(queue: JobQueue, name: str) -> tuple[QueuedJob, str]:
     """The entry by which a job goes on in the background as it was meant, to be queued.
 
-    Of a take whose recorder crashed, all frames that are there are taken over; that is told in a sentence, else "".
+    Of a recording that was cut short, all frames that are there are taken over; a sentence tells so, else "".
 
     Raises:
         PipelineError: it was never submitted, or its job file is damaged.

@@ -23,7 +23,7 @@ class JobState(StrEnum):
     STOPPED = "stopped"
     """It was cancelled, or stopped by hand, and is not in the queue."""
     RECORDED = "recorded"
-    """A take: its frames are there, and nothing has been asked to make a film of them."""
+    """A recording: its frames are there, and nothing has been asked to make a film of them."""
     NOT_STARTED = "not started"
     """It has never run, and nothing is there of it."""
     DONE = "done"

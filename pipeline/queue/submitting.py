@@ -98,7 +98,7 @@ def run(
     queue = JobQueue.of(layout)
     name = checked_name(layout.root.absolute().name)
     if job.recorded is not None and queue.find(name) is None:
-        refuse_if_held(layout.lease)  # by who records it: only the end of a take writes how many frames it has
+        refuse_if_held(layout.lease)  # by who records it: only the end of a recording writes how many frames it has
     job, job_text = (job, None) if submitted is None else _keep(submitted, layout)
     if paused is not None:
         entry = options.applied_to(paused.again(background=options.detach, settings=choice.settings))

@@ -52,7 +52,7 @@ def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Pa
     job = load_job(layout.job_file)
     if job.recorded is not None and "simulate" in choice.stages:
         raise PipelineError(
-            f"{job.name} is a live take ({job.recorded}): nothing can make its frames anew; --all removes the folder"
+            f"{job.name} is a recording ({job.recorded}): nothing can make its frames anew; --all removes the folder"
         )
     tasks = plan_job(job, layout, STAGES)
     planned = {output for task in tasks for output in task.outputs}

@@ -99,7 +99,7 @@ class SimulateStage(Stage):
 
         Raises:
             SimulationDivergedError: the state became unphysical; the last good checkpoint is kept.
-            StageUnavailableError: the frames so far come from another kind of device, or from a live take.
+            StageUnavailableError: the frames so far come from another kind of device, or from a recording.
         """
         missing = [k for k, output in enumerate(context.task.outputs) if not context.is_committed(output)]
         if missing and context.job.recorded is not None:
@@ -113,13 +113,13 @@ def _no_recording_anew(context: TaskContext, frame: int) -> StageUnavailableErro
     recorded_fps = _recorded_fps(context.layout, context.task.outputs[frame])
     if recorded_fps not in (None, job.fps):
         return StageUnavailableError(
-            f"the live take {job.recorded} was recorded at {recorded_fps} frames a second, and the job asks for "
-            f"{job.fps}: write fps = {recorded_fps} again; no computation can make other frames of a take"
+            f"the recording {job.recorded} was recorded at {recorded_fps} frames a second, and the job asks for "
+            f"{job.fps}: write fps = {recorded_fps} again; no computation can make other frames of a recording"
         )
     return StageUnavailableError(
-        f"frame {frame} of the live take {job.recorded} is not there as it was recorded, and no computation can make "
+        f"frame {frame} of the recording {job.recorded} is not there as it was recorded, and no computation can make "
         "it anew: bring its file and receipt back, or ask for fewer frames. To simulate the scene as it is written, "
-        'remove "recorded" in a copy of the job file under another name; here that would overwrite the take'
+        'remove "recorded" in a copy of the job file under another name; here that would overwrite the recording'
     )
 
 

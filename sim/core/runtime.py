@@ -34,6 +34,11 @@ STALE_LOCK_S = 600.0
 
 KEPT_KERNELS_BYTES = 2**30  # Taichi by itself keeps 100 MiB, a few scenes
 OK = "ok"
+UNTRIED = "it could not be tried: "
+"""Begins an answer that is about the environment, as where a package is absent, and not about the device."""
+
+ANSWERED = 3
+"""Exit code of a probe that has found why its device does not work; Python's own for any error is 1."""
 
 _in_use: dict[str, Any] = {}
 """Back end and thread count of this process once `initialize` has run."""
@@ -103,7 +108,8 @@ def resolve_device(device: Device) -> str:
 def available_devices() -> dict[str, str]:
     """Every device by name: "ok", or the reason why it does not work on this machine.
 
-    The answers are kept in the user's cache folder until Taichi, the driver or the visible devices change.
+    The answers are kept in the user's cache folder until Taichi, the driver or the visible devices change; not where
+    one is about the environment, which may be mended without a trace.
     """
     key = _machine_key()
     path = cache_folder() / "devices.json"
@@ -111,6 +117,8 @@ def available_devices() -> dict[str, str]:
     if remembered is not None:
         return remembered
     answers = _probe_all()
+    if any(answer.startswith(UNTRIED) for answer in answers.values()):
+        return answers
     # An unwritable cache folder costs the next process a second probe, nothing else.
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -254,6 +262,8 @@ def _read_probe(child: subprocess.Popen[str]) -> str:
     if child.returncode < 0:
         return f"its driver ends the process with {signal.Signals(-child.returncode).name}"
     lines = (answer.strip() or complaint.strip() or f"the probe ended with {child.returncode}").splitlines()
+    if child.returncode != ANSWERED:
+        return f"{UNTRIED}{lines[-1]}"
     # Taichi's own words for a missing driver library are "Arch=[<Arch.cuda: 3>] is not supported".
     return "no driver for it was found" if "is not supported" in lines[-1] else lines[-1]
 
@@ -279,11 +289,11 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         _probe(arguments.probe)
-    # Whatever a driver raises is the answer.
+    # Whatever a driver raises is the answer; a package or a library that does not load says nothing of the device.
     except Exception as error:
         reason = error.reason if isinstance(error, DeviceUnavailableError) else str(error) or type(error).__name__
         sys.stdout.write(f"{reason.strip().splitlines()[0]}\n")
-        return 1
+        return 1 if isinstance(error, ImportError) or isinstance(error.__cause__, ImportError) else ANSWERED
     return 0
 
 

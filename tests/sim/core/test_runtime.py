@@ -62,6 +62,28 @@ def test_devices_are_remembered_until_the_machine_changes(tmp_path, monkeypatch)
     assert available_devices() == {"cpu": "probed again"}
 
 
+def test_what_the_environment_lacks_is_told_and_not_remembered(tmp_path, monkeypatch):
+    """A machine whose environment was mended asks its devices again."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(runtime, "_reason_without_probe", lambda name: None if name == "cuda" else "not looked at")
+    package = tmp_path / "broken" / "taichi" / "__init__.py"
+    package.parent.mkdir(parents=True)
+    package.write_text("import no_such_module")
+    monkeypatch.setenv("PYTHONPATH", str(package.parents[1]))
+    assert available_devices()["cuda"] == (
+        "it could not be tried: Taichi does not load: No module named 'no_such_module'"
+    )
+    monkeypatch.setattr(runtime, "_probe_all", lambda: {"cuda": "ok"})
+    assert available_devices() == {"cuda": "ok"}
+
+
+def test_probe_that_cannot_even_start_says_nothing_of_the_device():
+    child = subprocess.Popen(
+        [sys.executable, "-m", "no_such_module"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert runtime._read_probe(child).startswith(runtime.UNTRIED)
+
+
 @pytest.mark.parametrize(("named", "base"), [("/elsewhere", "/elsewhere"), ("beside", "~/.cache"), ("", "~/.cache")])
 def test_a_relative_cache_home_counts_as_none(monkeypatch, named, base):
     monkeypatch.setenv("XDG_CACHE_HOME", named)
