@@ -7,13 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
+from pipeline.base.layout import JobLayout
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import LiveParameters
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from render.bounds import Reach
 from render.parameters import MaterialParameters
+from render.spec import SceneObject
 from sim.core.parameters import Parameters
+from sim.core.snapshots import Snapshot
 from sim.core.solver import Solver
 from sim.scene import SceneParameters
 from sim.shapes.parameters import Placement
@@ -21,10 +25,6 @@ from sim.shapes.parameters import Placement
 if TYPE_CHECKING:
     import h5py
 
-    from pipeline.base.layout import JobLayout
-    from render.bounds import Reach
-    from render.spec import SceneObject
-    from sim.core.snapshots import Snapshot
     from sim.shapes.placement import PlacedSolid
 
 Solids = Mapping[KeyPath, "PlacedSolid"]

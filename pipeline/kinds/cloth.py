@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.base.content import status_of, tool_version
 from pipeline.base.errors import MissingInputError
+from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.fluid import validate_mesh
@@ -18,19 +19,18 @@ from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from render.bounds import Reach, reach_of_points
 from render.parameters import MaterialParameters
+from render.spec import MeshSequenceObject, SceneObject
 from sim.cloth.materials import Material
 from sim.cloth.parameters import ClothParameters, RectangleSheet
+from sim.core.snapshots import Snapshot
 from sim.scene import SceneParameters
 from sim.shapes.parameters import MeshShape
 
 if TYPE_CHECKING:
     import h5py
 
-    from pipeline.base.layout import JobLayout
-    from render.bounds import Reach
-    from render.spec import SceneObject
-    from sim.core.snapshots import Snapshot
 
 BASE_BYTES = 250_000_000
 """Interpreter, numpy and h5py."""
@@ -99,14 +99,10 @@ def _coarser_sheet(path: KeyPath, sheet: RectangleSheet, factor: float) -> Chang
 
 
 def _objects(_job: Job, _layout: JobLayout, cloth: ClothParameters, material_of: Materials) -> Iterator[SceneObject]:
-    from render.spec import MeshSequenceObject
-
     yield MeshSequenceObject(name=cloth.name, file=MESH.file_of(cloth.name), material=material_of(BODY))
 
 
 def _reach(_job: Job, _layout: JobLayout, _cloth: ClothParameters, group: h5py.Group) -> Reach | None:
-    from render.bounds import reach_of_points
-
     return reach_of_points(group["position"][()])
 
 

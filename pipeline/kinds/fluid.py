@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from blender_scripts.look_table import LOOK_TABLE
 from pipeline.base.content import tool_version
+from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import FLUID_LIVE
@@ -16,7 +17,10 @@ from pipeline.model.job import Job
 from pipeline.model.looks import BODY, WHITEWATER
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from render.bounds import Reach, reach_of_particles
 from render.parameters import MaterialParameters
+from render.spec import MeshSequenceObject, PointSequenceObject, SceneObject
+from sim.core.snapshots import Snapshot
 from sim.fluid.parameters import FluidParameters
 from sim.scene import SceneParameters
 from sim.shapes.parameters import BoxShape, Placement
@@ -24,10 +28,6 @@ from sim.shapes.parameters import BoxShape, Placement
 if TYPE_CHECKING:
     import h5py
 
-    from pipeline.base.layout import JobLayout
-    from render.bounds import Reach
-    from render.spec import SceneObject
-    from sim.core.snapshots import Snapshot
 
 MOST_IN_A_VOLUME = 1.5
 """Particles of a thin block or a narrow opening, over what its volume holds: the last ones reach beyond it."""
@@ -83,8 +83,6 @@ def _coarser(job: Job, factor: float, _solids: SolidBuilder | None) -> list[Chan
 
 
 def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: Materials) -> Iterator[SceneObject]:
-    from render.spec import MeshSequenceObject, PointSequenceObject
-
     # Nobody sees from inside where a fluid of another look touches solids; a material of one's own may look at it.
     material = material_of(BODY)
     sees = material.look is None or LOOK_TABLE[material.look].refracts
@@ -104,8 +102,6 @@ def _objects(job: Job, _layout: JobLayout, fluid: FluidParameters, material_of: 
 
 
 def _reach(_job: Job, _layout: JobLayout, _fluid: FluidParameters, group: h5py.Group) -> Reach | None:
-    from render.bounds import reach_of_particles
-
     position = group["position"][()]
     return reach_of_particles(position, float(group.attrs["particle_radius"])) if len(position) else None
 

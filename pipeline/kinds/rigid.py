@@ -6,22 +6,21 @@ from collections.abc import Iterator
 from math import cos, radians, sin
 from typing import TYPE_CHECKING
 
+from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Display, Kind, Materials, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.live_parameters import RIGID_LIVE
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, NATURAL_MATERIALS, SOLID, parts_of
 from pipeline.model.problems import Findings
+from render.bounds import Reach, reach_of_points
+from render.spec import MeshObject, MovingMeshObject, SceneObject
 from sim.rigid.parameters import RigidBodyParameters
 
 if TYPE_CHECKING:
     import h5py
     import numpy as np
     from numpy.typing import NDArray
-
-    from pipeline.base.layout import JobLayout
-    from render.bounds import Reach
-    from render.spec import SceneObject
 
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
@@ -35,8 +34,6 @@ def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) 
 
 def _objects(_job: Job, layout: JobLayout, body: RigidBodyParameters, material_of: Materials) -> Iterator[SceneObject]:
     """A static body stands where the job puts it; the others are where the poses of the frame say."""
-    from render.spec import MeshObject, MovingMeshObject
-
     for part in parts_of(body.shape.type):
         name = body.name if part == BODY else f"{body.name}.{part}"
         file, material = layout.body_mesh(body.name, part), material_of(part)
@@ -62,7 +59,6 @@ def _reach(_job: Job, layout: JobLayout, body: RigidBodyParameters, group: h5py.
     """How far a body that moves reaches; one that stands still is of the film, not of a frame."""
     import numpy as np
 
-    from render.bounds import reach_of_points
     from sim.core.motion.rotation import rotated
 
     if body.kind == "static":

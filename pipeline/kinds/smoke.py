@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING
 
 from pipeline.base.content import ABSENT, tool_version
 from pipeline.base.errors import InvalidArtifactError
+from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Codec, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from render.bounds import Reach, box_of_smoke, reach_of_box
 from render.parameters import MaterialParameters
+from render.spec import SceneObject, VolumeSequenceObject
 from sim.shapes.parameters import Placement
 from sim.smoke.parameters import CELLS_PER_EDDY, SmokeParameters
 
 if TYPE_CHECKING:
     import h5py
 
-    from pipeline.base.layout import JobLayout
     from pipeline.kinds.smoke_codec import SmokeInBox
-    from render.bounds import Reach
-    from render.spec import SceneObject
 
 WORKER_BYTES = 130_000_000
 BYTES_PER_CELL = 80
@@ -68,8 +68,6 @@ def _coarser(job: Job, factor: float, solids: SolidBuilder | None) -> list[Chang
 
 
 def _objects(job: Job, _layout: JobLayout, smoke: SmokeParameters, material_of: Materials) -> Iterator[SceneObject]:
-    from render.spec import VolumeSequenceObject
-
     box_min, box_max = smoke.corners(job.domain)
     yield VolumeSequenceObject(
         name=smoke.name,
@@ -84,7 +82,6 @@ def _objects(job: Job, _layout: JobLayout, smoke: SmokeParameters, material_of: 
 
 def _reach(_job: Job, _layout: JobLayout, _smoke: SmokeParameters, group: h5py.Group) -> Reach | None:
     from pipeline.kinds.smoke_codec import read_density
-    from render.bounds import box_of_smoke, reach_of_box
 
     box = box_of_smoke(*read_density(group))
     return None if box is None else reach_of_box(box)

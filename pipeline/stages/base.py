@@ -6,13 +6,11 @@ from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
+from pipeline.model.job import Job
 
 
 class TaskContext(Protocol):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,17 @@ from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
 from pipeline.stages.base import Stage, TaskContext
 from pipeline.store.cache import open_bodies
-
-if TYPE_CHECKING:
-    from render.bounds import Reach
+from render.bounds import (
+    Reach,
+    around,
+    corners_of,
+    framed,
+    reach_of_box,
+    reach_of_points,
+    read_bounds,
+    validate_bounds,
+    write_bounds,
+)
 
 ACTION = "action"  # the film's one reach, by this name
 FILM = TaskId("bounds/film")
@@ -88,8 +95,6 @@ class BoundsStage(Stage):
 
     def run(self, context: TaskContext) -> None:
         """Find how far a frame's bodies reach, or the film's."""
-        from render.bounds import validate_bounds, write_bounds
-
         frame = context.task.frame
         reaches = {ACTION: _of_film(context)} if frame is None else _of_frame(context.job, context.layout, frame)
         with context.committing(context.task.outputs[0], validate_bounds) as path:
@@ -99,8 +104,6 @@ class BoundsStage(Stage):
 
 def read_framed(path: Path) -> NDArray[np.float64]:
     """The points that the camera of a film frames [m], (n, 3): corners of a convex body around the action."""
-    from render.bounds import corners_of, read_bounds
-
     return corners_of(read_bounds(path)[ACTION])
 
 
@@ -114,7 +117,6 @@ def _of_frame(job: Job, layout: JobLayout, frame: int) -> dict[str, Reach]:
 
 def _of_film(context: TaskContext) -> Reach:
     """How far all frames and the bodies that stand still reach, as far as they are in the world."""
-    from render.bounds import around, framed, reach_of_box, reach_of_points, read_bounds
     from sim.core.motion.rotation import from_degrees, rotated
 
     job, layout = context.job, context.layout

@@ -16,17 +16,14 @@ from dataclasses import asdict
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.base.errors import PipelineError
 from pipeline.base.files import replacing
 from pipeline.base.parameter_set import digest_of
+from pipeline.base.task import Task
+from pipeline.model.job import Job
+from render.gpus import Gpu, Probe, find_gpus
 from sim.core.runtime import cache_folder
-
-if TYPE_CHECKING:
-    from pipeline.base.task import Task
-    from pipeline.model.job import Job
-    from render.gpus import Gpu, Probe
 
 OWN_GPUS = "PIPELINE_GPUS"
 """Environment variable that leaves this process some of the machine's GPUs only, as `0,2`: places in Cycles' list.
@@ -97,8 +94,6 @@ def known_gpus(blender: str | None) -> Probe:
     Asked in a child process. The answer is kept in the user's cache folder until Blender, the driver or the visible
     devices change; one that was cut short is kept for `TROUBLE_KEPT_S`, and by this process.
     """
-    from render.gpus import Probe
-
     if sys.platform == "linux" and not _device_files():
         return Probe()
     return _answer(blender, _key(blender))
@@ -113,8 +108,6 @@ def driver_version() -> str:
 
 @lru_cache
 def _answer(blender: str | None, key: str) -> Probe:
-    from render.gpus import find_gpus
-
     path = cache_folder() / "render-gpus.json"
     remembered = _remembered(path, key)
     if remembered is not None:
@@ -129,8 +122,6 @@ def _answer(blender: str | None, key: str) -> Probe:
 
 def _remembered(path: Path, key: str) -> Probe | None:
     """The remembered answer, or None where there is none for this machine as it is now."""
-    from render.gpus import Gpu, Probe
-
     try:
         remembered = json.loads(path.read_text(encoding="utf-8"))
         trouble = str(remembered["trouble"])

@@ -7,7 +7,6 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +19,9 @@ from pipeline.stages.gpu_kernels import compiled_once
 from pipeline.stages.inputs import blender_version
 from pipeline.stages.render_scene import framed_points, render_spec
 from pipeline.stages.visibility import BodyAtFrame, expected_cells
+from render.blender import Renderer, open_renderer
 from render.camera_path import View
-
-if TYPE_CHECKING:
-    from render.blender import Renderer
-    from render.pictures import PictureStatistics
+from render.pictures import PictureStatistics, check_pixels, over_black, read_picture, require_more_than_set
 
 SET_PIXELS = 96
 """Along the longer side of the empty set that pictures are held against: half a percent of it is 25 pixels."""
@@ -52,8 +49,6 @@ class FrameDrawing:
     @property
     def renderer(self) -> Renderer:
         """This process's renderer for the frame, opened where the one that is there draws something else."""
-        from render.blender import open_renderer
-
         if self._key not in _WARM:
             close_renderers()
             root = self._context.layout.root
@@ -127,8 +122,6 @@ class FrameDrawing:
 
         Raises InvalidFileError: it is damaged, black, of one colour, or shows the set without its bodies.
         """
-        from render.pictures import check_pixels, over_black, read_picture, require_more_than_set
-
         job = self._context.job
         pixels = read_picture(path)
         statistics = check_pixels(path, pixels, job.render.resolution, may_be_empty=may_be_empty(job))
@@ -142,8 +135,6 @@ class FrameDrawing:
 
     def _empty_set(self, columns: int, rows: int) -> NDArray[np.uint8]:
         """The camera's view without any body, (rows, columns, 4); drawn once for a still camera."""
-        from render.pictures import over_black, read_picture
-
         if _STILL_SET in _EMPTY_SETS:
             return _EMPTY_SETS[_STILL_SET]
         with tempfile.TemporaryDirectory(prefix="set-") as folder:

@@ -11,17 +11,14 @@ from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.base.files import replacing
 from pipeline.base.parameter_set import digest_of
 from pipeline.job.input_files import split_blend
 from pipeline.store.receipts import hash_file
+from render.blend_file import Texture, read_textures
+from render.spec import RenderSpec
 from sim.core.runtime import cache_folder
-
-if TYPE_CHECKING:
-    from render.blend_file import Texture
-    from render.spec import RenderSpec
 
 BYTES_PER_HDRI_PIXEL = 25
 LIGHT_MAP_BYTES = 8 * 1024 * 512
@@ -59,7 +56,6 @@ def bytes_of_textures(textures: Iterable[Texture]) -> int:
 @lru_cache
 def _texture_bytes(file: str, name: str, blender: str | None, _size: int, _mtime_ns: int) -> int:
     """Asked of Blender, in a child process, once for a content: the answer is kept in the user's cache folder."""
-    from render.blend_file import read_textures
     from render.blender import BlenderUnavailableError
     from render.errors import InvalidFileError
 

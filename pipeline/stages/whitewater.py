@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from math import ceil
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.base.content import tool_version
@@ -15,14 +17,11 @@ from pipeline.model.job import Job
 from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.inputs import by_content
 from pipeline.store.cache import read_frame
+from sim.core.snapshots import Snapshot
+from sim.whitewater.cloud import WhitewaterCloud
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from sim.core.snapshots import Snapshot
     from sim.shapes.level_set import LevelSet
-    from sim.whitewater.cloud import WhitewaterCloud
     from sim.whitewater.obstacles import MovingObstacle
 
 CORES = 2  # threads of the neighbour sums; the rest of a frame is numpy's, which takes one
@@ -102,7 +101,6 @@ def _next_cloud(context: TaskContext) -> tuple[WhitewaterCloud, int]:
     """The task's cloud, and how many particles it has not for lack of room."""
     from render.point_clouds import read_point_cloud
     from sim.core.runtime import initialize
-    from sim.whitewater.cloud import WhitewaterCloud
 
     task, job = context.task, context.job
     assert task.frame is not None

@@ -25,16 +25,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import parse_qs
 
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pipeline.base.errors import PipelineError
-
-if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LEAST_TOKEN_LENGTH = 22
 LEAST_TOKEN_BITS = 72.0  # by the frequencies of its characters: 22 that were drawn have 78 and more

@@ -48,7 +48,7 @@ def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
         budget = memory_budget(job) if memory_bytes is None else MemoryBudget(memory_bytes, "this machine")
         check_camera(job, solids, findings)
         for kind in KINDS.values():
-            findings.elements[kind.name] = kind.check(job, solids, budget, findings)
+            findings.elements[kind.name] = kind.check(job, solids, budget, findings) if kind.bodies(job) else 0
     return findings
 
 

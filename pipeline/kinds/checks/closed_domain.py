@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kinds.base import Solids
 from pipeline.model.boxes import Box, overlap, smoke_box
+from pipeline.model.job import Job
 from pipeline.model.problems import Findings
+from sim.core.motion import rotation
+from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.paths import path_of
+from sim.shapes.mesh_solid import MeshSolid
+from sim.shapes.placement import PlacedSolid
+from sim.shapes.solid import TriangleMesh
 from sim.smoke.parameters import SmokeParameters
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
-    from sim.rigid.parameters import RigidBodyParameters
-    from sim.shapes.placement import PlacedSolid
 
 # Share of a closed box by which its air may be compressed or stretched.
 SQUEEZED = 0.001
@@ -64,11 +65,6 @@ def _must_flow(where: str) -> str:
 def _shares_inside(job: Job, body: RigidBodyParameters, solid: PlacedSolid, box: Box) -> NDArray[np.float64]:
     """Share of a kinematic body's bounds that is in a box at moments of the film, from its start on [-], (n,)."""
     from scipy.spatial import ConvexHull
-
-    from sim.core.motion import rotation
-    from sim.rigid.paths import path_of
-    from sim.shapes.mesh_solid import MeshSolid
-    from sim.shapes.solid import TriangleMesh
 
     shape = solid.shape
     if isinstance(shape, MeshSolid):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.cloth_bodies import check_bodies_for_cloth
 from pipeline.kinds.checks.cloth_fluid import check_buoyancy, fluid_over
 from pipeline.kinds.checks.cloth_start import ClothStart, start_cloths
@@ -16,17 +16,17 @@ from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.pins import check_pin_load, check_pin_speeds, check_pin_times
 from pipeline.model.amounts import count
 from pipeline.model.boxes import Box, domain_box, span, touch
+from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
-from sim.cloth.parameters import RUNAWAY_SPEED, RectangleSheet, shared_conflicts
+from sim.cloth.parameters import RUNAWAY_SPEED, ClothParameters, RectangleSheet, shared_conflicts
+from sim.cloth.springs import springs_of
+from sim.cloth.stable_step import ACCURATE_SHARE, longest_explicit_step, too_few_substeps
+from sim.cloth.start import TOUCHING, first_crossing
+from sim.core.domain import DomainParameters
+from sim.core.world import MAX_SUBSTEPS_PER_FRAME
 from sim.shapes.parameters import MeshShape
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
-    from sim.cloth.parameters import ClothParameters
-    from sim.core.domain import DomainParameters
-    from sim.shapes.solid import Solid
+from sim.shapes.solid import Solid
 
 # A mesh so many times as large as the domain is in other units, most likely.
 VAST = 20.0
@@ -125,10 +125,6 @@ def _check_spacing(start: ClothStart, findings: Findings) -> None:
 
 def _check_substeps(start: ClothStart, fps: int, findings: Findings) -> None:
     """Explicit springs are unstable beyond their step, and without a number of substeps dictate theirs."""
-    from sim.cloth.springs import springs_of
-    from sim.cloth.stable_step import ACCURATE_SHARE, longest_explicit_step, too_few_substeps
-    from sim.core.world import MAX_SUBSTEPS_PER_FRAME
-
     cloth = start.cloth
     if cloth.integrator != "explicit":
         return
@@ -174,8 +170,6 @@ def _check_crossings(start: ClothStart, earlier: Sequence[ClothStart], findings:
 
     Contacts keep what crosses crossed, and what touches has no side to be kept on.
     """
-    from sim.cloth.start import TOUCHING, first_crossing
-
     if start.cloth.self_collision and not isinstance(start.cloth.shape, RectangleSheet):
         point = first_crossing(start.position, start.edges, start.sheet.triangles)
         if point is not None:
@@ -199,8 +193,6 @@ def _check_crossings(start: ClothStart, earlier: Sequence[ClothStart], findings:
 
 def _crossing_of(one: ClothStart, other: ClothStart) -> NDArray[np.float64] | None:
     """Where an edge of one cloth passes through or touches a triangle of another [m]."""
-    from sim.cloth.start import TOUCHING, first_crossing
-
     position = np.concatenate([one.position, other.position])
     margin = np.array([[-TOUCHING], [TOUCHING]])
     edges = one.edges[_reaching(one.position[one.edges], other.box + margin)]

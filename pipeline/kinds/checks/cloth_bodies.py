@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kinds.base import Solids
+from pipeline.kinds.checks.cloth_start import ClothStart
 from pipeline.kinds.checks.shapes import thin_wall_problem
+from pipeline.model.job import Job
 from pipeline.model.problems import Findings
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.kinds.checks.cloth_start import ClothStart
-    from pipeline.model.job import Job
-    from sim.cloth.parameters import PinParameters
-    from sim.rigid.parameters import RigidBodyParameters
-    from sim.shapes.placement import PlacedSolid
+from sim.cloth.parameters import PinParameters
+from sim.cloth.pin_paths import path_of_pin
+from sim.core.motion import rotation
+from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.paths import path_of
+from sim.shapes.placement import PlacedSolid
 
 # A body whose shortest side has fewer edges of the cloth may show between its nodes, and pass with less than half.
 LEAST_EDGES = 2.0
@@ -72,10 +72,6 @@ class _Rod:
 
     def stays_with(self, pin: PinParameters, nodes: NDArray[np.float64], film_s: float) -> bool:
         """Whether it is a rod along which a pin holds its nodes, [m], (n, 3) at the start, for as long as it holds."""
-        from sim.cloth.pin_paths import path_of_pin
-        from sim.core.motion import rotation
-        from sim.rigid.paths import path_of
-
         if self.body.kind == "dynamic" or np.sort(self.sides)[1] >= LEAST_EDGES * self.longest_edge:
             return False
         of_body = path_of(self.body) if self.body.kind == "kinematic" else None

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.fluid import openings_of
 from pipeline.model.boxes import Box
+from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
+from sim.cloth.parameters import ClothParameters
+from sim.fluid.opening import Opening
 from sim.fluid.traits import TRAITS
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
-    from sim.cloth.parameters import ClothParameters
-    from sim.fluid.opening import Opening
 
 
 def fluid_over(job: Job, solids: Solids, box: Box) -> float:

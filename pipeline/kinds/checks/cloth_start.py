@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +14,15 @@ from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.shapes import mesh_exists
 from pipeline.model.amounts import count
 from pipeline.model.boxes import Box
+from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from sim.cloth.parameters import ClothParameters, RectangleSheet
+from sim.cloth.sheet import RestSheet, build_sheet
+from sim.cloth.springs import edges_of
+from sim.cloth.start import pinned_nodes, start_positions
 from sim.shapes.parameters import MeshShape
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
-    from sim.cloth.sheet import RestSheet
+from sim.shapes.solid import ShapeError
 
 BYTES_PER_NODE = 6000
 """Memory of the solver: 2.7 kB for springs, triangles and snapshots, and some forty contacts a node in a bundle."""
@@ -91,11 +91,6 @@ def start_cloths(job: Job, budget: MemoryBudget, findings: Findings) -> list[Clo
 
 def _start(job: Job, index: int, before: int, budget: MemoryBudget, findings: Findings) -> ClothStart | None:
     """A cloth after so many nodes of others."""
-    from sim.cloth.sheet import build_sheet
-    from sim.cloth.springs import edges_of
-    from sim.cloth.start import start_positions
-    from sim.shapes.solid import ShapeError
-
     path: KeyPath = ("cloth", index)
     cloth = job.cloth[index]
 
@@ -130,8 +125,6 @@ def _pinned(
     path: KeyPath, cloth: ClothParameters, sheet: RestSheet, position: NDArray[np.float64], findings: Findings
 ) -> dict[int, NDArray[np.int64]]:
     """The nodes of each pin that holds some, by its number; notes the others, and moving ones that share a node."""
-    from sim.cloth.start import pinned_nodes
-
     holders, pinned = np.full(len(position), -1), {}
     for number, pin in enumerate(cloth.pin):
         place = (*path, "pin", number)

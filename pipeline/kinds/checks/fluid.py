@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.jets import check_jets
 from pipeline.model.boxes import overlap
+from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path
-from sim.fluid.parameters import shared_conflicts
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
-    from sim.fluid.opening import Opening
-    from sim.fluid.parameters import FluidParameters
+from sim.fluid.nozzles import opening_problem
+from sim.fluid.opening import Opening
+from sim.fluid.parameters import FluidParameters, shared_conflicts
+from sim.shapes.sampling import fill_with_particles
 
 # Points of a block that are looked at for an overlap with another fluid's.
 OVERLAP_SAMPLES = 20_000
@@ -44,8 +42,6 @@ def openings_of(
     fluid: FluidParameters, index: int = 0, findings: Findings | None = None
 ) -> Iterator[tuple[int, Opening]]:
     """The openings of a fluid's emitters that are wide enough; the others are noted."""
-    from sim.fluid.opening import Opening
-
     for number, emitter in enumerate(fluid.emitter):
         try:
             yield number, Opening.of(emitter, fluid.spacing, fluid.lattice_volume, fluid.support_in_spacings)
@@ -63,8 +59,6 @@ def _check_emitter(
     *,
     findings: Findings,
 ) -> None:
-    from sim.fluid.nozzles import opening_problem
-
     obstacles = [solid for place, solid in solids.items() if place[0] == "rigid"]
     others = {format_path(place): other for place, other in earlier.items()}
     if reason := opening_problem(opening, job.fluid[0].spacing, job.domain, obstacles, others):
@@ -89,8 +83,6 @@ def _check_speeds(job: Job, index: int, findings: Findings) -> None:
 
 def _check_overlaps(job: Job, solids: Solids, findings: Findings) -> None:
     """A place that two fluids want belongs to the first."""
-    from sim.shapes.sampling import fill_with_particles
-
     blocks = [(path, solid) for path, solid in solids.items() if path[0] == "fluid"]
     for place, (path, solid) in enumerate(blocks):
         for earlier_path, earlier in blocks[:place]:

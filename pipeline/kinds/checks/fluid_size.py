@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.fluid import openings_of
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.model.amounts import count, gigabytes, rounded_up
@@ -16,11 +16,10 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from sim.core.domain import DomainParameters
+from sim.fluid.filling import free_places
 from sim.fluid.parameters import FluidParameters
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from sim.shapes.solid import Solid
+from sim.shapes.sampling import fill_with_particles
+from sim.shapes.solid import Solid
 
 BYTES_PER_PARTICLE, BYTES_PER_PARTICLE_ON_GPU = 1024, 600
 """Upper bounds of what the solvers take, neighbour search included, and on a CPU the snapshots."""
@@ -126,9 +125,6 @@ def _fill(
     solid: Solid, spacing: float, coarsening: float, domain: DomainParameters, obstacles: Sequence[Solid]
 ) -> tuple[int, int]:
     """Particles that find a free place in a solid, and those that obstacles keep out, by a coarser lattice."""
-    from sim.fluid.filling import free_places
-    from sim.shapes.sampling import fill_with_particles
-
     step = spacing * coarsening
     points = fill_with_particles(solid, step, lower=domain.min, upper=domain.max)
     near = [obstacle for obstacle in obstacles if touch(obstacle.bounds, solid.bounds, margin=step)]

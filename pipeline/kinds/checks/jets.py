@@ -8,23 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeline.kinds.base import Solids
 from pipeline.model.boxes import Box, touch
+from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path
+from sim.core.domain import DomainParameters
 from sim.fluid.nozzles import is_same_nozzle
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
-    from sim.core.domain import DomainParameters
-    from sim.fluid.opening import Opening
-    from sim.shapes.solid import Solid
+from sim.fluid.opening import Opening
+from sim.shapes.solid import Solid
 
 Points = NDArray[np.float64]
 Times = NDArray[np.float64]

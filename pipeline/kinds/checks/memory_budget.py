@@ -10,6 +10,7 @@ import psutil
 
 from pipeline.model.amounts import count, gigabytes
 from pipeline.model.job import Job
+from sim.core.runtime import DeviceUnavailableError, resolve_device
 
 SHARE = 0.9
 """Share of what is free now that a simulation may claim."""
@@ -53,8 +54,6 @@ class MemoryBudget:
 
 def memory_budget(job: Job) -> MemoryBudget:
     """Free memory for the job's simulation: that of a GPU if it is Nvidia's, else the machine's."""
-    from sim.core.runtime import DeviceUnavailableError, resolve_device
-
     try:
         device = resolve_device(job.device)
     except DeviceUnavailableError:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.kinds.checks.cloth_start import ClothStart
+from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
-from sim.cloth.parameters import DEFAULT_SUBSTEPS
-
-if TYPE_CHECKING:
-    from pipeline.kinds.checks.cloth_start import ClothStart
-    from pipeline.model.job import Job
-    from sim.cloth.parameters import ClothParameters
+from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters
+from sim.cloth.pin_paths import path_of_pin
 
 SOFTEST, FIRM = 1.0, 0.5
 """How far a sheet falls in a substep, times the nodes that each pinned one holds, over the spacing of nodes: springs at
@@ -48,8 +45,6 @@ def check_pin_speeds(start: ClothStart, fps: int, findings: Findings) -> None:
 
     Explicit springs whose substeps are omitted take as many as their stiffness asks for, which are not known here.
     """
-    from sim.cloth.pin_paths import path_of_pin
-
     cloth = start.cloth
     if cloth.integrator == "explicit" and cloth.substeps is None:
         return

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.kinds.base import Solids
 from pipeline.model.boxes import domain_box, overlap, smoke_box, span
+from pipeline.model.job import Job
 from pipeline.model.problems import Findings
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
+from sim.rigid.solver import RigidSolver
+from sim.rigid.start import start_problems
+from sim.shapes.solid import ShapeError
 
 # Share of a body's size by which ballast on its surface may be outside, as decimals do not add up exactly.
 ROUND_OFF = 1.0e-6
@@ -50,10 +50,6 @@ def check_rigid_start(job: Job, solids: Solids, findings: Findings) -> None:
 
     Bodies without a shape in `solids` have been found wanting already; then nothing is looked at.
     """
-    from sim.rigid.solver import RigidSolver
-    from sim.rigid.start import start_problems
-    from sim.shapes.solid import ShapeError
-
     dynamic = [index for index, body in enumerate(job.rigid) if body.kind == "dynamic"]
     if not dynamic or any(("rigid", index) not in solids for index in range(len(job.rigid))):
         return

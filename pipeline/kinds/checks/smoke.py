@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.closed_domain import check_closed_domain
 from pipeline.kinds.checks.memory_budget import MemoryBudget
 from pipeline.kinds.checks.smoke_bodies import (
@@ -22,15 +22,15 @@ from pipeline.kinds.checks.smoke_bodies import (
 )
 from pipeline.model.amounts import count, gigabytes, rounded_down, rounded_up
 from pipeline.model.boxes import ALL, Box, overlap, smoke_box, span, touch
+from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path, unknown_name
+from sim.core.motion.paths import path_through
+from sim.rigid.paths import path_of
+from sim.shapes.placement import PlacedSolid
+from sim.shapes.solid import Solid
+from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import CELLS_PER_EDDY, MOST_CELLS, SmokeParameters, SmokeSourceParameters
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
-    from sim.shapes.placement import PlacedSolid
-    from sim.shapes.solid import Solid
 
 BYTES_PER_CELL, BYTES_PER_CELL_ON_GPU = 320, 250
 """Upper bounds: 171 for the solver and its couplings, and, where a CPU computes, 144 for the six snapshots and
@@ -181,8 +181,6 @@ def _cell_size_that_fits(extent: NDArray[np.float64], cell_size: float, room: fl
 
 def _check_wind(job: Job, smoke: SmokeParameters, path: KeyPath, standing: Sequence[Solid], findings: Findings) -> None:
     """Note wind that has no way out of the box, or past static bodies; the latter in small grids only."""
-    from sim.smoke.grid import SmokeGrid
-
     if problem := smoke.wind_problem():
         findings.error((*path, "wind"), problem)
         return
@@ -331,9 +329,6 @@ def _centres_inside(solid: Solid, box: Box, cell_size: float) -> NDArray[np.floa
 
 def _check_path(job: Job, path: KeyPath, solid: Solid, box: Box, findings: Findings) -> None:
     """The path of a source must come into the box."""
-    from sim.core.motion.paths import path_through
-    from sim.rigid.paths import path_of
-
     source = job.smoke[int(path[1])].source[int(path[3])]
     reach = float(np.linalg.norm(solid.bounds[1] - solid.bounds[0]))
     if source.keyframe:

@@ -6,23 +6,23 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.kinds.base import Solids
 from pipeline.kinds.checks.shapes import thin_wall_problem
 from pipeline.model.amounts import rounded_down
 from pipeline.model.boxes import smoke_box, touch
+from pipeline.model.job import Job
 from pipeline.model.problems import Findings
+from sim.core.domain import DomainParameters
+from sim.coupling.smoke_reach import can_come, too_thin_bodies
+from sim.shapes.body_geometry import BodyGeometry
+from sim.shapes.placement import PlacedSolid
+from sim.shapes.solid import ShapeError
+from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import MOST_CELLS, SmokeParameters
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
-    from sim.core.domain import DomainParameters
-    from sim.shapes.body_geometry import BodyGeometry
-    from sim.shapes.placement import PlacedSolid
-    from sim.smoke.thin_walls import ThinWalls
+from sim.smoke.thin_walls import ThinWalls, thin_walls, thin_walls_on_the_way
 
 GeometryBuilder = Callable[[int], "BodyGeometry | None"]
 
@@ -34,8 +34,6 @@ MISSED = 0.05
 
 def geometry_builder(job: Job, findings: Findings) -> GeometryBuilder:
     """Builder of the geometry of a body that moves, by number; None for one too thin to have an inside, as is noted."""
-    from sim.shapes.body_geometry import BodyGeometry
-    from sim.shapes.solid import ShapeError
 
     @cache
     def build(number: int) -> BodyGeometry | None:
@@ -81,9 +79,6 @@ def _has_cells(
     job: Job, smoke: SmokeParameters, number: int, standing: Mapping[int, PlacedSolid], findings: Findings
 ) -> bool:
     """Whether a static body has a cell in a smoke's grid; notes one that has none, or through which air passes."""
-    from sim.smoke.grid import SmokeGrid
-    from sim.smoke.thin_walls import thin_walls
-
     solid = standing[number]
     if SmokeGrid.of_box(smoke, job.domain).misses(solid):
         thinnest = float(np.ptp(solid.bounds, axis=0).min())
@@ -106,8 +101,6 @@ def check_mesh_grids(
     job: Job, smoke: SmokeParameters, solids: Solids, geometry_of: GeometryBuilder, findings: Findings
 ) -> None:
     """Note meshes that can come into a smoke's box, and whose walls are too thin for the finest grid of distances."""
-    from sim.coupling.smoke_reach import can_come
-
     for number in _moving(job, solids):
         body, geometry = job.rigid[number], geometry_of(number)
         if geometry is not None and can_come(body, geometry, smoke, job.domain):
@@ -125,9 +118,6 @@ def _check_moving_bodies(
     job: Job, smoke: SmokeParameters, solids: Solids, geometry_of: GeometryBuilder, findings: Findings
 ) -> None:
     """Note bodies that move, can come into the box of a smoke, and are too thin for its cells."""
-    from sim.coupling.smoke_reach import can_come, too_thin_bodies
-    from sim.smoke.thin_walls import thin_walls_on_the_way
-
     for number in _moving(job, solids):
         body, solid = job.rigid[number], solids["rigid", number]
         unturned = replace(solid, rotation=np.eye(3), position=np.zeros(3))

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.kinds.base import Solids
+from pipeline.model.job import Job
 from pipeline.model.problems import Findings
+from sim.fluid.parameters import FluidParameters
 from sim.fluid.traits import TRAITS
-
-if TYPE_CHECKING:
-    from pipeline.kinds.base import Solids
-    from pipeline.model.job import Job
-    from sim.fluid.parameters import FluidParameters
-    from sim.rigid.parameters import RigidBodyParameters
-    from sim.shapes.solid import Solid
+from sim.rigid.parameters import RigidBodyParameters
+from sim.rigid.paths import path_of
+from sim.shapes.solid import Solid
 
 # Of particles that hit a wall (docs/decisions/0021-fixed-steps-at-impacts.md): omega d/c_s in a lattice, omega on the
 # samples of a wall over that, and the compression over v/c_s; omega grows with the cube of the density.
@@ -66,8 +64,6 @@ def expected_speed(job: Job, solids: Solids) -> float:
 
 def _body_speed(body: RigidBodyParameters, solid: Solid, fall: float) -> float:
     """Largest speed of a point of a body [m/s]; `fall` is the square of the speed of a fall [m²/s²]."""
-    from sim.rigid.paths import path_of
-
     reach = float(np.linalg.norm(np.abs(solid.bounds - np.asarray(body.position)).max(axis=0)))
     if body.kind == "kinematic":
         return path_of(body).largest_speed(reach)

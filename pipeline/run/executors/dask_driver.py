@@ -18,19 +18,15 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING
 
 from blake3 import blake3
-from distributed import get_worker
+from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
 from pipeline.base.task import FailureKind, TaskId
 from pipeline.run.events import Failed, Finished, Progress, TaskEvent
 from pipeline.run.executors.base import Assignment
 from pipeline.run.executors.processes import ProcessExecutor
-
-if TYPE_CHECKING:
-    from distributed import Worker
 
 _TURN_S = 0.1
 """How often a busy supervisor looks for another assignment or a cancellation [s]."""

@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.kinds.table import KINDS, material_of
+from pipeline.model.job import Job
 from pipeline.model.looks import BODY, parts_of
 from pipeline.store.cache import read_frame, read_smoke_density
 from pipeline.web.drawing.canvas import Canvas, Rgb
@@ -19,10 +20,7 @@ from pipeline.web.drawing.colors import BODY as BODY_COLOR
 from pipeline.web.drawing.colors import CLOTH, SURFACE, Colors, ramp, srgb
 from pipeline.web.drawing.shapes import Body, Particles, Pose, Sheet, Smoke
 from pipeline.web.drawing.smoke_pictures import cut, points
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
-    from sim.core.snapshots import Snapshot
+from sim.core.snapshots import Snapshot
 
 MeshOf = Callable[[str, str], tuple[NDArray[Any], NDArray[Any]] | None]
 """Vertices [m] and faces of a part of a body, by their names; None before they are made."""

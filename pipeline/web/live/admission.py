@@ -9,18 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 from pipeline.base.errors import PipelineError
 from pipeline.kinds.cloth import count_cloth_nodes
 from pipeline.kinds.live_parameters import Value
 from pipeline.kinds.table import KINDS
+from pipeline.model.job import Job
 from pipeline.web.live.frame_cost import cloth_frame_s, fewest_for_bodies, frame_s, steps_a_frame
 from pipeline.web.live.parameters import parameters_of
 from sim.cloth.parameters import DEFAULT_SUBSTEPS, ClothParameters
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
 
 GPU_CORES = 20
 """Cores that a GPU counts as: scenes that fit here are too small to fill it."""

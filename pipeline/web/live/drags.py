@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.model.job import Job
 from pipeline.web.pins import JobPin, pins_of_job
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
-    from sim.core.world import World
+from sim.core.world import World
 
 Vector = NDArray[np.float64]
 Point = tuple[float, float, float]

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.kinds.checks.steps import stable_dt
 from pipeline.kinds.cloth import count_cloth_nodes
+from pipeline.model.job import Job
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.time_step import VISCOUS_NUMBER
 from sim.fluid.traits import TRAITS
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
 
 NODE_SUBSTEP_S = 1.4e-6
 """Core time of a node in a substep of cloth in contact [s], with room for page and browser (docs/guide/live.md)."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import viser
 
 from pipeline.kinds.live_parameters import Parameter, Value
 from pipeline.web.live.admission import told_changes
@@ -12,9 +14,6 @@ from pipeline.web.live.recording import Recorder
 from pipeline.web.live.saving import save_job
 from pipeline.web.live.scene import LiveScene
 from pipeline.web.live.session import Session, Status
-
-if TYPE_CHECKING:
-    import viser
 
 DECADE_STEP = 0.02
 """Of sliders over the powers of ten: 5 %."""

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipeline.job.overrides import Override
 from pipeline.kinds.live_parameters import Parameter, Value
 from pipeline.kinds.table import KINDS
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
-    from sim.core.world import World
+from pipeline.model.job import Job
+from sim.core.world import World
 
 
 def parameters_of(job: Job, *, written: Job | None = None) -> tuple[Parameter, ...]:

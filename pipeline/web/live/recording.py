@@ -15,14 +15,13 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.base.errors import LeaseLostError, PipelineError
 from pipeline.base.files import replace_durably
 from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
-from pipeline.job.loading import job_of_text
+from pipeline.job.loading import LoadedJob, job_of_text
 from pipeline.job.overrides import Override
 from pipeline.kinds.live_parameters import Value
 from pipeline.record.manifest import Manifest
@@ -35,11 +34,8 @@ from pipeline.store.cache import validate_frame, write_frame
 from pipeline.store.provenance import maker
 from pipeline.web.live.saving import bodies_led_before, numbered_paths, text_with_values
 from pipeline.web.live.session import Session
+from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
-
-if TYPE_CHECKING:
-    from pipeline.job.loading import LoadedJob
-    from sim.core.snapshots import Snapshot
 
 _TROUBLES = (OSError, PipelineError, MemoryError, RuntimeError, sqlite3.Error)
 """Errors of writing a recording: the disk, a folder that another process uses, too little memory, HDF5, a lost writer,

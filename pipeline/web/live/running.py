@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.base.errors import PipelineError, StageUnavailableError
+from pipeline.job.loading import LoadedJob
+from pipeline.model.job import Job
 from pipeline.run.executors.failures import describe, is_out_of_memory
 from pipeline.web.live.recording import Recorder
 from pipeline.web.live.requests import CannotGoOnError
@@ -16,8 +18,6 @@ from pipeline.web.live.session import Session
 from pipeline.web.serving import address, page_server
 
 if TYPE_CHECKING:
-    from pipeline.job.loading import LoadedJob
-    from pipeline.model.job import Job
     from pipeline.web.live.page import LivePage
 
 SHOWN_EVERY_S = 1.0 / 30.0

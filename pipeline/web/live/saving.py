@@ -6,17 +6,13 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.base.files import sync
 from pipeline.base.layout import JobLayout
-from pipeline.job.loading import changed_text, job_of_text
+from pipeline.job.loading import LoadedJob, changed_text, job_of_text
 from pipeline.job.overrides import Override, without_key
 from pipeline.kinds.live_parameters import Value
 from pipeline.web.live.parameters import overrides_of, parameters_of
-
-if TYPE_CHECKING:
-    from pipeline.job.loading import LoadedJob
 
 
 def text_with_values(loaded: LoadedJob, values: Mapping[str, Value], changes: Sequence[Override] = ()) -> str:

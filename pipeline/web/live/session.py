@@ -9,12 +9,12 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.base.errors import PipelineError
 from pipeline.kinds.live_parameters import Parameter, Value
+from pipeline.model.job import Job
 from pipeline.run.executors.failures import describe, is_out_of_memory
 from pipeline.web.live.admission import told_changes
 from pipeline.web.live.drags import Drags
@@ -30,10 +30,7 @@ from pipeline.web.live.soundness import (
 )
 from sim.core.snapshots import Snapshot
 from sim.core.solver import SimulationDivergedError
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
-    from sim.core.world import FrameReport
+from sim.core.world import FrameReport
 
 MOST_SUBSTEPS = 2000
 """A frame that needs more counts as blown up, before it has taken long."""

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.kinds.live_parameters import Value
 from sim.core.solver import SimulationDivergedError
-
-if TYPE_CHECKING:
-    from sim.core.world import FrameReport, World
+from sim.core.world import FrameReport, World
 
 FASTEST = 200.0
 """A scene in which anything moves faster [m/s] has blown up: nothing of a tabletop does, and a jet has half of it."""

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import viser
@@ -29,9 +29,7 @@ from pipeline.web.viewer.numbers import SolverSeries, plot, table
 from pipeline.web.viewer.playback import Playback
 from pipeline.web.viewer.scene import CAMERA, SURFACES, JobScene
 from pipeline.web.viewer.texts import lacking, legend, notice, thinned, title
-
-if TYPE_CHECKING:
-    from render.camera_path import View
+from render.camera_path import View
 
 LOOK_S = 0.5
 """Time between two looks for new frames [s]."""

@@ -54,7 +54,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     machine = Machine()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv(gpus.OWN_GPUS, raising=False)
-    monkeypatch.setattr("render.gpus.find_gpus", machine.find_gpus)
+    monkeypatch.setattr("pipeline.stages.gpus.find_gpus", machine.find_gpus)
     monkeypatch.setattr(gpus, "_device_files", lambda: ["/dev/nvidia0", "/dev/nvidia1"])
     monkeypatch.setattr(gpus, "driver_version", lambda: "570.1")
     start_anew()

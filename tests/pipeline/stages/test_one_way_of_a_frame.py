@@ -21,7 +21,6 @@ from pipeline.run.checked_job import load_checked_job
 from pipeline.run.events import Finished
 from pipeline.stages import render_drawing
 from pipeline.stages.render import RenderStage
-from render import pictures
 from render.spec import RenderSpec
 
 JOB = """
@@ -59,7 +58,7 @@ def counts(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     count(Job, "model_validate", lambda *_: "job validated")
     count(render_drawing, "render_spec", lambda *_: "described")
     count(RenderSpec, "model_dump_json", lambda *_: "dumped")
-    count(pictures, "read_picture", lambda path: f"decoded {path.name.partition('.part')[0]}")
+    count(render_drawing, "read_picture", lambda path: f"decoded {path.name.partition('.part')[0]}")
     monkeypatch.setattr(loading, "_JOBS", {})
     return counted
 
@@ -88,7 +87,7 @@ def test_a_frame_is_described_once_and_its_picture_decoded_once(tmp_path, monkey
     mesh.parent.mkdir(parents=True)
     write_mesh(mesh, *BALL)
     tasks = RenderStage().plan(load_job(layout.job_file), layout)
-    monkeypatch.setattr("render.blender.open_renderer", lambda *_, **__: Pencil())
+    monkeypatch.setattr("pipeline.stages.render_drawing.open_renderer", lambda *_, **__: Pencil())
     try:
         for frame in (0, 1):
             counts.clear()
