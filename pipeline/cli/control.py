@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from pathlib import Path
-from types import FrameType
 
 import click
 
 from pipeline.base.errors import DiskFullError, PipelineError
 from pipeline.base.layout import JobLayout
+from pipeline.base.signals import signals_to
 from pipeline.cli.arguments import (
     PRIORITY,
     claim_cores,
@@ -178,29 +177,22 @@ def _run_stage(layout: JobLayout, stage: str, frames: str | None, *, cores: int 
     from pipeline.base.lease import refuse_if_held
     from pipeline.base.task import FailureKind
     from pipeline.job.loading import load_job
-    from pipeline.run.runner import STAGES_REFERENCE
     from pipeline.run.single_stage import run_stage
 
     layout = JobLayout(layout.root.absolute())
     refuse_if_held(layout.lease)
     capacity = claim_cores(cores)
-    stopped = []
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        stopped.append(True)
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, stop)
-    outcome = run_stage(
-        load_job(layout.job_file),
-        layout,
-        stage,
-        None if frames is None else parse_frames(frames),
-        capacity=capacity,
-        stages=STAGES_REFERENCE,
-        stop_requested=lambda: bool(stopped),
-        tell=_tell_openjd if openjd else _tell,
-    )
+    stopped: list[int] = []
+    with signals_to(lambda number, _: stopped.append(number)):
+        outcome = run_stage(
+            load_job(layout.job_file),
+            layout,
+            stage,
+            None if frames is None else parse_frames(frames),
+            capacity=capacity,
+            tell=_tell_openjd if openjd else _tell,
+            stop_requested=lambda: bool(stopped),
+        )
     for failed in outcome.failures:
         click.secho(f"{failed.task_id}: {failed.message}", err=True, fg="red")
     click.echo(

@@ -201,7 +201,6 @@ def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: 
     """
     from pipeline.base.lease import refuse_if_held
     from pipeline.job.loading import read_job
-    from pipeline.run.runner import STAGES_REFERENCE
     from pipeline.run.single_stage import run_tasks
     from pipeline.show.animatic import drawable_frames, made_before, make_animatic
     from pipeline.show.stills import survey
@@ -237,8 +236,6 @@ def animatic(job: str, *, output: Path, width: int, target: Path | None, cores: 
             todo,
             layout,
             capacity=capacity,
-            stages=STAGES_REFERENCE,
-            stop_requested=lambda: False,
             tell=lambda share, sentence: click.echo(f"{100 * share:.0f} %  {sentence}", err=True),
         )
     if outcome.failures:

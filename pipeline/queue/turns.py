@@ -25,10 +25,11 @@ from pipeline.queue.states import ending_of
 from pipeline.run.checked_job import needs_pictures
 from pipeline.run.control import RunControl, Selection
 from pipeline.run.events import JobOutcome, Observer, Outcome
+from pipeline.run.executors.attempt import STAGES_REFERENCE
 from pipeline.run.executors.choice import ExecutorChoice, open_machines
 from pipeline.run.goal import read_goal, what_is_made
 from pipeline.run.progress import ProgressObserver, open_display
-from pipeline.run.runner import STAGES_REFERENCE, run_job
+from pipeline.run.runner import run_job
 from pipeline.run.solver_numbers import SolverWatch, simulation_numbers
 from pipeline.stages.gpus import render_trouble, usable_gpus
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from types import FrameType
 
 from pipeline.base.errors import PlanError
+from pipeline.base.signals import signals_to
 from pipeline.base.task import Task, TaskId
 from pipeline.model.problems import suggestion
 from pipeline.run.plan import frame_ranges
@@ -68,16 +67,6 @@ class RunControl:
     @contextmanager
     def on_signals(self) -> Iterator[None]:
         """Take SIGINT and SIGTERM for interruptions, inside the block; only the main thread can."""
-        if threading.current_thread() is not threading.main_thread():
+        is_main = threading.current_thread() is threading.main_thread()
+        with signals_to(lambda *_: self.interrupt()) if is_main else nullcontext():
             yield
-            return
-
-        def interrupt(_number: int, _frame: FrameType | None) -> None:
-            self.interrupt()
-
-        before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)

@@ -22,37 +22,16 @@ from pipeline.base.task import ArtifactPath, Policy, Resources, TaskId, TaskStat
 from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest
 from pipeline.record.reconcile import reconcile
+from pipeline.run import events
 from pipeline.run.bookkeeping import RunRecord
 from pipeline.run.control import RunControl, Selection
-from pipeline.run.events import (
-    CancelRequested,
-    CapacityChanged,
-    DrainRequested,
-    ExecutorEvent,
-    Finish,
-    Instruction,
-    JobOutcome,
-    Kill,
-    Notice,
-    Observer,
-    Outcome,
-    RunEnded,
-    RunEvent,
-    RunStarted,
-    Skipped,
-    Start,
-    Stop,
-    Tick,
-)
-from pipeline.run.executors.attempt import load_stages
+from pipeline.run.executors.attempt import STAGES_REFERENCE, load_stages
 from pipeline.run.executors.base import Assignment, Executor
 from pipeline.run.executors.failures import is_disk_full
 from pipeline.run.goal import write_goal
 from pipeline.run.plan import Assessment, Verdict, assess, frame_turns, plan_job, up_to_date
 from pipeline.run.scheduler import Scheduler
 from pipeline.store.artifacts import sweep_parts
-
-STAGES_REFERENCE = "pipeline.stages:STAGES"
 
 _TURN_S = 0.25
 """Longest time that the loop sleeps [s]; so soon it answers Ctrl-C."""
@@ -67,14 +46,14 @@ def run_job(
     executor: Executor,
     job_text: str | None = None,
     stages: str = STAGES_REFERENCE,
-    observers: Sequence[Observer] = (),
+    observers: Sequence[events.Observer] = (),
     control: RunControl | None = None,
     rerun: Selection | None = None,
     until: Sequence[str] = (),
     capacity: Resources | None = None,
     machine: Resources | None = None,
     policy: Policy | None = None,
-) -> Outcome:
+) -> events.Outcome:
     """Run a job until nothing is left to do, or somebody stops it.
 
     Args:
@@ -98,7 +77,7 @@ def run_job(
         PlanError: the stages' tasks do not fit together, or `rerun` names what is not there.
     """
 
-    def notify(event: RunEvent) -> None:
+    def notify(event: events.RunEvent) -> None:
         for observer in observers:
             observer(event)
 
@@ -116,14 +95,14 @@ def run_job(
         clean = manifest.begin_run(job.name, run=lease.holder.token)
         if lease.takeover is not None:
             manifest.log_event("takeover", lease.takeover)
-            notify(Notice(lease.takeover))
+            notify(events.Notice(lease.takeover))
         reconciliation = reconcile(manifest, layout, clean=clean)
         for sentence in reconciliation.sentences:
-            notify(Notice(sentence))
+            notify(events.Notice(sentence))
         assessments = assess(
             tasks, reconciliation.rows, reconciliation.problems, parameters=manifest.parameters, forced=forced
         )
-        notify(RunStarted(assessments))
+        notify(events.RunStarted(assessments))
         lease.check()
         record = RunRecord(manifest, job, layout, stages, reconciliation.valid_rows, notify)
         record.invalidate(task for task in tasks if task.id in forced)
@@ -144,7 +123,7 @@ def run_job(
         manifest.record_plan(tasks, {task.id: scheduler.state(task.id) for task in tasks})
         run = _Run(layout, lease, manifest, executor, notify, control, forced, record, scheduler)
         outcome = run.outcome(run.loop(), time.monotonic() - began)
-    notify(RunEnded(outcome))
+    notify(events.RunEnded(outcome))
     return outcome
 
 
@@ -166,22 +145,22 @@ class _Run:
     lease: Lease
     manifest: Manifest
     executor: Executor
-    notify: Observer
+    notify: events.Observer
     control: RunControl
     forced: frozenset[TaskId]
     record: RunRecord
     scheduler: Scheduler
     obeyed: int = 0
-    ending: JobOutcome | None = None
+    ending: events.JobOutcome | None = None
 
-    def loop(self) -> JobOutcome:
+    def loop(self) -> events.JobOutcome:
         """Run until the scheduler says that it is over."""
         try:
             self._turn([], self.scheduler.start())
             while self.ending is None:
-                events = self.executor.wait(self._sleep_s())
+                news = self.executor.wait(self._sleep_s())
                 self.lease.check()
-                self._turn(events, self._obey_control() + self.scheduler.handle(Tick(time.monotonic())))
+                self._turn(news, self._obey_control() + self.scheduler.handle(events.Tick(time.monotonic())))
             if self.record.parts_left:
                 sweep_parts(self.layout)
             self.manifest.end_run(self.ending, clean=not self.record.ended_by_force)
@@ -191,14 +170,14 @@ class _Run:
             # Our own record could not be written. The receipts can tell all of it, so nothing is lost; the run does
             # not count as ended cleanly, and the next one reads them.
             self.executor.shutdown()
-            self.notify(Notice(str(DiskFullError.of(self.layout.root))))
-            return JobOutcome.DISK_FULL
+            self.notify(events.Notice(str(DiskFullError.of(self.layout.root))))
+            return events.JobOutcome.DISK_FULL
         return self.ending
 
-    def outcome(self, kind: JobOutcome, seconds: float) -> Outcome:
+    def outcome(self, kind: events.JobOutcome, seconds: float) -> events.Outcome:
         """The run in figures."""
         counts = self.scheduler.counts()
-        return Outcome(
+        return events.Outcome(
             kind=kind,
             ran=sum(count for (_, state), count in counts.items() if state is TaskState.SUCCEEDED),
             failures=tuple(
@@ -217,46 +196,46 @@ class _Run:
         wakeup = self.scheduler.next_wakeup
         return _TURN_S if wakeup is None else min(_TURN_S, max(0.0, wakeup - time.monotonic()))
 
-    def _obey_control(self) -> list[Instruction]:
-        instructions: list[Instruction] = []
+    def _obey_control(self) -> list[events.Instruction]:
+        instructions: list[events.Instruction] = []
         while self.obeyed < min(2, self.control.interruptions):
             self.obeyed += 1
             if self.obeyed == 1:
-                self.notify(Notice("stopping: what runs is finished or checkpointed; once more stops at once"))
-                instructions += self.scheduler.handle(DrainRequested())
+                self.notify(events.Notice("stopping: what runs is finished or checkpointed; once more stops at once"))
+                instructions += self.scheduler.handle(events.DrainRequested())
             else:
-                self.notify(Notice("stopping at once"))
-                instructions += self.scheduler.handle(CancelRequested())
+                self.notify(events.Notice("stopping at once"))
+                instructions += self.scheduler.handle(events.CancelRequested())
         return instructions
 
-    def _turn(self, events: Sequence[ExecutorEvent], instructions: Sequence[Instruction]) -> None:
+    def _turn(self, news: Sequence[events.ExecutorEvent], instructions: Sequence[events.Instruction]) -> None:
         """Take in what happened, in one commit to the manifest, and do what follows from it.
 
         The commit is not synced to the disk, which would cost a task more than everything else here: a killed process
         loses nothing by that, and after a power cut the receipts tell what is missing, for those are synced. Attempts
         are given out only when their numbers are on record, so that no number is used twice.
         """
-        if not events and not instructions:
+        if not news and not instructions:
             return
         todo = deque(instructions)
         assignments: list[Assignment] = []
         cancellations: list[tuple[TaskId, float]] = []
         with self.manifest.transaction(durable=False):
-            for event in events:
+            for event in news:
                 todo += self._take(event)
             while todo:
                 match todo.popleft():
-                    case Start(task, threads, need):
+                    case events.Start(task, threads, need):
                         # Early cutoff: what was made anew upstream may have turned out the same.
                         if task.id not in self.forced and up_to_date(task, self.record.rows):
-                            todo += self.scheduler.handle(Skipped(task.id))
+                            todo += self.scheduler.handle(events.Skipped(task.id))
                         else:
                             assignments.append(self.record.open_attempt(task, threads=threads, need=need))
-                    case Stop(task_id):
+                    case events.Stop(task_id):
                         cancellations.append((task_id, _STOP_GRACE_S))
-                    case Kill(task_id):
+                    case events.Kill(task_id):
                         cancellations.append((task_id, 0.0))
-                    case Finish(outcome):
+                    case events.Finish(outcome):
                         self.ending = outcome
             self._note_states()
         for assignment in assignments:
@@ -264,8 +243,8 @@ class _Run:
         for task_id, grace_s in cancellations:
             self.executor.cancel(task_id, grace_s=grace_s)
 
-    def _take(self, event: ExecutorEvent) -> list[Instruction]:
-        if isinstance(event, CapacityChanged):
+    def _take(self, event: events.ExecutorEvent) -> list[events.Instruction]:
+        if isinstance(event, events.CapacityChanged):
             return self.scheduler.handle(event)
         self.notify(event)
         settled = self.record.take(event, lacking=self.scheduler.lacking)

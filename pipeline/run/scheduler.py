@@ -21,24 +21,7 @@ from dataclasses import dataclass, field
 from pipeline.base.errors import PipelineError
 from pipeline.base.resources import claim, whole_machine
 from pipeline.base.task import ArtifactPath, FailureKind, Policy, Resources, Task, TaskId, TaskState
-from pipeline.run.events import (
-    CancelRequested,
-    CapacityChanged,
-    Committed,
-    DrainRequested,
-    Failed,
-    Finish,
-    Finished,
-    Instruction,
-    JobOutcome,
-    Kill,
-    SchedulerEvent,
-    Skipped,
-    Start,
-    StateChanged,
-    Stop,
-    Tick,
-)
+from pipeline.run import events
 from pipeline.run.packing import Packing, Priority
 
 TERMINAL_STATES = frozenset(TaskState) - {TaskState.PENDING, TaskState.READY, TaskState.RUNNING}
@@ -114,9 +97,9 @@ class Scheduler:
         self._waiting: list[tuple[float, TaskId]] = []
         self._running: dict[TaskId, _Entry] = {}
         self._counts: Counter[tuple[str, TaskState]] = Counter()
-        self._changes: list[StateChanged] = []
+        self._changes: list[events.StateChanged] = []
         self._now = 0.0
-        self._ending: JobOutcome | None = None
+        self._ending: events.JobOutcome | None = None
         self._finished = False
 
         stages: dict[str, int] = {}
@@ -175,50 +158,50 @@ class Scheduler:
         """Number of tasks by stage and state."""
         return {key: count for key, count in self._counts.items() if count}
 
-    def drain_changes(self) -> list[StateChanged]:
+    def drain_changes(self) -> list[events.StateChanged]:
         """State changes since the last call, in order."""
         changes, self._changes = self._changes, []
         return changes
 
     # --- the machine ---
 
-    def start(self) -> list[Instruction]:
+    def start(self) -> list[events.Instruction]:
         """The first instructions; call once, before any event."""
         return self._next_instructions()
 
-    def handle(self, event: SchedulerEvent) -> list[Instruction]:
+    def handle(self, event: events.SchedulerEvent) -> list[events.Instruction]:
         """Take in what happened and say what to do. A failure happens at the time of the last `Tick`.
 
         Raises:
             InvalidTransitionError: this cannot happen to a task in that state.
         """
-        instructions: list[Instruction] = []
+        instructions: list[events.Instruction] = []
         match event:
-            case Committed(task_id, _, receipt):
+            case events.Committed(task_id, _, receipt):
                 entry = self._running_entry(task_id, f"commit of {receipt.artifact}")
                 if receipt.artifact not in entry.task.outputs:
                     raise entry.refuse(f"commit of {receipt.artifact}, not its output,")
                 self._commit(receipt.artifact)
-            case Finished(task_id):
+            case events.Finished(task_id):
                 entry = self._running_entry(task_id, "success")
                 if lacking := self.lacking(task_id):
                     raise entry.refuse(f"success without {lacking[0]}")
                 self._end(entry, TaskState.SUCCEEDED)
-            case Skipped(task_id):
+            case events.Skipped(task_id):
                 entry = self._running_entry(task_id, "skip")
                 for artifact in entry.task.outputs:
                     self._commit(artifact)
                 self._end(entry, TaskState.UP_TO_DATE)
-            case Failed(task_id, _, kind):
+            case events.Failed(task_id, _, kind):
                 instructions += self._fail(self._running_entry(task_id, kind), kind)
-            case CapacityChanged(offered):
+            case events.CapacityChanged(offered):
                 self._packing.resize(offered)
-            case DrainRequested():
-                instructions += self._drain(JobOutcome.DRAINED)
-            case CancelRequested():
-                self._ending = JobOutcome.CANCELLED
-                instructions += [Kill(task_id) for task_id in self._running]
-            case Tick(now):
+            case events.DrainRequested():
+                instructions += self._drain(events.JobOutcome.DRAINED)
+            case events.CancelRequested():
+                self._ending = events.JobOutcome.CANCELLED
+                instructions += [events.Kill(task_id) for task_id in self._running]
+            case events.Tick(now):
                 self._now = now
                 while self._waiting and self._waiting[0][0] <= now:
                     _, task_id = heapq.heappop(self._waiting)
@@ -240,7 +223,7 @@ class Scheduler:
         self._counts[entry.task.stage, state] += 1
         entry.state = state
         entry.history.append(state)
-        self._changes.append(StateChanged(entry.task.id, entry.task.stage, state))
+        self._changes.append(events.StateChanged(entry.task.id, entry.task.stage, state))
 
     def _make_ready(self, entry: _Entry) -> None:
         self._set_state(entry, TaskState.READY)
@@ -277,12 +260,12 @@ class Scheduler:
                     self._set_state(reader, state)
                     lost += self.lacking(reader.task.id)
 
-    def _fail(self, entry: _Entry, kind: FailureKind) -> list[Instruction]:
+    def _fail(self, entry: _Entry, kind: FailureKind) -> list[events.Instruction]:
         if kind in OWN_FAILURES:
             return self._fail_for_good(entry)
         if kind is FailureKind.DISK_FULL:
             self._end(entry, TaskState.CANCELLED)
-            return self._drain(JobOutcome.DISK_FULL)
+            return self._drain(events.JobOutcome.DISK_FULL)
         if kind is FailureKind.CANCELLED and self._ending is not None:
             self._end(entry, TaskState.CANCELLED)
             return []
@@ -302,45 +285,45 @@ class Scheduler:
         heapq.heappush(self._waiting, (self._now + pause, entry.task.id))
         return []
 
-    def _fail_for_good(self, entry: _Entry) -> list[Instruction]:
+    def _fail_for_good(self, entry: _Entry) -> list[events.Instruction]:
         self._end(entry, TaskState.FAILED)
         stage = entry.task.stage
         failed = self._counts[stage, TaskState.FAILED]
         ended = failed + self._counts[stage, TaskState.SUCCEEDED]
         policy = self._policy_of(stage)
         if failed >= policy.failure_count and failed >= policy.failure_share * ended:
-            return self._drain(JobOutcome.TOO_MANY_FAILURES)
+            return self._drain(events.JobOutcome.TOO_MANY_FAILURES)
         return []
 
     def _policy_of(self, stage: str) -> Policy:
         return self._policies.get(stage, self._policy)
 
-    def _drain(self, outcome: JobOutcome) -> list[Instruction]:
+    def _drain(self, outcome: events.JobOutcome) -> list[events.Instruction]:
         if self._ending is not None:
             return []
         self._ending = outcome
-        return [Stop(task_id) for task_id, entry in self._running.items() if entry.task.checkpointed]
+        return [events.Stop(task_id) for task_id, entry in self._running.items() if entry.task.checkpointed]
 
     # --- what follows ---
 
-    def _next_instructions(self) -> list[Instruction]:
-        instructions: list[Instruction] = []
+    def _next_instructions(self) -> list[events.Instruction]:
+        instructions: list[events.Instruction] = []
         if self._ending is None:
             while (task_id := self._packing.take()) is not None:
                 instructions.append(self._start(self._entries[task_id]))
         startable = bool(self._waiting) or self._packing.has_ready
         if not self._running and not self._finished and (self._ending is not None or not startable):
             self._finished = True
-            instructions.append(Finish(self._close()))
+            instructions.append(events.Finish(self._close()))
         return instructions
 
-    def _start(self, entry: _Entry) -> Start:
+    def _start(self, entry: _Entry) -> events.Start:
         self._set_state(entry, TaskState.RUNNING)
         self._running[entry.task.id] = entry
         threads = claim(entry.task.resources, self._packing.machine).cores
-        return Start(entry.task, threads=threads, need=entry.need)
+        return events.Start(entry.task, threads=threads, need=entry.need)
 
-    def _close(self) -> JobOutcome:
+    def _close(self) -> events.JobOutcome:
         """Settle what never ran, and say how the job ended."""
         unsettled = [entry for entry in self._entries.values() if entry.state not in TERMINAL_STATES]
         if unsettled and self._ending is None:
@@ -352,4 +335,4 @@ class Scheduler:
         if self._ending is not None and TaskState.CANCELLED in states:
             return self._ending
         # Also when the end was asked for while the last task ran: nothing was left out.
-        return JobOutcome.FAILED if TaskState.FAILED in states else JobOutcome.SUCCEEDED
+        return events.JobOutcome.FAILED if TaskState.FAILED in states else events.JobOutcome.SUCCEEDED

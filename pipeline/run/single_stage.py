@@ -19,7 +19,7 @@ from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task
 from pipeline.model.job import Job
 from pipeline.run.control import Selection
 from pipeline.run.events import Failed, Progress, TaskEvent
-from pipeline.run.executors.attempt import load_stages, run_attempt
+from pipeline.run.executors.attempt import STAGES_REFERENCE, load_stages, run_attempt
 from pipeline.run.executors.base import Assignment
 from pipeline.run.plan import plan_job
 from pipeline.stages.gpus import first_gpu
@@ -45,9 +45,9 @@ def run_stage(
     frames: frozenset[int] | None = None,
     *,
     capacity: Resources,
-    stages: str,
-    stop_requested: Callable[[], bool],
     tell: Callable[[float, str], None],
+    stages: str = STAGES_REFERENCE,
+    stop_requested: Callable[[], bool] = lambda: False,
 ) -> StageOutcome:
     """Run the tasks of a stage, or of some of its frames; see `run_tasks`. Raises PlanError if there are none such."""
     tasks = plan_job(job, layout, load_stages(stages))
@@ -61,9 +61,9 @@ def run_tasks(
     layout: JobLayout,
     *,
     capacity: Resources,
-    stages: str,
-    stop_requested: Callable[[], bool],
     tell: Callable[[float, str], None],
+    stages: str = STAGES_REFERENCE,
+    stop_requested: Callable[[], bool] = lambda: False,
 ) -> StageOutcome:
     """Run those of these tasks that are not done, one after another, in this process.
 
@@ -71,9 +71,9 @@ def run_tasks(
         todo: the tasks, makers before users; what else they read is there.
         layout: the job's folder, with its job file.
         capacity: what a task may use.
+        tell: takes the share that is done, 0 to 1, and a sentence.
         stages: where the stages are, as `module:ATTRIBUTE`.
         stop_requested: whether to write a checkpoint and return.
-        tell: takes the share that is done, 0 to 1, and a sentence.
 
     Raises:
         PipelineError: an input is not there.

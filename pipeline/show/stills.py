@@ -20,9 +20,8 @@ from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Resources, Task
 from pipeline.job.loading import LoadedJob
-from pipeline.run.executors.attempt import load_stages
+from pipeline.run.executors.attempt import STAGES_REFERENCE, load_stages
 from pipeline.run.plan import made_from, plan_job
-from pipeline.run.runner import STAGES_REFERENCE
 from pipeline.run.single_stage import run_tasks
 from pipeline.store.receipts import Receipt, read_receipt, verify_artifact
 
@@ -96,8 +95,6 @@ def make_still(
                 [task],
                 scratch,
                 capacity=capacity,
-                stages=STAGES_REFERENCE,
-                stop_requested=lambda: False,
                 tell=tell,
             )
             for failed in outcome.failures:

@@ -17,7 +17,6 @@ import http
 import io
 import ipaddress
 import logging
-import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -31,6 +30,7 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from pipeline.base.errors import PipelineError
+from pipeline.base.signals import signals_to
 from pipeline.web.auth import Access, host_of, is_address, is_loopback
 
 if TYPE_CHECKING:
@@ -95,17 +95,6 @@ def remark_of(listening: socket.socket, host: str) -> str:
         f"{host} is {address} on this machine, as its /etc/hosts says, which only this machine reaches; "
         "for others, name its address in the network: --host ADDRESS"
     )
-
-
-@contextmanager
-def signals_to(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Have SIGINT and SIGTERM call this inside the block."""
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler_before in before.items():
-            signal.signal(number, handler_before)
 
 
 @contextmanager

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pipeline.model.job import Job
     from pipeline.stages.base import Stage
 
+STAGES_REFERENCE = "pipeline.stages:STAGES"
 PROGRESS_INTERVAL_S = 0.2
 """Shortest time between two reports of progress [s]."""
 
@@ -55,7 +56,7 @@ class AttemptContext:
         self.committed: set[ArtifactPath] = set()
         self._inputs = assignment.inputs
         self._emit = emit
-        self._stop_requested = stop_requested
+        self.stop_requested = stop_requested
         self._progress_told_at = 0.0
         self._preparing = False
 
@@ -100,10 +101,6 @@ class AttemptContext:
         """Tell what is worth a look, in the log and to the runner; the task goes on."""
         print(f"warning: {message}", flush=True)
         self._emit(Warned(self.task.id, self.attempt, kind, message))
-
-    def stop_requested(self) -> bool:
-        """Whether the task should checkpoint and return."""
-        return self._stop_requested()
 
 
 def run_attempt(

@@ -15,7 +15,6 @@ import threading
 import time
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from queue import Empty, SimpleQueue
 
@@ -23,6 +22,7 @@ from blake3 import blake3
 from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
+from pipeline.base.content import tool_version
 from pipeline.base.task import FailureKind, TaskId
 from pipeline.run.events import Failed, Finished, Progress, TaskEvent
 from pipeline.run.executors.base import Assignment
@@ -69,17 +69,10 @@ def software() -> str:
     root = Path(__file__).parents[3]
     digest = blake3(platform.python_version().encode())
     for name in _PACKAGES:
-        digest.update(f"{name} {_version(name)}\n".encode())
+        digest.update(f"{name} {tool_version(name)}\n".encode())
     for path in sorted(source for folder in _FOLDERS for source in (root / folder).rglob("*.py")):
         digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
     return digest.hexdigest(length=8)
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "absent"
 
 
 # --- the processes of one job on this worker ---
