@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.compare import arguments_of, run, timed
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
-from pipeline.base.task import ArtifactPath, Resources, Task, TaskId, TaskState
+from pipeline.base.task import ArtifactPath, Resources, Task, TaskId, TaskState, task_fingerprint
 from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest
 from pipeline.run.control import Selection

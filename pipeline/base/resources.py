@@ -1,4 +1,4 @@
-"""Arithmetic on `Resources`, and the resources of this machine."""
+"""Resources of this machine, and what of them a task claims."""
 
 from __future__ import annotations
 
@@ -15,21 +15,6 @@ def machine_capacity(*, gpus: int = 0) -> Resources:
     """Cores this process may use, memory of the machine [bytes], and as many GPUs as the caller has found."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return Resources(cores=cores, memory_bytes=int(machine_memory_bytes() * MEMORY_SHARE), gpus=gpus)
-
-
-def plus(a: Resources, b: Resources) -> Resources:
-    """Both together."""
-    return Resources(a.cores + b.cores, a.memory_bytes + b.memory_bytes, a.gpus + b.gpus)
-
-
-def minus(a: Resources, b: Resources) -> Resources:
-    """`a` without `b`."""
-    return Resources(a.cores - b.cores, a.memory_bytes - b.memory_bytes, a.gpus - b.gpus)
-
-
-def fits(need: Resources, capacity: Resources) -> bool:
-    """Whether `need` is within `capacity` in every respect."""
-    return need.cores <= capacity.cores and need.memory_bytes <= capacity.memory_bytes and need.gpus <= capacity.gpus
 
 
 def claim(request: Resources, capacity: Resources) -> Resources:

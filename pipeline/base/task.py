@@ -7,11 +7,13 @@ later stage starts on a frame as soon as that frame's inputs are committed.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from json.encoder import encode_basestring_ascii as _quoted
 from typing import NewType
 
-from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.parameter_set import ParameterSet, digest_of
 
 TaskId = NewType("TaskId", str)
 ArtifactPath = NewType("ArtifactPath", str)  # POSIX path relative to the job's folder
@@ -24,6 +26,22 @@ class Resources:
     cores: int = 1
     memory_bytes: int = 0
     gpus: int = 0
+
+    def __add__(self, other: Resources) -> Resources:
+        return Resources(self.cores + other.cores, self.memory_bytes + other.memory_bytes, self.gpus + other.gpus)
+
+    def __sub__(self, other: Resources) -> Resources:
+        return Resources(self.cores - other.cores, self.memory_bytes - other.memory_bytes, self.gpus - other.gpus)
+
+    def fits(self, room: Resources) -> bool:
+        """Whether they are within others in every respect."""
+        return self.cores <= room.cores and self.memory_bytes <= room.memory_bytes and self.gpus <= room.gpus
+
+    def at_least(self, other: Resources) -> Resources:
+        """The more of each."""
+        return Resources(
+            max(self.cores, other.cores), max(self.memory_bytes, other.memory_bytes), max(self.gpus, other.gpus)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +58,16 @@ class Task:
     resources: Resources = field(default=Resources())
     checkpointed: bool = False  # it commits its outputs one by one and continues where it stopped
     on_first_gpu: bool = False  # if it needs a GPU, it takes the machine's first one and cannot be given another
+
+
+def task_fingerprint(task: Task, hashes: Mapping[ArtifactPath, str]) -> str:
+    """Digest of everything that decides what a task's outputs hold: its parameters, and paths and hashes of its inputs.
+
+    `hashes` are those of its inputs' contents, and maybe of more files. Raises KeyError if an input has none.
+    """
+    # As json.dumps(..., separators=(",", ":")) writes [digest, [[path, hash], ...]], in a third of its time.
+    inputs = ",".join([f"[{_quoted(path)},{_quoted(hashes[path])}]" for path in task.inputs])
+    return digest_of(f"[{_quoted(task.parameters.digest)},[{inputs}]]")
 
 
 class TaskState(StrEnum):

@@ -294,10 +294,11 @@ def _activity(
     layout: JobLayout, entry: QueuedJob | None, state: JobState, summary: Sequence[StageSummary], pid: int | None
 ) -> str:
     """What happens to a job, or would."""
+    from pipeline.record.reader import done_and_total
+
     if pid is not None:
         return f"{state}, process {pid}"
-    done = sum(stage.done for stage in summary)
-    total = sum(stage.total for stage in summary)
+    done, total = done_and_total(summary)
     if state == "recorded":
         return _activity_of_recording(layout)
     words = [state if entry is None or not entry.note else f"{state} ({entry.note})"]

@@ -117,8 +117,7 @@ def plan(
     for line in summarize(assessments):
         click.echo(line)
     for each in estimate(assessments, estimates):
-        if each.seconds is not None and each.bytes is not None:
-            click.echo(f"{each.stage}: about {wording.duration(each.seconds)} of work, {wording.size(each.bytes)}")
+        click.echo(f"{each.stage}: about {wording.duration(each.seconds)} of work, {wording.size(each.bytes)}")
     todo = sum(len(each.rebuilds) for each in assessments)
     at_most = "at most " if any(each.verdict is Verdict.DOWNSTREAM for each in assessments) else ""
     click.echo(f"{at_most}{todo} of {sum(len(each.task.outputs) for each in assessments)} files to make")

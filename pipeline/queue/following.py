@@ -12,7 +12,7 @@ from pipeline.base.lease import busy_error, live_holder
 from pipeline.base.task import TaskState
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob
 from pipeline.queue.states import ending_of
-from pipeline.record.reader import LastRun, ManifestReader, StageSummary
+from pipeline.record.reader import LastRun, ManifestReader, StageSummary, done_and_total
 from pipeline.run.events import JobOutcome
 from pipeline.run.goal import what_is_made
 from pipeline.run.progress import Display, StageProgress, open_display
@@ -24,8 +24,6 @@ CTRL_C = 130
 
 STOPPED_FROM_ELSEWHERE = 8
 """The job was paused or cancelled by another command."""
-
-DONE = (TaskState.SUCCEEDED, TaskState.UP_TO_DATE)
 
 
 def watch(layout: JobLayout) -> int:
@@ -42,7 +40,7 @@ def watch(layout: JobLayout) -> int:
             holder = live_holder(layout.lease)
             if holder is not None:
                 watched = holder.token
-            summary, last_run = _record(layout)
+            summary, last_run = record_of(layout)
             _update(stages, summary)
             display.show(stages.values())
             preview_said = preview_said or (holder is not None and _say_preview_movie(display, layout))
@@ -65,7 +63,7 @@ class Follower:
         self._queue = queue
         self._layout = layout
         self._name = layout.root.absolute().name
-        self._before = _record(layout)[1].run
+        self._before = record_of(layout)[1].run
         self._seen_running = live_holder(layout.lease) is not None
         self._said = ""
         self._preview_said = False
@@ -97,7 +95,7 @@ class Follower:
             while True:
                 entry = self._queue.find(self._name)
                 runs = live_holder(self._layout.lease) is not None
-                summary, last_run = _record(self._layout)
+                summary, last_run = record_of(self._layout)
                 _update(stages, summary)
                 if runs:
                     self._seen_running = True
@@ -157,7 +155,7 @@ def _say_how_it_ended(display: Display, layout: JobLayout, summary: list[StageSu
     if ended_as == JobOutcome.SUCCEEDED:
         display.say(f"{what_is_made(layout)} is done")
         return 0
-    done, total = sum(map(_done, summary)), sum(stage.total for stage in summary)
+    done, total = done_and_total(summary)
     display.say(
         f"it is {ending_of(ended_as)} with {done} of {total} tasks done; continue with: pipeline resume {layout.root}"
     )
@@ -172,7 +170,7 @@ def _say_preview_movie(display: Display, layout: JobLayout) -> bool:
     return True
 
 
-def _record(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:
+def record_of(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:
     """Counts by stage and the last run; nothing while the runner is still making its manifest, or renewing it."""
     if not layout.manifest.exists():
         return [], LastRun(None, None)
@@ -183,22 +181,12 @@ def _record(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:
         return [], LastRun(None, None)
 
 
-def done_and_total(layout: JobLayout) -> tuple[int, int]:
-    """How many of a job's tasks are done, and how many there are."""
-    summary, _ = _record(layout)
-    return sum(map(_done, summary)), sum(stage.total for stage in summary)
-
-
 def _update(stages: dict[str, StageProgress], summary: list[StageSummary]) -> None:
     now = time.monotonic()
     for counts in summary:
-        done = _done(counts)
+        done = counts.done
         stage = stages.setdefault(counts.stage, StageProgress(counts.stage, counts.total, done, at_start=done))
         stage.total = counts.total
         stage.failed = counts.counts.get(TaskState.FAILED, 0)
         if done > stage.done:
             stage.advance(done - stage.done, now)
-
-
-def _done(stage: StageSummary) -> int:
-    return sum(stage.counts.get(state, 0) for state in DONE)

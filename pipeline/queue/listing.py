@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pipeline.base.errors import ManifestError, OutdatedManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import live_holder
-from pipeline.queue.following import done_and_total
+from pipeline.queue.following import record_of
 from pipeline.queue.job_queue import JobQueue, QueuedJob
 from pipeline.queue.states import JobState, state_after, state_of
-from pipeline.record.reader import LastRun, ManifestReader
+from pipeline.record.reader import LastRun, ManifestReader, done_and_total
 from pipeline.store.artifacts import holds_frames
 
 
@@ -54,13 +54,20 @@ def state_of_job(layout: JobLayout, entry: QueuedJob | None) -> JobState:
     if layout.manifest.exists():
         with ManifestReader.open_readonly(layout.manifest) as manifest:
             last_run, is_empty = manifest.last_run(), manifest.is_empty()
+    return state_by_record(layout, last_run, runs=runs, is_empty=is_empty, is_recording=layout.recording_story.exists())
+
+
+def state_by_record(
+    layout: JobLayout, last_run: LastRun, *, runs: bool, is_empty: bool, is_recording: bool
+) -> JobState:
+    """Where a job stands that is not in the queue; its record may be empty, and its folder that of a recording."""
     if runs:
         return JobState.RUNNING
     if last_run.run is not None:
         return state_after(last_run.outcome)
-    if layout.recording_story.exists():
+    if is_recording:
         return JobState.RECORDED
-    # A record that was lost and rebuilt knows no run, although there were some.
+    # A record may be lost, and knows no run then; that of a recording that crashed is empty, as it is filled last.
     return JobState.NOT_STARTED if is_empty and not holds_frames(layout) else JobState.INTERRUPTED
 
 
@@ -70,7 +77,7 @@ def _listed(layout: JobLayout, entry: QueuedJob | None, flaws: list[str]) -> Lis
     changed = _last_change(layout) if entry is None else entry.submitted
     try:
         state = state_of_job(layout, entry)
-        done, tasks = done_and_total(layout)
+        done, tasks = done_and_total(record_of(layout)[0])
     except OutdatedManifestError:  # the next run brings it up to date
         return ListedJob(name, JobState.INTERRUPTED, priority, changed, note=note)
     except (ManifestError, OSError) as error:

@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -77,6 +77,11 @@ class StageSummary(NamedTuple):
     def done(self) -> int:
         """Number of those that are done."""
         return sum(self.counts.get(state, 0) for state in (TaskState.SUCCEEDED, TaskState.UP_TO_DATE))
+
+
+def done_and_total(summary: Iterable[StageSummary]) -> tuple[int, int]:
+    """How many tasks of all stages are done, and how many there are."""
+    return sum(stage.done for stage in summary), sum(stage.total for stage in summary)
 
 
 class StageCost(NamedTuple):

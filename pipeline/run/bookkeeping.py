@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
-from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, TaskId
+from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, TaskId, task_fingerprint
 from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest, artifact_row
 from pipeline.record.reader import ArtifactRow
@@ -15,7 +14,7 @@ from pipeline.run.events import Committed, Failed, Finished, Notice, Observer, T
 from pipeline.run.executors.base import Assignment
 from pipeline.run.plan import input_hashes
 from pipeline.run.scheduler import OWN_FAILURES
-from pipeline.store.receipts import read_receipt, verify_artifact
+from pipeline.store.receipts import committed_receipt
 
 _FORCED_ENDS = frozenset(FailureKind) - OWN_FAILURES - {FailureKind.DISK_FULL}
 """Ends that may come from outside, at any moment: between a commit and the word of it, too."""
@@ -140,12 +139,8 @@ class RunRecord:
         commits: list[Settled] = []
         gone: list[ArtifactPath] = []
         for artifact in untold:
-            receipt = read_receipt(self.layout, artifact)
-            if (
-                receipt is not None
-                and receipt.fingerprint == assignment.fingerprint
-                and verify_artifact(self.layout, receipt) is None
-            ):
+            receipt = committed_receipt(self.layout, artifact, assignment.fingerprint)
+            if receipt is not None:
                 commit = Committed(task_id, assignment.attempt, receipt)
                 self.notify(commit)
                 self._take_commit(commit)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import heapq
 from collections import defaultdict
 
-from pipeline.base.resources import fits, minus, plus
 from pipeline.base.task import Resources, TaskId
 
 Priority = tuple[int, int, int]
@@ -24,7 +23,7 @@ class Packing:
 
     def __init__(self, *, machine: Resources, capacity: Resources) -> None:
         self.machine = machine
-        self._capacity = self._at_least_a_machine(capacity)
+        self._capacity = capacity.at_least(machine)  # a task that claims a machine which went waits for it
         self.free = self._capacity
         self._ready: defaultdict[Resources, list[tuple[Priority, TaskId]]] = defaultdict(list)
         self._blocked: tuple[TaskId, Resources] | None = None
@@ -37,8 +36,8 @@ class Packing:
 
     def resize(self, offered: Resources) -> None:
         """Machines came or went: all that there are now offer this much together."""
-        capacity = self._at_least_a_machine(offered)
-        self.free = plus(self.free, minus(capacity, self._capacity))
+        capacity = offered.at_least(self.machine)
+        self.free = self.free + capacity - self._capacity
         self._capacity = capacity
 
     def add(self, task_id: TaskId, *, need: Resources, priority: Priority) -> None:
@@ -48,7 +47,7 @@ class Packing:
     def give_back(self, task_id: TaskId, need: Resources) -> None:
         """A task that was taken occupies nothing any more."""
         self._overtakers.pop(task_id, None)
-        self.free = plus(self.free, need)
+        self.free += need
 
     def take(self) -> TaskId | None:
         """Take the most urgent task that fits; it occupies its need.
@@ -61,7 +60,7 @@ class Packing:
             candidate = (heap[0][1], need)
             if position == 0 and self._blocked != candidate:
                 self._blocked = None
-            if not fits(need, self.free):
+            if not need.fits(self.free):
                 if position == 0 and self._blocked is None:
                     self._blocked = candidate
                     self._overtakers = {}
@@ -72,21 +71,13 @@ class Packing:
                 self._blocked = None
             elif self._blocked is not None:
                 self._overtakers[heap[0][1]] = need
-            self.free = minus(self.free, need)
+            self.free -= need
             return heapq.heappop(heap)[1]
         return None
 
     def _would_delay_blocked(self, need: Resources) -> bool:
         assert self._blocked is not None
-        left = minus(self._capacity, self._blocked[1])
+        left = self._capacity - self._blocked[1]
         for taken in self._overtakers.values():
-            left = minus(left, taken)
-        return not fits(need, left)
-
-    def _at_least_a_machine(self, capacity: Resources) -> Resources:
-        """A capacity that a task can claim its machine of: it waits for one that went, and does not block for ever."""
-        return Resources(
-            cores=max(self.machine.cores, capacity.cores),
-            memory_bytes=max(self.machine.memory_bytes, capacity.memory_bytes),
-            gpus=max(self.machine.gpus, capacity.gpus),
-        )
+            left -= taken
+        return not need.fits(left)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -14,11 +14,10 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipeline.base.errors import PlanError
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet, explain_difference
 from pipeline.base.paused_gc import many_objects
-from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.base.task import ArtifactPath, Task, TaskId, task_fingerprint
 from pipeline.record.reader import ArtifactRow, StageCost
 from pipeline.record.reconcile import FileCondition, FileProblem
 
@@ -67,12 +66,11 @@ class Assessment:
 
 
 class Estimate(NamedTuple):
-    """What a stage's share of a plan would take; None where nothing is known of it yet."""
+    """What a stage's share of a plan would take: time of one task after the other [s], and disk space."""
 
     stage: str
-    artifacts: int
-    seconds: float | None
-    bytes: float | None
+    seconds: float
+    bytes: float
 
 
 def plan_job(job: Job, layout: JobLayout, stages: Sequence[Stage], until: Sequence[str] = ()) -> list[Task]:
@@ -329,23 +327,17 @@ def frame_ranges(frames: Iterable[int], planned: Iterable[int]) -> str:
 
 
 def estimate(assessments: Iterable[Assessment], costs: Mapping[str, StageCost]) -> list[Estimate]:
-    """What the plan would take, per stage, going by what the same stage has taken before (`stage_costs`).
+    """What the plan would take, per stage, going by what the same stage has taken before (`stage_costs`), where it has.
 
-    Time is that of one task after the other [s]; tasks that run only if their inputs differ count in full.
+    Tasks that run only if their inputs differ count in full.
     """
-    artifacts: dict[str, int] = {}
-    for assessment in assessments:
-        stage = assessment.task.stage
-        artifacts[stage] = artifacts.get(stage, 0) + len(assessment.rebuilds)
+    counts: Counter[str] = Counter()
+    for each in assessments:
+        counts[each.task.stage] += len(each.rebuilds)
     return [
-        Estimate(
-            stage,
-            count,
-            costs[stage].seconds_per_artifact * count if stage in costs else None,
-            costs[stage].bytes_per_artifact * count if stage in costs else None,
-        )
-        for stage, count in artifacts.items()
-        if count
+        Estimate(stage, costs[stage].seconds_per_artifact * count, costs[stage].bytes_per_artifact * count)
+        for stage, count in counts.items()
+        if count and stage in costs
     ]
 
 

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from itertools import count
 
 from pipeline.base.errors import PipelineError
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.resources import claim
-from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task
+from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, task_fingerprint
 from pipeline.model.job import Job
 from pipeline.run.control import Selection
 from pipeline.run.events import Failed, Progress, TaskEvent

@@ -16,14 +16,13 @@ from tempfile import TemporaryDirectory
 
 from pipeline.base.errors import PipelineError
 from pipeline.base.files import replacing
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
-from pipeline.base.task import ArtifactPath, Resources, Task
+from pipeline.base.task import ArtifactPath, Resources, Task, task_fingerprint
 from pipeline.job.loading import LoadedJob
 from pipeline.run.executors.attempt import STAGES_REFERENCE, load_stages
 from pipeline.run.plan import made_from, plan_job
 from pipeline.run.single_stage import run_tasks
-from pipeline.store.receipts import Receipt, read_receipt, verify_artifact
+from pipeline.store.receipts import Receipt, committed_receipt
 
 SIMULATION = "simulate"
 
@@ -128,9 +127,5 @@ def _committed(
     if any(artifact not in receipts for artifact in task.inputs):
         return {}
     fingerprint = task_fingerprint(task, {artifact: receipts[artifact].hash for artifact in task.inputs})
-    found = {artifact: read_receipt(layout, artifact) for artifact in wanted}
-    return {
-        artifact: receipt
-        for artifact, receipt in found.items()
-        if receipt is not None and receipt.fingerprint == fingerprint and verify_artifact(layout, receipt) is None
-    }
+    found = {artifact: committed_receipt(layout, artifact, fingerprint) for artifact in wanted}
+    return {artifact: receipt for artifact, receipt in found.items() if receipt is not None}

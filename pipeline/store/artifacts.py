@@ -32,6 +32,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.base.errors import InvalidArtifactError, StaleAttemptError
@@ -62,22 +63,20 @@ def holds_frames(layout: JobLayout) -> bool:
     return False
 
 
+@dataclass
 class Commit:
     """An artifact on its way; see `committing`."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        """Where to write it: `.<name>.part.<attempt>`, in the artifact's own folder."""
-        self.kept_aside: ArtifactPath | None = None
-        """Where a file that was edited by hand went, if there was one in the way."""
-        self._receipt: Receipt | None = None
+    path: Path  # where to write it: `.<name>.part.<attempt>`, in the artifact's own folder
+    kept_aside: ArtifactPath | None = None  # where a file that was edited by hand went, if there was one in the way
+    done: Receipt | None = None
 
     @property
     def receipt(self) -> Receipt:
         """The receipt; there is one after the block has ended well."""
-        if self._receipt is None:
+        if self.done is None:
             raise RuntimeError(f"{self.path} is not committed yet")
-        return self._receipt
+        return self.done
 
 
 @contextmanager
@@ -154,7 +153,7 @@ def committing(
             sync(target.parent)
             receipt_part.replace(receipt_path)
             sync(receipt_path.parent)
-        commit._receipt = receipt
+        commit.done = receipt
     finally:
         for part in (commit.path, receipt_part):
             with suppress(OSError):  # must not hide the error that is on its way; sweep_parts gets what stays

@@ -32,7 +32,7 @@ class Receipt:
     task: TaskId  # that made it
     stage: str
     attempt: int  # number of the attempt that made it; grows with every try of the task, for ever
-    fingerprint: str  # of what its content was made from; see pipeline.base.fingerprint
+    fingerprint: str  # of what its content was made from; see pipeline.base.task
     parameters: str  # digest of the task's parameter set, so that a change can be named
     size: int  # [bytes]
     mtime_ns: int  # modification time [ns since the epoch]; with the size it short-cuts to the hash
@@ -108,7 +108,13 @@ def verify_artifact(layout: JobLayout, receipt: Receipt, *, deep: bool = False) 
     return None
 
 
-def is_committed(layout: JobLayout, artifact: ArtifactPath, fingerprint: str) -> bool:
-    """Whether the artifact is there, whole, and was made from this fingerprint. Needs no manifest."""
+def committed_receipt(layout: JobLayout, artifact: ArtifactPath, fingerprint: str) -> Receipt | None:
+    """The artifact's receipt, if it is there, whole, and was made from this fingerprint. Needs no manifest."""
     receipt = read_receipt(layout, artifact)
-    return receipt is not None and receipt.fingerprint == fingerprint and verify_artifact(layout, receipt) is None
+    is_of_it = receipt is not None and receipt.fingerprint == fingerprint
+    return receipt if receipt is not None and is_of_it and verify_artifact(layout, receipt) is None else None
+
+
+def is_committed(layout: JobLayout, artifact: ArtifactPath, fingerprint: str) -> bool:
+    """Whether there is such a receipt."""
+    return committed_receipt(layout, artifact, fingerprint) is not None

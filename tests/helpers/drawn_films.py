@@ -5,9 +5,8 @@ from __future__ import annotations
 import drawing_stages
 from inline_tasks import run_task
 
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
-from pipeline.base.task import TaskState
+from pipeline.base.task import TaskState, task_fingerprint
 from pipeline.job.loading import load_job
 from pipeline.record.manifest import Manifest
 from pipeline.run.events import Finished

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from drawn_jobs import job_of_the_ball, pose
 
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
+from pipeline.base.task import task_fingerprint
 from pipeline.run.plan import plan_job
 from pipeline.stages import STAGES
 from pipeline.store.artifacts import committing

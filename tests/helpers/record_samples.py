@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.base.errors import InvalidArtifactError
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
-from pipeline.base.task import ArtifactPath, Task, TaskId
+from pipeline.base.task import ArtifactPath, Task, TaskId, task_fingerprint
 from pipeline.store.artifacts import committing
 from pipeline.store.receipts import Receipt
 

@@ -20,7 +20,6 @@ from queue import Empty
 from distributed import Future
 
 from pipeline.base.errors import PipelineError
-from pipeline.base.resources import fits
 from pipeline.base.task import FailureKind, Resources, TaskId
 from pipeline.run.events import CapacityChanged, ExecutorEvent, Failed, Finished, TaskEvent
 from pipeline.run.executors.base import Assignment, Executor
@@ -258,7 +257,7 @@ class DaskExecutor(Executor):
                 self._running[task_id] = _Attempt(assignment, need, offer, future, time.monotonic())
             elif (address := self._slots.emptiest(need, reserved=reserved)) is not None:
                 reserved.add(address)
-            elif not any(fits(need, each.resources) for each in self._slots.offers):
+            elif not any(need.fits(each.resources) for each in self._slots.offers):
                 wants = f"{need.cores} cores, {need.memory_bytes / 1e9:.1f} GB and {need.gpus} GPUs"
                 if time.monotonic() - since > self.patience_s:
                     del self._waiting[task_id]

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import reduce
+from operator import add
 from typing import Any
 
-from pipeline.base.resources import fits, minus, plus
 from pipeline.base.task import Resources
 
 CPU_TAG, MEMORY_TAG, GPU_TAG = "CPU", "MEM", "GPU"
@@ -73,17 +73,12 @@ class Slots:
     @property
     def total(self) -> Resources:
         """All workers together."""
-        return reduce(plus, (offer.resources for offer in self.offers), Resources(0, 0, 0))
+        return reduce(add, (offer.resources for offer in self.offers), Resources(0, 0, 0))
 
     @property
     def largest(self) -> Resources:
         """The most that a single worker has, of each; no worker need have all of it, see `clamp`."""
-        offers = [offer.resources for offer in self.offers]
-        return Resources(
-            cores=max((each.cores for each in offers), default=0),
-            memory_bytes=max((each.memory_bytes for each in offers), default=0),
-            gpus=max((each.gpus for each in offers), default=0),
-        )
+        return reduce(Resources.at_least, (offer.resources for offer in self.offers), Resources(0, 0, 0))
 
     def update(self, offers: Mapping[str, Offer], present: Collection[str] = ()) -> None:
         """Take in which workers there are now: `offers` by address, and addresses of others that are `present`.
@@ -115,7 +110,7 @@ class Slots:
         those with enough GPUs. Workers that went count: a need that one of them met waits for its like.
         """
         able = [each for each in self._seen if need.gpus <= each.gpus]
-        if not able or any(fits(need, each) for each in able):
+        if not able or any(need.fits(each) for each in able):
             return need
         best = max(able, key=lambda each: (min(need.memory_bytes, each.memory_bytes), each.cores, -each.gpus))
         return Resources(min(need.cores, best.cores), min(need.memory_bytes, best.memory_bytes), need.gpus)
@@ -126,18 +121,18 @@ class Slots:
         Of those that it fits on, one that has run the stage before, so that Blender is warm there; else the fullest, so
         that room is left for tasks that need more. Workers at `reserved` addresses are kept for others.
         """
-        fitting = [each for each in self._trusted(reserved) if each.threads > 0 and fits(need, each.free)]
+        fitting = [each for each in self._trusted(reserved) if each.threads > 0 and need.fits(each.free)]
         if not fitting:
             return None
         best = min(fitting, key=lambda each: (stage not in each.stages, each.free.cores, each.offer.address))
-        best.free = minus(best.free, need)
+        best.free = best.free - need
         best.threads -= 1
         best.stages.add(stage)
         return best.offer
 
     def emptiest(self, need: Resources, *, reserved: Collection[str] = ()) -> str | None:
         """Address of the worker that will have room for this need first, going by its free cores; None: none ever."""
-        able = [each for each in self._trusted(reserved) if fits(need, each.offer.resources)]
+        able = [each for each in self._trusted(reserved) if need.fits(each.offer.resources)]
         return max(able, key=lambda each: (each.free.cores, each.offer.address)).offer.address if able else None
 
     def _trusted(self, reserved: Collection[str]) -> list[_Worker]:
@@ -148,5 +143,5 @@ class Slots:
         """A task has ended; nothing happens if its worker is gone."""
         worker = self._workers.get(offer.address)
         if worker is not None and worker.offer.identity == offer.identity:
-            worker.free = plus(worker.free, need)
+            worker.free = worker.free + need
             worker.threads += 1

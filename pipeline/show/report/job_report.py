@@ -16,7 +16,7 @@ from pipeline.base.task import ArtifactPath
 from pipeline.job.loading import load_job
 from pipeline.kinds.table import bodies
 from pipeline.model.job import Job
-from pipeline.record.reader import ManifestReader, StageTiming
+from pipeline.record.reader import ManifestReader, StageTiming, done_and_total
 from pipeline.run.assessment import assess_job
 from pipeline.run.solver_numbers import CountedWarning, simulation_numbers
 from pipeline.show.picture_set import PictureSet, evenly_spread, picture_set
@@ -121,13 +121,14 @@ def gather(layout: JobLayout, *, title: str) -> JobReport:
         summary, timings, last = manifest.summary(), manifest.stage_timings(), manifest.last_run()
         drawn_on = manifest.devices("render")
         artifacts = manifest.artifacts()
+    done, total = done_and_total(summary)
     simulation = simulation_numbers(layout, history=True)
     frames = picture_set(job, layout)
     return JobReport(
         job=job,
         title=title,
-        done=sum(stage.done for stage in summary),
-        total=sum(stage.total for stage in summary),
+        done=done,
+        total=total,
         outcome=last.outcome,
         timings=tuple(timings),
         numbers=JobNumbers(title, simulation.frames),

@@ -6,7 +6,6 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
@@ -15,10 +14,10 @@ from pipeline.base.errors import ManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import LeaseHolder, live_holder
 from pipeline.queue.job_queue import JobQueue, QueuedJob
-from pipeline.queue.states import JobState, state_after, state_of
+from pipeline.queue.listing import state_by_record
+from pipeline.queue.states import JobState, state_of
 from pipeline.record.glance import Version, glance, version_of
 from pipeline.record.reader import AttemptRow, LastRun, ManifestReader, StageSummary
-from pipeline.store.artifacts import holds_frames
 from pipeline.web.dashboard.estimates import LongTask, Remaining, StageRow, remaining, stage_rows
 from pipeline.web.dashboard.places import NotThereError, Places, printable
 
@@ -197,36 +196,20 @@ class FarmView:
 
     def _card_of(self, name: str, entry: QueuedJob | None, layout: JobLayout, submitted: float) -> JobCard:
         """Raises OSError if its folder cannot be read."""
-        holder = None
-        with suppress(NotThereError):
-            holder = live_holder(self.places.file(name, layout.lease.name))
+        holder = live_holder(layout.lease) if self.places.has(name, layout.lease.name) else None
         remembered = self._record(name, layout, runs=holder is not None)
         record, flaw = remembered.record, remembered.flaw
         if entry is not None:
             state = state_of(entry, runs=holder is not None)
-        elif holder is not None:
-            state = JobState.RUNNING
-        elif flaw:
+        elif holder is None and flaw:
             state = JobState.UNKNOWN
-        elif record.last_run.run is None:
-            state = self._state_without_run(name, layout, record)
         else:
-            state = state_after(record.last_run.outcome)
+            recording, runs = self.places.has(name, layout.recording_story.name), holder is not None
+            state = state_by_record(
+                layout, record.last_run, runs=runs, is_empty=record.is_empty, is_recording=recording
+            )
         changed = max(submitted, remembered.version.changed_ns / 1e9)
         return JobCard(name, state, entry, holder, record, flaw, changed)
-
-    def _state_without_run(self, name: str, layout: JobLayout, record: Record) -> JobState:
-        """State of a job whose record tells of no run; if the record was lost and rebuilt, there were some.
-
-        Raises:
-            OSError: its folder cannot be read.
-        """
-        with suppress(NotThereError):
-            self.places.file(name, layout.recording_story.name)
-            return JobState.RECORDED
-        # A record may be lost; that of a recording that crashed is empty, as it is filled at the end.
-        is_new = record.is_empty and not holds_frames(layout)
-        return JobState.NOT_STARTED if is_new else JobState.INTERRUPTED
 
     def _record(self, name: str, layout: JobLayout, *, runs: bool) -> _Remembered:
         now = time.time()

@@ -145,7 +145,7 @@ def look_at_job(places: Places, card: JobCard, question: Question) -> JobDetail:
         story=_story(places, card, question, found),
         pictures=found.pictures,
         film=film_of(places, card),
-        has_report=_is_file(places, card.name, layout.report.name),
+        has_report=places.has(card.name, layout.report.name),
         events=found.events[::-1],
         work=_work(card),
     )
@@ -225,14 +225,6 @@ def _codec(places: Places, name: str) -> str:
     except (NotThereError, OSError, ValueError, RecursionError):  # whether its film is played the browser finds out
         return USUAL_CODEC
     return str(movie.get("codec", USUAL_CODEC)) if isinstance(movie, dict) else USUAL_CODEC
-
-
-def _is_file(places: Places, name: str, relative: str) -> bool:
-    try:
-        places.file(name, relative)
-    except NotThereError:
-        return False
-    return True
 
 
 def _number(text: str, least: int) -> int:

@@ -49,6 +49,14 @@ class Places:
             raise NotThereError(f"no such file in {name}") from error
         raise NotThereError(f"no such file in {name}")
 
+    def has(self, name: str, relative: str) -> bool:
+        """Whether a job has such a file."""
+        try:
+            self.file(name, relative)
+        except NotThereError:
+            return False
+        return True
+
     def tail(self, name: str, relative: str, byte_count: int) -> tuple[str, int]:
         """The last bytes of a text file of a job, from a line's beginning on, and the size of all of it [bytes].
 

@@ -54,9 +54,6 @@ class BodySpring:
         angular[number] = -(1.0 - np.exp(-SPIN_DECAY * dt)) * bodies.angular_momentum()[number]
         bodies.apply_impulses(linear, angular)
 
-    def release(self) -> None:
-        """It goes on with the velocity that it has."""
-
 
 class BodyPath:
     """A path of a kinematic body, which moves whatever it hits; when it is released it stays."""
@@ -77,9 +74,6 @@ class BodyPath:
         self._velocity = towards(self.target - self._arm, position, self._velocity, dt)
         ends = tuple(float(each) for each in position + dt * self._velocity)
         self._rigid.lead(self._rigid.bodies.names[self._number], ends, within_s=dt)
-
-    def release(self) -> None:
-        """It stays where it is: its path of one frame is over."""
 
 
 class NodePath:
@@ -263,7 +257,7 @@ class Drags:
         return handle
 
     def _end(self, handle: Handle) -> None:
-        if (constraint := self.held.pop(handle, None)) is not None:
+        if isinstance(constraint := self.held.pop(handle, None), NodePath):  # a body flies on, or stays, by itself
             constraint.release()
 
 

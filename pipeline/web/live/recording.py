@@ -18,9 +18,9 @@ from pathlib import Path
 
 from pipeline.base.errors import LeaseLostError, PipelineError
 from pipeline.base.files import replace_durably
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
+from pipeline.base.task import task_fingerprint
 from pipeline.job.loading import LoadedJob, job_of_text
 from pipeline.job.overrides import Override
 from pipeline.kinds.live_parameters import Value

@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from record_samples import film, parameter_set
 
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.parameter_set import ParameterSet, explain_difference
-from pipeline.base.task import ArtifactPath
+from pipeline.base.task import ArtifactPath, task_fingerprint
 
 SCALARS = st.one_of(
     st.none(),

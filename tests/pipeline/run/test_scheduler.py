@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scheduled_tasks import TWO_CORES, begun, commit, fail, film, finished, outcome, started, succeed, task
 
-from pipeline.base.resources import claim, fits
+from pipeline.base.resources import claim
 from pipeline.base.task import ArtifactPath, FailureKind, Policy, Resources, Task, TaskId, TaskState
 from pipeline.run.events import (
     CancelRequested,
@@ -251,7 +251,7 @@ def test_random_events_never_break_an_invariant(jobs, seed, faults, ending):
                     assert task_id in running
         needs = [claim(by_id[task_id].resources, capacity) for task_id in running]
         total = Resources(*(sum(getattr(n, f) for n in needs) for f in ("cores", "memory_bytes", "gpus")))
-        assert fits(total, capacity)
+        assert total.fits(capacity)
         assert sorted(scheduler.running) == sorted(running)
         if outcome(instructions) is not None:
             break

@@ -13,8 +13,8 @@ import pytest
 from command_line import pipeline
 from PIL import Image
 
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
+from pipeline.base.task import task_fingerprint
 from pipeline.job.loading import load_job
 from pipeline.record.manifest import Manifest
 from pipeline.run.plan import plan_job

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 from drawing_stages import DrawStage
 
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
-from pipeline.base.task import Task, TaskId
+from pipeline.base.task import Task, TaskId, task_fingerprint
 from pipeline.job.loading import load_job
 from pipeline.model.job import Job
 from pipeline.run.plan import plan_job

@@ -16,9 +16,8 @@ from places import HELPERS
 from record_samples import commit, film, validate_text
 
 from pipeline.base.errors import InvalidArtifactError, StaleAttemptError
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
-from pipeline.base.task import ArtifactPath
+from pipeline.base.task import ArtifactPath, task_fingerprint
 from pipeline.store.artifacts import Commit, committing, sweep_parts
 from pipeline.store.receipts import is_committed, read_receipt, verify_artifact
 

@@ -13,8 +13,8 @@ from blake3 import blake3
 from record_samples import commit, film
 
 from pipeline.base.errors import InvalidArtifactError
-from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
+from pipeline.base.task import task_fingerprint
 from pipeline.store.receipts import Receipt, hash_file, is_committed, read_receipt, verify_artifact
 
 SIMULATE = film(1)[0]
