@@ -12,19 +12,12 @@ from pipeline.model.positions import KeyPath
 
 @dataclass(frozen=True)
 class InputFile:
-    """One file that a job reads.
+    """One file that a job reads."""
 
-    Attributes:
-        place: of the key that names it.
-        path: as the job names it.
-        kind: what it is, for messages: "mesh".
-        rest: what the key's value says after the path.
-    """
-
-    place: KeyPath
-    path: str
-    kind: str
-    rest: str = ""
+    place: KeyPath  # of the key that names it
+    path: str  # as the job names it
+    kind: str  # what it is, for messages: "mesh"
+    rest: str = ""  # what the key's value says after the path
 
     def written(self, path: str) -> str:
         """The key's value with the file under another path."""

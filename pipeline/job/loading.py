@@ -34,21 +34,13 @@ _SYNTAX_POSITION = re.compile(
 
 @dataclass(frozen=True)
 class LoadedJob:
-    """A valid job, and the text to keep of it.
+    """A valid job, and the text to keep of it."""
 
-    Attributes:
-        job: the job; its files (meshes, the Blender executable) are absolute paths.
-        text: self-contained TOML: overrides applied, files absolute. Loading it anywhere gives the same job.
-        path: the file it was read from.
-        source: turns a problem into a line with its place.
-        warnings: what is worth a look, one line each.
-    """
-
-    job: Job
-    text: str
-    path: Path
-    source: JobSource
-    warnings: tuple[str, ...] = ()
+    job: Job  # the job; its files (meshes, the Blender executable) are absolute paths
+    text: str  # self-contained TOML: overrides applied, files absolute. Loading it anywhere gives the same job
+    path: Path  # the file it was read from
+    source: JobSource  # turns a problem into a line with its place
+    warnings: tuple[str, ...] = ()  # what is worth a look, one line each
 
 
 def load_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False) -> Job:

@@ -24,17 +24,11 @@ class OverrideError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One key and the value that replaces it.
+    """One key and the value that replaces it."""
 
-    Attributes:
-        path: where it goes; every array index exists.
-        value: a TOML value as Python has it.
-        origin: the option it comes from, as shown in messages.
-    """
-
-    path: KeyPath
-    value: Any
-    origin: str
+    path: KeyPath  # where it goes; every array index exists
+    value: Any  # a TOML value as Python has it
+    origin: str  # the option it comes from, as shown in messages
 
 
 def parse_override(argument: str, document: Mapping[str, Any]) -> Override:

@@ -54,33 +54,19 @@ class Codec(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Product:
-    """The file that a stage makes of a body of this kind in each frame, for the renderer.
+    """The file that a stage makes of a body of this kind in each frame, for the renderer."""
 
-    Attributes:
-        stage: name of the stage, and the first part of its tasks' names.
-        version: raised when the same cache gives another file.
-        folder: of the files in the job's folder.
-        suffix: of the files.
-        tools: version of each package that does the work.
-        parameters: what decides the file besides the cache.
-        memory_bytes: memory of a task.
-        preflight: why this machine cannot make it, a sentence each.
-        write: makes the file of a body, with so many threads.
-        validate: decodes the file; raises InvalidArtifactError.
-        file_bytes: about the size of a file by the number of the body's elements.
-    """
-
-    stage: str
-    version: int
-    folder: str
-    suffix: str
-    tools: Callable[[Job], Mapping[str, str]]
-    parameters: Callable[[Job], Mapping[str, Any]]
-    memory_bytes: Callable[[Job, Any], int]
-    write: Callable[[Path, Any, Job, int], None]
-    validate: Callable[[Path], None]
-    file_bytes: Callable[[float], float]
-    preflight: Callable[[], list[str]] = list
+    stage: str  # name of the stage, and the first part of its tasks' names
+    version: int  # raised when the same cache gives another file
+    folder: str  # of the files in the job's folder
+    suffix: str  # of the files
+    tools: Callable[[Job], Mapping[str, str]]  # version of each package that does the work
+    parameters: Callable[[Job], Mapping[str, Any]]  # what decides the file besides the cache
+    memory_bytes: Callable[[Job, Any], int]  # memory of a task
+    write: Callable[[Path, Any, Job, int], None]  # makes the file of a body, with so many threads
+    validate: Callable[[Path], None]  # decodes the file; raises InvalidArtifactError
+    file_bytes: Callable[[float], float]  # about the size of a file by the number of the body's elements
+    preflight: Callable[[], list[str]] = list  # why this machine cannot make it, a sentence each
 
     def file_of(self, body: str) -> str:
         """Files of a body for the renderer: path below the job's folder, with {frame}."""
@@ -89,73 +75,52 @@ class Product:
 
 @dataclass(frozen=True)
 class Display:
-    """How `pipeline view` and `pipeline live` show a body of this kind.
+    """How `pipeline view` and `pipeline live` show a body of this kind."""
 
-    Attributes:
-        layer: title of the box that shows and hides the bodies of the kind.
-        form: points at `position` [m], coloured by the speed of `velocity` or any array of a number each; a mesh of
-            `position` [m] and `triangles`; parts of the body's shape, placed by `position` [m] and `orientation`;
-            density of the cells of a grid.
-        radius: of points: the attribute that holds it [m].
-    """
-
-    layer: str
+    layer: str  # title of the box that shows and hides the bodies of the kind
+    # points at `position` [m], coloured by the speed of `velocity` or any array of a number each; a mesh of `position`
+    # [m] and `triangles`; parts of the body's shape, placed by `position` [m] and `orientation`; density of the cells
+    # of a grid
     form: Literal["points", "mesh", "parts", "density"]
-    radius: str = "radius"
+    radius: str = "radius"  # of points: the attribute that holds it [m]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """A kind of body.
+    """A kind of body."""
 
-    Attributes:
-        name: of its tables in the job file, `[[name]]`, and of its snapshots.
-        parameters: what a table of it says.
-        about: what the reference says of the table.
-        size: how many elements the bodies of a job have, for people: "about {:,} particles".
-        elements: about how many of these a body has at most.
-        snapshot_bytes: size of an element in memory, in a frame of the cache, and in a checkpoint.
-        wears: the kind whose looks its bodies can have (`blender_scripts.look_table`).
-        material: usual materials of the parts of a body, itself first.
-        placements: the solids that its tables place, each with the path of its table below the body's.
-        check: looks at all bodies of the kind; returns the number of their elements.
-        coarser: changes that make the bodies coarser by a factor, for a preview; the last argument builds the solids
-            of the job, or is None where its numbers cannot be computed with.
-        solvers: its solvers in a scene, at so many frames a second; None for the kinds that `sim.build` couples.
-        shares_solver: whether a body is one of those that have one solver, which is called by the name of the kind;
-            None for kinds whose solvers have the names of their bodies.
-        is_closed: its drawn meshes have an inside.
-        codec: how the cache keeps it, if not array by array.
-        product: the file that is made of each frame; None if the renderer needs none but the cached frame.
-        objects: what the renderer draws of a body.
-        reach: how far a body reaches in a frame, from its group of the cache; None where there is nothing of it.
-        reach_bytes: what finding that takes, by the number of elements.
-        display: how the viewer shows it.
-        live: what can be changed of it while it runs; None: it does not run live.
-        facts: a body in a few words, for the report, with the number of its elements in the last frame if known.
-    """
-
-    name: str
-    parameters: type[Parameters]
-    about: str
-    size: str = ""
-    elements: Callable[[Job, Any], float] = lambda _job, _body: 0.0
+    name: str  # of its tables in the job file, `[[name]]`, and of its snapshots
+    parameters: type[Parameters]  # what a table of it says
+    about: str  # what the reference says of the table
+    size: str = ""  # how many elements the bodies of a job have, for people: "about {:,} particles"
+    elements: Callable[[Job, Any], float] = lambda _job, _body: 0.0  # about how many of these a body has at most
+    # size of an element in memory, in a frame of the cache, and in a checkpoint
     snapshot_bytes: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    wears: str = "rigid"
-    material: Callable[[Any], Mapping[str, MaterialParameters]]
+    wears: str = "rigid"  # the kind whose looks its bodies can have (`blender_scripts.look_table`)
+    material: Callable[[Any], Mapping[str, MaterialParameters]]  # usual materials of the parts of a body, itself first
+    # the solids that its tables place, each with the path of its table below the body's
     placements: Callable[[Job, int], Iterator[tuple[KeyPath, Placement]]] = lambda _job, _index: iter(())
+    # looks at all bodies of the kind; returns the number of their elements
     check: Callable[[Job, Solids, MemoryBudget, Findings], int]
+    # changes that make the bodies coarser by a factor, for a preview; the last argument builds the solids of the job,
+    # or is None where its numbers cannot be computed with
     coarser: Callable[[Job, float, SolidBuilder | None], Sequence[Change]] = lambda _job, _factor, _solids: ()
+    # its solvers in a scene, at so many frames a second; None for the kinds that `sim.build` couples
     solvers: Callable[[SceneParameters, float], Sequence[Solver]] | None = None
+    # whether a body is one of those that have one solver, which is called by the name of the kind; None for kinds whose
+    # solvers have the names of their bodies
     shares_solver: Callable[[Any], bool] | None = None
-    is_closed: bool = True
-    codec: Callable[[], Codec] | None = None
+    is_closed: bool = True  # its drawn meshes have an inside
+    codec: Callable[[], Codec] | None = None  # how the cache keeps it, if not array by array
+    # the file that is made of each frame; None if the renderer needs none but the cached frame
     product: Product | None = None
-    objects: Callable[[Job, JobLayout, Any, Materials], Iterator[SceneObject]]
+    objects: Callable[[Job, JobLayout, Any, Materials], Iterator[SceneObject]]  # what the renderer draws of a body
+    # how far a body reaches in a frame, from its group of the cache; None where there is nothing of it
     reach: Callable[[Job, JobLayout, Any, h5py.Group], Reach | None]
-    reach_bytes: float = 0.0
-    display: Display
-    live: LiveParameters | None = None
+    reach_bytes: float = 0.0  # what finding that takes, by the number of elements
+    display: Display  # how the viewer shows it
+    live: LiveParameters | None = None  # what can be changed of it while it runs; None: it does not run live
+    # a body in a few words, for the report, with the number of its elements in the last frame if known
     facts: Callable[[Any, float | None], str] = lambda _body, _count: ""
 
     def bodies(self, job: SceneParameters) -> Sequence[Any]:

@@ -20,26 +20,18 @@ SUBSTEPS_RANGE = 2, 60
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a job that can be changed while it runs.
+    """A parameter of a job that can be changed while it runs."""
 
-    Attributes:
-        name: unique, as `--set` would write it: "cloth.sheet.friction".
-        label: on the page, with the unit.
-        folder: its heading.
-        paths: keys of the job that it stands for; several where bodies share the value.
-        widget: a slider ("decades": over the powers of ten, "whole": of whole numbers), a switch, or three numbers.
-        low, high: ends of the range, in the key's unit.
-        start: the job's value.
-    """
-
-    name: str
-    label: str
-    folder: str
-    paths: tuple[KeyPath, ...]
+    name: str  # unique, as `--set` would write it: "cloth.sheet.friction"
+    label: str  # on the page, with the unit
+    folder: str  # its heading
+    paths: tuple[KeyPath, ...]  # keys of the job that it stands for; several where bodies share the value
+    # a slider ("decades": over the powers of ten, "whole": of whole numbers), a switch, or three numbers
     widget: Widget
+    # ends of the range, in the key's unit
     low: float
     high: float
-    start: Value
+    start: Value  # the job's value
 
     @classmethod
     def within(
@@ -85,19 +77,15 @@ class Parameter:
 
 @dataclass(frozen=True)
 class LiveParameters:
-    """Live parameters of one kind of body.
+    """Live parameters of one kind of body."""
 
-    Attributes:
-        of: those of a job that has such bodies, as it is simulated and as it was read.
-        solver: name of the kind's solver in the world of a job.
-        set: gives that solver another value from the next frame on: the solver, the name of a body, or of the first one
-            if they share the value, the key, the value, and the value before.
-        set_gravity: gives it another gravity [m/s²]; None: gravity is fixed where there is a body of this kind.
-    """
-
+    # those of a job that has such bodies, as it is simulated and as it was read
     of: Callable[[Job, Job], Iterator[Parameter]]
-    solver: Callable[[Job], str]
+    solver: Callable[[Job], str]  # name of the kind's solver in the world of a job
+    # gives that solver another value from the next frame on: the solver, the name of a body, or of the first one if
+    # they share the value, the key, the value, and the value before
     set: Callable[[Any, str, str, Any, Any], None]
+    # gives it another gravity [m/s²]; None: gravity is fixed where there is a body of this kind
     set_gravity: Callable[[Any, Any], None] | None
 
 

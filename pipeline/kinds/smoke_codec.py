@@ -40,25 +40,15 @@ out of place by 1/256 of a cell at most."""
 
 @dataclass(frozen=True)
 class SmokeInBox:
-    """The part of a smoke that is not empty, as dense arrays; its fields are keywords of `render.volume.write_volume`.
+    """The part of a smoke that is not empty, as dense arrays; its fields are keywords of `render.volume.write_volume`."""
 
-    Attributes:
-        density: (nx, ny, nz) float32 [-].
-        temperature: (nx, ny, nz) float32 [K].
-        velocity: (nx, ny, nz, 3) float32 [m/s], at cell centres.
-        first_cell: which cell of the smoke the arrays begin at.
-        origin: lower corner of the smoke's whole box [m].
-        cell_size: edge of a cell [m].
-        ambient_temperature: [K].
-    """
-
-    density: Float32Array
-    temperature: Float32Array
-    velocity: Float32Array
-    first_cell: tuple[int, int, int]
-    origin: tuple[float, float, float]
-    cell_size: float
-    ambient_temperature: float
+    density: Float32Array  # (nx, ny, nz) float32 [-]
+    temperature: Float32Array  # (nx, ny, nz) float32 [K]
+    velocity: Float32Array  # (nx, ny, nz, 3) float32 [m/s], at cell centres
+    first_cell: tuple[int, int, int]  # which cell of the smoke the arrays begin at
+    origin: tuple[float, float, float]  # lower corner of the smoke's whole box [m]
+    cell_size: float  # edge of a cell [m]
+    ambient_temperature: float  # [K]
 
 
 def write(group: h5py.Group, name: str, snapshot: Snapshot, *, longest_shutter_s: float) -> None:

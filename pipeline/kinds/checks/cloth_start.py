@@ -30,23 +30,14 @@ BYTES_PER_NODE = 6000
 
 @dataclass(frozen=True, eq=False)
 class ClothStart:
-    """A cloth where it starts.
+    """A cloth where it starts."""
 
-    Attributes:
-        path: of its table.
-        cloth: its parameters.
-        sheet: at rest.
-        position: of its nodes [m], (n, 3).
-        edges: (e, 2) node numbers.
-        pinned: nodes of each pin, by its number.
-    """
-
-    path: KeyPath
-    cloth: ClothParameters
-    sheet: RestSheet
-    position: NDArray[np.float64]
-    edges: NDArray[np.int32]
-    pinned: Mapping[int, NDArray[np.int64]]
+    path: KeyPath  # of its table
+    cloth: ClothParameters  # its parameters
+    sheet: RestSheet  # at rest
+    position: NDArray[np.float64]  # of its nodes [m], (n, 3)
+    edges: NDArray[np.int32]  # (e, 2) node numbers
+    pinned: Mapping[int, NDArray[np.int64]]  # nodes of each pin, by its number
 
     @cached_property
     def held(self) -> NDArray[np.bool_]:

@@ -18,17 +18,11 @@ SHARE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class MemoryBudget:
-    """Memory that a simulation may take.
+    """Memory that a simulation may take."""
 
-    Attributes:
-        bytes: how much.
-        owner: whose it is, in words.
-        on_gpu: it is a GPU's own: what is on the way to the disk does not count.
-    """
-
-    bytes: int
-    owner: str
-    on_gpu: bool = False
+    bytes: int  # how much
+    owner: str  # whose it is, in words
+    on_gpu: bool = False  # it is a GPU's own: what is on the way to the disk does not count
 
     def refusal(
         self, elements: float, called: str, bytes_each: float, *, before: float = 0.0, beside: str = ""
