@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+
+import click
 
 
 def duration(seconds: float) -> str:
@@ -47,3 +49,9 @@ def mixed_devices(drawn_on: Mapping[str, int]) -> list[str]:
         f"the film's frames were drawn by devices that round differently: {counts}; pipeline explain tells about each "
         "frame, pipeline rerun --stage render draws them anew"
     ]
+
+
+def print_warnings(warnings: Sequence[str]) -> None:
+    """Warnings go to the error stream, so that output stays fit for a pipe."""
+    for warning in warnings:
+        click.secho(f"warning: {warning}", err=True, fg="yellow")

@@ -32,8 +32,7 @@ def verify(job: str, output: Path, deep: bool, rebuild: bool, as_json: bool) -> 
     pipeline verify my-film --deep
     """
     from pipeline.base.lease import Lease
-    from pipeline.record.reconcile import rebuild_manifest
-    from pipeline.record.verifying import flaws_of, mark_as_touched, restore_text
+    from pipeline.record.reconcile import flaws_of, mark_as_touched, rebuild_manifest, restore_text
     from pipeline.store.provenance import damaged_texts
 
     layout = find_job(job, output)

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.base import wording
-from pipeline.base.console import print_warnings
 from pipeline.base.errors import JobFileError, PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import TaskId
+from pipeline.base.wording import print_warnings
 from pipeline.cli.arguments import (
     find_job,
     job_folder,
@@ -218,7 +218,7 @@ def _tell_story(layout: JobLayout, task: str, *, as_json: bool) -> None:
     from pipeline.queue.states import task_word
     from pipeline.record.reader import ManifestReader
     from pipeline.run.assessment import assess_job
-    from pipeline.store.origins import origins_of
+    from pipeline.store.provenance import origins_of
     from pipeline.store.receipts import read_receipt, verify_artifact
 
     assessments, _, _ = assess_job(load_job(layout.job_file), layout)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pipeline.base import wording
-from pipeline.base.console import print_warnings
 from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
+from pipeline.base.wording import print_warnings
 from pipeline.cli.arguments import (
     find_job,
     job_options,

@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
-from pipeline.base.console import print_warnings
 from pipeline.base.errors import PipelineError, StageUnavailableError
+from pipeline.base.wording import print_warnings
 from pipeline.cli.arguments import (
     cores_option,
     find_job,

@@ -40,7 +40,7 @@ out of place by 1/256 of a cell at most."""
 
 @dataclass(frozen=True)
 class SmokeInBox:
-    """The part of a smoke that is not empty, as dense arrays; its fields are keywords of `render.volume.write_volume`."""
+    """The part of a smoke that is not empty, as dense arrays; its fields are keywords of `write_volume`."""
 
     density: Float32Array  # (nx, ny, nz) float32 [-]
     temperature: Float32Array  # (nx, ny, nz) float32 [K]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.base import wording
-from pipeline.base.console import print_warnings
 from pipeline.base.errors import DiskFullError, MissingInputError, OutdatedManifestError, PipelineError
 from pipeline.base.layout import JobLayout
+from pipeline.base.wording import print_warnings
 from pipeline.run.executors.choice import ExecutorChoice, require_named_devices, require_possible
 from pipeline.run.executors.failures import is_disk_full
 

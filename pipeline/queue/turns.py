@@ -9,11 +9,11 @@ from pathlib import Path
 import click
 
 from pipeline.base import wording
-from pipeline.base.console import print_warnings
 from pipeline.base.errors import DiskFullError, JobBusyError, PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
 from pipeline.base.resources import machine_capacity
+from pipeline.base.wording import print_warnings
 from pipeline.job.loading import job_of_text, load_job
 from pipeline.model.job import Job
 from pipeline.queue.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background

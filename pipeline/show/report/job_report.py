@@ -22,7 +22,7 @@ from pipeline.run.solver_numbers import CountedWarning, simulation_numbers
 from pipeline.show.picture_set import PictureSet, evenly_spread, picture_set
 from pipeline.show.report.film import ReportFilm, film_of
 from pipeline.show.report.panels import JobNumbers
-from pipeline.store.origins import origins_of
+from pipeline.store.provenance import origins_of
 from pipeline.store.receipts import read_receipt
 
 SHEET_PICTURES, SHEET_COLUMNS = 12, 4

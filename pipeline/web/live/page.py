@@ -13,7 +13,7 @@ from pipeline.web.live.admission import told_changes
 from pipeline.web.live.recording import Recorder
 from pipeline.web.live.saving import save_job
 from pipeline.web.live.scene import LiveScene
-from pipeline.web.live.session import Session, Status
+from pipeline.web.live.session import Session
 
 DECADE_STEP = 0.02
 """Of sliders over the powers of ten: 5 %."""
@@ -53,13 +53,13 @@ class LivePage:
         """Show where the scene is."""
         self._scene.show(self._session.bodies(), self._session.drags.pins)
 
-    def tell(self, status: Status) -> None:
-        """Show the status, and the parameters if something other than the page has changed them; only news are sent."""
+    def tell(self) -> None:
+        """Show how it goes, and parameters that something other than the page has changed; only news are sent."""
         self._changes.content = _plain(told_changes(self._written, self._session.values))
-        self._pause.label = "Go on" if status.is_paused else "Pause"
+        self._pause.label = "Go on" if self._session.is_paused else "Pause"
         self._record.label = "Stop recording" if self._recorder.is_recording else "Record"
-        self._state.content = _written(status, self._session.speed)
-        self._notice.content = f"**{_plain(status.message)}**" if status.message else ""
+        self._state.content = _written(self._session)
+        self._notice.content = f"**{_plain(self._session.message)}**" if self._session.message else ""
         if self._session.revision != self._revision:
             self._revision = self._session.revision
             for name, (parameter, handle) in self._sliders.items():
@@ -153,19 +153,19 @@ def _meant(parameter: Parameter, shown: Any) -> object:
     return tuple(map(float, shown)) if parameter.widget == "vector" else shown
 
 
-def _written(status: Status, speed: float) -> str:
-    """The status in two lines."""
-    asked = status.substeps_asked
+def _written(session: Session) -> str:
+    """How a scene goes, in two lines."""
+    asked = session.substeps_asked
     counts = [
         f"{name} {count}{f' ({asked} asked for)' if name == 'cloth' and asked not in (None, count) else ''}"
-        for name, count in status.substeps.items()
+        for name, count in session.substeps.items()
     ]
     substeps = ", ".join(counts) or "none yet"
-    wanted = "" if speed == 1.0 else f" (slow motion, {speed:g} wanted)"
-    going = "paused" if status.is_paused else f"{status.real_time:.2f} × real time{wanted}"
+    wanted = "" if session.speed == 1.0 else f" (slow motion, {session.speed:g} wanted)"
+    going = "paused" if session.is_paused else f"{session.real_time:.2f} × real time{wanted}"
     return (
-        f"frame **{status.frame}** · {status.time_s:.2f} s · {going}\n\n"
-        f"{status.frame_ms:.0f} ms a frame · substeps: {substeps}"
+        f"frame **{session.world.frame}** · {session.world.time_s:.2f} s · {going}\n\n"
+        f"{session.frame_ms:.0f} ms a frame · substeps: {substeps}"
     )
 
 

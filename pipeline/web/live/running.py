@@ -133,7 +133,7 @@ def run(session: Session, page: LivePage, *, ends: Callable[[], bool]) -> None:
                 # Not so long after this: of frames that take two thirds of that time, only every other would be seen.
                 shown, show_due = moment, max(show_due + SHOWN_EVERY_S, now)
             if now - told_at >= TOLD_EVERY_S:
-                page.tell(session.status())
+                page.tell()
                 told_at, was_told = now, True
         except (MemoryError, RuntimeError) as error:
             if not (was_told and is_out_of_memory(error)):

@@ -8,7 +8,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -42,22 +41,6 @@ FASTER = " --anyway lets frames take as long as they do; fewer substeps or --pre
 """Remedies where nobody changed or dragged anything: against steps that are too long, and against slow frames."""
 
 
-@dataclass(frozen=True)
-class Status:
-    """State of a running scene."""
-
-    frame: int
-    time_s: float  # simulated [s]
-    frame_ms: float  # wall time of the last frame's computation [ms]
-    substeps: Mapping[str, int]  # of the last frame, by solver
-    # of that frame, by its cloth, where contacts and bodies may want more; None without a frame or without cloth in
-    # fixed steps
-    substeps_asked: Value | None
-    real_time: float  # simulated over wall time in the last second or so; 0 while it is paused
-    is_paused: bool
-    message: str  # the last thing that has to be known, "" if there is none
-
-
 class _FrameLeftError(Exception):
     """Nobody wants the frame any more that is being computed."""
 
@@ -74,6 +57,9 @@ class Session(Requests):
         drags: everything that browsers hold.
         speed: simulated over wall time that is wanted, 1 for real time.
         report: of the last frame; None before the first.
+        frame_ms: wall time of that frame's computation [ms].
+        substeps_asked: of that frame, by its cloth, where contacts and bodies may want more; None without a frame or
+            without cloth in fixed steps.
         on_frame: called after each frame with its report, as a recording does; None: nobody.
         on_jump: called before time goes back, as a recording cannot; None: nobody.
         ends: asked within frames whether all is over, so that the frame need not be computed to its end.
@@ -126,8 +112,8 @@ class Session(Requests):
         self._changes: list[tuple[int, str]] = []
         self._checkpoints = Checkpoints()
         self.report: FrameReport | None = None
-        self._frame_ms = 0.0
-        self._substeps_asked: Value | None = None
+        self.frame_ms = 0.0
+        self.substeps_asked: Value | None = None
 
     def ask_reset(self) -> None:
         """Have all begin anew; a frame that is being computed is left for it."""
@@ -168,8 +154,8 @@ class Session(Requests):
             return
         self.report = report
         self.clear(FIRST)
-        self._frame_ms = 1e3 * took_s
-        self._substeps_asked = self.values.get("cloth.substeps")
+        self.frame_ms = 1e3 * took_s
+        self.substeps_asked = self.values.get("cloth.substeps")
         if self.on_frame is not None and bodies is not None:
             self.on_frame(report, bodies)
         if checkpoint is not None:
@@ -179,21 +165,16 @@ class Session(Requests):
         """Go back to where the scene was sound, as there was no memory for something else. Raises CannotGoOnError."""
         self._go_back(f"{NO_MEMORY}: {trouble}", remedy="")
 
-    def status(self) -> Status:
-        """The state now."""
+    @property
+    def substeps(self) -> Mapping[str, int]:
+        """Substeps of the last frame, by solver."""
+        return {} if self.report is None else self.report.substeps
+
+    @property
+    def real_time(self) -> float:
+        """Simulated over wall time in the last second or so; 0 while it is paused."""
         span = self._clock() - self._begins[0] if len(self._begins) > 1 else 0.0
-        rate = 0.0 if self.is_paused or span <= 0.0 else (len(self._begins) - 1) * self.dt / span
-        substeps = {} if self.report is None else self.report.substeps
-        return Status(
-            frame=self.world.frame,
-            time_s=self.world.time_s,
-            frame_ms=self._frame_ms,
-            substeps=substeps,
-            substeps_asked=self._substeps_asked,
-            real_time=rate,
-            is_paused=self.is_paused,
-            message=self.message,
-        )
+        return 0.0 if self.is_paused or span <= 0.0 else (len(self._begins) - 1) * self.dt / span
 
     def bodies(self) -> dict[str, Snapshot]:
         """All bodies now; arrays that no later frame changes."""

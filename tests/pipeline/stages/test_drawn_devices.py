@@ -15,7 +15,7 @@ from pipeline.base.task import ArtifactPath, Task, TaskId, TaskState
 from pipeline.record.manifest import Manifest
 from pipeline.show.report.page import write_report
 from pipeline.store.artifacts import committing
-from pipeline.store.origins import origins_of
+from pipeline.store.provenance import origins_of
 from pipeline.store.receipts import Receipt
 
 GPU = "OPTIX: NVIDIA H100"

@@ -34,10 +34,7 @@ class Clock:
     def show(self) -> None:
         self.shown_at.append(self.now)
 
-    def tell(self, status: Any) -> None:
-        pass
-
-    def status(self) -> None:
+    def tell(self) -> None:
         pass
 
     def free_memory(self, trouble: str) -> None:

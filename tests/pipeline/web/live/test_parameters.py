@@ -128,7 +128,7 @@ def test_a_small_fluid_runs_and_is_drawn(tmp_path):
         for _ in range(20):
             session.advance()
         page.show()
-        page.tell(session.status())
+        page.tell()
         assert "substeps: water" in page._state.content
         water = session.bodies()["water"].arrays["position"]
         assert server.scene.get_handle_by_name("/fluid/water").points.shape == water.shape
@@ -144,13 +144,13 @@ def test_a_page_has_odd_values_and_tells_what_happens_while_time_stands_still(tm
     with page_server(port=0, label="drape") as server:
         page = page_of(server, read, session, tmp_path)
         session.advance()
-        page.tell(session.status())
+        page.tell()
         assert "substeps: cloth 9 (1 asked for), rigid 9" in page._state.content  # as many as the ball asks for
         session.message = "something new"
-        page.tell(session.status())
+        page.tell()
         assert "something new" in page._notice.content
         session.message = ""
-        page.tell(session.status())
+        page.tell()
         assert page._notice.content == ""
         assert tuple(server.initial_camera.up) == (0.0, 0.0, 1.0)
 

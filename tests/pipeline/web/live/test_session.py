@@ -171,16 +171,16 @@ def test_after_a_blow_up_live_does_not_take_for_its_own_what_was_turned_long_ago
 def test_substeps_are_told_beside_those_that_their_frame_was_asked_for_and_not_after_a_jump(tmp_path):
     session = session_of(tmp_path)
     run(session, 1)
-    taken = session.status().substeps["cloth"]
+    taken = session.substeps["cloth"]
     session.set("cloth.substeps", 6)
-    assert (session.status().substeps["cloth"], session.status().substeps_asked) == (taken, 8)
+    assert (session.substeps["cloth"], session.substeps_asked) == (taken, 8)
     session.reset()
     assert session.report is None
-    assert (session.status().substeps, session.status().substeps_asked) == ({}, None)
+    assert (session.substeps, session.substeps_asked) == ({}, None)
     run(session, 1)
-    assert session.status().substeps_asked == 6
+    assert session.substeps_asked == 6
     blow_up(session)
-    assert (session.status().substeps, session.status().substeps_asked) == ({}, None)
+    assert (session.substeps, session.substeps_asked) == ({}, None)
 
 
 def test_cloth_with_values_that_are_no_numbers_goes_back_too(tmp_path):
@@ -221,7 +221,7 @@ def test_a_single_step_stands_still_after_it(tmp_path):
     session.meet_requests()
     assert session.world.frame == 1
     assert session.is_paused
-    assert session.status().real_time == 0.0
+    assert session.real_time == 0.0
 
 
 EXPLICIT = WITHOUT_BALL.replace("substeps = 8", 'integrator = "explicit"\nsubsteps = 100\nmass_per_area = 0.2')
