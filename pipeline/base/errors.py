@@ -18,11 +18,7 @@ NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUP
 
 
 class PipelineError(Exception):
-    """Base of everything that ends a command with a clear line instead of a traceback.
-
-    Attributes:
-        exit_code: what the command line exits with.
-    """
+    """Base of everything that ends a command, with an exit code, with a clear line instead of a traceback."""
 
     exit_code = 1
 

@@ -70,9 +70,7 @@ class LeaseHolder:
 class Lease:
     """A lease that this process holds; a context manager that keeps its heartbeat going, and gives it back.
 
-    Attributes:
-        holder: this process.
-        takeover: a sentence, if the lease of a dead holder was taken over; else None.
+    `takeover` is a sentence, if the lease of a dead holder was taken over; else None.
     """
 
     def __init__(self, path: Path, holder: LeaseHolder, takeover: str | None) -> None:

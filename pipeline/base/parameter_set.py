@@ -46,14 +46,9 @@ class ParameterSet:
         tools: Mapping[str, str],
         **more: Any,
     ) -> ParameterSet:
-        """Collect parameters; models and plain JSON values alike, in any order.
+        """Collect parameters, by name; models and plain JSON values alike, in any order.
 
-        Args:
-            values: parameters by name; here a name may be one of the words below.
-            stage: name of the stage.
-            version: of the stage.
-            tools: version of each tool that does the work.
-            **more: further parameters.
+        A name in `values` may be one of the words that follow. `tools` are versions of what does the work.
 
         Raises:
             ValueError: two parameters share a name, or a value is not a finite number.

@@ -51,10 +51,7 @@ def load_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool =
 def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool = False) -> LoadedJob:
     """Read and validate a job file; the scene itself is looked at by `check_job`.
 
-    Args:
-        path: the TOML file.
-        overrides: arguments of `--set`, applied in order.
-        preview: make the fast, small version of the job.
+    `overrides` are arguments of `--set`, applied in order; `preview` makes it the fast, small version of the job.
 
     Raises:
         JobFileError: carries every problem found.

@@ -32,11 +32,9 @@ class Override:
 
 
 def parse_override(argument: str, document: Mapping[str, Any]) -> Override:
-    """Read `path.to.key=value`; the path may name an element by its index or its `name`.
+    """Read `path.to.key=value`; the path may name an element by its index or its `name` in the job file as parsed.
 
-    Args:
-        argument: e.g. `render.quality=final`, `fluid.water.viscosity=1e-3`, `camera.position=[1, 2, 3]`.
-        document: the job file as parsed, which indices and names refer to.
+    As `render.quality=final`, `fluid.water.viscosity=1e-3`, `camera.position=[1, 2, 3]`.
 
     Raises:
         OverrideError: no `=`, a path that no job has, an element that this job does not have.

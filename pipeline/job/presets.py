@@ -21,8 +21,7 @@ where coarser cells could not carry their eddies."""
 def preview_overrides(job: Job) -> list[Override]:
     """A fast, small version: half the picture, coarse physics, draft quality; the same scene, camera and length.
 
-    Args:
-        job: with absolute mesh paths.
+    The job has absolute mesh paths.
     """
     width, height = job.render.resolution
     changes: list[tuple[tuple[str | int, ...], object]] = [

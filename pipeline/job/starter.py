@@ -14,13 +14,7 @@ _FOLDER = Path(__file__).with_name("templates")
 
 
 def starter(name: str, template: str, *, file: str) -> str:
-    """The text of a job file that passes every check.
-
-    Args:
-        name: the job's name.
-        template: one of `TEMPLATES`.
-        file: how the file is called in the commands that it shows.
-    """
+    """The text of a job file that passes every check; the commands that it shows call it `file`."""
     text = (_FOLDER / f"{template}.toml").read_text(encoding="utf-8")
     return Template(text).substitute(name=name, file=file)
 

@@ -42,10 +42,7 @@ class Findings:
 class JobSource:
     """Source of each key of a job: a line of the file, or the option that set it.
 
-    Args:
-        name: how the file is called in messages.
-        text: the file's text, valid TOML.
-        options: keys that an option set, with the option's spelling, e.g. `--preview`.
+    Messages call the file by `name`; `text` is valid TOML; `options` has each key's option as it is spelled.
     """
 
     def __init__(self, name: str, text: str, options: Mapping[KeyPath, str] | None = None) -> None:

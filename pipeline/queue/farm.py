@@ -48,11 +48,7 @@ class StopReason(StrEnum):
 
 
 class FarmControl(RunControl):
-    """Stops a run when its entry in the queue, a more urgent job or the disk says so; and on signals.
-
-    Attributes:
-        reason: why the farm stopped it; None while it did not.
-    """
+    """Stops a run, for a `reason`, when its entry, a more urgent job or the disk says so; and on signals."""
 
     def __init__(self, queue: JobQueue, job: QueuedJob, lease: Lease, say: Callable[[str], None]) -> None:
         super().__init__()

@@ -67,10 +67,8 @@ def run(
     """Queue a job, run or watch it, say how it ended, and return the exit code of that.
 
     Args:
-        job: the job.
         layout: its folder; made if it is not there.
         todo: the stages that will have to run; that they can run here is made sure of before any work.
-        options: how it waits its turn.
         submitted: the job file, kept in the folder with the meshes that it names; None: it is there already.
         rerun: tasks to run again although they are up to date.
         paused: its entry in the queue, which is to go on as it was meant.

@@ -104,8 +104,7 @@ class Manifest(ManifestReader):
     def transaction(self, *, durable: bool = True) -> Iterator[None]:
         """Group calls into one commit; nested ones join the outermost.
 
-        Args:
-            durable: sync it to the disk. Without, a power cut may take the last commits; a crash of the process not.
+        Unless it is `durable`, a power cut may take the last commits; a crash of the process not.
 
         Raises:
             OSError: ENOSPC, the disk is full.
@@ -203,14 +202,7 @@ class Manifest(ManifestReader):
     ) -> None:
         """Close an attempt; what a closed one says stands.
 
-        Args:
-            task: the task.
-            attempt: number from `start_attempt`.
-            failure: why it ended; None if it succeeded.
-            message: what the user should read about it.
-            seconds: how long it worked.
-            peak_memory_bytes: most memory that its process held.
-            state: the task's state from now on, set in the same commit; None leaves it.
+        `failure` is why it ended, None if it succeeded; `state` is the task's from now on, set in the same commit.
         """
         outcome = SUCCEEDED if failure is None else str(failure)
         with self.transaction():

@@ -153,13 +153,10 @@ class ManifestReader:
     def open_readonly(
         cls, path: Path, *, leave_no_trace: bool = False, timeout_s: float = BUSY_TIMEOUT_S
     ) -> ManifestReader:
-        """Open beside a working runner, or where the folder itself may only be read.
+        """Open beside a working runner, or where the folder itself may only be read; wait so long for a lock.
 
-        Args:
-            path: the manifest.
-            leave_no_trace: make no file beside one that nobody has open, as SQLite else does for its index. A runner
-                that starts meanwhile is not noticed then: see `pipeline.record.glance`.
-            timeout_s: how long to wait for another process's lock.
+        To `leave_no_trace` no file is made beside a manifest that nobody has open, as SQLite else does for its index. A
+        runner that starts meanwhile is not noticed then: see `pipeline.record.glance`.
 
         Raises:
             ManifestError: there is none, it is damaged, or a newer program's.

@@ -198,14 +198,10 @@ def assess(
     parameters: Callable[[str], ParameterSet | None],
     forced: frozenset[TaskId] = frozenset(),
 ) -> list[Assessment]:
-    """What would run, and why.
+    """What would run, and why, of a plan with makers before users, held against the artifacts on record.
 
-    Args:
-        tasks: the plan, makers before users.
-        rows: the artifacts on record.
-        problems: the recorded artifacts whose file does not count; see `reconcile.inspect_files`.
-        parameters: finds an old parameter set by its digest, to name what changed: `Manifest.parameters`.
-        forced: tasks that are to run again whatever the record says.
+    `problems` are of recorded artifacts whose file does not count; see `reconcile.inspect_files`. `parameters` finds an
+    old parameter set by its digest, to name what changed. Tasks that are `forced` run whatever the record says.
     """
     with many_objects():
         assessor = _Assessor(rows, problems, parameters, forced)

@@ -57,7 +57,6 @@ def run_job(
     """Run a job until nothing is left to do, or somebody stops it.
 
     Args:
-        job: the job.
         layout: its folder; made if it is not there.
         executor: runs the tasks; shut down by the caller.
         job_text: the job file, kept in the folder for the workers; None: it is there already.

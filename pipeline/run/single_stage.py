@@ -64,15 +64,10 @@ def run_tasks(
     stages: str = STAGES_REFERENCE,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> StageOutcome:
-    """Run those of these tasks that are not done, one after another, in this process.
+    """Run those of these tasks, makers before users, that are not done, one after another, in this process.
 
-    Args:
-        todo: the tasks, makers before users; what else they read is there.
-        layout: the job's folder, with its job file.
-        capacity: what a task may use.
-        tell: takes the share that is done, 0 to 1, and a sentence.
-        stages: where the stages are, as `module:ATTRIBUTE`.
-        stop_requested: whether to write a checkpoint and return.
+    What else they read is in the job's folder. `tell` takes the share that is done, 0 to 1, and a sentence. Once
+    `stop_requested` says so a task writes a checkpoint, and no other one follows.
 
     Raises:
         PipelineError: an input is not there.

@@ -24,10 +24,8 @@ from sim.core.runtime import cache_folder
 def compiled_once(device: str, blender: str, tell: Callable[[str], None]) -> Iterator[None]:
     """The first picture of a renderer on a GPU: alone, where the kernels for that GPU may have to be compiled.
 
-    Args:
-        device: what Cycles draws on, e.g. `OPTIX: NVIDIA RTX 4090`.
-        blender: version of the Blender that draws.
-        tell: called with the reason of a long wait; "" where there is none.
+    `device` is what Cycles draws on, e.g. `OPTIX: NVIDIA RTX 4090`, and `blender` a version. `tell` is called with the
+    reason of a long wait; "" where there is none.
     """
     marker = kernels_marker(device, blender)
     with _alone(marker, device, tell):

@@ -98,10 +98,6 @@ def committing(
     OSError that it is.
 
     Args:
-        layout: the job's folder.
-        artifact: what is committed.
-        task: the task that makes it.
-        attempt: number of this attempt, from `Manifest.start_attempt`.
         fingerprint: `task_fingerprint` of the task with the inputs as they are now.
         validate: decodes the file; raises InvalidArtifactError if it is not what it should be.
         inputs: hash of each input, kept so that `explain` can name the one that changed.

@@ -72,15 +72,10 @@ def write_frame(
     device: str,
     longest_shutter_s: float | None = None,
 ) -> None:
-    """Write one frame, and the device that computed it.
+    """Write the bodies of one frame, by name, with its report and the device that computed it.
 
-    Args:
-        path: the file to write.
-        bodies: snapshots by name.
-        report: number, time and diagnostics of the frame.
-        device: what computed it.
-        longest_shutter_s: the longest time that the shutter of any picture is open [s]: what no picture shows of a
-            smoke is left out, and the rest rounded (`kinds.smoke_codec`). None keeps smoke as it is.
+    What no picture shows of a smoke whose shutter is open `longest_shutter_s` [s] at the longest is left out, and the
+    rest rounded (`kinds.smoke_codec`). None keeps smoke as it is.
 
     Raises:
         InvalidArtifactError: a value of a smoke is not finite.

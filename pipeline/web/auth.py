@@ -184,13 +184,9 @@ def is_loopback(host: str) -> bool:
 class Gate:
     """Middleware that passes requests whose host, session and origin are right, and adds `HEADERS` to every answer.
 
-    `scope["session"]` is the session's name behind it.
-
-    Args:
-        app, access: the application behind it, and the rules.
-        refuse: makes the answer to a request that may not pass, of a status and a sentence.
-        ask: makes the page that asks for the token, with a sentence about the one that was given.
-        welcome: makes the page that leads on to the farm.
+    `scope["session"]` is the session's name behind it. The answer to a request that may not pass is what `refuse` makes
+    of a status and a sentence; the page that asks for the token is `ask`'s, with a sentence about the one that was
+    given, and the one that leads on to the farm is `welcome`'s.
     """
 
     def __init__(

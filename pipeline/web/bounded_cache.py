@@ -14,9 +14,7 @@ V = TypeVar("V")
 class BoundedCache(Generic[K, V]):
     """A cache by key; each value is valid for one state of its source. Safe to share between threads.
 
-    Args:
-        most_bytes: of all values together; the one that came last is kept in any case.
-        size_of: of a value [bytes].
+    All values together have `most_bytes` by their sizes [bytes]; the one that came last is kept in any case.
     """
 
     def __init__(self, most_bytes: int, size_of: Callable[[V], int]) -> None:

@@ -193,9 +193,7 @@ class Server(uvicorn.Server):
 def page_server(*, host: str = LOCAL, port: int = 0, label: str | None = None) -> Iterator[viser.ViserServer]:
     """A viser server that answers its own pages only, and only on this machine, for the time of the block.
 
-    Args:
-        host, port: address that it listens at; port 0 takes one that is free.
-        label: of its panel.
+    Port 0 takes one that is free; `label` is that of its panel.
 
     Raises:
         PipelineError: viser cannot be guarded, or the address cannot be had, or others reach it.

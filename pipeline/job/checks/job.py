@@ -28,13 +28,10 @@ BURNING_SUN = 20.0
 
 
 def check_description(job: Job, memory_bytes: int | None = None) -> Findings:
-    """Look at all that the job file describes.
+    """Look at all that a job describes, which `read_job` has returned, with absolute mesh paths.
 
-    Reads the mesh files and fills the fluid's blocks, so it takes a second or two for a large scene.
-
-    Args:
-        job: a job as `read_job` returns it, with absolute mesh paths.
-        memory_bytes: what the simulation may use; this machine's if omitted.
+    Reads the mesh files and fills the fluid's blocks, so it takes a second or two for a large scene. The simulation may
+    use `memory_bytes`; this machine's if omitted.
     """
     findings = Findings()
     _check_bodies(job, findings)

@@ -27,14 +27,9 @@ class MemoryBudget:
     def refusal(
         self, elements: float, called: str, bytes_each: float, *, before: float = 0.0, beside: str = ""
     ) -> str | None:
-        """Reason why so many elements, with those `before` them, do not fit; None if they do.
+        """Reason why so many elements, of a memory each [bytes], do not fit with those `before` them; None if they do.
 
-        Args:
-            elements: how many.
-            called: what they are, for people: "particles".
-            bytes_each: memory of each [bytes].
-            before: of others that have their place.
-            beside: the others, in words.
+        For people, they are `called` "particles", say, and the others are named in `beside`.
         """
         need = (elements + before) * bytes_each
         if need <= self.bytes:

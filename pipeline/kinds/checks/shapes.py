@@ -40,13 +40,9 @@ def mesh_exists(shape: object, path: KeyPath, findings: Findings) -> bool:
 
 
 def file_exists(name: str, kind: str, key: KeyPath, findings: Findings) -> bool:
-    """Whether a file is there; notes what is wrong, and the name that may be meant.
+    """Whether a file, by its absolute path, is there; notes what is wrong with the key, and the name that may be meant.
 
-    Args:
-        name: its absolute path.
-        kind: what it is, for messages: "mesh".
-        key: that names it.
-        findings: where errors go.
+    `kind` is what it is, for messages: "mesh".
     """
     file = Path(name)
     if file.is_file():
@@ -64,10 +60,7 @@ def file_exists(name: str, kind: str, key: KeyPath, findings: Findings) -> bool:
 def thin_wall_problem(solid: PlacedSolid, *, who: str, what: str) -> str | None:
     """Reason why walls of a body are too thin for the finest grid of its distances; None if they are not.
 
-    Args:
-        solid: the body; primitives need no grid.
-        who: meets it by that grid.
-        what: may pass through the walls then.
+    `who` meets it by that grid, and `what` may pass through the walls then; primitives need no grid.
     """
     from sim.shapes.distance_grids import CELLS_PER_WALL, THIN_SHARE, grid_spacing, thin_wall
 

@@ -62,12 +62,10 @@ def stage_rows(
     busy_s: Mapping[str, float],
     window_s: float,
 ) -> tuple[StageRow, ...]:
-    """The stages of a job.
+    """The stages of a job, by their numbers of tasks, their speed, and their long tasks.
 
-    Args:
-        summaries, paces, long_tasks: of the stages: numbers of tasks by state, speed, long tasks by stage.
-        busy_s: how long attempts of a stage took in the last `window_s`, those beside each other added up [s].
-        window_s: length of that time [s]; 0 if nothing runs.
+    `busy_s` is how long attempts of a stage took in the last `window_s`, those beside each other added up [s]; that is
+    0 if nothing runs.
     """
     rows = []
     for summary in summaries:

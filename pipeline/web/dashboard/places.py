@@ -13,11 +13,7 @@ class NotThereError(PipelineError):
 
 
 class Places:
-    """Paths of jobs and files by their names, all within a farm.
-
-    Attributes:
-        farm: the folder that holds the jobs' folders, resolved.
-    """
+    """Paths of jobs and files by their names, all within a farm: the folder of the jobs' folders, resolved."""
 
     def __init__(self, farm: Path) -> None:
         self.farm = farm.resolve()

@@ -30,9 +30,7 @@ MOST_ERROR_IN_RADII = 0.1
 class Canvas:
     """The scene of a viser server. Not for several threads at once.
 
-    Args:
-        server: what pages connect to.
-        when_new: called with the name and viser's handle of each thing that is made, also of one that is made anew.
+    `when_new` is called with the name and viser's handle of each thing that is made, also of one that is made anew.
     """
 
     def __init__(
@@ -96,14 +94,9 @@ class Canvas:
         position: ArrayLike = (0.0, 0.0, 0.0),
         orientation: ArrayLike = NO_TURN,
     ) -> None:
-        """A triangle mesh.
+        """A triangle mesh of vertices [m], (n, 3), in its own axes, and faces, (k, 3), in sRGB, opaque or not.
 
-        Args:
-            name: of the thing.
-            vertices, faces: [m], (n, 3), in its own axes, and their indices, (k, 3).
-            color, opacity: sRGB, and 0 to 1; opaque if omitted.
-            two_sided: as cloth is.
-            position, orientation: of its axes: [m], and a unit quaternion w, x, y, z.
+        Its axes are at a position [m] and turned by a unit quaternion w, x, y, z; cloth is two-sided.
         """
         rows, triangles = np.asarray(vertices, np.float32), np.asarray(faces, np.uint32)
         if not len(triangles):

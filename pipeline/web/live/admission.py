@@ -72,8 +72,7 @@ def computing_power(*, cores: int, on_gpu: bool) -> int:
 def require_small(job: Job, particles: int, *, cores: int, on_gpu: bool) -> None:
     """Refuse a scene whose frames would take too long on this many cores, or on a GPU.
 
-    Args:
-        particles: that its fluids will have, as the checks count them: of emitters, what flows in during the film.
+    `particles` are those that its fluids will have, as the checks count them: of emitters, what flows in in the film.
 
     Raises:
         PipelineError: says about how long a frame takes, and what would fit.

@@ -45,9 +45,7 @@ the record."""
 class Recorder:
     """A recorder of a session: each recording has a folder NAME-take, NAME-take-2, ... of its own.
 
-    Attributes:
-        loaded: the job, as it was read.
-        became: the outcome of the last recording that has ended, "" before.
+    `became` is the outcome of the last one that has ended, "" before.
     """
 
     def __init__(self, loaded: LoadedJob, session: Session, output: Path, *, device: str) -> None:

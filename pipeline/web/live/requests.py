@@ -16,14 +16,9 @@ class CannotGoOnError(PipelineError):
 
 
 class Requests:
-    """A queue of calls from any thread, met by the thread that owns the scene.
+    """A queue of calls from any thread, met by the thread that owns the scene; `message` is the first one.
 
-    Attributes:
-        revision: grows with every request that is refused.
-        silent: requests that leave a refusal standing.
-
-    Args:
-        message: the first one.
+    `revision` grows with every request that is refused; those that are `silent` leave a refusal standing.
     """
 
     def __init__(self, message: str) -> None:

@@ -39,13 +39,9 @@ def require_sound(report: FrameReport) -> None:
 
 
 class FrameTimer:
-    """A timer that looks at the clock after every substep of a frame: a page answers between frames only.
+    """A timer that looks at the clock [s] after every substep of a frame: a page answers between frames only.
 
-    Attributes:
-        longest_s: longest time that a frame may take [s]; infinite where people asked for slow frames.
-
-    Args:
-        clock: tells the time [s].
+    A frame may take `longest_s` at the longest; infinite where people asked for slow frames.
     """
 
     def __init__(self, longest_s: float, *, clock: Callable[[], float]) -> None:

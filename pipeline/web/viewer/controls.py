@@ -17,12 +17,9 @@ RATES = (120, 60, 30, 24, 15, 10, 5, 2, 1)
 
 
 class Controls:
-    """The panel beside the scene.
+    """The panel beside the scene, at first with so many frames a second; `changed` is called when something is chosen.
 
-    Args:
-        rate: frames a second at first.
-        waits: whether there is no frame yet, so that the newest is to be followed.
-        changed: called when another thing is to be shown or plotted.
+    `waits`: there is no frame yet, so that the newest is to be followed.
     """
 
     def __init__(self, gui: viser.GuiApi, job: Job, *, rate: int, waits: bool, changed: Callable[[Any], None]) -> None:

@@ -50,10 +50,7 @@ def read_shown_frame(
 ) -> ShownFrame:
     """Read a committed frame; files that are missing yet are left out, those that are damaged are told.
 
-    Args:
-        committed: the job's frames, one of which has the number `frame`.
-        most_particles: of a fluid that are kept.
-        surfaces: whether to read the fluids' surfaces, which take longer than all the rest.
+    Of a fluid `most_particles` are kept; its surface takes longer to read than all the rest.
 
     Raises:
         InvalidArtifactError: the cached frame itself cannot be read.

@@ -25,11 +25,7 @@ TABLE_STYLE = (
 
 
 class SolverSeries:
-    """The numbers of all frames that have been read, by frame.
-
-    Attributes:
-        version: grows with every change.
-    """
+    """The numbers of all frames that have been read, by frame; `version` grows with every change."""
 
     def __init__(self) -> None:
         self._frames: dict[int, FrameNumbers] = {}
@@ -112,14 +108,7 @@ def table(numbers: FrameNumbers) -> str:
 
 
 def plot(frames: Sequence[int], values: Sequence[float], *, current: int | None, last: int) -> str:
-    """A number over the frames as HTML, with a mark at the frame that is seen.
-
-    Args:
-        frames: rising.
-        values: as many, finite.
-        current: the frame that is seen.
-        last: the film's last frame, where the axis ends.
-    """
+    """A finite number over rising frames as HTML, with a mark at the current one; the axis ends at the last."""
     if not frames:
         return f'{PLOT_STYLE}<div class="plot" style="opacity:.6">nothing to plot yet</div>'
     whole = Line("the film", [0, max(last, 1)], [0.0, 0.0])  # not drawn, but the axes hold it

@@ -40,12 +40,7 @@ ASIDE = np.radians(24.0)
 
 
 class ViewPage:
-    """A job in the browsers of a server.
-
-    Args:
-        layout: the job's folder, which is only read.
-        most_particles: of a fluid that are drawn.
-        most_bytes: of frames that are kept in memory.
+    """A job in the browsers of a server; its folder is only read, and kept frames take `most_bytes` of memory.
 
     Raises:
         PipelineError: the job file cannot be used.

@@ -7,13 +7,10 @@ from collections.abc import Sequence
 
 
 class Playback:
-    """A playhead over the frames that are there, which may become more.
+    """A playhead over the frames that are there, which may become more, at a rate of the film's frames a second.
 
     Frames are chosen by the clock: a page that is too slow for the rate misses some, and the film keeps its pace.
-
-    Attributes:
-        rate: frames of the film a second.
-        repeats: begin again behind the last frame; else stay there.
+    Behind the last frame it `repeats`, or stays there.
     """
 
     def __init__(self, *, rate: float, repeats: bool = True) -> None:
