@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,6 +77,14 @@ class JobLayout:
     def log(self, task_id: TaskId, attempt: int) -> Path:
         """Log of one attempt."""
         return self.root / "logs" / f"{task_id}.{attempt}.log"
+
+    def logs(self) -> Iterator[tuple[TaskId, int, Path]]:
+        """Every log: of which task and attempt, and where it is."""
+        folder = self.root / "logs"
+        for path in sorted(folder.rglob("*.log")):
+            task, _, number = path.relative_to(folder).as_posix().removesuffix(".log").rpartition(".")
+            if number.isdigit():
+                yield TaskId(task), int(number), path
 
     def receipt(self, artifact: ArtifactPath) -> Path:
         """Receipt of a committed artifact."""

@@ -5,7 +5,7 @@ The solvers name their diagnostics (`sim.core.solver.Diagnostics`); a name that 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 SHARE = "%"  # unit of numbers that are stored as fractions of 1 and shown in per cent
@@ -20,6 +20,11 @@ class Quantity:
     unit: str  # in which it is stored, `SHARE` for fractions; empty for counts
     panel: str  # title of the plot that it belongs on, with others of its kind
     counted: bool = False  # it is a whole number
+
+    @property
+    def scale(self) -> float:
+        """What a stored number is multiplied by to be in its unit."""
+        return 100.0 if self.unit == SHARE else 1.0
 
     def text(self, value: float) -> str:
         """The number with its unit, to four digits."""
@@ -120,6 +125,13 @@ def in_order(names: Iterable[str]) -> list[str]:
         return known.index(of_all) if of_all in _KNOWN else len(known), name
 
     return sorted(names, key=place)
+
+
+def with_energy(numbers: Mapping[str, float]) -> dict[str, float]:
+    """A solver's numbers, and its mechanical energy where it tells its parts."""
+    if not {"kinetic_energy", "potential_energy"} <= set(numbers):
+        return dict(numbers)
+    return {**numbers, MECHANICAL_ENERGY: sum(numbers.get(part, 0.0) for part in PARTS_OF_ENERGY)}
 
 
 @dataclass(frozen=True, slots=True)

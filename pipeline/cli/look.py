@@ -268,15 +268,15 @@ def _tell_story(layout: JobLayout, task: str, *, as_json: bool) -> None:
 
 
 def _print_log(job: str, layout: JobLayout, task: str | None, attempt: int | None, *, follow: bool) -> None:
-    folder = layout.root / "logs"
     if task is None:
-        for path in sorted(folder.rglob("*.log")):
-            name, _, number = path.relative_to(folder).as_posix().removesuffix(".log").rpartition(".")
+        for name, number, path in layout.logs():
             click.echo(f"{name}  attempt {number}  {path.stat().st_size:,} bytes")
         return
-    attempts = _attempts_with_log(layout, TaskId(task))
+    attempts = {number: path for name, number, path in layout.logs() if name == task}
     if not attempts:
-        raise PipelineError(f'no log of a task "{task}" in {folder}; those that have one: pipeline explain {job} --log')
+        raise PipelineError(
+            f'no log of a task "{task}" in {layout.root}; those that have one: pipeline explain {job} --log'
+        )
     chosen = max(attempts) if attempt is None else attempt
     if chosen not in attempts:
         raise PipelineError(f"no log of attempt {chosen}; there are {', '.join(map(str, sorted(attempts)))}")
@@ -327,13 +327,6 @@ def _activity_of_recording(layout: JobLayout) -> str:
         return f"{short}: {found.flaw}" if found.is_cut else f"{short} before its first frame"
     short += f" with {wording.counted(found.whole, 'frame')}"
     return f"{short}, and {found.flaw}; {film} of those before it" if found.is_cut else f"{short}; {film} of all"
-
-
-def _attempts_with_log(layout: JobLayout, task: TaskId) -> dict[int, Path]:
-    first = layout.log(task, 1)
-    stem = first.name.removesuffix(".1.log")
-    logs = first.parent.glob(f"{stem}.*.log") if first.is_relative_to(layout.root / "logs") else iter(())
-    return {int(path.name.split(".")[-2]): path for path in logs if path.name.split(".")[-2].isdigit()}
 
 
 def _is_running(layout: JobLayout, task: TaskId, attempt: int) -> bool:

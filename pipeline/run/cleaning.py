@@ -10,6 +10,7 @@ from pathlib import Path
 
 from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
+from pipeline.base.task import TaskId
 from pipeline.job.loading import load_job
 from pipeline.record.manifest import Manifest
 from pipeline.run.plan import plan_job
@@ -85,14 +86,10 @@ def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Pa
 
 def superseded_logs(layout: JobLayout) -> list[Path]:
     """The logs of attempts that a later one of the same task has followed."""
-    folder = layout.root / "logs"
-    last: dict[str, tuple[int, Path]] = {}
+    last: dict[TaskId, tuple[int, Path]] = {}
     older = []
-    for path in sorted(folder.rglob("*.log")):
-        task, _, number = path.relative_to(folder).as_posix().removesuffix(".log").rpartition(".")
-        if not number.isdigit():
-            continue
-        attempt = (int(number), path)
+    for task, number, path in layout.logs():
+        attempt = (number, path)
         if task in last:
             older.append(min(attempt, last[task])[1])
         last[task] = max(attempt, last.get(task, attempt))

@@ -30,10 +30,10 @@ class ReportFilm:
     height: int
     remark: str = ""  # why it is not the film itself, or not that of the job as it is now; empty if it is
 
-    @property
-    def address(self) -> str:
-        """An address that holds it."""
-        return f"data:{self.mime};base64,{b64encode(self.content).decode()}"
+
+def as_address(content: bytes, mime: str) -> str:
+    """An address that holds a picture or a film."""
+    return f"data:{mime};base64,{b64encode(content).decode()}"
 
 
 def film_of(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -159,11 +158,6 @@ def made_with(layout: JobLayout, artifacts: Iterable[ArtifactPath], *, stages: S
     found = [MadeWith(stage, dict(tools), maker, host, count) for (stage, tools, maker, host), count in files.items()]
     place = {stage: index for index, stage in enumerate(stages)}
     return sorted(found, key=lambda each: place.get(each.stage, len(place)))
-
-
-def as_data(picture: bytes) -> str:
-    """A WebP picture as an address that holds it."""
-    return f"data:image/webp;base64,{b64encode(picture).decode()}"
 
 
 def _current(job: Job, layout: JobLayout) -> frozenset[ArtifactPath] | None:

@@ -18,8 +18,8 @@ from pipeline.record.reader import StageTiming
 from pipeline.run.plan import frame_ranges
 from pipeline.run.solver_numbers import unreadable_whitewater
 from pipeline.show.report.chart import line_chart, swatch
-from pipeline.show.report.film import ReportFilm
-from pipeline.show.report.job_report import JobReport, MadeWith, as_data, gather
+from pipeline.show.report.film import ReportFilm, as_address
+from pipeline.show.report.job_report import JobReport, MadeWith, gather
 from pipeline.show.report.panels import Panel, panels_of
 
 
@@ -67,15 +67,12 @@ def _energies(reports: Sequence[JobReport]) -> str:
         energies = [energy for energy in report.numbers.total_energy() if math.isfinite(energy)]
         if energies:
             first, last = energies[0], energies[-1]
-            rows.append(
-                f"<tr><th>{escape(report.title)}</th><td>{first:.5g} J</td><td>{last:.5g} J</td>"
-                f"<td>{first - last:.5g} J</td></tr>"
-            )
+            numbers = "".join(f"<td>{number:.5g} J</td>" for number in (first, last, first - last))
+            rows.append(f"<th>{escape(report.title)}</th>{numbers}")
     if not rows:
         return '<p class="quiet">No solver tells its mechanical energy.</p>'
-    head = "<th>job</th><th>first frame</th><th>last frame</th><th>lost</th>"
     return (
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+        f"{_table(('job', 'first frame', 'last frame', 'lost'), rows)}"
         '<p class="quiet">Kinetic, potential and elastic energy of all bodies. Particles and bodies that leave the '
         "domain take theirs along.</p>"
     )
@@ -98,6 +95,14 @@ def _figure(panel: Panel) -> str:
 
 def _section(title: str, content: str) -> str:
     return f"<section><h2>{escape(title)}</h2>{content}</section>"
+
+
+def _table(names: Iterable[str], rows: Iterable[str], *, kind: str = "") -> str:
+    """A table, as wide as the page at most, of a heading and rows."""
+    head = "".join(f"<th>{name}</th>" for name in names)
+    mark = f' class="{kind}"' if kind else ""
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    return f'<div class="wide"><table{mark}><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _json(data: object) -> str:
@@ -134,7 +139,9 @@ def job_section(report: JobReport, *, headed: bool) -> str:
     if report.sheet is not None or report.sheet_remark:
         parts.append("<h3>Frames</h3>")
     if report.sheet is not None:
-        parts.append(f'<img class="sheet" src="{as_data(report.sheet)}" alt="frames of {escape(report.title)}">')
+        parts.append(
+            f'<img class="sheet" src="{as_address(report.sheet, "image/webp")}" alt="frames of {escape(report.title)}">'
+        )
     if report.sheet_remark:
         parts.append(f'<p class="quiet">{escape(report.sheet_remark)}</p>')
     return f"<section>{''.join(parts)}</section>"
@@ -150,10 +157,11 @@ def origins_section(report: JobReport, *, headed: bool) -> str:
 
 def _film(film: ReportFilm, title: str) -> str:
     size = f'width="{film.width}" height="{film.height}"'
+    address = as_address(film.content, film.mime)
     if film.mime.startswith("video/"):
-        shown = f'<video class="film" controls loop muted playsinline {size} src="{film.address}"></video>'
+        shown = f'<video class="film" controls loop muted playsinline {size} src="{address}"></video>'
     else:
-        shown = f'<img class="film" {size} src="{film.address}" alt="film of {escape(title)}">'
+        shown = f'<img class="film" {size} src="{address}" alt="film of {escape(title)}">'
     remark = f'<p class="quiet">{escape(film.remark)}</p>' if film.remark else ""
     return f"<div>{shown}{remark}</div>"
 
@@ -186,27 +194,23 @@ def _warnings(report: JobReport) -> str:
 
 def _timings(timings: Sequence[StageTiming]) -> str:
     most = max(timing.seconds for timing in timings) or 1.0
-    rows = "".join(
-        f"<tr><th>{escape(timing.stage)}</th><td>{timing.attempts:,}</td><td>{timing.failed:,}</td>"
+    rows = (
+        f"<th>{escape(timing.stage)}</th><td>{timing.attempts:,}</td><td>{timing.failed:,}</td>"
         f'<td class="bar"><span style="width:{100.0 * timing.seconds / most:.1f}%"></span>'
         f"{wording.duration(timing.seconds)}</td><td>{wording.duration(timing.longest_s)}</td>"
         f"<td>{wording.size(timing.peak_memory_bytes) if timing.peak_memory_bytes else '–'}</td>"
-        f"<td>{timing.artifacts:,}</td><td>{wording.size(timing.bytes)}</td></tr>"
+        f"<td>{timing.artifacts:,}</td><td>{wording.size(timing.bytes)}</td>"
         for timing in timings
     )
-    head = "".join(
-        f"<th>{name}</th>"
-        for name in ("stage", "attempts", "failed", "time of all", "longest", "peak memory", "files", "size")
-    )
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+    names = ("stage", "attempts", "failed", "time of all", "longest", "peak memory", "files", "size")
+    return _table(names, rows)
 
 
 def _versions(versions: Sequence[MadeWith]) -> str:
-    rows = "".join(
-        f"<tr><th>{escape(each.stage)}</th><td>{each.files:,}</td>"
+    rows = (
+        f"<th>{escape(each.stage)}</th><td>{each.files:,}</td>"
         f"<td>{escape(', '.join(f'{name} {version}' for name, version in each.tools.items()))}</td>"
-        f"<td>{escape(each.maker)}</td><td>{escape(each.host)}</td></tr>"
+        f"<td>{escape(each.maker)}</td><td>{escape(each.host)}</td>"
         for each in versions
     )
-    head = "".join(f"<th>{name}</th>" for name in ("stage", "files", "versions", "program", "machine"))
-    return f'<div class="wide"><table class="texts"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+    return _table(("stage", "files", "versions", "program", "machine"), rows, kind="texts")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from pipeline.base.quantities import MECHANICAL_ENERGY, PARTS_OF_ENERGY, SHARE, Quantity, in_order, quantity
+from pipeline.base.quantities import MECHANICAL_ENERGY, Quantity, in_order, quantity, with_energy
 from pipeline.show.report.chart import Line
 from pipeline.store.cache import FrameNumbers
 
@@ -35,8 +35,7 @@ class JobNumbers:
 
     def names(self, solver: str) -> list[str]:
         """Names of a solver's numbers, the mechanical energy among them where it has its parts."""
-        names = set().union(*(frame.solvers.get(solver, {}) for frame in self.frames))
-        return in_order(names | ({MECHANICAL_ENERGY} if _has_energy(names) else set()))
+        return in_order(set().union(*(with_energy(frame.solvers.get(solver, {})) for frame in self.frames)))
 
     def series(self, solver: str, name: str) -> list[float]:
         """A number of a solver by frame; NaN where it has none."""
@@ -114,8 +113,7 @@ def _all_series(index: int, job: JobNumbers, *, several: bool) -> Iterable[_Seri
     for solver_index, solver in enumerate(job.solvers):
         for name in job.names(solver):
             known = quantity(name, of_kind=kinds.get(solver))
-            scale = 100.0 if known.unit == SHARE else 1.0
-            values = [scale * value for value in job.series(solver, name)]
+            values = [known.scale * value for value in job.series(solver, name)]
             if name in NUMBERS_OF_STEPS:
                 steps = job.series(solver, "substeps")
                 values = [value if count else math.nan for value, count in zip(values, steps, strict=True)]
@@ -155,10 +153,4 @@ def _is_seen(values: Sequence[float]) -> bool:
 
 def _value(frame: FrameNumbers, solver: str, name: str) -> float:
     numbers = frame.solvers.get(solver, {})
-    if name == MECHANICAL_ENERGY:
-        return sum(numbers.get(part, 0.0) for part in PARTS_OF_ENERGY) if _has_energy(numbers) else math.nan
-    return numbers.get(name, math.nan)
-
-
-def _has_energy(names: Iterable[str]) -> bool:
-    return {"kinetic_energy", "potential_energy"} <= set(names)
+    return (with_energy(numbers) if name == MECHANICAL_ENERGY else numbers).get(name, math.nan)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 
-from pipeline.base.quantities import MECHANICAL_ENERGY, PARTS_OF_ENERGY, SHARE, in_order, quantity
+from pipeline.base.quantities import in_order, quantity, with_energy
 from pipeline.show.report.chart import Line, line_chart
 from pipeline.store.cache import FrameNumbers
 
@@ -57,7 +57,7 @@ class SolverSeries:
         found: dict[str, set[str]] = {}
         for frame in self._frames.values():
             for solver, of in frame.solvers.items():
-                found.setdefault(solver, set()).update(_with_energy(of))
+                found.setdefault(solver, set()).update(with_energy(of))
         return [(solver, name) for solver, of in found.items() for name in in_order(of)]
 
     def first_choice(self) -> tuple[str, str] | None:
@@ -69,10 +69,10 @@ class SolverSeries:
     def of(self, solver: str, name: str) -> tuple[list[int], list[float]]:
         """Frames, and the number of a solver at each, shares in per cent."""
         kind = next((each.kinds.get(solver) for each in self._frames.values()), None)
-        scale = 100.0 if quantity(name, of_kind=kind).unit == SHARE else 1.0
+        scale = quantity(name, of_kind=kind).scale
         frames, values = [], []
         for frame in sorted(self._frames):
-            of = _with_energy(self._frames[frame].solvers.get(solver, {}))
+            of = with_energy(self._frames[frame].solvers.get(solver, {}))
             if name in of and math.isfinite(of[name]):
                 frames.append(frame)
                 values.append(scale * of[name])
@@ -98,7 +98,7 @@ def table(numbers: FrameNumbers) -> str:
     parts = []
     for solver, of in numbers.solvers.items():
         kind = numbers.kinds.get(solver)
-        values = _with_energy(of)
+        values = with_energy(of)
         rows = "".join(
             f"<tr><td>{escape(known.label)}</td><td>{escape(known.text(values[known.name]))}</td></tr>"
             for known in (quantity(name, of_kind=kind) for name in in_order(values))
@@ -118,10 +118,3 @@ def plot(frames: Sequence[int], values: Sequence[float], *, current: int | None,
         if current in frames:
             told = f"frame {current}: {values[frames.index(current)]:.4g}"
     return f'{PLOT_STYLE}<div class="plot">{line_chart(lines, x_label=f"frames 0 to {last}")}{told}</div>'
-
-
-def _with_energy(of: Mapping[str, float]) -> dict[str, float]:
-    """A solver's numbers, and its mechanical energy where it tells its parts."""
-    if not {"kinetic_energy", "potential_energy"} <= set(of):
-        return dict(of)
-    return {**of, MECHANICAL_ENERGY: sum(of.get(part, 0.0) for part in PARTS_OF_ENERGY)}
