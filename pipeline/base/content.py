@@ -1,7 +1,5 @@
 """Content of what a job is made from beside its text: files of the user's, packages that do the work."""
 
-from __future__ import annotations
-
 import errno
 import os
 from functools import cache

@@ -1,7 +1,5 @@
 """Errors of the orchestrator. Each survives pickling, and its text is fit for the user."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 from typing import Self

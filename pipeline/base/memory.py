@@ -1,7 +1,5 @@
 """Memory of processes, and kills by the kernel for want of it (Linux)."""
 
-from __future__ import annotations
-
 import os
 import resource
 import sys

@@ -1,7 +1,5 @@
 """The garbage collector, paused while very many objects are made at once."""
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 The solvers name their diagnostics (`sim.core.solver.Diagnostics`); a name that is not known here is shown as it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Resources of this machine, and what of them a task claims."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

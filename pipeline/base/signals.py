@@ -1,7 +1,5 @@
 """The wish to end: SIGINT, as of Ctrl-C, and SIGTERM."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Times, sizes and common phrases, as people read them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 

@@ -1,7 +1,5 @@
 """Commands that control jobs which run or wait: pause, resume, cancel, priority, work."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commands that keep things in order: verify, clean, doctor, schema."""
 
-from __future__ import annotations
-
 import json
 import sys
 from contextlib import suppress

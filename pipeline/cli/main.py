@@ -1,7 +1,5 @@
 """The command line: parse, call, print. Importing this module loads neither the physics nor Blender."""
 
-from __future__ import annotations
-
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any

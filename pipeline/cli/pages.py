@@ -1,7 +1,5 @@
 """Commands that open a page in a browser: view, live, dashboard."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """The user's own files that a job names, each with its place in the job file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The user's own files, kept with the job: its folder can be moved, and continued when the originals are gone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from blake3 import blake3

@@ -1,7 +1,5 @@
 """A job file becomes a Job: read, changed by options, validated; every problem at once."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Mapping, Sequence

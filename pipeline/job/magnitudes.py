@@ -1,7 +1,5 @@
 """Numbers that no film can mean, told before they overflow something."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Validation errors in the words of the person who wrote the job file."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from typing import Any

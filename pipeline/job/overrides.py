@@ -3,8 +3,6 @@
 Changes go into the TOML text itself, so the copy in the job's folder keeps the user's comments and says everything.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

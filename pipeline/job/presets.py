@@ -1,7 +1,5 @@
 """Presets: the same job in another size, expressed as overrides so that the saved copy says everything."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from pipeline.job.magnitudes import check_magnitudes

@@ -5,8 +5,6 @@
 writes it between the file's two markers; a test asserts that it is current.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

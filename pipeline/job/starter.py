@@ -1,7 +1,5 @@
 """Commented job files to start from, made of the files in `templates`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from string import Template

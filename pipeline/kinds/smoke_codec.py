@@ -5,8 +5,6 @@ reads them as no smoke, air of the ambient temperature, at rest. Checkpoints are
 docs/decisions/0025-smoke-on-disk.md.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Arrays in HDF5 files of the cache: how they are compressed, and what is refused of a damaged file."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import h5py

@@ -3,8 +3,6 @@
 A new kind of body is a module beside this one and a row here; see docs/architecture.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache, partial
 from typing import Any

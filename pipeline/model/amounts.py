@@ -1,7 +1,5 @@
 """Numbers in words, as the checks tell them."""
 
-from __future__ import annotations
-
 import math
 
 

@@ -1,7 +1,5 @@
 """Axis-aligned boxes: where things are, and whether they can meet, before their shapes are looked at."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The job file's schema: the scene's physics, and what is made of it."""
 
-from __future__ import annotations
-
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator

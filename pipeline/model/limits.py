@@ -1,7 +1,5 @@
 """Limits of a stage's tasks, as a job file names them: `[limits.render]`. They decide no output."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Annotated
 

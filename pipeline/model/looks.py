@@ -1,7 +1,5 @@
 """Materials of bodies for which the job file names none."""
 
-from __future__ import annotations
-
 from render.parameters import MaterialParameters
 
 BODY = "body"

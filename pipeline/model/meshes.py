@@ -1,7 +1,5 @@
 """Mesh files in a job: wherever a shape of one stands."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -3,8 +3,6 @@
 The scanner reads TOML that `tomllib` has accepted already, so it need not diagnose anything.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from itertools import count

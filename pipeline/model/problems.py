@@ -1,7 +1,5 @@
 """Problems of a job, and their places in the file."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable, Mapping

@@ -3,8 +3,6 @@
 Commands and the dashboard call these. Each only changes the job's entry in the queue, which whoever runs it looks at.
 """
 
-from __future__ import annotations
-
 from pipeline.base.errors import JobBusyError, PipelineError
 from pipeline.base.lease import live_holder
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob, new_entry

@@ -5,8 +5,6 @@ stops continues later), settles the entry of a job that has ended, and takes the
 in the queue: the next runner takes the lease over and continues them.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Followers of a job that another process runs, or that waits in the queue."""
 
-from __future__ import annotations
-
 import time
 
 import click

@@ -1,7 +1,5 @@
 """All jobs of a farm, each with its state: what `pipeline status` shows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pipeline.base.errors import ManifestError, OutdatedManifestError

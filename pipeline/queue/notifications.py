@@ -13,8 +13,6 @@ Who gets which stands in the user's own settings, never in a job file: no job fi
 A notification that fails is a warning. It changes nothing about the job.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

@@ -5,8 +5,6 @@ core, and whatever becomes of it, the run goes on. A film is renamed when it has
 one. What is left of a killed run is removed by the next.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

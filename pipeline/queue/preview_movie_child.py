@@ -1,7 +1,5 @@
 """The child process that makes one preview movie: `REQUEST_FILE`; prints the processor time that it took [s]."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

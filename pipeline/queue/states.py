@@ -1,7 +1,5 @@
 """The words for where a job, or one of its tasks, stands: the same in `pipeline status`, its JSON and the dashboard."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from enum import StrEnum
 

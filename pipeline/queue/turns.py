@@ -1,7 +1,5 @@
 """A job's turn in the queue: run it with progress, or watch whoever does, and say how it ended."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path

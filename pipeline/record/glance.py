@@ -4,8 +4,6 @@ SQLite makes an index file beside a write-ahead-log database that it opens, even
 it. A manifest that nobody has open is therefore read as one that does not change, and if it did change, once more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, TypeVar

@@ -3,8 +3,6 @@
 Only the end of a recording writes `frames` into its job; until then the job has one, and the recording's story none.
 """
 
-from __future__ import annotations
-
 import json
 from typing import Any, NamedTuple, TypeGuard
 

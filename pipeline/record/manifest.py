@@ -7,8 +7,6 @@ What must outlive a power cut (attempts, artifacts, the plan) is synced at its c
 the next run works states out again. Either way a killed process loses nothing that was written.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Bring the record and the files together at the start of a run, whatever ended the last one."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

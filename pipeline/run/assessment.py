@@ -1,7 +1,5 @@
 """How a job stands, held against its record and its files; changes nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

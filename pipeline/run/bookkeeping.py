@@ -1,7 +1,5 @@
 """What a run puts on record: its attempts, each numbered before it starts, what they commit, and how they end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 

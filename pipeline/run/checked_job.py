@@ -1,7 +1,5 @@
 """The check of a job before any work: what its file describes, and what its stages can do here."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of a job that are to go: by stage and age, those of no use any more, or all."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a person asks of a run: which tasks to run again, and to stop."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext

@@ -3,8 +3,6 @@
 It lies in the job's folder, so that what is asked of the job later (status, resume, rerun) goes by it, too.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 Part of the scheduler, and as pure: it does no input or output and has no clock.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections import defaultdict
 

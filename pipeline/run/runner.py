@@ -6,8 +6,6 @@ Killed at any point, it leaves a folder that the next run continues from: what i
 die with it, and the lease of a dead process counts for nothing.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Sequence

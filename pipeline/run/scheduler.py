@@ -11,8 +11,6 @@ instructions. Tasks wait for artifacts, so each commit of a long task sets its r
 Costs O(log n) an event plus the readers of what it committed, whatever the number of tasks.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -4,8 +4,6 @@ No manifest and no lease: what is done is what has a receipt, so any number of m
 the same job folder at once. `pipeline resume` later takes all of it over into the record.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

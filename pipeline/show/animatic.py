@@ -1,7 +1,5 @@
 """Animatics: a job's whole film in plain pictures, in seconds, to see how it moves before it is rendered."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -4,8 +4,6 @@ Whatever loads foreign code (Blender, OpenVDB, codecs, device drivers) is tried 
 there is a finding. The doctor itself always ends with a report.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import re

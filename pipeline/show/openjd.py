@@ -5,8 +5,6 @@ reads, and a stage whose frames do not depend on each other is cut into chunks o
 `pipeline work --stage` in the job's folder, which all machines share.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ Neither the record nor the caches need to be there, nor does the job have to be 
 another version of a program, with what were the defaults then, make a film as well as those of today.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

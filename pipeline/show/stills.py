@@ -5,8 +5,6 @@ receipts, what is missing of that one frame is made there. So the job's record, 
 see nothing of it.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The stages of a job, each with a pure plan() and an idempotent run()."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a stage is, and what it gets to run a task with."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager

@@ -1,7 +1,5 @@
 """Bodies: the mesh of each rigid body in its rest pose, for the renderer."""
 
-from __future__ import annotations
-
 from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet

@@ -1,7 +1,5 @@
 """Bounds: where the action is, for a camera that frames it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -6,8 +6,6 @@ picture has been drawn on a GPU of that name, with that Blender and driver, on t
 a lock lets one renderer of the machine draw its first picture alone. The kernel drops the lock with its holder.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import platform

@@ -3,8 +3,6 @@
 Cycles numbers them differently from Taichi, and drives some that Taichi does not, so Blender itself is asked.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

@@ -1,7 +1,5 @@
 """Inputs of stages beside artifacts: Blender's version, and bodies with mesh files named by their content."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import TypeVar
 

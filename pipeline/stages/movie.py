@@ -1,7 +1,5 @@
 """Movie: pictures into segments, segments into the film."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Writing beside computing: a bounded queue of writes, done one after the other by a thread."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from queue import Full, Queue

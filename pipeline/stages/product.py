@@ -1,7 +1,5 @@
 """The stages that make one file of each body of a kind and frame: surfaces, cloths, volumes."""
 
-from __future__ import annotations
-
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet

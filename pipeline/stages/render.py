@@ -1,7 +1,5 @@
 """Render: each frame of the job, drawn by Blender's Cycles."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from math import prod

@@ -1,7 +1,5 @@
 """The drawing of a frame: by the warm renderer of this worker process, once more if the picture fails the checks."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

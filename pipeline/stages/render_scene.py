@@ -1,7 +1,5 @@
 """The scene that Blender is given of a job, and the places of bodies and camera at a frame."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path

@@ -3,8 +3,6 @@
 Frames and checkpoints are written while the next frame is computed; see docs/decisions/0015-asynchronous-frames.md.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -5,8 +5,6 @@ bytes a pixel of an HDRI, with the map of where light comes from; of textures in
 bytes and 42 of floats. Blender and Cycles hold a picture each, and for a while the file as it was read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """The visibility of bodies in a frame: from the files that it is drawn from, before it is drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -23,8 +23,6 @@ an older attempt finds the newer receipt and gives up. The lock is a `flock` on 
 kernel drops it with its holder, so none is ever left behind.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import platform

@@ -3,8 +3,6 @@
 The same arrays give the same bytes: HDF5 stores no times here, and groups and attributes are written in a fixed order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ names, written before the first receipt that names them, so that an artifact's s
 lost.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 import sys

@@ -8,8 +8,6 @@ Starlette's own middleware is not used: its list of trusted hosts holds names, n
 IPv6, and its sessions grow younger with every answer, while ours end a week after the token was shown.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import ipaddress

@@ -1,7 +1,5 @@
 """Pins of a job's cloths: their nodes and when they are released, found as the simulation finds them."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

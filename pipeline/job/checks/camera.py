@@ -4,8 +4,6 @@ Bodies are known here where they start, so a camera that goes with one is checke
 itself shows is looked at when a frame is drawn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks of a valid job as a whole: names, materials, times, pictures; then its bodies, kind by kind."""
 
-from __future__ import annotations
-
 from math import log2
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a valid job may have wrong about the set that it is drawn on, and about materials of .blend files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from blender_scripts.look_table import looks_for

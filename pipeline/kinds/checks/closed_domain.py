@@ -1,7 +1,5 @@
 """Checks of closed boxes of smoke: nothing may come in and press on their air."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks of cloths: sheets, and the places where they start."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

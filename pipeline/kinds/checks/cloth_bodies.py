@@ -1,7 +1,5 @@
 """Checks of bodies that cloth meets: size, thickness, rods to be pinned to."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Checks of cloth and fluid: the fluid's weight on a cloth, and its buoyancy."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cloths where they start, as the simulation will build them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Checks of fluids: together, at their emitters, and in number."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 

@@ -1,7 +1,5 @@
 """Checks of the size of fluids: particles, memory, and blocks that hold none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ A jet is followed as its middle flies, straight through its nozzle and on a para
 that it meets: what becomes of it then nobody can tell without the simulation. Bodies and blocks stand where they start.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Memory budget of a simulation: the GPU's where that computes, else the machine's."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 from dataclasses import dataclass

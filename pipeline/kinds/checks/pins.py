@@ -1,7 +1,5 @@
 """Checks of pins: times, speeds and loads."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

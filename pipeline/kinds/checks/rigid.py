@@ -1,7 +1,5 @@
 """Checks of rigid bodies: places, starts of those that move, ballast."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

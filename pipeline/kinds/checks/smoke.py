@@ -1,7 +1,5 @@
 """Checks of smoke: memory, air to move in, and sources."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

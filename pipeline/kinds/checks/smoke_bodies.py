@@ -1,7 +1,5 @@
 """Checks of smoke cells against the bodies in them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

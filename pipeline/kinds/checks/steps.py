@@ -1,7 +1,5 @@
 """Checks of fixed time steps against the speeds that the start of a job foretells."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The manifest's schema, as numbered migrations. A released one is never edited: a change is a new file."""
 
-from __future__ import annotations
-
 import re
 import sqlite3
 from functools import cache

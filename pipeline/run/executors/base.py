@@ -1,7 +1,5 @@
 """The base of executors, which run assignments somewhere and report what becomes of them."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ The supervisor's side never blocks, whatever the worker does: one that is stoppe
 costs nothing but its own message. (`multiprocessing.Connection.recv` waits for the rest of a message once it began.)
 """
 
-from __future__ import annotations
-
 import pickle
 import socket
 import struct

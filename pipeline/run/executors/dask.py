@@ -8,8 +8,6 @@ A worker that is lost costs the tasks on it, as a lost process does. A scheduler
 when it is back within the executor's patience the run goes on, else it ends and can be resumed.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

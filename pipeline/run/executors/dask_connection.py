@@ -4,8 +4,6 @@ Dask carries names and paths only. A driver task starts an attempt, and what the
 a topic, in order, by way of the scheduler: the runner needs no way to the workers' machines.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import pickle

@@ -5,8 +5,6 @@ what that reports, and ends with the attempt. Whatever ends the Dask worker ends
 die with the thread that started them; a proper end, because the plugin ends them, after time for a checkpoint.
 """
 
-from __future__ import annotations
-
 import asyncio
 import pickle
 import platform

@@ -1,7 +1,5 @@
 """A Dask cluster of this machine alone, for trying the cluster out and for tests."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Workers say what they offer with Dask's resource tags: `--resources "CPU=16 MEM=
 put tasks with tags into the queues of workers that are busy, so the worker is chosen here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import reduce

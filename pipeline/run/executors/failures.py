@@ -1,7 +1,5 @@
 """Whose fault a failure is: the task's, the machine's, or a full disk's."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator

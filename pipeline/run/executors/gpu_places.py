@@ -3,8 +3,6 @@
 A simulation computes on the first one, as Taichi chooses that itself; so pictures take the highest that is free.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence

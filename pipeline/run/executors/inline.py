@@ -1,7 +1,5 @@
 """The executor for looking into a stage: runs each assignment here and now, where a debugger can follow it."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from contextlib import ExitStack, redirect_stderr, redirect_stdout

@@ -5,8 +5,6 @@ kept for the next task of the same stage: Blender stays imported and the scene s
 its own task with it and nothing else, and a supervisor that dies takes all of its workers with it.
 """
 
-from __future__ import annotations
-
 import os
 import selectors
 import time

@@ -7,8 +7,6 @@ A worker leads its own session and dies with its supervisor, and nothing that it
   folder and kills the rest of the group: an external Blender for example, which knows nothing of us.
 """
 
-from __future__ import annotations
-
 import ctypes
 import faulthandler
 import os

@@ -1,7 +1,5 @@
 """One worker process as its supervisor sees it: how it is started, watched and ended."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

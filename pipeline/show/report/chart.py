@@ -1,7 +1,5 @@
 """Line charts as inline SVG. Colours are classes, which the page defines for light and dark."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

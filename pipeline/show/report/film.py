@@ -1,7 +1,5 @@
 """The film of a job as the report holds it: itself where it is small enough and browsers play it, else a small loop."""
 
-from __future__ import annotations
-
 import tempfile
 from base64 import b64encode
 from collections.abc import Sequence, Set

@@ -1,7 +1,5 @@
 """What a report tells of a job, gathered from its folder."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The report's page: HTML with its style, charts, pictures and numbers inside, a section for each job."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -1,7 +1,5 @@
 """From the solvers' numbers of one or several jobs to charts: one for each kind of quantity. Pure."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Actions on jobs: the buttons of each state, their hints, and carrying them out."""
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import NamedTuple

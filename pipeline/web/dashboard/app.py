@@ -1,7 +1,5 @@
 """The dashboard as a web application: addresses and their answers."""
 
-from __future__ import annotations
-
 import platform
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Estimates of progress and of the time left: pure functions of a job's record."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """View of a farm: its jobs, the state of each, and the runner of the queue. Reads only."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

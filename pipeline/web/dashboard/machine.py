@@ -1,7 +1,5 @@
 """Load of this machine, and the processes of a job on it."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """Pages and their parts, from templates that escape whatever they are given."""
 
-from __future__ import annotations
-
 import hashlib
 from datetime import UTC, datetime
 from importlib.resources import files

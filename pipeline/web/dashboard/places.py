@@ -1,7 +1,5 @@
 """Places that the dashboard may read: regular files in the folders of the farm's jobs, links resolved."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipeline.base.errors import PipelineError

@@ -1,7 +1,5 @@
 """Small versions of frames, made when they are asked for and kept in memory."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bodies by form: `DRAWERS` says of each form what is kept of a body and how that is drawn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ It knows arrays, not jobs. viser keeps, for each thing, only its last state for 
 skips states and holds up nobody.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import combinations, product

@@ -1,7 +1,5 @@
 """Colours of particles by their values, and of bodies by their materials. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

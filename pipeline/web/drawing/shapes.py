@@ -1,7 +1,5 @@
 """Bodies as they are drawn: arrays in world axes, one class for each form (`pipeline.kinds.base.Display`)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures of smoke: points, a cell each, and slices. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ times longer than a hand can wait for. Only what does not fit is given up, told,
 which make cloth softer, then its collisions with itself.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Drags: constraints by which mice lead bodies, pins and cloth, smoothly and never faster than contacts can follow."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Cost of a frame: estimates, by kind of body, of how long it takes to compute. Estimated, not measured."""
 
-from __future__ import annotations
-
 import math
 from itertools import product
 

@@ -1,7 +1,5 @@
 """The page of a session: its scene and its controls. Callbacks only put requests into the session's queue."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

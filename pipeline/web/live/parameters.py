@@ -1,7 +1,5 @@
 """Live parameters of a scene: those of its kinds of bodies, and gravity."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

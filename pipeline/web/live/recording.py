@@ -4,8 +4,6 @@ The job's file names the recording in `recorded`, which its simulation's fingerp
 receipted as simulated ones are, every later stage finds them, and nothing ever simulates over them or claims to.
 """
 
-from __future__ import annotations
-
 import json
 import shlex
 import sqlite3

@@ -1,7 +1,5 @@
 """Requests of browsers to a scene, which are met between its frames, and the message that they leave."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Any

@@ -1,7 +1,5 @@
 """Saving: the job with its present values as a job file, with the remarks of the old one."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count

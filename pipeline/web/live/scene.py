@@ -1,7 +1,5 @@
 """A running scene on the canvas, and which of its things can be dragged."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A scene that runs and can be changed; knows nothing of pages. One thread owns it; others ask through its queue."""
 
-from __future__ import annotations
-
 import gc
 import threading
 import time

@@ -1,7 +1,5 @@
 """Committed frames of a job: those with a receipt, so that no file is opened while it is written."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The controls of `pipeline view` and their values. They decide nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A frame of a job, read from its cache and from what was made from that, as bodies that can be drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """The solvers' numbers beside the picture: those of the frame as a table, one of them as a plot over all frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from html import escape

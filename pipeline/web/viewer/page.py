@@ -4,8 +4,6 @@ Controls only say that something changed; one loop reads them all and decides. S
 browsers cannot make it inconsistent: they share the controls and see the same frame.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Playback: the frame to be seen at a time. Pure: the caller brings the clock."""
 
-from __future__ import annotations
-
 import bisect
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """A job's cached frames on the canvas: bodies, and around them surfaces, whitewater, pins, the domain, the camera."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The texts of the viewer's page, as HTML. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from html import escape
 
