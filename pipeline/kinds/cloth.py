@@ -13,13 +13,14 @@ from pipeline.base.errors import MissingInputError
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Change, Display, Kind, Materials, Product, SolidBuilder, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
-from pipeline.kinds.fluid import validate_mesh
 from pipeline.kinds.live_parameters import CLOTH_LIVE
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_points
+from render.cloth import vertex_normals
+from render.meshes import validate_ply, write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshSequenceObject, SceneObject
 from sim.cloth.materials import Material
@@ -107,9 +108,6 @@ def _reach(_job: Job, _layout: JobLayout, _cloth: ClothParameters, group: h5py.G
 
 
 def _write_mesh(path: Path, cloth: Snapshot, _job: Job, _threads: int) -> None:
-    from render.cloth import vertex_normals
-    from render.meshes import write_ply
-
     arrays = cloth.arrays
     write_ply(
         path,
@@ -130,7 +128,7 @@ MESH = Product(
     parameters=lambda _job: {},
     memory_bytes=lambda _job, cloth: BASE_BYTES + BYTES_PER_NODE * count_nodes(cloth),
     write=_write_mesh,
-    validate=validate_mesh,
+    validate=validate_ply,
     file_bytes=lambda nodes: 70.0 * nodes,
 )
 

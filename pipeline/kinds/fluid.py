@@ -18,8 +18,10 @@ from pipeline.model.looks import BODY, WHITEWATER
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_particles
+from render.meshes import validate_ply, write_ply
 from render.parameters import MaterialParameters
 from render.spec import MeshSequenceObject, PointSequenceObject, SceneObject
+from render.surface import reconstruct_surface
 from sim.core.snapshots import Snapshot
 from sim.fluid.parameters import FluidParameters
 from sim.scene import SceneParameters
@@ -130,9 +132,6 @@ def _surface_memory(job: Job, fluid: FluidParameters) -> int:
 
 
 def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
-    from render.meshes import write_ply
-    from render.surface import reconstruct_surface
-
     surface = reconstruct_surface(
         fluid.arrays["position"],
         fluid.arrays["velocity"],
@@ -141,13 +140,6 @@ def _write_surface(path: Path, fluid: Snapshot, job: Job, threads: int) -> None:
         threads=threads,
     )
     write_ply(path, surface.vertices, surface.faces, normals=surface.normals, velocities=surface.velocities)
-
-
-def validate_mesh(path: Path) -> None:
-    """Decode a PLY; raises InvalidArtifactError."""
-    from render.meshes import validate_ply
-
-    validate_ply(path)
 
 
 def _facts(fluid: FluidParameters, count: float | None) -> str:
@@ -164,7 +156,7 @@ SURFACE = Product(
     parameters=_surface_parameters,
     memory_bytes=_surface_memory,
     write=_write_surface,
-    validate=validate_mesh,
+    validate=validate_ply,
     file_bytes=lambda particles: 2_500.0 * particles ** (2 / 3),
 )
 

@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from math import cos, radians, sin
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.base import Display, Kind, Materials, Solids
 from pipeline.kinds.checks.memory_budget import MemoryBudget
@@ -14,13 +17,13 @@ from pipeline.model.job import Job
 from pipeline.model.looks import BODY, NATURAL_MATERIALS, SOLID, parts_of
 from pipeline.model.problems import Findings
 from render.bounds import Reach, reach_of_points
+from render.meshes import read_ply
 from render.spec import MeshObject, MovingMeshObject, SceneObject
+from sim.core.motion.rotation import rotated
 from sim.rigid.parameters import RigidBodyParameters
 
 if TYPE_CHECKING:
     import h5py
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 def _check(job: Job, solids: Solids, _budget: MemoryBudget, findings: Findings) -> int:
@@ -57,10 +60,6 @@ def _orientation(rotation_deg: tuple[float, float, float]) -> tuple[float, float
 
 def _reach(_job: Job, layout: JobLayout, body: RigidBodyParameters, group: h5py.Group) -> Reach | None:
     """How far a body that moves reaches; one that stands still is of the film, not of a frame."""
-    import numpy as np
-
-    from sim.core.motion.rotation import rotated
-
     if body.kind == "static":
         return None
     position, orientation = (np.asarray(group[key][()], np.float64) for key in ("position", "orientation"))
@@ -69,10 +68,6 @@ def _reach(_job: Job, layout: JobLayout, body: RigidBodyParameters, group: h5py.
 
 def rest_vertices(layout: JobLayout, body: RigidBodyParameters) -> NDArray[np.float64]:
     """Vertices of all parts of a body at rest [m], (n, 3)."""
-    import numpy as np
-
-    from render.meshes import read_ply
-
     files = [layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
     return np.concatenate([read_ply(layout.path(file)).vertices for file in files]).astype(np.float64)
 

@@ -17,8 +17,10 @@ from pipeline.model.looks import BODY
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings
 from render.bounds import Reach, box_of_smoke, reach_of_box
+from render.errors import VolumeUnavailableError
 from render.parameters import MaterialParameters
 from render.spec import SceneObject, VolumeSequenceObject
+from render.volume import import_openvdb, validate_volume, write_volume
 from sim.shapes.parameters import Placement
 from sim.smoke.parameters import CELLS_PER_EDDY, SmokeParameters
 
@@ -97,9 +99,6 @@ def _openvdb(_job: Job) -> dict[str, str]:
 
 
 def _missing_openvdb() -> list[str]:
-    from render.errors import VolumeUnavailableError
-    from render.volume import import_openvdb
-
     try:
         import_openvdb()
     except VolumeUnavailableError as error:
@@ -108,18 +107,10 @@ def _missing_openvdb() -> list[str]:
 
 
 def _write_volume(path: Path, smoke: SmokeInBox, job: Job, _threads: int) -> None:
-    from render.volume import write_volume
-
     try:
         write_volume(path, **vars(smoke), parameters=job.volume, fps=job.fps, shutter=job.render.shutter)
     except ValueError as error:
         raise InvalidArtifactError(str(error)) from error
-
-
-def _validate_volume(path: Path) -> None:
-    from render.volume import validate_volume
-
-    validate_volume(path)
 
 
 VOLUME = Product(
@@ -131,7 +122,7 @@ VOLUME = Product(
     parameters=lambda job: {"volume": job.volume, "fps": job.fps, "shutter": job.render.shutter},
     memory_bytes=lambda job, smoke: WORKER_BYTES + BYTES_PER_CELL * prod(smoke.cell_counts(job.domain)),
     write=_write_volume,
-    validate=_validate_volume,
+    validate=validate_volume,
     file_bytes=lambda cells: 20_000 + 3.0 * cells,
     preflight=_missing_openvdb,
 )

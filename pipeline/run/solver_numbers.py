@@ -16,6 +16,8 @@ from pipeline.run.events import Committed, RunEvent
 from pipeline.run.plan import frame_ranges
 from pipeline.store.cache import FrameNumbers, read_numbers
 from pipeline.store.receipts import Receipt, read_receipt
+from render.errors import InvalidFileError
+from render.point_clouds import read_point_counts
 from sim.core.solver import Diagnostics
 
 SIMULATE = "simulate"  # the stage whose artifacts are frames of the cache
@@ -251,9 +253,6 @@ def _read_whitewater(layout: JobLayout, artifact: ArtifactPath) -> Diagnostics:
     Raises:
         InvalidArtifactError: it cannot be read.
     """
-    from render.errors import InvalidFileError
-    from render.point_clouds import read_point_counts
-
     try:
         counts = read_point_counts(layout.path(artifact))
     except (OSError, InvalidFileError) as error:

@@ -11,7 +11,10 @@ from pipeline.base.task import Task
 from pipeline.job.loading import LoadedJob
 from pipeline.show.stills import Survey, scratch_folder, survey
 from pipeline.stages.render_scene import framed_points, render_spec, write_motion
+from render.blender import FrameRenderError
+from render.movie import encode_segment, validate_movie
 from render.parameters import MovieParameters
+from render.workbench import draw_frames
 
 QUALITY = MovieParameters(crf=20, preset="veryfast")
 
@@ -43,10 +46,6 @@ def make_animatic(
     The job has the resolution that the film is to have; its folder holds all that these frames are drawn of. `drawn` is
     called with each frame that is there. Raises PipelineError: a frame could not be drawn.
     """
-    from render.blender import FrameRenderError
-    from render.movie import encode_segment, validate_movie
-    from render.workbench import draw_frames
-
     job = loaded.job
     found = survey(loaded, layout, range(frames))
     with scratch_folder(loaded, found, layout) as scratch, TemporaryDirectory(prefix="animatic-") as folder:

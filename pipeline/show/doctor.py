@@ -15,8 +15,15 @@ import tempfile
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
+
+import psutil
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from pipeline.base.resources import machine_capacity
 from render.system_libraries import DEBIAN_PACKAGES, install_line, missing_libraries
@@ -79,10 +86,6 @@ def examine(output: Path) -> list[Examination]:
 
 def print_report(examinations: Iterable[Examination]) -> None:
     """A table for people."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     marks = {"ok": "[green]ok[/]", "warning": "[yellow]warning[/]", "failed": "[red]failed[/]"}
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(no_wrap=True)
@@ -151,9 +154,6 @@ def _examine_blender() -> Iterable[Examination]:
 
 def _examine_render_gpus() -> Iterable[Examination]:
     """What Blender finds now, whatever is remembered."""
-    from importlib.metadata import version
-    from importlib.util import find_spec
-
     from pipeline.stages.gpu_kernels import kernels_marker
     from render.gpus import find_gpus
 
@@ -181,8 +181,6 @@ def _examine_processor() -> Iterable[Examination]:
 
 
 def _examine_memory() -> Iterable[Examination]:
-    import psutil
-
     memory = psutil.virtual_memory()
     found = f"{memory.total / 1e9:.1f} GB, {memory.available / 1e9:.1f} GB of it free"
     if memory.total < LITTLE_MEMORY_BYTES:

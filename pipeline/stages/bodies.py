@@ -9,8 +9,10 @@ from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
 from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.inputs import by_content
+from render.meshes import validate_ply, write_ply
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.parameters import MeshShape
+from sim.shapes.solid import TriangleMesh
 
 
 class BodiesStage(Stage):
@@ -42,10 +44,8 @@ class BodiesStage(Stage):
 
     def run(self, context: TaskContext) -> None:
         """Mesh one body."""
-        from render.meshes import validate_ply, write_ply
         from sim.shapes.mesh_file import texture_coordinates
         from sim.shapes.placement import build_solid
-        from sim.shapes.solid import TriangleMesh
 
         parameters = next(body for body in context.job.rigid if body.name == context.task.subject)
         mesh = build_solid(parameters).rest_mesh()

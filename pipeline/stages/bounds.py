@@ -26,6 +26,7 @@ from render.bounds import (
     validate_bounds,
     write_bounds,
 )
+from sim.core.motion.rotation import from_degrees, rotated
 
 ACTION = "action"  # the film's one reach, by this name
 FILM = TaskId("bounds/film")
@@ -115,8 +116,6 @@ def _of_frame(job: Job, layout: JobLayout, frame: int) -> dict[str, Reach]:
 
 def _of_film(context: TaskContext) -> Reach:
     """How far all frames and the bodies that stand still reach, as far as they are in the world."""
-    from sim.core.motion.rotation import from_degrees, rotated
-
     job, layout = context.job, context.layout
     domain = np.array([job.domain.min, job.domain.max])
     smokes = [smoke.corners(job.domain) for smoke in job.smoke]

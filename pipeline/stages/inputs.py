@@ -8,6 +8,7 @@ from pydantic import BaseModel
 from pipeline.base.content import content_name, tool_version
 from pipeline.base.errors import StageUnavailableError
 from pipeline.model.meshes import mesh_shapes, with_value
+from render.blender import BlenderUnavailableError, require_supported_executable
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -18,8 +19,6 @@ def blender_version(executable: str | None) -> str:
 
     Raises StageUnavailableError: the executable is not there, or not a Blender that can be used.
     """
-    from render.blender import BlenderUnavailableError, require_supported_executable
-
     if executable is None:
         return tool_version("bpy")
     try:

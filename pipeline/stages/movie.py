@@ -9,7 +9,8 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Task, TaskId
 from pipeline.model.job import Job
 from pipeline.stages.base import Stage, TaskContext
-from render.movie import SEGMENT_FRAMES
+from render.continuity import Continuity
+from render.movie import SEGMENT_FRAMES, encode_segment, join_segments, missing_encoder, validate_movie
 
 
 class MovieStage(Stage):
@@ -53,8 +54,6 @@ class MovieStage(Stage):
 
     def preflight(self, job: Job) -> list[str]:
         """An encoder that this build of FFmpeg lacks."""
-        from render.movie import missing_encoder
-
         name = missing_encoder(job.movie.codec)
         if name is None:
             return []
@@ -65,9 +64,6 @@ class MovieStage(Stage):
 
     def run(self, context: TaskContext) -> None:
         """Encode one segment, or join them all."""
-        from render.continuity import Continuity
-        from render.movie import encode_segment, join_segments, validate_movie
-
         task, job = context.task, context.job
         inputs = [context.layout.path(artifact) for artifact in task.inputs]
         if task.frame is not None:

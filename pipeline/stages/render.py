@@ -23,6 +23,11 @@ from pipeline.stages.render_drawing import CPU, FrameDrawing, close_renderers, m
 from pipeline.stages.render_scene import render_spec, write_motion
 from pipeline.stages.texture_memory import own_picture_bytes
 from pipeline.stages.visibility import bodies_at, warn_if_invisible
+from render.blend_file import read_material_names
+from render.blender import BlenderDiedError, BlenderUnavailableError, require_bpy, require_supported_executable
+from render.errors import InvalidFileError
+from render.meshes import read_ply
+from render.pictures import validate_exr
 from render.spec import RenderSpec
 
 CORES = 2  # threads a frame: Cycles with one keeps a second busy waiting. The pixels do not depend on it
@@ -88,8 +93,6 @@ class RenderStage(Stage):
 
     def preflight(self, job: Job) -> list[str]:
         """No Blender, one that is too old or lacks a shared library, or one without the material or GPU asked for."""
-        from render.blender import BlenderUnavailableError, require_bpy, require_supported_executable
-
         try:
             if job.render.blender is None:
                 require_bpy()
@@ -101,9 +104,6 @@ class RenderStage(Stage):
 
     def run(self, context: TaskContext) -> None:
         """Draw one frame."""
-        from render.blender import BlenderDiedError
-        from render.pictures import validate_exr
-
         task, job, layout = context.task, context.job, context.layout
         assert task.frame is not None
         poses, view = write_motion(job, layout, task.frame, attempt=context.attempt)
@@ -166,9 +166,6 @@ def _missing_materials(job: Job) -> Iterator[str]:
 
     Raises BlenderUnavailableError: Blender does not answer.
     """
-    from render.blend_file import read_material_names
-    from render.errors import InvalidFileError
-
     wanted: dict[str, dict[str, str]] = {}
     for body, material in job.material.items():
         if material.blend is not None:
@@ -228,8 +225,6 @@ def _warn_of_flat_pictures(context: TaskContext, pictures_by_uv: Collection[str]
 
 def _without_coordinates(job: Job, layout: JobLayout) -> Iterator[tuple[str, str]]:
     """Objects with a .blend material and no texture coordinates: their names, and `file.blend:Name`."""
-    from render.meshes import read_ply
-
     for body in job.rigid:
         for part in parts_of(body.shape.type):
             material = material_of(job, body.name, part)

@@ -19,6 +19,7 @@ from pipeline.stages.render_scene import framed_points, render_spec
 from pipeline.stages.visibility import BodyAtFrame, expected_cells
 from render.blender import Renderer, open_renderer
 from render.camera_path import View
+from render.errors import InvalidFileError
 from render.pictures import PictureStatistics, check_pixels, over_black, read_picture, require_more_than_set
 
 SET_PIXELS = 96
@@ -64,8 +65,6 @@ class FrameDrawing:
 
         `masters` gets the EXR, if the job asks for one. Raises InvalidArtifactError if the picture failed again.
         """
-        from render.errors import InvalidFileError
-
         context, frame = self._context, self._frame
         for once_more in (True, False):
             try:

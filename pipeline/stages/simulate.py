@@ -34,6 +34,7 @@ from pipeline.store.cache import (
 )
 from pipeline.store.provenance import read_text
 from pipeline.store.receipts import read_receipt
+from sim.core.runtime import DeviceUnavailableError, initialize, resolve_device
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport, World
 from sim.scene import SceneParameters
@@ -84,8 +85,6 @@ class SimulateStage(Stage):
 
     def preflight(self, job: Job) -> list[str]:
         """A device that does not work here."""
-        from sim.core.runtime import DeviceUnavailableError, resolve_device
-
         try:
             resolve_device(job.device)
         except DeviceUnavailableError as error:
@@ -133,7 +132,6 @@ class _Simulation:
 
     def __init__(self, context: TaskContext) -> None:
         from sim.build import build_world
-        from sim.core.runtime import initialize
 
         self._context = context
         self._folder = context.layout.checkpoints
@@ -252,8 +250,6 @@ def _resources(job: Job) -> Resources:
 
     A device that does not work here is planned all the same; preflight reports it.
     """
-    from sim.core.runtime import resolve_device
-
     device = resolve_device("auto") if job.device == "auto" else job.device
     memory_bytes = WORKER_BYTES + SNAPSHOTS_AT_ONCE * _snapshot_bytes(job)
     return Resources(cores=0) if device == "cpu" else Resources(cores=1, memory_bytes=memory_bytes, gpus=1)

@@ -15,6 +15,9 @@ from pipeline.base.parameter_set import digest_of
 from pipeline.job.input_files import split_blend
 from pipeline.store.receipts import hash_file
 from render.blend_file import Texture, read_textures
+from render.blender import BlenderUnavailableError
+from render.environment import environment_pixels
+from render.errors import InvalidFileError
 from render.spec import RenderSpec
 from sim.core.runtime import cache_folder
 
@@ -30,8 +33,6 @@ def own_picture_bytes(spec: RenderSpec) -> int:
     """
     total = 0
     if spec.set.hdri is not None:
-        from render.environment import environment_pixels
-
         with suppress(OSError):
             total += BYTES_PER_HDRI_PIXEL * (environment_pixels(Path(spec.set.hdri)) or 0) + LIGHT_MAP_BYTES
     for drawn in spec.objects:
@@ -54,9 +55,6 @@ def bytes_of_textures(textures: Iterable[Texture]) -> int:
 @lru_cache
 def _texture_bytes(file: str, name: str, blender: str | None, _size: int, _mtime_ns: int) -> int:
     """Asked of Blender, in a child process, once for a content: the answer is kept in the user's cache folder."""
-    from render.blender import BlenderUnavailableError
-    from render.errors import InvalidFileError
-
     kept = cache_folder() / "blend-textures" / digest_of(f"{hash_file(Path(file))}\n{name}")
     with suppress(OSError, ValueError):
         return int(kept.read_text(encoding="ascii"))

@@ -16,6 +16,7 @@ from render.meshes import read_ply
 from render.point_clouds import read_point_cloud
 from render.spec import MeshObject, MeshSequenceObject, PointSequenceObject, VolumeSequenceObject
 from render.visibility import covered_cells, in_picture, is_inside, points_of_box
+from sim.core.motion.rotation import rotated
 
 Array = NDArray[np.float64]
 
@@ -56,8 +57,6 @@ def bodies_at(
     job: Job, layout: JobLayout, frame: int, poses: Mapping[str, Mapping[str, NDArray[Any]]]
 ) -> Iterator[BodyAtFrame]:
     """All drawn bodies at a frame; of a smoke, its whole box."""
-    from sim.core.motion.rotation import rotated
-
     read: set[str] = set()
     for kind, body, drawn in drawn_bodies(job, layout):
         if isinstance(drawn, VolumeSequenceObject):

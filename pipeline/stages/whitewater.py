@@ -17,7 +17,10 @@ from pipeline.model.job import Job
 from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.inputs import by_content
 from pipeline.store.cache import read_frame
+from render.point_clouds import PointCloud, read_point_cloud, validate_point_cloud, write_point_cloud
+from sim.core.runtime import initialize
 from sim.core.snapshots import Snapshot
+from sim.shapes.parameters import Placement
 from sim.whitewater.cloud import WhitewaterCloud
 
 if TYPE_CHECKING:
@@ -62,8 +65,6 @@ class WhitewaterStage(Stage):
 
     def run(self, context: TaskContext) -> None:
         """Make one frame of one fluid's whitewater."""
-        from render.point_clouds import PointCloud, validate_point_cloud, write_point_cloud
-
         cloud, not_made = _next_cloud(context)
         with context.committing(context.task.outputs[0], validate_point_cloud) as path:
             write_point_cloud(
@@ -99,9 +100,6 @@ def _resources(job: Job, fluid: str) -> Resources:
 
 def _next_cloud(context: TaskContext) -> tuple[WhitewaterCloud, int]:
     """The task's cloud, and how many particles it has not for lack of room."""
-    from render.point_clouds import read_point_cloud
-    from sim.core.runtime import initialize
-
     task, job = context.task, context.job
     assert task.frame is not None
     if task.frame == 0:
@@ -139,7 +137,6 @@ def _fluids_and_bodies(path: Path) -> dict[str, Snapshot]:
 def _bodies(
     job: Job, before: Mapping[str, Snapshot], now: Mapping[str, Snapshot], particle_radius: float
 ) -> list[MovingObstacle]:
-    from sim.shapes.parameters import Placement
     from sim.whitewater.obstacles import MovingObstacle, Pose
 
     return [
@@ -155,7 +152,6 @@ def _bodies(
 @cache
 def _level_set(placement: str, particle_radius: float) -> LevelSet:
     """Distances of a shape, its placement given as JSON; kept, as sampling a mesh takes longer than a frame."""
-    from sim.shapes.parameters import Placement
     from sim.whitewater.obstacles import sample_at_rest
 
     return sample_at_rest(Placement.model_validate_json(placement), particle_radius)

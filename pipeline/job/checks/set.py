@@ -9,6 +9,8 @@ from pipeline.kinds.checks.shapes import file_exists
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, quoted_list
+from render.environment import read_environment_size
+from render.errors import InvalidFileError
 from render.parameters import MaterialParameters
 
 # A picture of the whole sphere is 360 degrees wide and 180 high.
@@ -61,9 +63,6 @@ def check_keys_beside_blend(material: MaterialParameters, path: KeyPath, finding
 
 
 def _check_hdri(name: str, findings: Findings) -> None:
-    from render.environment import read_environment_size
-    from render.errors import InvalidFileError
-
     key = ("set", "hdri")
     if not file_exists(name, "picture", key, findings):
         return

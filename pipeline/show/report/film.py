@@ -12,6 +12,8 @@ from pipeline.base.task import ArtifactPath
 from pipeline.model.job import Job
 from pipeline.show.picture_set import evenly_spread
 from pipeline.store.receipts import read_receipt
+from render.errors import InvalidFileError
+from render.loop import write_loop
 
 MOST_BYTES = 24 << 20  # of a film that is put into the page: a browser holds the page in memory, a third larger as text
 PLAYABLE = frozenset({"h264", "av1"})  # codecs that the usual browsers play; H.265 and ProRes are not among them
@@ -61,9 +63,6 @@ def film_of(
 
 
 def _loop(layout: JobLayout, job: Job, pictures: Sequence[Path], remark: str) -> ReportFilm | None:
-    from render.errors import InvalidFileError
-    from render.loop import write_loop
-
     if not pictures:
         return None
     chosen = evenly_spread(pictures, LOOP_PICTURES)

@@ -21,6 +21,8 @@ from pipeline.show.report.film import ReportFilm, film_of
 from pipeline.show.report.panels import JobNumbers
 from pipeline.store.provenance import origins_of
 from pipeline.store.receipts import read_receipt
+from render.errors import InvalidFileError
+from render.sheet import contact_sheet
 
 SHEET_PICTURES, SHEET_COLUMNS = 12, 4
 SHEET_WIDTH = 1200  # at most [pixels]; small pictures are not enlarged
@@ -173,9 +175,6 @@ def _remark(frames: PictureSet) -> str:
 
 
 def _sheet(layout: JobLayout, pictures: Sequence[Path], *, picture_width: int) -> bytes | None:
-    from render.errors import InvalidFileError
-    from render.sheet import contact_sheet
-
     if not pictures:
         return None
     chosen = evenly_spread(pictures, SHEET_PICTURES)

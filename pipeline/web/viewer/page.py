@@ -16,6 +16,7 @@ import viser
 from pipeline.base.errors import InvalidArtifactError, PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
+from pipeline.stages.render_scene import camera_path
 from pipeline.store.cache import read_numbers
 from pipeline.web.bounded_cache import BoundedCache
 from pipeline.web.drawing.bodies import Extents, Look
@@ -272,8 +273,6 @@ class ViewPage:
     # --- where it is seen from ---
 
     def _first_view(self) -> View:
-        from pipeline.stages.render_scene import camera_path
-
         return camera_path(self._job).first()
 
     def _look_from_aside(self) -> None:

@@ -118,7 +118,7 @@ def test_the_film_of_a_folder_is_the_one_that_its_job_asks_for(tmp_path):
 
 
 def test_an_encoder_that_is_not_there_is_told_before_any_work(monkeypatch):
-    monkeypatch.setattr("render.movie.missing_encoder", lambda _codec: "libx265")
+    monkeypatch.setattr("pipeline.stages.movie.missing_encoder", lambda _codec: "libx265")
     (told,) = MovieStage().preflight(job(movie={"codec": "h265"}))
     assert told.startswith('"h265" needs the encoder libx265')
 
