@@ -50,8 +50,7 @@ class ParameterSet:
 
         A name in `values` may be one of the words that follow. `tools` are versions of what does the work.
 
-        Raises:
-            ValueError: two parameters share a name, or a value is not a finite number.
+        Raises ValueError: two parameters share a name, or a value is not a finite number.
         """
         document = {"stage_name": stage, "stage_version": version, "tools": dict(tools)}
         for name, value in (*(values or {}).items(), *more.items()):

@@ -22,8 +22,7 @@ def keep_inputs(loaded: LoadedJob, layout: JobLayout) -> tuple[Job, str]:
         The job that reads the copies, as the workers will load it, and its text, which names them by paths relative to
         the folder.
 
-    Raises:
-        OSError: a file cannot be read, or the folder not be written.
+    Raises OSError: a file cannot be read, or the folder not be written.
     """
     changes = []
     for file in input_files(loaded.job):

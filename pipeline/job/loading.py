@@ -51,8 +51,7 @@ def read_job(path: Path | str, overrides: Sequence[str] = (), *, preview: bool =
 
     `overrides` are arguments of `--set`, applied in order; `preview` makes it the fast, small version of the job.
 
-    Raises:
-        JobFileError: carries every problem found.
+    Raises JobFileError: carries every problem found.
     """
     path = Path(path)
     text = _read_text(path)

@@ -34,8 +34,7 @@ def parse_override(argument: str, document: Mapping[str, Any]) -> Override:
 
     As `render.quality=final`, `fluid.water.viscosity=1e-3`, `camera.position=[1, 2, 3]`.
 
-    Raises:
-        OverrideError: no `=`, a path that no job has, an element that this job does not have.
+    Raises OverrideError: no `=`, a path that no job has, an element that this job does not have.
     """
     written_path, equals, written_value = argument.partition("=")
     written_path = written_path.strip()
@@ -57,8 +56,7 @@ def parse_override(argument: str, document: Mapping[str, Any]) -> Override:
 def apply_overrides(text: str, overrides: Iterable[Override]) -> str:
     """The TOML text with the overrides in it; comments and order stay.
 
-    Raises:
-        OverrideError: a key on the way holds something else than a table.
+    Raises OverrideError: a key on the way holds something else than a table.
     """
     try:
         document = tomlkit.parse(text)

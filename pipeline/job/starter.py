@@ -20,8 +20,7 @@ def starter(name: str, template: str, *, file: str) -> str:
 def write_starter(target: Path, template: str) -> Path:
     """Write a starter to `target`, `.toml` added where it is missing. The job is named after the file.
 
-    Raises:
-        JobFileError: the name is none for a job, the file exists, or it cannot be written.
+    Raises JobFileError: the name is none for a job, the file exists, or it cannot be written.
     """
     path = target if target.suffix == ".toml" else target.with_name(f"{target.name}.toml")
     name = path.stem

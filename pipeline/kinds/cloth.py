@@ -55,8 +55,7 @@ def count_cloth_nodes(scene: SceneParameters) -> int:
 def count_nodes(cloth: ClothParameters) -> int:
     """Number of nodes; a mesh is read for it, once, as files of a size hold ten times as many or as few.
 
-    Raises:
-        MissingInputError: a mesh file cannot be read, or holds no sheet.
+    Raises MissingInputError: a mesh file cannot be read, or holds no sheet.
     """
     shape = cloth.shape
     if isinstance(shape, RectangleSheet):

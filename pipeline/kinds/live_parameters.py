@@ -58,8 +58,7 @@ class Parameter:
     def checked(self, value: object) -> Value:
         """The value, as one of this parameter's; where it starts is always one.
 
-        Raises:
-            ValueError: it is none, or out of range.
+        Raises ValueError: it is none, or out of range.
         """
         if self.widget == "switch":
             return bool(value)

@@ -54,15 +54,14 @@ def write(group: h5py.Group, name: str, snapshot: Snapshot, *, longest_shutter_s
 
     The velocity is kept as far around smoke and heat as they are drawn in motion blur with the longest shutter [s].
 
-    Raises:
-        InvalidArtifactError: a value is not finite.
+    Raises InvalidArtifactError: a value is not finite.
     """
     fields = {key: np.asarray(snapshot.arrays[key], np.float32) for key in GRIDS}
     for key, values in fields.items():
         _require_finite(name, key, values)
     density, temperature, velocity = fields.values()
     ambient, cell_size = np.float32(snapshot.number("ambient_temperature")), snapshot.number("cell_size")
-    step = _power_of_two_below(cell_size / longest_shutter_s / VELOCITY_STEPS)
+    step = 2.0 ** math.floor(math.log2(cell_size / longest_shutter_s / VELOCITY_STEPS))
     present = _present(density, temperature, ambient)
     around, box = _around(present, velocity, shutter_s=longest_shutter_s, cell_size=cell_size)
 
@@ -97,8 +96,7 @@ def write(group: h5py.Group, name: str, snapshot: Snapshot, *, longest_shutter_s
 def read(group: h5py.Group) -> SmokeInBox:
     """Read the part of a smoke that is not empty, from the group of its body.
 
-    Raises:
-        InvalidArtifactError: its grids are none that `write` writes.
+    Raises InvalidArtifactError: its grids are none that `write` writes.
     """
     grids = _grids_of(group)
     part = _stored_box(grids["velocity"])
@@ -120,8 +118,7 @@ def read(group: h5py.Group) -> SmokeInBox:
 def sparse(group: h5py.Group) -> dict[str, Iterator[Box]]:
     """The grids, each in slabs of the box that is not empty.
 
-    Raises:
-        InvalidArtifactError: they are none that `write` writes.
+    Raises InvalidArtifactError: they are none that `write` writes.
     """
     return {key: _slabs(_stored_box(grid)) for key, grid in _grids_of(group).items()}
 
@@ -133,8 +130,7 @@ def read_density(group: h5py.Group) -> tuple[Float32Array, tuple[float, float, f
         Density of the cells that are not empty (nx, ny, nz) [-], lower corner of the first of them [m], and the edge of
         a cell [m].
 
-    Raises:
-        InvalidArtifactError: its grids are none that `write` writes.
+    Raises InvalidArtifactError: its grids are none that `write` writes.
     """
     density = _grids_of(group)["density"]
     part, cell_size = _stored_box(density), float(group.attrs["cell_size"])
@@ -240,7 +236,3 @@ def _to_steps(temperature: Float32Array, ambient: np.float32) -> Float32Array:
     """Round to multiples of TEMPERATURE_STEP_K above the ambient temperature [K]."""
     steps: Float32Array = np.rint((temperature - ambient) / np.float32(TEMPERATURE_STEP_K))
     return ambient + steps * np.float32(TEMPERATURE_STEP_K)
-
-
-def _power_of_two_below(value: float) -> float:
-    return 2.0 ** math.floor(math.log2(value))

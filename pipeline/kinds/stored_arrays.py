@@ -31,8 +31,7 @@ def write_array(group: h5py.Group, key: str, array: NDArray[np.generic]) -> None
 def read_array(dataset: h5py.Dataset) -> NDArray[Any]:
     """All of a dataset.
 
-    Raises:
-        InvalidArtifactError: it claims to be far larger than what is stored of it.
+    Raises InvalidArtifactError: it claims to be far larger than what is stored of it.
     """
     require_stored(dataset)
     return np.asarray(dataset[()])
@@ -41,8 +40,7 @@ def read_array(dataset: h5py.Dataset) -> NDArray[Any]:
 def require_stored(dataset: h5py.Dataset) -> None:
     """Refuse a dataset that claims to be far larger than what is stored of it, before it is read.
 
-    Raises:
-        InvalidArtifactError: it does.
+    Raises InvalidArtifactError: it does.
     """
     if dataset.nbytes > MOST_COMPRESSED * dataset.id.get_storage_size() + SMALL_BYTES:
         raise InvalidArtifactError(f"{dataset.name}: claims {dataset.nbytes} bytes, and hardly any are stored")

@@ -39,8 +39,7 @@ KINDS: dict[str, Kind] = {kind.name: kind for kind in (RIGID, FLUID, CLOTH, SMOK
 def register(kind: Kind) -> None:
     """Add a kind to the table: jobs may have tables of it from now on.
 
-    Raises:
-        ValueError: its name is taken, by a kind or by another key of the job file.
+    Raises ValueError: its name is taken, by a kind or by another key of the job file.
     """
     if kind.name in KINDS or kind.name in Job.model_fields:
         raise ValueError(f'"{kind.name}" is a key of the job file already')

@@ -28,8 +28,7 @@ def pause_job(queue: JobQueue, name: str) -> bool:
     Returns:
         Whether it runs now.
 
-    Raises:
-        PipelineError: it is not in the queue, or has failed.
+    Raises PipelineError: it is not in the queue, or has failed.
     """
     entry_of(queue, name)  # before the lock, which would make a folder where there is none
     with queue.locked():
@@ -55,8 +54,7 @@ def set_priority(queue: JobQueue, name: str, priority: int) -> None:
 def another_try(queue: JobQueue, name: str, *, background: bool) -> QueuedJob:
     """The entry by which the failed tasks of a job are tried again, to be queued.
 
-    Raises:
-        PipelineError: the job is not in the queue, or waits for its turn already.
+    Raises PipelineError: the job is not in the queue, or waits for its turn already.
     """
     entry = entry_of(queue, name)
     if entry.desired is Desired.RUN and not _runs(queue, name):

@@ -83,11 +83,6 @@ _BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
 """What one file of a stage takes, roughly, where nothing has been made yet to go by [bytes]."""
 
 
-def checkpoint_bytes(size: Size) -> float:
-    """What the two checkpoints that are kept take, about [bytes]."""
-    return 2 * _snapshot_bytes(size, 2)
-
-
 def _snapshot_bytes(size: Size, where: int) -> float:
     """Of the bodies of all kinds; `where` as in `Kind.snapshot_bytes`."""
     from pipeline.kinds.table import KINDS
@@ -115,4 +110,4 @@ def estimate_bytes(assessments: Iterable[Assessment], costs: Mapping[str, StageC
         one = cost.bytes_per_artifact if cost is not None else _bytes_per_artifact(stage, size)
         total += one * len(each.rebuilds)
         simulated |= stage == "simulate" and bool(each.rebuilds)
-    return total + (checkpoint_bytes(size) if simulated else 0.0)
+    return total + (2 * _snapshot_bytes(size, 2) if simulated else 0.0)  # two checkpoints are kept

@@ -157,8 +157,7 @@ class JobQueue:
     def locked(self) -> Iterator[None]:
         """Exclude every other change of the queue, in all processes and threads, for the block; a thread may nest it.
 
-        Raises:
-            QueueError: the farm cannot be written to, or its file system has no locks.
+        Raises QueueError: the farm cannot be written to, or its file system has no locks.
         """
         with self._mutex:  # the kernel's lock keeps processes out, not the threads of this one
             if self._is_locked:

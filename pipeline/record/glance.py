@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from pipeline.base.errors import ManifestError
+from pipeline.base.files import stamp_of
 from pipeline.record.reader import ManifestReader
 
 TIMEOUT_S = 0.5  # how long a glance waits for a lock, which only a manifest on a network file system has
@@ -31,7 +32,7 @@ class Version(NamedTuple):
 
 def version_of(path: Path) -> Version:
     """A manifest's version now; `Version(None, None)` if there is none. Raises OSError."""
-    return Version(_of_file(path), _of_file(path.with_name(f"{path.name}-wal")))
+    return Version(stamp_of(path), stamp_of(path.with_name(f"{path.name}-wal")))
 
 
 def glance(path: Path, query: Callable[[ManifestReader], T]) -> T:
@@ -54,11 +55,3 @@ def glance(path: Path, query: Callable[[ManifestReader], T]) -> T:
         if last or before.log is not None or version_of(path) == before:
             return found
     raise AssertionError("the last try returns or raises")
-
-
-def _of_file(path: Path) -> tuple[int, int, int] | None:
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        return None
-    return status.st_ino, status.st_mtime_ns, status.st_size

@@ -169,8 +169,8 @@ class Manifest(ManifestReader):
             )
 
     # --- attempts ---
-    def start_attempt(self, task: TaskId, *, host: str | None = None) -> int:
-        """Open an attempt of a planned task on a machine, by default this one, and set the task RUNNING.
+    def start_attempt(self, task: TaskId) -> int:
+        """Open an attempt of a planned task on this machine, and set the task RUNNING.
 
         Returns:
             The attempt's number, one higher than any of this task before it, for ever.
@@ -179,7 +179,7 @@ class Manifest(ManifestReader):
             (number,) = self._connection.execute(
                 "INSERT INTO attempt (task, number, started, host)"
                 " SELECT ?1, coalesce(max(number), 0) + 1, ?2, ?3 FROM attempt WHERE task = ?1 RETURNING number",
-                (task, time.time(), platform.node() if host is None else host),
+                (task, time.time(), platform.node()),
             ).fetchone()
             layout = JobLayout(self._path.parent)
             log = layout.log(task, number).relative_to(layout.root).as_posix()

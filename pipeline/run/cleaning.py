@@ -39,8 +39,7 @@ class Choice:
 def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Path]], bool]) -> None:
     """Remove files of a job by choice, with their receipts and rows; see `remove_contents`.
 
-    Raises:
-        PipelineError: there is no such stage, or its files could never be made anew.
+    Raises PipelineError: there is no such stage, or its files could never be made anew.
     """
     from pipeline.stages import STAGES
 

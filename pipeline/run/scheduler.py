@@ -70,8 +70,7 @@ class Scheduler:
         policies: the same by stage, where it is another.
         turns: place of each frame in the order; None: as they are numbered.
 
-    Raises:
-        ValueError: a task needs more GPUs than there are.
+    Raises ValueError: a task needs more GPUs than there are.
     """
 
     def __init__(
@@ -170,8 +169,7 @@ class Scheduler:
     def handle(self, event: events.SchedulerEvent) -> list[events.Instruction]:
         """Take in what happened and say what to do. A failure happens at the time of the last `Tick`.
 
-        Raises:
-            InvalidTransitionError: this cannot happen to a task in that state.
+        Raises InvalidTransitionError: this cannot happen to a task in that state.
         """
         instructions: list[events.Instruction] = []
         match event:

@@ -67,8 +67,7 @@ def run_tasks(
     What else they read is in the job's folder. `tell` takes the share that is done, 0 to 1, and a sentence. Once
     `stop_requested` says so a task writes a checkpoint, and no other one follows.
 
-    Raises:
-        PipelineError: an input is not there.
+    Raises PipelineError: an input is not there.
     """
     ran, up_to_date, failures = 0, 0, list[Failed]()
     for index, task in enumerate(todo):

@@ -15,7 +15,7 @@ from pipeline.record.reader import ManifestReader
 from pipeline.run.events import Committed, RunEvent
 from pipeline.run.plan import frame_ranges
 from pipeline.store.cache import FrameNumbers, read_numbers
-from pipeline.store.receipts import Receipt, read_receipt
+from pipeline.store.receipts import Receipt, of_newest, read_receipt
 from render.errors import InvalidFileError
 from render.point_clouds import read_point_counts
 from sim.core.solver import Diagnostics
@@ -91,11 +91,10 @@ def simulation_numbers(layout: JobLayout, *, history: bool = False) -> Simulatio
 
     With `history` all numbers of all frames; else all of the last frame, and of the others what warnings need.
 
-    Raises:
-        ManifestError: the record, which tells the fluids with whitewater, cannot be read.
+    Raises ManifestError: the record, which tells the fluids with whitewater, cannot be read.
     """
     only = None if history else [event.name for event in WARNINGS]
-    receipts = _frame_receipts(layout)
+    receipts = of_newest({_frame_of(each.artifact): each for each in _receipts(layout, layout.frame_cache(0))})
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         whitewater, unreadable_files = _whitewater_numbers(layout, receipts, manifest.subjects(WHITEWATER))
 
@@ -207,17 +206,6 @@ def _receipts(layout: JobLayout, first: ArtifactPath) -> list[Receipt]:
     return [receipt for receipt in (read_receipt(layout, artifact) for artifact in artifacts) if receipt]
 
 
-def _frame_receipts(layout: JobLayout) -> dict[int, Receipt]:
-    """Receipts of the frames with the fingerprint of the one that was committed last, by frame."""
-    receipts = _receipts(layout, layout.frame_cache(0))
-    newest = max(receipts, key=lambda receipt: receipt.finished, default=None)
-    return {
-        _frame_of(receipt.artifact): receipt
-        for receipt in receipts
-        if newest is not None and receipt.fingerprint == newest.fingerprint
-    }
-
-
 def _whitewater_numbers(
     layout: JobLayout, cached: Mapping[int, Receipt], fluids: Collection[str]
 ) -> tuple[dict[int, dict[str, Diagnostics]], list[ArtifactPath]]:
@@ -250,8 +238,7 @@ def _whitewater_numbers(
 def _read_whitewater(layout: JobLayout, artifact: ArtifactPath) -> Diagnostics:
     """How many particles a file of whitewater has, and how many had no room, as its header tells.
 
-    Raises:
-        InvalidArtifactError: it cannot be read.
+    Raises InvalidArtifactError: it cannot be read.
     """
     try:
         counts = read_point_counts(layout.path(artifact))

@@ -75,8 +75,7 @@ def write_frame(
     What no picture shows of a smoke whose shutter is open `longest_shutter_s` [s] at the longest is left out, and the
     rest rounded (`kinds.smoke_codec`). None keeps smoke as it is.
 
-    Raises:
-        InvalidArtifactError: a value of a smoke is not finite.
+    Raises InvalidArtifactError: a value of a smoke is not finite.
     """
     with _new_file(path) as file:
         file.attrs["format"] = FRAME_FORMAT

@@ -118,3 +118,13 @@ def committed_receipt(layout: JobLayout, artifact: ArtifactPath, fingerprint: st
 def is_committed(layout: JobLayout, artifact: ArtifactPath, fingerprint: str) -> bool:
     """Whether there is such a receipt."""
     return committed_receipt(layout, artifact, fingerprint) is not None
+
+
+def of_newest(receipts: Mapping[int, Receipt]) -> dict[int, Receipt]:
+    """Those, by frame, with the fingerprint of the one that was committed last; others are of an earlier version."""
+    newest = max(receipts.values(), key=lambda receipt: receipt.finished, default=None)
+    return {
+        frame: receipt
+        for frame, receipt in receipts.items()
+        if newest is not None and receipt.fingerprint == newest.fingerprint
+    }

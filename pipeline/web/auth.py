@@ -125,8 +125,7 @@ class Access:
 def access_of(host: str, port: int, token_file: Path | None) -> Access:
     """Access as the command line asks for it: an address that others reach needs a token, drawn if no file holds it.
 
-    Raises:
-        PipelineError: the file cannot be read, others may read or write it, or its token is not hard to guess.
+    Raises PipelineError: the file cannot be read, others may read or write it, or its token is not hard to guess.
     """
     if token_file is None:
         return Access(host, port, None if is_loopback(host) else secrets.token_urlsafe(32))

@@ -51,8 +51,7 @@ _OPENING = threading.Lock()
 def listen(host: str, port: int) -> socket.socket:
     """A socket that listens on an address; port 0: on any free one.
 
-    Raises:
-        PipelineError: the port is taken, or the address is none of this machine; names what would do.
+    Raises PipelineError: the port is taken, or the address is none of this machine; names what would do.
     """
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -195,8 +194,7 @@ def page_server(*, host: str = LOCAL, port: int = 0, label: str | None = None) -
 
     Port 0 takes one that is free; `label` is that of its panel.
 
-    Raises:
-        PipelineError: viser cannot be guarded, or the address cannot be had, or others reach it.
+    Raises PipelineError: viser cannot be guarded, or the address cannot be had, or others reach it.
     """
     _require_loopback(host, port)
     import viser

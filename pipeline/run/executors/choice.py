@@ -92,8 +92,7 @@ def open_machines(
 ) -> Iterator[Machines]:
     """Make an executor ready with what may be used of this machine, `here`; it is shut down at the end of the block.
 
-    Raises:
-        PipelineError: Dask is not installed, or there is no cluster.
+    Raises PipelineError: Dask is not installed, or there is no cluster.
     """
     from pipeline.run.executors.inline import InlineExecutor
     from pipeline.run.executors.processes import ProcessExecutor
@@ -113,8 +112,7 @@ def open_machines(
 def require_named_devices(job: Job, stages: Collection[str]) -> None:
     """Refuse a device that each of several machines would choose for itself: CPU and GPU round differently.
 
-    Raises:
-        PipelineError: one of the stages that are to run leaves its device open.
+    Raises PipelineError: one of the stages that are to run leaves its device open.
     """
     devices = (("device", "simulate", job.device), ("render.device", "render", job.render.device))
     names = [name for name, stage, device in devices if stage in stages and device == "auto"]
@@ -128,8 +126,7 @@ def require_named_devices(job: Job, stages: Collection[str]) -> None:
 def require_possible(job: Job, stages: Collection[str]) -> None:
     """Refuse before any work what has to be done and cannot be done here.
 
-    Raises:
-        StageUnavailableError: one of the stages that are to run cannot run on this machine.
+    Raises StageUnavailableError: one of the stages that are to run cannot run on this machine.
     """
     from pipeline.stages import STAGES
 

@@ -61,8 +61,7 @@ class DaskExecutor(Executor):
         patience_s: how long to wait for a scheduler and for workers [s].
         say: called with what a person should know.
 
-    Raises:
-        ClusterError: there was no scheduler, or no worker that can be used, within `patience_s`.
+    Raises ClusterError: there was no scheduler, or no worker that can be used, within `patience_s`.
     """
 
     def __init__(
@@ -116,8 +115,7 @@ class DaskExecutor(Executor):
     def wait(self, timeout_s: float) -> list[ExecutorEvent]:
         """What happened since the last call.
 
-        Raises:
-            ClusterError: the scheduler or all workers have been gone for longer than the executor's patience.
+        Raises ClusterError: the scheduler or all workers have been gone for longer than the executor's patience.
         """
         until = time.monotonic() + timeout_s
         while not self._shut_down:

@@ -69,8 +69,7 @@ class Connection:
 
     The address is such as `tcp://farm:8786` or `tls://farm:8786`; certificates come from Dask's settings.
 
-    Raises:
-        OSError: there is no scheduler, or this machine is too busy to ask for one.
+    Raises OSError: there is no scheduler, or this machine is too busy to ask for one.
     """
 
     def __init__(self, address: str, folder: Path, *, of_runner: bool) -> None:

@@ -25,8 +25,7 @@ _HTTP = f"{_HOST}:0"  # Dask listens for HTTP even without a dashboard, and on a
 def split(capacity: Resources, workers: int) -> list[Resources]:
     """Cores and memory in shares as equal as whole numbers allow; GPUs one each, from the first on.
 
-    Raises:
-        ValueError: more workers than cores.
+    Raises ValueError: more workers than cores.
     """
     if not 1 <= workers <= capacity.cores:
         raise ValueError(f"{workers} workers cannot share {capacity.cores} cores")

@@ -31,8 +31,7 @@ class GpuPlaces:
             first: it computes on the first GPU whatever it is given, even one that is taken or not among the own.
             there: how many GPUs there are, where all may be given; None: unknown, and the lowest that is free is given.
 
-        Raises:
-            PipelineError: there is none to give.
+        Raises PipelineError: there is none to give.
         """
         with self._lock:
             place = 0 if first else next((each for each in sorted(warm) if not self._tasks[each]), None)

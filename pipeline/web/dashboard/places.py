@@ -31,8 +31,7 @@ class Places:
     def file(self, name: str, relative: str) -> Path:
         """A regular file of a job, by its path relative to the job's folder.
 
-        Raises:
-            NotThereError: there is none, or it is a link that leads out of the job's folder.
+        Raises NotThereError: there is none, or it is a link that leads out of the job's folder.
         """
         root = self.job(name)
         try:
@@ -54,8 +53,7 @@ class Places:
     def tail(self, name: str, relative: str, byte_count: int) -> tuple[str, int]:
         """The last bytes of a text file of a job, from a line's beginning on, and the size of all of it [bytes].
 
-        Raises:
-            NotThereError: see `file`.
+        Raises NotThereError: see `file`.
         """
         with self.file(name, relative).open("rb") as file:
             size = file.seek(0, 2)

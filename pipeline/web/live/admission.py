@@ -37,8 +37,7 @@ _CHANGED_KEYS = ("substeps", "self_collision")
 def live_job(job: Job, *, substeps: int | None = None) -> Job:
     """The job as it is simulated live: bodies that rest can be moved where there is no fluid, and steps are as asked.
 
-    Raises:
-        PipelineError: live does not run what the job has.
+    Raises PipelineError: live does not run what the job has.
     """
     for kind in KINDS.values():
         if kind.live is None and kind.bodies(job):
@@ -72,8 +71,7 @@ def require_small(job: Job, particles: int, *, cores: int, on_gpu: bool) -> None
 
     `particles` are those that its fluids will have, as the checks count them: of emitters, what flows in in the film.
 
-    Raises:
-        PipelineError: says about how long a frame takes, and what would fit.
+    Raises PipelineError: says about how long a frame takes, and what would fit.
     """
     nodes = count_cloth_nodes(job)
     power = computing_power(cores=cores, on_gpu=on_gpu)

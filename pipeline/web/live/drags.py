@@ -154,8 +154,7 @@ class Drags:
     def grab(self, kind: str, name: str, point: Point = (0.0, 0.0, 0.0), holder: int = 0) -> None:
         """Take something in hand at a point of the world [m]; a cloth at its node nearest to that, or that node's pin.
 
-        Raises:
-            ValueError: there is no such thing that moves, or another browser holds it.
+        Raises ValueError: there is no such thing that moves, or another browser holds it.
         """
         if kind not in GRABS:
             raise ValueError(f'"{name}" cannot be moved')
@@ -246,8 +245,7 @@ class Drags:
     def _freed(self, handle: Handle, *, called: str) -> Handle:
         """The handle of a thing that only one browser can hold, after its own constraint has ended.
 
-        Raises:
-            ValueError: another browser holds it.
+        Raises ValueError: another browser holds it.
         """
         if any(held[:2] == handle[:2] and held.holder != handle.holder for held in self.held):
             raise ValueError(f"another browser holds {called}")

@@ -24,8 +24,7 @@ def parameters_of(job: Job, *, written: Job | None = None) -> tuple[Parameter, .
 def set_parameter(world: World, job: Job, parameter: Parameter, value: Value, *, before: Value) -> None:
     """Make the solvers step with another value from the next frame on.
 
-    Raises:
-        ValueError: a solver cannot have it; nothing has changed then.
+    Raises ValueError: a solver cannot have it; nothing has changed then.
     """
     solvers: Mapping[str, Any] = world.solvers
     path = parameter.paths[0]

@@ -60,8 +60,7 @@ class Recorder:
     def toggle(self) -> bool:
         """Begin a recording with the present frame, or end it; returns whether it records.
 
-        Raises:
-            PipelineError, OSError: its folder cannot be made.
+        Raises PipelineError, OSError: its folder cannot be made.
         """
         if self._recording is not None:
             self.stop()
@@ -156,8 +155,7 @@ class _Recording:
 
         A lease that did not answer for long may be ours still: the frames are named then, and the loss is told.
 
-        Raises:
-            OSError, PipelineError, RuntimeError, sqlite3.Error: something of it could not be written.
+        Raises OSError, PipelineError, RuntimeError, sqlite3.Error: something of it could not be written.
         """
         with self._held:
             try:

@@ -46,8 +46,7 @@ class Requests:
     def meet_requests(self, wait_s: float = 0.0) -> None:
         """Do all that was asked for; wait for the first request for so long at most [s].
 
-        Raises:
-            CannotGoOnError: a scene that had to begin anew has no memory.
+        Raises CannotGoOnError: a scene that had to begin anew has no memory.
         """
         try:
             request, arguments = self._queue.get(timeout=wait_s) if wait_s > 0.0 else self._queue.get_nowait()

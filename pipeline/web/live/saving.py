@@ -16,8 +16,7 @@ from pipeline.web.live.parameters import overrides_of, parameters_of
 def text_with_values(loaded: LoadedJob, values: Mapping[str, Value], changes: Sequence[Override] = ()) -> str:
     """The job's text with these values and changes: remarks, order and all other keys stay.
 
-    Raises:
-        JobFileError: the values make no job.
+    Raises JobFileError: the values make no job.
     """
     text = changed_text(loaded.text, [*overrides_of(parameters_of(loaded.job), values), *changes])
     job_of_text(text, loaded.path)

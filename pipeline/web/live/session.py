@@ -69,8 +69,7 @@ class Session(Requests):
         longest_frame_s: a frame that takes longer counts as blown up [s]; infinite where slow frames were asked for.
         clock: tells the time [s].
 
-    Raises:
-        ShapeError, ValueError: as `sim.build.build_world`.
+    Raises ShapeError, ValueError: as `sim.build.build_world`.
     """
 
     def __init__(

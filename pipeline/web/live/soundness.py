@@ -29,8 +29,7 @@ FRAMES_TO_TRUST = 60
 def require_sound(report: FrameReport) -> None:
     """Blow-ups show as speeds long before they show as values that are no numbers.
 
-    Raises:
-        SimulationDivergedError: something is absurdly fast.
+    Raises SimulationDivergedError: something is absurdly fast.
     """
     for name, numbers in report.diagnostics.items():
         speed = float(numbers.get("max_speed", 0.0))

@@ -2,16 +2,16 @@
 
 import time
 from collections.abc import Iterable
-from pathlib import Path
 
+from pipeline.base.files import stamp_of
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
 from pipeline.model.job import Job
 from pipeline.model.looks import parts_of
-from pipeline.store.receipts import Receipt, read_receipt
+from pipeline.store.receipts import Receipt, of_newest, read_receipt
 
-FileStamp = tuple[int, int]
-"""Modification time [ns] and size of a file."""
+FileStamp = tuple[int, int, int]
+"""As `stamp_of` has it."""
 Stamp = tuple[FileStamp | None, ...]
 """Stamps of receipts; None where there is none. It differs when one of them was replaced."""
 
@@ -44,7 +44,7 @@ class CommittedFrames:
     def update(self) -> bool:
         """Look again; returns whether frames have come, gone or been replaced. Reads only receipts that are new."""
         folder_stamp = stamp_of(self.folder)
-        if folder_stamp is not None and time.time_ns() - folder_stamp[0] <= SETTLED_NS:
+        if folder_stamp is not None and time.time_ns() - folder_stamp[1] <= SETTLED_NS:
             folder_stamp = None  # another receipt may come at the same time of the file system's clock
         if folder_stamp is not None and folder_stamp == self._folder_stamp:
             return False
@@ -62,12 +62,7 @@ class CommittedFrames:
             return False
         self._seen = seen
         receipts = {frame: receipt for frame, (_, receipt) in seen.items() if receipt is not None}
-        newest = max(receipts.values(), key=lambda receipt: receipt.finished, default=None)
-        self._receipts = {
-            frame: receipt
-            for frame, receipt in receipts.items()
-            if newest is not None and receipt.fingerprint == newest.fingerprint
-        }
+        self._receipts = of_newest(receipts)
         return True
 
     def bounds_are_known(self, job: Job, frame: int) -> bool:
@@ -114,12 +109,3 @@ def artifacts_of_frame(job: Job, layout: JobLayout, frame: int | None) -> list[A
         artifacts += [layout.film_bounds(), layout.frame_bounds(frame), layout.frame_bounds(last)]
         artifacts.append(layout.frame_cache(last))
     return artifacts
-
-
-def stamp_of(path: Path) -> FileStamp | None:
-    """The stamp of a file, None if there is none. Raises OSError: the file system does not say."""
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        return None
-    return status.st_mtime_ns, status.st_size

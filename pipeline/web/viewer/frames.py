@@ -50,8 +50,7 @@ def read_shown_frame(
 
     Of a fluid `most_particles` are kept; its surface takes longer to read than all the rest.
 
-    Raises:
-        InvalidArtifactError: the cached frame itself cannot be read.
+    Raises InvalidArtifactError: the cached frame itself cannot be read.
     """
     path = layout.path(layout.frame_cache(frame))
     try:

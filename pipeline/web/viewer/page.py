@@ -14,6 +14,7 @@ import numpy as np
 import viser
 
 from pipeline.base.errors import InvalidArtifactError, PipelineError
+from pipeline.base.files import stamp_of
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
 from pipeline.stages.render_scene import camera_path
@@ -21,7 +22,7 @@ from pipeline.store.cache import read_numbers
 from pipeline.web.bounded_cache import BoundedCache
 from pipeline.web.drawing.bodies import Extents, Look
 from pipeline.web.drawing.canvas import Canvas, begin_at, camera_orientation, vertical_fov
-from pipeline.web.viewer.committed import CommittedFrames, Stamp, artifacts_of_frame, stamp_of
+from pipeline.web.viewer.committed import CommittedFrames, Stamp, artifacts_of_frame
 from pipeline.web.viewer.controls import Controls
 from pipeline.web.viewer.frames import ShownFrame, read_shown_frame
 from pipeline.web.viewer.numbers import SolverSeries, plot, table
@@ -41,8 +42,7 @@ ASIDE = np.radians(24.0)
 class ViewPage:
     """A job in the browsers of a server; its folder is only read, and kept frames take `most_bytes` of memory.
 
-    Raises:
-        PipelineError: the job file cannot be used.
+    Raises PipelineError: the job file cannot be used.
     """
 
     def __init__(self, server: viser.ViserServer, layout: JobLayout, *, most_particles: int, most_bytes: int) -> None:
