@@ -1,19 +1,16 @@
 """Disk space: how much a job will take, and how much of it stays free."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from pipeline.base import wording
-
-if TYPE_CHECKING:
-    from pipeline.model.job import Job
-    from pipeline.model.problems import Findings
-    from pipeline.record.reader import StageCost
-    from pipeline.run.plan import Assessment
+from pipeline.kinds.table import KINDS
+from pipeline.model.job import Job
+from pipeline.model.problems import Findings
+from pipeline.record.reader import StageCost
+from pipeline.run.plan import Assessment
 
 RESERVE_BYTES = 2 * 2**30
 """Free space at which a job pauses: a checkpoint of a large simulation and a few frames fit."""
@@ -85,15 +82,11 @@ _BYTES_PER_ARTIFACT: Mapping[str, Callable[[Size], float]] = {
 
 def _snapshot_bytes(size: Size, where: int) -> float:
     """Of the bodies of all kinds; `where` as in `Kind.snapshot_bytes`."""
-    from pipeline.kinds.table import KINDS
-
     return sum(kind.snapshot_bytes[where] * size.elements.get(name, 0.0) for name, kind in KINDS.items())
 
 
 def _bytes_per_artifact(stage: str, size: Size) -> float:
     """What one file of a stage takes, about [bytes]; those of a product of bodies by their kind."""
-    from pipeline.kinds.table import KINDS
-
     for name, kind in KINDS.items():
         if kind.product is not None and kind.product.stage == stage:
             return kind.product.file_bytes(size.elements.get(name, 0.0))

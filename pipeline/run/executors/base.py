@@ -1,7 +1,8 @@
 """The base of executors, which run assignments somewhere and report what becomes of them."""
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
@@ -50,6 +51,9 @@ class Executor(ABC):
     that shuts down at its end.
     """
 
+    def __init__(self) -> None:
+        self._events: list[ExecutorEvent] = []
+
     def __enter__(self) -> Self:
         return self
 
@@ -60,9 +64,20 @@ class Executor(ABC):
     def submit(self, assignment: Assignment) -> None:
         """Run this attempt. No other attempt of the same task may be under way."""
 
+    def wait(self, timeout_s: float) -> list[ExecutorEvent]:
+        """What happened since the last call; returns as soon as there is something, or empty after `timeout_s` [s]."""
+        until = time.monotonic() + timeout_s
+        while True:
+            remaining = 0.0 if self._events else until - time.monotonic()
+            self._turn(remaining)
+            if self._events or remaining <= 0:
+                break
+        events, self._events = self._events, []
+        return events
+
     @abstractmethod
-    def wait(self, timeout_s: float) -> Sequence[ExecutorEvent]:
-        """What happened; returns as soon as there is something, and empty after `timeout_s` [s]."""
+    def _turn(self, timeout_s: float) -> None:
+        """Wait for `timeout_s` [s] at most until something happens, and act on it; what there is to tell is kept."""
 
     @abstractmethod
     def cancel(self, task_id: TaskId, *, grace_s: float) -> None:

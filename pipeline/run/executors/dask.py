@@ -19,7 +19,7 @@ from distributed import Future
 
 from pipeline.base.errors import PipelineError
 from pipeline.base.task import FailureKind, Resources, TaskId
-from pipeline.run.events import CapacityChanged, ExecutorEvent, Failed, Finished, TaskEvent
+from pipeline.run.events import CapacityChanged, Failed, Finished, TaskEvent
 from pipeline.run.executors.base import Assignment, Executor
 from pipeline.run.executors.dask_connection import Connection, DriverEnded, Message, SchedulerLost, Workers
 from pipeline.run.executors.dask_slots import Offer, Slots
@@ -73,6 +73,7 @@ class DaskExecutor(Executor):
         patience_s: float = PATIENCE_S,
         say: Callable[[str], None] = print,
     ) -> None:
+        super().__init__()
         self._scheduler = scheduler
         self._folder = folder
         self._of_runner = of_runner
@@ -84,7 +85,6 @@ class DaskExecutor(Executor):
         self._all_offer = False
         self._waiting: dict[TaskId, tuple[Assignment, float]] = {}
         self._running: dict[TaskId, _Attempt] = {}
-        self._events: list[ExecutorEvent] = []
         self._connection: Connection | None = None
         self._alone_since = time.monotonic()
         self._next_try = 0.0
@@ -111,20 +111,6 @@ class DaskExecutor(Executor):
         """Give the attempt to a worker that has room for it, now or when there is one."""
         self._waiting[assignment.task.id] = (assignment, time.monotonic())
         self._place()
-
-    def wait(self, timeout_s: float) -> list[ExecutorEvent]:
-        """What happened since the last call.
-
-        Raises ClusterError: the scheduler or all workers have been gone for longer than the executor's patience.
-        """
-        until = time.monotonic() + timeout_s
-        while not self._shut_down:
-            remaining = 0.0 if self._events else until - time.monotonic()
-            self._turn(remaining)
-            if self._events or remaining <= 0:
-                break
-        events, self._events = self._events, []
-        return events
 
     def cancel(self, task_id: TaskId, *, grace_s: float) -> None:
         """Ask the task to stop; its processes are killed where they run after `grace_s` [s]."""
@@ -158,7 +144,13 @@ class DaskExecutor(Executor):
     # --- one turn of the loop ---
 
     def _turn(self, timeout_s: float) -> None:
-        """Wait for a message for `timeout_s` [s] at most, and take in all that came."""
+        """Wait for a message for `timeout_s` [s] at most, and take in all that came.
+
+        Raises ClusterError: the scheduler or all workers have been gone for longer than the executor's patience.
+        """
+        if self._shut_down:
+            time.sleep(max(0.0, timeout_s))
+            return
         if self._connection is None:
             self._try_to_connect(timeout_s)
         else:

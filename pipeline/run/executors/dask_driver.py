@@ -11,6 +11,7 @@ import platform
 import signal
 import threading
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,7 +23,7 @@ from distributed.diagnostics.plugin import WorkerPlugin
 
 from pipeline.base.content import tool_version
 from pipeline.base.task import FailureKind, TaskId
-from pipeline.run.events import Failed, Finished, Progress, TaskEvent
+from pipeline.run.events import CapacityChanged, ExecutorEvent, Failed, Finished, Progress, TaskEvent
 from pipeline.run.executors.base import Assignment
 from pipeline.run.executors.processes import ProcessExecutor
 
@@ -166,8 +167,9 @@ class _JobSupervisor(threading.Thread):
                 for task_id, _ in [*self._inboxes]:
                     executor.cancel(task_id, grace_s=grace_s)
 
-    def _deliver(self, events: list[TaskEvent]) -> None:
+    def _deliver(self, events: Iterable[ExecutorEvent]) -> None:
         for event in events:
+            assert not isinstance(event, CapacityChanged)  # it is one machine
             key = event.task_id, event.attempt
             inbox = self._inboxes.pop(key, None) if isinstance(event, Finished | Failed) else self._inboxes.get(key)
             if inbox is not None:

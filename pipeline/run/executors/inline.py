@@ -6,7 +6,7 @@ from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from dataclasses import replace
 
 from pipeline.base.task import FailureKind, TaskId
-from pipeline.run.events import Failed, TaskEvent
+from pipeline.run.events import Failed
 from pipeline.run.executors.attempt import run_attempt
 from pipeline.run.executors.base import Assignment, Executor
 from pipeline.stages.gpus import first_gpu
@@ -20,21 +20,19 @@ class InlineExecutor(Executor):
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self._queue: deque[Assignment] = deque()
-        self._events: list[TaskEvent] = []
 
     def submit(self, assignment: Assignment) -> None:
         """Put the attempt into the queue."""
         self._queue.append(replace(assignment, gpu=first_gpu(assignment.task)) if assignment.need.gpus else assignment)
 
-    def wait(self, timeout_s: float) -> list[TaskEvent]:
+    def _turn(self, timeout_s: float) -> None:
         """Run the next assignment to its end, however long that takes."""
         if not self._events and self._queue:
             self._run(self._queue.popleft())
         elif not self._events:
-            time.sleep(timeout_s)
-        events, self._events = self._events, []
-        return events
+            time.sleep(max(0.0, timeout_s))
 
     def cancel(self, task_id: TaskId, *, grace_s: float) -> None:  # noqa: ARG002 - nothing that runs can be here
         """Take a task out of the queue."""

@@ -14,7 +14,7 @@ from math import inf
 from pipeline.base.memory import machine_memory_bytes, resident_memory_bytes
 from pipeline.base.resources import MEMORY_SHARE
 from pipeline.base.task import FailureKind, TaskId
-from pipeline.run.events import Failed, Finished, Progress, TaskEvent
+from pipeline.run.events import Failed, Finished, Progress
 from pipeline.run.executors.base import Assignment, Executor
 from pipeline.run.executors.channel import Channel
 from pipeline.run.executors.failures import full_place, is_disk_full
@@ -54,6 +54,7 @@ class ProcessExecutor(Executor):
 
     def __init__(self, limits: WorkerLimits | None = None, *, gpus: int | None = None) -> None:
         """`gpus` is how many there are for tasks, where that is known."""
+        super().__init__()
         self._limits = limits or WorkerLimits()
         self._gpus = gpus
         memory_bytes = machine_memory_bytes()
@@ -64,7 +65,6 @@ class ProcessExecutor(Executor):
         self._places = places_of_process()
         self._workers: list[WorkerProcess] = []
         self._selector = selectors.DefaultSelector()
-        self._events: list[TaskEvent] = []
 
     @property
     def worker_pids(self) -> list[int]:
@@ -99,17 +99,6 @@ class ProcessExecutor(Executor):
             if worker.exit_descriptor is not None:
                 self._selector.register(worker.exit_descriptor, selectors.EVENT_READ, worker)
         worker.assign(assignment)
-
-    def wait(self, timeout_s: float) -> list[TaskEvent]:
-        """What happened since the last call."""
-        until = time.monotonic() + timeout_s
-        while True:
-            remaining = 0.0 if self._events else until - time.monotonic()
-            self._turn(remaining)
-            if self._events or remaining <= 0:
-                break
-        events, self._events = self._events, []
-        return events
 
     def cancel(self, task_id: TaskId, *, grace_s: float) -> None:
         """Ask the task to stop; its worker's whole process group is killed after `grace_s` [s]."""
