@@ -12,6 +12,7 @@ from blender_scenes import read, redness, spec_of, sphere, write_mesh
 from command_line import pipeline
 from half_simulated_jobs import half_simulated_job
 from needed_blender import needs_bpy, needs_egl
+from warm_blender import WarmRenderer
 
 from pipeline.base.layout import JobLayout
 from render import workbench
@@ -87,6 +88,11 @@ def test_a_job_without_simulated_frames_is_told_what_to_do(tmp_path):
     assert f"cache/000000.h5 is not simulated yet; go on with: pipeline resume {job.root}" in result.stderr
 
 
+@pytest.fixture
+def warm(monkeypatch):
+    monkeypatch.setattr("render.workbench.ChildRenderer", WarmRenderer)
+
+
 def workbench_pictures(folder: Path, *objects: SceneObject, frames: int = 1, **changes: object) -> list[np.ndarray]:
     spec = spec_of(*objects, resolution=(96, 54)).model_copy(update={"engine": "workbench", **changes})
     spec.write(folder / "spec.json")
@@ -110,7 +116,7 @@ COLUMNS = [48 + round(PIXELS_PER_METRE * x) for x in (-0.35, 0.0, 0.35)]
 
 @needs_bpy
 @needs_egl
-def test_bodies_have_the_colours_of_their_looks(tmp_path):
+def test_bodies_have_the_colours_of_their_looks(tmp_path, warm):
     materials = {look: MaterialParameters(look=look) for look in ("rubber", "plastic", "ceramic")}
     materials["own"] = MaterialParameters(look="metal", color=(0.05, 0.6, 0.1))
     (picture,) = workbench_pictures(tmp_path, *balls(tmp_path, materials), set=SetParameters(tank=True))
@@ -125,7 +131,7 @@ def test_bodies_have_the_colours_of_their_looks(tmp_path):
 @needs_bpy
 @needs_egl
 @pytest.mark.parametrize("tank", [False, True])
-def test_bodies_that_are_called_as_parts_of_the_set_have_their_own_colour_and_the_set_keeps_its(tmp_path, tank):
+def test_bodies_that_are_called_as_parts_of_the_set_have_their_own_colour_and_the_set_keeps_its(tmp_path, warm, tank):
     green = MaterialParameters(look="plastic", color=(0.05, 0.6, 0.1))
     named = balls(tmp_path, dict.fromkeys(("cyclorama", "tank_edge", "tank_glass"), green))
     (picture,) = workbench_pictures(tmp_path, *named, set=SetParameters(tank=tank))
@@ -141,7 +147,7 @@ def test_bodies_that_are_called_as_parts_of_the_set_have_their_own_colour_and_th
 @needs_bpy
 @needs_egl
 @pytest.mark.parametrize("look", ["smoke", "fire"])
-def test_smoke_and_fire_are_seen_where_they_are(tmp_path, look):
+def test_smoke_and_fire_are_seen_where_they_are(tmp_path, warm, look):
     cells = 16
     for frame, filled in enumerate((0, cells // 2)):
         density = np.zeros((cells,) * 3, np.float32)

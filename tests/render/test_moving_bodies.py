@@ -18,6 +18,7 @@ from blender_scenes import (
 )
 from drawn_jobs import BALL, draw_frame, job_of_the_ball, pose
 from needed_blender import needs_bpy
+from warm_blender import WarmRenderer
 from warm_python import run_python
 
 from pipeline.base.layout import JobLayout
@@ -119,7 +120,8 @@ color = [0.1, 0.3, 0.8]
 """
 
 
-def test_a_job_is_drawn_with_the_poses_of_its_cache(tmp_path):
+def test_a_job_is_drawn_with_the_poses_of_its_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr("render.blender.open_renderer", WarmRenderer)
     job, layout = job_of_the_ball(tmp_path, "flight", CAMERA_AND_ROCK)
     task = RenderStage().plan(job, layout)[2]
     assert task.inputs == ("meshes/ball.ply", "meshes/rock.ply", "cache/000002.h5")

@@ -19,6 +19,7 @@ from blender_scenes import (
 from drawn_jobs import BALL as MOVING_BALL
 from drawn_jobs import RED, draw_frame, job_of_the_ball, pose
 from needed_blender import needs_bpy
+from warm_blender import WarmRenderer
 from warm_python import run_python
 
 from pipeline.stages.render import RenderStage
@@ -106,7 +107,8 @@ follow = "ball"
 """
 
 
-def test_a_body_that_the_camera_follows_stays_in_the_middle_and_sharp(tmp_path):
+def test_a_body_that_the_camera_follows_stays_in_the_middle_and_sharp(tmp_path, monkeypatch):
+    monkeypatch.setattr("render.blender.open_renderer", WarmRenderer)
     job, layout = job_of_the_ball(tmp_path, "chase", FOLLOWING_CAMERA)
     task = RenderStage().plan(job, layout)[2]
     ball = Snapshot("rigid", pose(position=(0.4, 0.0, 0.5), velocity=(24.0, 0.0, 0.0))["ball"], {})

@@ -10,10 +10,16 @@ from exr_channels import exr_channels
 from half_simulated_jobs import half_simulated_job
 from needed_blender import needs_bpy
 from PIL import Image
+from warm_blender import WarmRenderer
 
 from pipeline.base.layout import JobLayout
 from pipeline.stages import render_drawing
 from render.pictures import validate_exr, validate_picture
+
+
+@pytest.fixture(autouse=True)
+def warm(monkeypatch):
+    monkeypatch.setattr("render.blender.open_renderer", WarmRenderer)
 
 
 @pytest.fixture
