@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -147,13 +148,17 @@ def test_broken_input_is_refused_with_frame_and_file(ball_pictures):
     assert not (folder / ".000004.png.part#1").exists()
 
 
-@pytest.mark.parametrize("quality", ["draft", "preview"])
-def test_a_denoised_frame_does_not_depend_on_the_process_or_its_threads(quality, tmp_path):
-    write_ball_frames(tmp_path)
-    spec_of(BALL, denoise=True, quality=quality, motion_blur=True).write(tmp_path / "spec.json")
-    for run, threads in ((run_python, "1"), (run_fresh_python, "2")):
-        run(RENDER_FRAMES, str(tmp_path), f"{threads}-{{frame}}.png", "2", threads)
-    assert (tmp_path / "1-2.png").read_bytes() == (tmp_path / "2-2.png").read_bytes()
+def test_a_denoised_frame_does_not_depend_on_the_process_or_its_threads(tmp_path):
+    both = ""
+    for quality in ("draft", "preview"):
+        folder = tmp_path / quality
+        write_ball_frames(folder)
+        spec_of(BALL, denoise=True, quality=quality, motion_blur=True).write(folder / "spec.json")
+        run_python(RENDER_FRAMES, str(folder), "warm-{frame}.png", "2", "1")
+        both += f"\nsys.argv[1:] = [{str(folder)!r}, 'fresh-{{frame}}.png', '2', '2']\n" + dedent(RENDER_FRAMES)
+    run_fresh_python("import sys" + both)
+    for quality in ("draft", "preview"):
+        assert (tmp_path / quality / "warm-2.png").read_bytes() == (tmp_path / quality / "fresh-2.png").read_bytes()
 
 
 @pytest.fixture
@@ -161,12 +166,29 @@ def blender_stand_in(tmp_path) -> Path:
     return write_blender_stand_in(tmp_path)
 
 
-def test_external_executable_draws_the_same_bytes_as_the_module(ball_pictures, blender_stand_in):
+@pytest.fixture
+def temporary(tmp_path, monkeypatch) -> Path:
+    """The folder of all temporary files."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def require_own_folder(temporary: Path) -> None:
+    (own,) = temporary.iterdir()
+    assert list(own.glob("blender_*"))  # Blender's own folder lies there
+
+
+def test_an_executable_draws_the_same_bytes_as_the_module_and_leaves_no_temporary_files(
+    ball_pictures, blender_stand_in, temporary
+):
     folder, printed = ball_pictures
     assert "DEVICE CPU" in printed
     renderer = open_renderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
     try:
         assert renderer.device == "CPU"
+        require_own_folder(temporary)
         renderer.render(0, folder / "external 0.png")
         with pytest.raises(FrameRenderError, match=r"frame 4: .*not finite"):
             renderer.render(4, folder / "external 4.png")
@@ -178,11 +200,15 @@ def test_external_executable_draws_the_same_bytes_as_the_module(ball_pictures, b
         assert (folder / f"external {frame}.png").read_bytes() == expected
     assert isinstance(renderer, ChildRenderer)
     assert renderer._process.poll() is not None
+    assert list(temporary.iterdir()) == []
 
 
-def test_a_killed_executable_is_reported_with_its_last_lines(ball_pictures, blender_stand_in):
+def test_a_killed_executable_is_reported_with_its_last_lines_and_leaves_no_temporary_files(
+    ball_pictures, blender_stand_in, temporary
+):
     folder, _ = ball_pictures
     renderer = ChildRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
+    require_own_folder(temporary)
     renderer._process.kill()
     renderer._process.wait()
     with pytest.raises(BlenderDiedError, match=r"(?s)exit code -9; .*noise that Blender prints") as death:
@@ -190,21 +216,6 @@ def test_a_killed_executable_is_reported_with_its_last_lines(ball_pictures, blen
     assert (death.value.frame, death.value.returncode) == (0, -9)
     again = pickle.loads(pickle.dumps(death.value))
     assert (str(again), again.returncode) == (str(death.value), -9)
-    renderer.close()
-
-
-@pytest.mark.parametrize("is_killed", [False, True])
-def test_an_executable_leaves_no_temporary_files(ball_pictures, blender_stand_in, tmp_path, monkeypatch, is_killed):
-    folder, _ = ball_pictures
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    renderer = ChildRenderer(folder / "spec.json", threads=1, blender=str(blender_stand_in))
-    (own,) = temporary.iterdir()
-    assert list(own.glob("blender_*"))  # Blender's own folder lies there
-    if is_killed:
-        renderer._process.kill()
-        renderer._process.wait()
     renderer.close()
     assert list(temporary.iterdir()) == []
 

@@ -68,24 +68,24 @@ def blender(tmp_path: Path) -> Path:
     return script
 
 
-@pytest.mark.parametrize("device", ["auto", "gpu"])
-def test_two_gpus_have_a_renderer_each_one_compiles_and_each_frame_says_what_drew_it(
-    tmp_path, monkeypatch, blender, device
-):
+def test_two_gpus_have_a_renderer_each_one_compiles_and_each_frame_says_what_drew_it(tmp_path, monkeypatch, blender):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(gpus, "_device_files", lambda: ["/dev/nvidia0"])
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(4)))  # cores for two renderers
     (tmp_path / "ball.toml").write_text(JOB)
-    options = ["--set", f"render.blender={blender}", "--set", f"render.device={device}"]
-    result = pipeline("submit", tmp_path / "ball.toml", "--output", tmp_path / "renders", *options)
-    assert result.exit_code == 0, result.stderr
-    assert result.stderr.count(f"render: compiling Cycles' kernels for {CARD}; minutes, once") == 1
-    assert kernels_marker(f"OPTIX: {CARD}", "5.0.1").exists()
-    used = sorted(path.name.rpartition("-")[0] for path in tmp_path.glob(f"{device}-*"))
-    assert used == [f"{device}-0", f"{device}-1"]
     layout = JobLayout(tmp_path / "renders" / "ball")
-    receipts = [read_receipt(layout, layout.picture(frame)) for frame in range(4)]
-    assert {receipt and receipt.device for receipt in receipts} == {f"OPTIX: {CARD}"}
-    logs = [path.read_text() for path in (layout.root / "logs" / "render").glob("*.log")]
-    assert len(logs) == 4 and all(f"Cycles draws on OPTIX: {CARD}, GPU " in log for log in logs)
-    assert f"drawn on OPTIX: {CARD}" in pipeline("explain", layout.root, "render/000003").stdout
+    for seed, device in enumerate(("auto", "gpu")):  # what was simulated for the first is drawn anew for the second
+        keys = {"blender": blender, "device": device, "seed": seed}
+        options = [word for key, value in keys.items() for word in ("--set", f"render.{key}={value}")]
+        result = pipeline("submit", tmp_path / "ball.toml", "--output", tmp_path / "renders", *options)
+        assert result.exit_code == 0, result.stderr
+        assert result.stderr.count(f"render: compiling Cycles' kernels for {CARD}; minutes, once") == 1
+        assert kernels_marker(f"OPTIX: {CARD}", "5.0.1").exists()
+        used = sorted(path.name.rpartition("-")[0] for path in tmp_path.glob(f"{device}-*"))
+        assert used == [f"{device}-0", f"{device}-1"]
+        receipts = [read_receipt(layout, layout.picture(frame)) for frame in range(4)]
+        assert {receipt and receipt.device for receipt in receipts} == {f"OPTIX: {CARD}"}
+        logs = [path.read_text() for path in (layout.root / "logs" / "render").glob(f"*.{seed + 1}.log")]
+        assert len(logs) == 4 and all(f"Cycles draws on OPTIX: {CARD}, GPU " in log for log in logs)
+        assert f"drawn on OPTIX: {CARD}" in pipeline("explain", layout.root, "render/000003").stdout
+        kernels_marker(f"OPTIX: {CARD}", "5.0.1").unlink()
