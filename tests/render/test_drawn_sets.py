@@ -161,10 +161,10 @@ def test_the_ground_takes_the_colour_of_its_look(tmp_path):
 def test_stone_on_the_ground_is_mottled_near_the_scene(tmp_path):
     above = CameraParameters(position=(0.0, -1.5, 1.5), look_at=(0.0, 0.0, 0.0))
     stone, matt = (
-        draw(tmp_path, ball=None, camera=above, name="outdoor", strength=0.3, **keys) @ LUMINANCE
+        draw(tmp_path, ball=None, camera=above, name="night", strength=4.0, **keys) @ LUMINANCE
         for keys in ({"ground": "stone"}, {})
     )
-    # The sun lights all of the ground alike; noise of 16 samples is in both.
+    # The moon lights all of the ground alike; noise of 16 samples is in both.
     assert stone.std() / stone.mean() > 2.0 * matt.std() / matt.mean()
 
 

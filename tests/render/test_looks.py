@@ -47,6 +47,7 @@ def liquids(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
             for look, x in places.items()
         ),
         resolution=(128, 72),
+        samples=8,
     )
     return {look: patch(picture, x, 0.5, 0.12).mean(axis=(0, 1)) for look, x in places.items()}
 
@@ -78,12 +79,12 @@ def test_density_decides_how_far_light_gets_inside(look, tmp_path):
             tmp_path,
             MeshObject(name=look, file="ball.ply", material=MaterialParameters(look=look, density=density)),
             resolution=(128, 72),
-            samples=16,
+            samples=4,
         )
         for density in (0.02, 0.5)
     )
     # The backdrop shows through thin honey. In thin milk, light that entered far away fills the shadow below; 500
-    # pixels of 16 samples are good to a per cent.
+    # pixels of 4 samples are good to two per cent.
     z, half, factor = (0.5, 0.2, 1.3) if look == "honey" else (0.3, 0.06, 1.05)
     lighter, darker = ((patch(each, 0.0, z, half) @ LUMINANCE).mean() for each in (thin, dense))
     assert lighter > factor * darker
@@ -107,7 +108,7 @@ def test_wood_is_brown_and_has_a_grain_that_plastic_of_its_colour_lacks(tmp_path
         MeshObject(name=look.look, file="ball.ply", position=(x, 0.0, 0.5), material=look)
         for look, x in ((WOOD, -0.35), (plain, 0.35))
     )
-    picture = draw(tmp_path, left, right, resolution=(128, 72), samples=64)
+    picture = draw(tmp_path, left, right, resolution=(128, 72), samples=16)
     wood, plastic = patch(picture, -0.35, 0.5, 0.15), patch(picture, 0.35, 0.5, 0.15)
     red, green, blue = wood.mean(axis=(0, 1))
     assert red > 1.1 * green > 1.2 * blue
@@ -125,7 +126,7 @@ def test_the_grain_of_wood_runs_along_a_body_and_turns_with_it(tmp_path):
         MeshObject(name=name, file="egg.ply", position=(x, 0.0, 0.5), orientation=turn, material=WOOD)
         for name, x, turn in (("upright", -0.35, (1.0, 0.0, 0.0, 0.0)), ("lying", 0.35, QUARTER_TURN))
     )
-    picture = draw(tmp_path, upright, lying, resolution=(192, 108), samples=64)
+    picture = draw(tmp_path, upright, lying, resolution=(128, 72), samples=16)
     assert stripes(patch(picture, -0.35, 0.5, 0.15)) > 1.25
     assert stripes(patch(picture, 0.35, 0.5, 0.15)) < 0.8
 
@@ -145,7 +146,7 @@ def test_the_grain_of_a_sheet_hangs_on_its_coordinates_at_rest(tmp_path):
         normals = np.broadcast_to((0.0, -1.0, 0.0), positions.shape)
         write_ply(folder / "sheet000000.ply", positions, triangles, normals=normals, velocities=0 * positions, uv=uv)
         sheet = MeshSequenceObject(name="sheet", file="sheet{frame}.ply", material=WOOD)
-        pictures.append(patch(draw(folder, sheet, resolution=(128, 72), samples=64), 0.0, 0.5, 0.35))
+        pictures.append(patch(draw(folder, sheet, resolution=(128, 72), samples=16), 0.0, 0.5, 0.35))
     assert stripes(pictures[0]) > 1.25
     assert stripes(pictures[1]) < 0.8
 
@@ -177,11 +178,11 @@ def test_caustics_bend_the_sun_s_light_and_leave_the_rest_of_the_ground_as_it_is
         glass = MaterialParameters(look="glass", caustics=caustics)
         ball = MeshObject(name="ball", file="ball.ply", material=glass)
         scene = {"set": SetParameters(name="outdoor", strength=0.5), "camera": above}
-        (picture,) = draw_all(tmp_path, spec_of(ball, samples=64, motion_blur=False).model_copy(update=scene))
+        (picture,) = draw_all(tmp_path, spec_of(ball, samples=16, motion_blur=False).model_copy(update=scene))
         pictures.append(picture @ LUMINANCE)
     straight, bent = pictures
     ground = straight[:, :8].mean()
-    # A far disc stands for the sun: the same light to a hundredth, and noise of 64 samples over 288 pixels.
+    # A far disc stands for the sun: the same light to a hundredth, and noise of 16 samples over 288 pixels.
     assert bent[:, :8].mean() == pytest.approx(ground, rel=0.02)
     behind = np.s_[8:28, 38:60]  # the ground beside the ball, away from the sun
     assert bent[behind].min() < 0.75 * straight[behind].min()
