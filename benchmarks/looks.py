@@ -21,6 +21,7 @@ from PIL import Image
 from blender_scripts.look_table import CLOTHS, LOOK_TABLE, looks_for
 from render.blender import open_renderer
 from render.camera_path import CameraPath
+from render.cloth import vertex_normals
 from render.meshes import write_ply
 from render.parameters import CameraParameters, MaterialParameters, RenderParameters, SetParameters
 from render.point_clouds import KINDS
@@ -87,13 +88,8 @@ def write_table_cloth(path: Path, x: float, *, width: float = 0.85, counts: int 
     first = (counts * np.arange(counts - 1)[:, None] + np.arange(counts - 1)).ravel()
     corners = np.stack([first, first + counts, first + counts + 1, first + 1], axis=1)
     faces = np.concatenate([corners[:, (0, 2, 1)], corners[:, (0, 3, 2)]])
-    normals = np.zeros(vertices.shape)
-    of_faces = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], of_faces)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     uv = np.stack([width * s, t], axis=1)
-    write_ply(path, vertices, faces, normals=normals, velocities=np.zeros(vertices.shape), uv=uv)
+    write_ply(path, vertices, faces, normals=vertex_normals(vertices, faces), velocities=0 * vertices, uv=uv)
 
 
 def solids(first: MaterialParameters, second: MaterialParameters) -> tuple[MeshObject, ...]:

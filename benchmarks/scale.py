@@ -2,8 +2,8 @@
 
     python -m benchmarks.scale [--tasks 1000 10000 100000] [--dispatched 300] [--plot docs/performance-scale.svg]
 
-Prints JSON. The job has one no-op stage, a task and a small file a frame (`benchmarks.dispatch`). Each size is measured
-in a process of its own, whose largest resident memory is the runner's:
+Prints JSON. The job has one no-op stage, a task and a small file a frame. Each size is measured in a process of
+its own, whose largest resident memory is the runner's:
 
     plan            tasks planned and held against an empty record
     nothing to do   a whole run of a finished job: record, files, plan, nothing to start
@@ -27,23 +27,152 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from benchmarks import dispatch
 from benchmarks.compare import HERE, arguments_of, child, run, timed
+from pipeline.base.fingerprint import task_fingerprint
 from pipeline.base.layout import JobLayout
+from pipeline.base.parameter_set import ParameterSet
+from pipeline.base.task import ArtifactPath, Resources, Task, TaskId, TaskState
 from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest
 from pipeline.run.control import Selection
+from pipeline.run.events import JobOutcome
+from pipeline.run.executors.base import Executor
 from pipeline.run.executors.inline import InlineExecutor
 from pipeline.run.executors.processes import ProcessExecutor, WorkerLimits
 from pipeline.run.plan import assess, plan_job
+from pipeline.run.runner import run_job
+from pipeline.store import artifacts
+from pipeline.store.receipts import Receipt, hash_file
+
+if TYPE_CHECKING:
+    from pipeline.stages.base import TaskContext
 
 SIZES = (1_000, 10_000, 100_000)
-STAGES = "benchmarks.dispatch:STAGES"
+
+JOB = 'name = "dispatch"\nframes = {frames}\n'
+PARAMETERS = ParameterSet.of(stage="noop", version=1, tools={})
+
+
+def accept(path: Path) -> None:
+    path.read_bytes()
+
+
+class NoopStage:
+    """Commits one byte a frame."""
+
+    name = "noop"
+    version = 1
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:  # noqa: ARG002 - the protocol's signature
+        return [_task("noop", frame) for frame in range(job.frame_count)]
+
+    def run(self, context: TaskContext) -> None:
+        with context.committing(context.task.outputs[0], accept) as path:
+            path.write_bytes(b"x")
+
+
+STAGES = (NoopStage(),)
+STAGES_REFERENCE = "benchmarks.scale:STAGES"
+
+
+class CommitClock:
+    """Notes when each commit reaches the runner."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+        self.processor_times: list[float] = []
+
+    def task_ms(self) -> tuple[float, float]:
+        """Wall time and the runner's processor time a task, from the first commit to the last [ms].
+
+        Neither has the start of the workers in it.
+        """
+        both = (self.times, self.processor_times)
+        wall, processor = (1e3 * (each[-1] - each[0]) / (len(each) - 1) for each in both)
+        return wall, processor
+
+    def notify(self, event: Any) -> None:
+        if hasattr(event, "receipt"):
+            self.times.append(time.perf_counter())
+            self.processor_times.append(time.process_time())
+
+
+def _task(stage: str, frame: int) -> Task:
+    return Task(
+        id=TaskId(f"{stage}/{frame:06d}"),
+        stage=stage,
+        inputs=(),
+        outputs=(ArtifactPath(f"{stage}/{frame:06d}.bin"),),
+        parameters=PARAMETERS,
+        frame=frame,
+    )
+
+
+def run_noops(
+    root: Path, tasks: int, executor: Executor, clock: CommitClock, *, rerun: Selection | None = None
+) -> None:
+    """Run the job of so many tasks, or some of them again."""
+    outcome = run_job(
+        Job(name="dispatch", frames=tasks),
+        JobLayout(root),
+        executor=executor,
+        job_text=JOB.format(frames=tasks),
+        stages=STAGES_REFERENCE,
+        observers=[clock.notify],
+        rerun=rerun,
+        capacity=Resources(cores=1),
+    )
+    assert outcome.kind is JobOutcome.SUCCEEDED
+
+
+def nothing_to_do_s(root: Path, tasks: int) -> tuple[float, float]:
+    """Wall and processor time of a whole run over a finished job [s]; its files are made up, and put on record."""
+    layout = JobLayout(root)
+    (root / NoopStage.name).mkdir(parents=True)
+    plan = NoopStage().plan(Job(name="dispatch", frames=tasks), layout)
+    receipts = []
+    for task in plan:
+        path = layout.path(task.outputs[0])
+        path.write_bytes(b"x")
+        status = path.stat()
+        receipts.append(
+            Receipt(
+                artifact=task.outputs[0],
+                task=task.id,
+                stage=task.stage,
+                attempt=1,
+                fingerprint=task_fingerprint(task, {}),
+                parameters=task.parameters.digest,
+                size=status.st_size,
+                mtime_ns=status.st_mtime_ns,
+                hash=hash_file(path),
+            )
+        )
+    with Manifest(layout.manifest) as manifest:
+        manifest.begin_run("dispatch")
+        manifest.record_plan(plan, {task.id: TaskState.SUCCEEDED for task in plan})
+        manifest.record_artifacts(receipts)
+        manifest.end_run()
+    run_noops(root, tasks, InlineExecutor(), CommitClock())  # the first one takes the states over as "up to date"
+    return timed(lambda: run_noops(root, tasks, InlineExecutor(), CommitClock()))
+
+
+def bare_commit_ms(root: Path, count: int) -> float:
+    """Wall time of one commit in a loop without anything else [ms]."""
+    layout = JobLayout(root)
+    began = time.perf_counter()
+    for frame in range(count):
+        task = _task("bare", frame)
+        output = task.outputs[0]
+        with artifacts.committing(layout, output, task=task, attempt=1, fingerprint="", validate=accept) as commit:
+            commit.path.write_bytes(b"x")
+    return (time.perf_counter() - began) / count * 1e3
 
 
 def measure(folder: Path, tasks: int, dispatched: int, repeats: int) -> dict[str, Any]:
@@ -52,24 +181,24 @@ def measure(folder: Path, tasks: int, dispatched: int, repeats: int) -> dict[str
     layout = JobLayout(folder / "renders" / job.name)
 
     def plan() -> None:
-        assess(plan_job(job, layout, dispatch.STAGES), {}, {}, parameters=lambda _: None)
+        assess(plan_job(job, layout, STAGES), {}, {}, parameters=lambda _: None)
 
     figures: dict[str, Any] = {"tasks": tasks, "plan": fastest(repeats, plan)}
-    idle = [dispatch.nothing_to_do_s(layout.root, tasks)]
-    again = partial(dispatch.run_noops, layout.root, tasks, InlineExecutor(), dispatch.CommitClock())
+    idle = [nothing_to_do_s(layout.root, tasks)]
+    again = partial(run_noops, layout.root, tasks, InlineExecutor(), CommitClock())
     idle += [timed(again) for _ in range(repeats - 1)]
     figures["nothing to do"] = [round(min(column), 3) for column in zip(*idle, strict=True)]
     figures["status"] = fastest(5 * repeats, lambda: status(layout))
-    (folder / "dispatch.toml").write_text(dispatch.JOB.format(frames=tasks))
-    layout.job_file.write_text(dispatch.JOB.format(frames=tasks))
+    (folder / "dispatch.toml").write_text(JOB.format(frames=tasks))
+    layout.job_file.write_text(JOB.format(frames=tasks))
     for name, arguments in (("submit", ("submit", "dispatch.toml")), ("status command", ("status", job.name))):
         figures[name] = [round(seconds, 3) for seconds in _command(folder, arguments)]
-    clock = dispatch.CommitClock()
+    clock = CommitClock()
     with ProcessExecutor(WorkerLimits(tasks_per_worker=dispatched + 1)) as executor:
         chosen = Selection(frames=frozenset(range(dispatched)))
-        dispatch.run_noops(layout.root, tasks, executor, clock, rerun=chosen)
+        run_noops(layout.root, tasks, executor, clock, rerun=chosen)
     figures["dispatch [ms]"] = [round(each, 3) for each in clock.task_ms()]
-    figures["bare commit [ms]"] = round(dispatch.bare_commit_ms(folder / "bare", dispatched), 3)
+    figures["bare commit [ms]"] = round(bare_commit_ms(folder / "bare", dispatched), 3)
     figures["memory [MB]"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6, 1)
     return figures
 
@@ -103,8 +232,8 @@ def run_command(arguments: list[str]) -> None:
     import pipeline.stages
     from pipeline.cli.main import main as command_line
 
-    pipeline.stages.STAGES = dispatch.STAGES  # type: ignore[assignment]
-    pipeline.queue.turns.STAGES_REFERENCE = STAGES
+    pipeline.stages.STAGES = STAGES  # type: ignore[assignment]
+    pipeline.queue.turns.STAGES_REFERENCE = STAGES_REFERENCE
     command_line(arguments)
 
 
