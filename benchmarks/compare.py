@@ -189,12 +189,6 @@ def film(tree: Path, job: str) -> Numbers:
         return numbers | {f"{stage}_s": statistics.median(spent) for stage, spent in seconds.items()}
 
 
-def start_up(tree: Path) -> Numbers:
-    """This checkout's `benchmarks.start_up` for another's command line."""
-    result = child([str(HERE / "benchmarks" / "start_up.py"), "--repeats", "1"], cwd=tree, env=environment(tree))
-    return dict(times_in(result))
-
-
 def take_turns(measure: Callable[[Path], Numbers], other: Path, turns: int) -> list[tuple[Numbers, Numbers]]:
     """What is measured here and in another checkout, turn by turn, after one of each that warms up."""
     pairs = []
@@ -255,7 +249,7 @@ quality = "draft"
 """
 
 MEASURED: dict[str, Callable[[Path], Numbers]] = {
-    "start-up": start_up,
+    "start-up": lambda tree: benchmark(tree, "start_up", "--repeats", "1"),
     "fluid": lambda tree: benchmark(tree, "fluid", "--particles", "30000", "--steps", "10", "--blocks", "5"),
     "smoke": lambda tree: benchmark(tree, "smoke", "--cells", "64"),
     "cloth": lambda tree: benchmark(tree, "cloth", "--nodes", "64", "--frames", "20"),

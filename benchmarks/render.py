@@ -11,12 +11,14 @@ wall time and by CPU time; the first frame of each side warms up and is not coun
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 from benchmarks.compare import arguments_of, run, timed
 from render.blender import open_renderer
@@ -30,40 +32,15 @@ FPS = 60.0
 
 
 def wave(frame: int, triangle_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A closed slab of water with a travelling wave: positions, triangles, normals, velocities."""
-    side = max(4, int(np.sqrt(triangle_count / 4)))
-    axis = np.linspace(-0.5, 0.5, side)
-    x, y = (grid.ravel() for grid in np.meshgrid(axis, axis, indexing="ij"))
-    phase = 9.0 * x + 3.0 * y - 6.0 * frame / FPS
-    height = 0.25 + 0.05 * np.sin(phase)
-    top = np.stack([x, y, height], axis=1)
-    bottom = np.stack([x, y, np.zeros_like(x)], axis=1)
-    a = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
-    b, c, d = a + side, a + side + 1, a + 1
-    upper = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    ring = np.concatenate(
-        [
-            np.arange(side - 1) * side,
-            (side - 1) * side + np.arange(side - 1),
-            side * side - 1 - np.arange(side - 1) * side,
-            side - 1 - np.arange(side - 1),
-        ]
-    )
-    after, below = np.roll(ring, -1), side * side
-    walls = np.concatenate(
-        [np.stack([ring, ring + below, after + below], axis=1), np.stack([ring, after + below, after], axis=1)]
-    )
-    triangles = np.concatenate([upper, upper[:, ::-1] + below, walls])
-    slope = 0.05 * np.cos(phase)
-    normal = np.stack([-9.0 * slope, -3.0 * slope, np.ones_like(x)], axis=1)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    velocity = np.stack([np.zeros_like(x), np.zeros_like(x), -6.0 * slope], axis=1)
-    return (
-        np.concatenate([top, bottom]).astype(np.float32),
-        triangles.astype(np.int32),
-        np.concatenate([normal, np.broadcast_to((0.0, 0.0, -1.0), normal.shape)]).astype(np.float32),
-        np.concatenate([velocity, np.zeros_like(velocity)]).astype(np.float32),
-    )
+    """A flat drop of water with a travelling wave, of about so many triangles: positions, these, normals, velocity."""
+    drop = trimesh.creation.icosphere(subdivisions=max(1, round(math.log(triangle_count / 20, 4))), radius=0.5)
+    phase = 9.0 * drop.vertices[:, 0] + 3.0 * drop.vertices[:, 1] - 6.0 * frame / FPS
+    drop.vertices = drop.vertices * (1.0, 1.0, 0.3)
+    drop.vertices[:, 2] += 0.2 + 0.05 * np.sin(phase)
+    velocity = np.outer(-6.0 * 0.05 * np.cos(phase), (0.0, 0.0, 1.0))
+    columns = drop.vertices, drop.vertex_normals, velocity
+    positions, normals, velocities = (each.astype(np.float32) for each in columns)
+    return positions, drop.faces.astype(np.int32), normals, velocities
 
 
 def write_smoke(path: Path, frame: int, cells: int = 64) -> None:

@@ -8,14 +8,14 @@ Milliseconds; medians of the repeats, after one of each that warms the file syst
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+from benchmarks.compare import arguments_of, run
 
 JOB = """
 name = "nothing"
@@ -54,16 +54,10 @@ def measure(repeats: int) -> dict[str, float]:
 
 
 def main() -> dict[str, float]:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments_of(__doc__)
     parser.add_argument("--repeats", type=int, default=9)
     return measure(parser.parse_args().repeats)
 
 
 if __name__ == "__main__":
-    # Run by its path it needs nothing of this checkout: so it measures another's command line.
-    if "--against" in sys.argv:
-        from benchmarks.compare import run
-
-        run(main)
-    else:
-        print(json.dumps(main(), indent=1))
+    run(main)

@@ -14,6 +14,7 @@ from mathutils import Vector
 
 from blender_scripts.documents import numbers_of, read_document
 from blender_scripts.errors import RenderInputError
+from blender_scripts.geometry import new_object
 from blender_scripts.keyframes import forget_keyframes
 
 SENSOR_WIDTH_MM = 36.0
@@ -35,9 +36,8 @@ def add_camera(parameters: dict[str, Any]) -> Any:
     if parameters["f_stop"] is not None:
         camera.dof.use_dof = True
         camera.dof.aperture_fstop = parameters["f_stop"]
-    blender_object = bpy.data.objects.new("camera", camera)
+    blender_object = new_object("camera", camera)
     _set_view(blender_object, parameters)
-    bpy.context.scene.collection.objects.link(blender_object)
     bpy.context.scene.camera = blender_object
     return blender_object
 

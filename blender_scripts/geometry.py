@@ -89,13 +89,18 @@ def _set_uv_map(mesh: Any, name: str, corners: np.ndarray | None) -> None:
         layer.uv.foreach_set("vector", corners.ravel())
 
 
+def new_object(name: str, data: Any) -> Any:
+    """An object with this data, linked into the scene."""
+    blender_object = bpy.data.objects.new(name, data)
+    bpy.context.scene.collection.objects.link(blender_object)
+    return blender_object
+
+
 def new_mesh_object(name: str, source: SurfaceMesh) -> Any:
     """A mesh object with this geometry, linked into the scene."""
     mesh = bpy.data.meshes.new(name)
     fill_mesh(mesh, source)
-    blender_object = bpy.data.objects.new(name, mesh)
-    bpy.context.scene.collection.objects.link(blender_object)
-    return blender_object
+    return new_object(name, mesh)
 
 
 def keep_sharp_edges(mesh: Any, angle_deg: float) -> None:

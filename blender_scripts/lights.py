@@ -14,7 +14,7 @@ from mathutils import Vector
 from blender_scripts.camera import aim, pixel_angle
 from blender_scripts.compatibility import set_physical_sky
 from blender_scripts.errors import RenderInputError
-from blender_scripts.geometry import new_mesh_object
+from blender_scripts.geometry import new_mesh_object, new_object
 from blender_scripts.looks import new_material
 from blender_scripts.ply import SurfaceMesh
 from blender_scripts.shading import Color, LookContext, NodeBuilder, or_default
@@ -384,9 +384,8 @@ def _add_light(name: str, kind: str, energy: float, color: Color, size: float, *
         light.shadow_soft_size = size
     else:
         light.angle = math.radians(size)
-    lamp = bpy.data.objects.new(name, light)
+    lamp = new_object(name, light)
     aim(lamp, place, target)
     # Lamps are reflected and refracted, but a glowing square in the picture itself would look like a mistake.
     lamp.visible_camera = False
-    bpy.context.scene.collection.objects.link(lamp)
     return lamp

@@ -11,7 +11,7 @@ import numpy as np
 
 from blender_scripts.documents import content_of
 from blender_scripts.errors import RenderInputError
-from blender_scripts.geometry import set_attribute
+from blender_scripts.geometry import new_object, set_attribute
 from blender_scripts.ply import KINDS, POINT
 from blender_scripts.ply import read_points as read_rows
 
@@ -55,9 +55,7 @@ def new_points_object(name: str, material: Any) -> Any:
     Its vertices become spheres in a geometry-nodes modifier: `radius` is their size, and `velocity` [m/s], which the
     modifier passes on, blurs them.
     """
-    mesh = bpy.data.meshes.new(name)
-    blender_object = bpy.data.objects.new(name, mesh)
-    bpy.context.scene.collection.objects.link(blender_object)
+    blender_object = new_object(name, bpy.data.meshes.new(name))
     modifier = blender_object.modifiers.new("spheres", "NODES")
     modifier.node_group = _spheres(name, material)
     return blender_object

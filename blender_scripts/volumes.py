@@ -9,6 +9,7 @@ import bpy
 
 from blender_scripts.errors import RenderInputError
 from blender_scripts.flames import Glow, Lamp, lamps_of_file
+from blender_scripts.geometry import new_object
 
 
 def new_volume_object(name: str) -> Any:
@@ -17,9 +18,7 @@ def new_volume_object(name: str) -> Any:
     # With 'FRAME', the default, the shutter time would be ignored.
     volume.velocity_unit = "SECOND"
     volume.render.space = "OBJECT"
-    blender_object = bpy.data.objects.new(name, volume)
-    bpy.context.scene.collection.objects.link(blender_object)
-    return blender_object
+    return new_object(name, volume)
 
 
 def load_volume(volume: Any, path: Path) -> None:
@@ -68,13 +67,11 @@ class FireLight:
                 _set_lamp(blender_object, lamps[index])
 
     def _new_lamp(self) -> Any:
-        light = bpy.data.lights.new(self._name, "POINT")
-        blender_object = bpy.data.objects.new(self._name, light)
+        blender_object = new_object(self._name, bpy.data.lights.new(self._name, "POINT"))
         # The eye and mirrors see the volume itself.
         blender_object.visible_camera = False
         blender_object.visible_glossy = False
         blender_object.visible_transmission = False
-        bpy.context.scene.collection.objects.link(blender_object)
         return blender_object
 
 
