@@ -24,7 +24,7 @@ def test_a_body_smears_as_long_as_it_flies_while_the_shutter_is_open(shutter, tm
     (tmp_path / "poses").mkdir()
     for frame, speed in enumerate((0.0, LENGTH_M * 60.0 / shutter)):
         write_poses(tmp_path / f"poses/{frame:06d}.json", frame, pose(velocity=(speed, 0.0, 0.0)))
-    draw_all(tmp_path, spec_of(BALL, samples=32, shutter=shutter), (0, 1))
+    draw_all(tmp_path, spec_of(BALL, samples=8, shutter=shutter), (0, 1))
     still, flying = spread(tmp_path, 0), spread(tmp_path, 1)
     # Even smearing over a length L adds L²/12 to the variance. Open for half a frame, it would be twice or half of it.
     assert np.sqrt(flying[0] ** 2 - still[0] ** 2) == pytest.approx(LENGTH_M / np.sqrt(12.0), rel=0.2)
@@ -38,7 +38,7 @@ def test_a_ball_out_of_focus_has_a_wider_rim_than_the_one_in_focus(tmp_path):
         for name, place in (("near", (-0.4, 0.0, 0.5)), ("far", (0.7, 1.5, 0.5)))
     )
     camera = still_camera(CameraParameters(position=(0.0, -2.5, 0.5), look_at=(0.0, 0.0, 0.5), f_stop=0.1))
-    spec = spec_of(*balls, samples=32, motion_blur=False, resolution=(width, height))
+    spec = spec_of(*balls, samples=8, motion_blur=False, resolution=(width, height))
     (picture,) = draw_all(tmp_path, spec.model_copy(update={"camera": camera}))
     red = redness(picture)[height // 2 - 8 : height // 2 + 8].mean(axis=0)
     # Between the stage's 0.27 to 0.30 and the ball's 0.5 and more.

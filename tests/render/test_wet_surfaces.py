@@ -85,7 +85,7 @@ def draw(folder: Path, *objects: SceneObject) -> np.ndarray:
 
 def draw_frames(folder: Path, count: int, *objects: SceneObject) -> list[np.ndarray]:
     """Display values of the first frames, all drawn in one process."""
-    spec = spec_of(*objects, samples=8, motion_blur=False, resolution=(128, 72), quality="preview")
+    spec = spec_of(*objects, samples=4, motion_blur=False, resolution=(128, 72), quality="preview")
     return draw_all(folder, spec.model_copy(update={"camera": CAMERA}), range(count))
 
 
@@ -108,7 +108,7 @@ def block(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
 def test_the_floor_under_water_is_seen_and_mirrors_nothing(tmp_path, block):
     write_water(tmp_path)
     bare, wet = brightness(draw(tmp_path), FLOOR), brightness(block, FLOOR)
-    # What the water's surfaces keep back comes to 0.1 % in display values, noise of 8 samples to less.
+    # What the water's surfaces keep back comes to 0.1 % in display values, noise of 4 samples to less.
     assert wet == pytest.approx(bare, rel=0.05)
     # What does not wet is a mirror, of the dark upper half of the room.
     assert brightness(draw(tmp_path, water(NO_REACH)), FLOOR) < 0.5 * wet
