@@ -142,7 +142,6 @@ def test_only_a_way_that_goes_far_around_sees_behind_its_first_place():
         ({"easing": "linear"}, "easing has no meaning without keyframes"),
         ({"keyframe": KEYS, "look_at": "duck"}, "look_at of a keyframe has no meaning beside a body"),
         ({"focus": "duck"}, "focus has no effect without f_stop"),
-        ({"framing": "action", "position": (0, 0, 0)}, 'framing = "action" has no meaning beside a position'),
     ],
 )
 def test_motions_that_contradict_each_other_are_refused(camera, complaint):

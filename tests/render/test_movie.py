@@ -60,7 +60,7 @@ def decode(path: Path) -> tuple[list[np.ndarray], list[Fraction]]:
     return list(planes), list(times)
 
 
-@pytest.mark.parametrize("fps", [60, 24, 23.976, 7.3, 0.01])
+@pytest.mark.parametrize("fps", [24, 23.976, 7.3, 0.01])  # 60 below, with each codec
 def test_the_film_shows_the_segments_frames_at_exact_times(tmp_path, pictures, fps):
     segments = encode_all(tmp_path, pictures, fps)
     film = tmp_path / "film.mp4"
@@ -81,39 +81,34 @@ def test_the_film_looks_like_its_pictures(tmp_path, pictures):
         assert np.sqrt((difference**2).mean()) < 3.0  # crf 8 quantizes the noise in steps of a few levels
 
 
-@pytest.mark.parametrize(
-    ("color", "luma"),
-    # Y' = 16 + 219 (0.2126 R' + 0.7152 G' + 0.0722 B') after ITU-R BT.709-6; BT.601 would give 81, 145, 41.
-    [((255, 0, 0), 63), ((0, 255, 0), 173), ((0, 0, 255), 32), ((255, 255, 255), 235), ((0, 0, 0), 16)],
-)
-def test_colours_are_converted_by_bt709(tmp_path, color, luma):
-    plain = tmp_path / "000000.png"
-    Image.new("RGB", (32, 32), color).save(plain)
-    planes, _ = decode(encode(tmp_path / "segment.mp4", [plain]))
-    np.testing.assert_array_equal(planes[0][:32, :32], luma)
-
-
-DEEP_CODECS = ("h265", "av1", "prores")
-CODECS = ("h264", *DEEP_CODECS)
+CODECS = ("h264", "h265", "av1", "prores")
 
 
 def codec_parameters(codec: str) -> MovieParameters:
     return MovieParameters(codec=codec) if codec == "prores" else MovieParameters(codec=codec, preset="veryfast")
 
 
-@pytest.mark.parametrize("codec", DEEP_CODECS)
+@pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize(
-    ("color", "luma"),
-    # Y' = 64 + 876 (0.2126 R' + 0.7152 G' + 0.0722 B') in 10 bits after ITU-R BT.709-6: red 250.2, green 690.5.
-    [((255, 0, 0), 250), ((0, 255, 0), 691), ((0, 0, 255), 127), ((255, 255, 255), 940), ((0, 0, 0), 64)],
+    ("color", "eight_bits", "ten_bits"),
+    # Y' = 16 + 219 (0.2126 R' + 0.7152 G' + 0.0722 B') after ITU-R BT.709-6; BT.601 would give 81, 145, 41. In 10 bits
+    # it is 64 + 876 (...): red 250.2, green 690.5.
+    [
+        ((255, 0, 0), 63, 250),
+        ((0, 255, 0), 173, 691),
+        ((0, 0, 255), 32, 127),
+        ((255, 255, 255), 235, 940),
+        ((0, 0, 0), 16, 64),
+    ],
 )
-def test_colours_of_ten_bits_are_converted_by_bt709(tmp_path, codec, color, luma):
+def test_colours_are_converted_by_bt709(tmp_path, codec, color, eight_bits, ten_bits):
     plain = tmp_path / "000000.png"
     Image.new("RGB", (64, 64), color).save(plain)
     parameters = codec_parameters(codec)
     shown = luma_of(encode(tmp_path / f"film{parameters.suffix}", [plain], parameters=parameters))
     # A lossy encoder may miss a plain area by one level of 1023.
-    assert abs(shown - luma).max() <= 1
+    luma, error = (eight_bits, 0) if codec == "h264" else (ten_bits, 1)
+    assert abs(shown - luma).max() <= error
 
 
 @pytest.mark.parametrize("codec", CODECS)
@@ -146,8 +141,9 @@ def test_films_are_joined_tagged_and_reproducible(tmp_path, pictures, codec):
     threads = 1 if codec == "h264" else 2
     again = encode(tmp_path / f"again{parameters.suffix}", pictures[:30], parameters=parameters, threads=threads)
     assert again.read_bytes() == segments[0].read_bytes()
-    with pytest.raises(InvalidFileError, match="has 62 frames, expected 61"):
-        validate_movie(film, 61)
+    for expected in (61, 63):
+        with pytest.raises(InvalidFileError, match=f"has 62 frames, expected {expected}"):
+            validate_movie(film, expected)
 
 
 @pytest.mark.parametrize("codec", CODECS)
@@ -237,13 +233,6 @@ def test_a_truncated_film_is_refused(tmp_path, pictures, kept):
     film.write_bytes(content[: int(kept * len(content))])
     with pytest.raises(InvalidFileError):
         validate_movie(film, 30)
-
-
-@pytest.mark.parametrize("expected", [29, 31])
-def test_a_film_of_another_length_is_refused(tmp_path, pictures, expected):
-    film = encode(tmp_path / "film.mp4", pictures[:30])
-    with pytest.raises(InvalidFileError, match=f"has 30 frames, expected {expected}"):
-        validate_movie(film, expected)
 
 
 def test_nothing_to_encode_or_join_is_refused(tmp_path):

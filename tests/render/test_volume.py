@@ -74,9 +74,8 @@ def test_half_precision_rounds_to_sixteen_bits(tmp_path, smoke):
     assert full.stat().st_size - half.stat().st_size > 2 * 2 * smoke["density"].size
 
 
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_memory_order_of_the_arrays_does_not_matter(tmp_path, smoke, order):
-    fields = {name: np.asarray(values, order=order) for name, values in smoke.items()}
+def test_memory_order_of_the_arrays_does_not_matter(tmp_path, smoke):
+    fields = {name: np.asarray(values, order="F") for name, values in smoke.items()}
     reference = write(tmp_path / "reference.vdb", smoke)
     assert write(tmp_path / "other.vdb", fields).read_bytes() == reference.read_bytes()
 
