@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import bpy
@@ -52,11 +53,13 @@ def _water(builder: NodeBuilder, context: LookContext) -> None:
     builder.volume(_homogeneous_absorption(builder, tuple(factor * value for value in coefficients)))
 
 
-def _clear_surface(builder: NodeBuilder, context: LookContext, *, ior: float, tint: tuple[float, float, float]) -> None:
-    """The surface of a clear liquid, which lets light through to what lies under it in a tint."""
+def _clear_surface(
+    builder: NodeBuilder, context: LookContext, *, ior: float, tint: Color, color: Color = (1.0, 1.0, 1.0)
+) -> None:
+    """The surface of what is clear, which lets light through to what lies under it in a tint."""
     shader = builder.node(
         "ShaderNodeBsdfPrincipled",
-        Base_Color=(1.0, 1.0, 1.0),
+        Base_Color=color,
         Roughness=or_default(context.roughness, 0.0),
         IOR=ior,
         Transmission_Weight=1.0,
@@ -103,34 +106,8 @@ def _milk(builder: NodeBuilder, context: LookContext) -> None:
 
 @draws("glass")
 def _glass(builder: NodeBuilder, context: LookContext) -> None:
-    shader = builder.node(
-        "ShaderNodeBsdfPrincipled",
-        Base_Color=or_default(context.color, (0.97, 0.99, 0.98)),
-        Roughness=or_default(context.roughness, 0.0),
-        IOR=1.5,
-        Transmission_Weight=1.0,
-    )
-    builder.surface(_refracting(builder, context, shader, tint=or_default(context.color, (0.90, 0.93, 0.92))))
-
-
-@draws("rubber")
-def _rubber(builder: NodeBuilder, context: LookContext) -> None:
-    _even(builder, context, color=(0.95, 0.56, 0.02), roughness=0.42, Specular_IOR_Level=0.45)
-
-
-@draws("ceramic")
-def _ceramic(builder: NodeBuilder, context: LookContext) -> None:
-    _even(builder, context, color=(0.82, 0.79, 0.74), roughness=0.35, Coat_Weight=0.6, Coat_Roughness=0.06)
-
-
-@draws("plastic")
-def _plastic(builder: NodeBuilder, context: LookContext) -> None:
-    _even(builder, context, color=(0.62, 0.06, 0.05), roughness=0.25, IOR=1.46)
-
-
-@draws("metal")
-def _metal(builder: NodeBuilder, context: LookContext) -> None:
-    _even(builder, context, color=(0.62, 0.61, 0.60), roughness=0.28, Metallic=1.0)
+    own, tint = (or_default(context.color, color) for color in ((0.97, 0.99, 0.98), (0.90, 0.93, 0.92)))
+    _clear_surface(builder, context, ior=1.5, tint=tint, color=own)
 
 
 @draws("stone")
@@ -196,12 +173,6 @@ def _tank_glass(builder: NodeBuilder, context: LookContext) -> None:
     builder.surface(builder.mix_shaders(seen, through, reflection))
 
 
-@draws("tank_edge")
-def _tank_edge(builder: NodeBuilder, context: LookContext) -> None:
-    """The cut edge of a pane, where glass shows its green."""
-    _even(builder, context, color=(0.50, 0.72, 0.66), roughness=0.15, Specular_IOR_Level=0.6)
-
-
 def _even(builder: NodeBuilder, context: LookContext, *, color: Color, roughness: float, **inputs: float) -> None:
     """An opaque surface of one colour; other inputs of the shader by name."""
     builder.surface(
@@ -212,6 +183,14 @@ def _even(builder: NodeBuilder, context: LookContext, *, color: Color, roughness
             **inputs,
         )
     )
+
+
+draws("rubber")(partial(_even, color=(0.95, 0.56, 0.02), roughness=0.42, Specular_IOR_Level=0.45))
+draws("ceramic")(partial(_even, color=(0.82, 0.79, 0.74), roughness=0.35, Coat_Weight=0.6, Coat_Roughness=0.06))
+draws("plastic")(partial(_even, color=(0.62, 0.06, 0.05), roughness=0.25, IOR=1.46))
+draws("metal")(partial(_even, color=(0.62, 0.61, 0.60), roughness=0.28, Metallic=1.0))
+# The cut edge of a pane, where glass shows its green.
+draws("tank_edge")(partial(_even, color=(0.50, 0.72, 0.66), roughness=0.15, Specular_IOR_Level=0.6))
 
 
 def _scattering(builder: NodeBuilder, color: Color) -> Any:
