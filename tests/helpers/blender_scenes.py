@@ -11,8 +11,15 @@ from warm_python import run_python
 
 from render.camera_path import CameraPath
 from render.meshes import write_ply
-from render.parameters import CameraParameters, RenderParameters, SetParameters
-from render.spec import Camera, RenderSpec
+from render.parameters import CameraParameters, MaterialParameters, RenderParameters, SetParameters
+from render.spec import Camera, MeshSequenceObject, RenderSpec
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Of linear red, green and blue after BT.709."""
+
+# Fully rough, so that no highlight hides the colour.
+RED = MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0)
+BALL = MeshSequenceObject(name="ball", file="ball/{frame}.ply", material=RED)
 
 RESOLUTION = (64, 36)
 PIXELS_PER_METRE = RESOLUTION[0] * 50.0 / 36.0 / 2.5

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from blender_scenes import sphere, write_mesh
+from blender_scenes import RED, sphere, write_mesh
 from blender_stand_in import write_blender_stand_in
 from inline_tasks import run_task
 from numpy.typing import ArrayLike, NDArray
@@ -18,13 +18,10 @@ from pipeline.model.job import Job
 from pipeline.run.events import Finished
 from pipeline.stages import render_drawing
 from pipeline.store.cache import write_frame
-from render.parameters import MaterialParameters
 from render.spec import MovingMeshObject
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
 
-# Fully rough, so that no highlight hides the colour.
-RED = MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 BALL = MovingMeshObject(name="ball", file="ball.ply", body="ball", poses="poses/{frame}.json", material=RED)
 

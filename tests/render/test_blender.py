@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from bare_volumes import smoke_object, write_frame
 from blender_scenes import (
+    BALL,
     RENDER_FRAMES,
     RESOLUTION,
     read,
@@ -53,18 +54,11 @@ from render.blender import (
 )
 from render.gpus import find_gpus
 from render.parameters import CameraParameters, MaterialParameters, SetParameters
-from render.spec import MeshObject, MeshSequenceObject, RenderSpec
+from render.spec import MeshObject, RenderSpec
 from render.temporary_folder import environment_of_child
 
 pytestmark = needs_bpy
 
-
-# Fully rough, so that no highlight hides the colour.
-BALL = MeshSequenceObject(
-    name="ball",
-    file="ball/{frame}.ply",
-    material=MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0),
-)
 
 # Share of red in a pixel: 0.29 on the grey stage, about 0.7 on the ball.
 MOSTLY_RED = 0.45

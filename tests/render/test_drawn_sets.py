@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import draw_all, spec_of, sphere, still_camera, write_mesh
+from blender_scenes import LUMINANCE, draw_all, spec_of, sphere, still_camera, write_mesh
 from needed_blender import needs_bpy
 from radiance_pictures import write_hdr
 
@@ -16,7 +16,6 @@ from render.spec import MeshObject
 
 pytestmark = needs_bpy
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 WHITE = MaterialParameters(look="plastic", color=(0.8, 0.8, 0.8), roughness=1.0)
 MIDDLE_ROW, MIDDLE_COLUMN = 18, 32
 BALL = np.s_[MIDDLE_ROW - 5 : MIDDLE_ROW + 5, MIDDLE_COLUMN - 5 : MIDDLE_COLUMN + 5]

@@ -8,7 +8,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from blender_scenes import RESOLUTION, read, redness, spec_of, sphere, write_mesh
+from blender_scenes import BALL, RESOLUTION, read, redness, spec_of, sphere, write_mesh
 from blender_stand_in import write_blender_stand_in
 from exr_channels import exr_channels
 from needed_blender import needs_bpy
@@ -16,17 +16,10 @@ from warm_python import run_python
 
 from render.blender import open_renderer
 from render.errors import InvalidFileError
-from render.parameters import MaterialParameters
 from render.pictures import validate_exr, validate_picture
-from render.spec import MeshSequenceObject
 
 pytestmark = needs_bpy
 
-BALL = MeshSequenceObject(
-    name="ball",
-    file="ball/{frame}.ply",
-    material=MaterialParameters(look="plastic", color=(0.8, 0.02, 0.02), roughness=1.0),
-)
 PASSES = ("depth", "vector", "normal", "cryptomatte", "denoising")
 LAYER = "ViewLayer.Combined"
 

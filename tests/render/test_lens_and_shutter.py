@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from blender_scenes import draw_all, redness, spec_of, sphere, spread, still_camera, write_mesh
-from drawn_jobs import BALL, RED, pose
+from blender_scenes import RED, draw_all, redness, spec_of, sphere, spread, still_camera, write_mesh
+from drawn_jobs import BALL, pose
 from needed_blender import needs_bpy
 
 from render.parameters import CameraParameters

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RESOLUTION, draw_all, spec_of, sphere, still_camera, write_mesh
+from blender_scenes import LUMINANCE, RESOLUTION, draw_all, spec_of, sphere, still_camera, write_mesh
 from needed_blender import needs_bpy
 
 from render.meshes import write_ply
@@ -16,7 +16,6 @@ from render.spec import MeshObject, MeshSequenceObject, SceneObject
 
 pytestmark = needs_bpy
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 QUARTER_TURN = (sqrt(0.5), 0.0, sqrt(0.5), 0.0)  # about the y axis, along which the camera looks
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from blender_scenes import (
     HALF_A_PIXEL,
+    RED,
     RENDER_FRAMES,
     centroid,
     spec_of,
@@ -17,7 +18,7 @@ from blender_scenes import (
     write_mesh,
 )
 from drawn_jobs import BALL as MOVING_BALL
-from drawn_jobs import RED, draw_frame, job_of_the_ball, pose
+from drawn_jobs import draw_frame, job_of_the_ball, pose
 from needed_blender import needs_bpy
 from warm_blender import WarmRenderer
 from warm_python import run_python

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import read, spec_of, sphere, still_camera, write_mesh
-from drawn_jobs import RED, job_of_the_ball, pose
+from blender_scenes import RED, read, spec_of, sphere, still_camera, write_mesh
+from drawn_jobs import job_of_the_ball, pose
 from inline_tasks import run_task
 from needed_blender import needs_bpy
 from PIL import Image

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bare_volumes import PICTURE_WIDTH_M, draw_bare, smoke_object, write_frame
-from blender_scenes import RENDER_FRAMES, read, spec_of
+from blender_scenes import LUMINANCE, RENDER_FRAMES, read, spec_of
 from needed_blender import needs_bpy
 from warm_python import run_python
 
@@ -19,7 +19,6 @@ pytestmark = [needs_bpy, pytest.mark.slow]
 BLACK = (0.0, 0.0, 0.0)
 LENGTH_M = 0.6
 MIDDLE = np.s_[24:40, 24:40]
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 def depth_of(picture: np.ndarray) -> float:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blender_scenes import RENDER_FRAMES, draw_all, redness, spec_of, sphere, still_camera, write_mesh
+from blender_scenes import LUMINANCE, RENDER_FRAMES, draw_all, redness, spec_of, sphere, still_camera, write_mesh
 from needed_blender import needs_bpy
 from warm_python import run_python
 
@@ -17,7 +17,6 @@ from render.spec import MeshObject, MeshSequenceObject, MovingMeshObject, SceneO
 
 pytestmark = needs_bpy
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 REACH = 0.012  # of particles with a radius of 8 mm [m]
 GAP = 0.002  # between the water and what it lies on, a quarter of a radius [m]
 NO_REACH = 0.1 * GAP  # too short to reach across the gap [m]
