@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
-from places import PROJECT
+from fresh_python import run_python as run_fresh_python
 
 from render.errors import InvalidFileError, VolumeUnavailableError
 from render.parameters import VolumeParameters
@@ -267,19 +265,21 @@ def test_fields_of_different_grids_are_refused(tmp_path, smoke):
         write(tmp_path / "smoke.vdb", smoke)
 
 
-def test_openvdb_is_found_without_importing_bpy():
-    script = "import sys; from render.volume import import_openvdb; import_openvdb(); assert 'bpy' not in sys.modules"
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=PROJECT)
-
-
-def test_a_python_without_bpy_is_told_where_openvdb_comes_from(tmp_path):
-    script = """
-import importlib.util, sys
-found = importlib.util.find_spec
-importlib.util.find_spec = lambda name, *rest: None if name in ("bpy", "openvdb") else found(name, *rest)
-from render.volume import import_openvdb
-import_openvdb()
-"""
-    done = subprocess.run([sys.executable, "-c", script], check=False, cwd=PROJECT, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "VolumeUnavailableError: OpenVDB is not installed: it comes inside the bpy wheel" in done.stderr
+def test_openvdb_is_found_without_importing_bpy_and_a_python_without_it_is_told_where_it_comes_from():
+    run_fresh_python("""
+    import importlib.util, sys
+    from unittest.mock import patch
+    from render.errors import VolumeUnavailableError
+    from render.volume import import_openvdb
+    found = importlib.util.find_spec
+    without = lambda name, *rest: None if name in ("bpy", "openvdb") else found(name, *rest)
+    with patch("importlib.util.find_spec", without):
+        try:
+            import_openvdb()
+        except VolumeUnavailableError as error:
+            assert "OpenVDB is not installed: it comes inside the bpy wheel" in str(error)
+        else:
+            raise AssertionError("it is there")
+    import_openvdb()
+    assert "bpy" not in sys.modules
+    """)
