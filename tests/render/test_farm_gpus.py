@@ -26,7 +26,6 @@ frames = 4
 render = { resolution = [64, 36], quality = "draft", samples = 1 }
 [[rigid]]
 name = "ball"
-kind = "kinematic"
 shape = { type = "sphere", radius = 0.1 }
 position = [0.0, 0.0, 0.5]
 """
