@@ -109,14 +109,12 @@ def _build(builder: NodeBuilder, context: LookContext, weave: Weave) -> None:
     builder.surface(shader)
 
 
-def mean_appearance(weave: Weave, *, samples: int = 64) -> tuple[float, float]:
+def mean_appearance(weave: Weave) -> tuple[float, float]:
     """Mean appearance of a weave over its period: share of weft on its front, and brightness of its threads.
 
-    Args:
-        weave: the pattern; its unevenness has no mean effect.
-        samples: a thread, along and across.
+    By 64 samples a thread, along and across; its unevenness has no mean effect.
     """
-    place = (np.arange(weave.period * samples) + 0.5) / samples
+    place = (np.arange(weave.period * 64) + 0.5) / 64
     u, v = np.meshgrid(place, place, indexing="ij")
 
     def surface(along: np.ndarray, across: np.ndarray, step: int, sign: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Rendered pictures: every pixel decoded, measured and hashed."""
+"""Rendered pictures: every pixel decoded and measured."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from blake3 import blake3
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -44,12 +43,10 @@ class PictureStatistics:
     """Statistics of a picture.
 
     Attributes:
-        bit_depth: bits a channel.
         mean_luminance: BT.709 weights on display values from 0 to 1 [-].
         white_share: of the pixels whose least channel is at `WHITE_LEVEL` or above [-].
     """
 
-    bit_depth: int
     mean_luminance: float
     white_share: float
 
@@ -130,32 +127,26 @@ def _rgb(pixels: Pixels) -> Pixels:
     return color
 
 
-def validate_picture(path: Path, resolution: tuple[int, int], *, may_be_empty: bool = False) -> PictureStatistics:
-    """Decode a rendered picture and check that it shows something.
+def check_pixels(
+    path: Path, pixels: Pixels, resolution: tuple[int, int], *, may_be_empty: bool = False
+) -> PictureStatistics:
+    """Check that a rendered picture shows something.
 
     Args:
-        path: a PNG of 8 or 16 bits.
+        path: the picture, for messages.
+        pixels: its pixels as `read_picture` gives them.
         resolution: expected width and height [pixels].
         may_be_empty: whether nothing is left of it where no body is, so that it may be black or of one colour.
 
     Raises:
-        InvalidFileError: it is damaged, of another size, black, or of one colour only.
-        OSError: it cannot be read.
+        InvalidFileError: it is of another size, black, or of one colour only.
     """
-    return check_pixels(path, read_picture(path), resolution, may_be_empty=may_be_empty)
-
-
-def check_pixels(
-    path: Path, pixels: Pixels, resolution: tuple[int, int], *, may_be_empty: bool = False
-) -> PictureStatistics:
-    """Check that the decoded pixels of a picture show something; arguments and errors as for `validate_picture`."""
     height, width, channels = pixels.shape
     _require_size(path, (width, height), resolution)
     scale = float(np.iinfo(pixels.dtype).max)
     luminance = pixels[..., :3] @ _BT709_WEIGHTS / scale if channels >= 3 else pixels[..., 0] / scale
     color = pixels[..., :3] if channels >= 3 else pixels[..., :1]
     statistics = PictureStatistics(
-        bit_depth=8 * pixels.dtype.itemsize,
         mean_luminance=float(luminance.mean()),
         white_share=float((color.min(axis=2) >= WHITE_LEVEL * scale).mean()),
     )
@@ -199,7 +190,7 @@ def validate_exr(path: Path, resolution: tuple[int, int], *, layer: str = "", ma
         path: an EXR in one part.
         resolution: expected width and height [pixels].
         layer: the layer that is the picture; empty where there is nothing else.
-        may_be_empty: as for `validate_picture`.
+        may_be_empty: as for `check_pixels`.
 
     Raises:
         InvalidFileError: it is damaged, of another size, black, or has values that are not finite.
@@ -223,14 +214,6 @@ def validate_exr(path: Path, resolution: tuple[int, int], *, layer: str = "", ma
     brightest = max(float(plane.max()) for plane in planes)
     if brightest < BLACK_LUMINANCE and not may_be_empty:
         raise InvalidFileError(path, f"is black (brightest value {brightest:.2g})")
-
-
-def pixel_hash(path: Path) -> str:
-    """blake3 of the size, the depth and every pixel; the same for pictures that differ in metadata or compression."""
-    pixels = np.ascontiguousarray(read_picture(path))
-    digest = blake3(f"{pixels.shape} {pixels.dtype.str}".encode())
-    digest.update(pixels.tobytes())
-    return digest.hexdigest()
 
 
 def _require_size(path: Path, size: tuple[int, int], asked_for: tuple[int, int]) -> None:

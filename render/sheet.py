@@ -22,26 +22,21 @@ def contact_sheet(
     *,
     columns: int = 6,
     width: int = 1440,
-    labels: Sequence[str] | None = None,
 ) -> None:
-    """Draw pictures side by side, each with its label in the lower left corner.
+    """Draw pictures side by side, each with its frame number in the lower left corner.
 
     Args:
         pictures: PNG files, row by row; each is fitted into a cell of the first one's proportions.
         output: the picture to write; its suffix names the format.
         columns: how many in a row; fewer when there are fewer pictures.
         width: of the sheet [pixels], at most: pictures are never enlarged.
-        labels: one a picture; the frame number from the file's name if omitted.
 
     Raises:
         InvalidFileError: a picture is damaged.
-        ValueError: there are no pictures, too little room, or another number of labels.
+        ValueError: there are no pictures, or there is too little room.
     """
     if not pictures:
         raise ValueError("a contact sheet needs at least one picture")
-    names = [frame_label(path) for path in pictures] if labels is None else list(labels)
-    if len(names) != len(pictures):
-        raise ValueError(f"{len(pictures)} pictures need as many labels, got {len(names)}")
     columns = min(columns, len(pictures))
     cell_width = (width - (columns + 1) * _GAP) // columns if columns > 0 else 0
     if cell_width < 8:
@@ -55,13 +50,21 @@ def contact_sheet(
     sheet = Image.new("RGB", (width, rows * (cell_height + _GAP) + _GAP), _BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=max(9, min(18, cell_height // 9)))
-    for index, (path, name) in enumerate(zip(pictures, names, strict=True)):
+    for index, path in enumerate(pictures):
         row, column = divmod(index, columns)
         x, y = _GAP + column * (cell_width + _GAP), _GAP + row * (cell_height + _GAP)
         thumbnail = Image.fromarray(read_rgb8(path))
         thumbnail.thumbnail((cell_width, cell_height), Image.Resampling.LANCZOS)
         sheet.paste(thumbnail, (x, y))
-        draw.text((x + _GAP, y + cell_height - _GAP), name, _INK, font, anchor="ls", stroke_width=1, stroke_fill=_SHADE)
+        draw.text(
+            (x + _GAP, y + cell_height - _GAP),
+            frame_label(path),
+            _INK,
+            font,
+            anchor="ls",
+            stroke_width=1,
+            stroke_fill=_SHADE,
+        )
     sheet.save(output)
 
 

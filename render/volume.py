@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -33,24 +32,6 @@ HALF_MAX = 65504.0  # largest number of 16 bits; OpenVDB would silently make inf
 
 _SLAB = 32  # cells along x that are looked at together
 _COLUMN = 32  # cells along x and y that are given to OpenVDB together; whole leaves of its tree, which are 8 wide
-
-
-@dataclass(frozen=True)
-class Volume:
-    """The dense contents of a file over a box of cells, in the units of `write_volume`.
-
-    Attributes:
-        temperature: above ambient [K].
-        centre: world position of the centre of cell (0, 0, 0) [m].
-        metadata: of each grid, by its name.
-    """
-
-    density: Float32Array
-    temperature: Float32Array
-    velocity: Float32Array
-    centre: tuple[float, float, float]
-    cell_size: float
-    metadata: dict[str, dict[str, Any]]
 
 
 def import_openvdb() -> ModuleType:
@@ -149,23 +130,6 @@ def validate_volume(path: Path) -> None:
             values = _dense(grid, (start, low[1], low[2]), (stop, high[1] + 1, high[2] + 1))
             if not np.isfinite(values).all():
                 raise InvalidFileError(path, f'grid "{grid.name}" has values that are not finite')
-
-
-def read_volume(path: Path, shape: tuple[int, int, int], first_cell: tuple[int, int, int] = (0, 0, 0)) -> Volume:
-    """Read a box of cells of a file by `write_volume`, from `first_cell` on, into dense arrays.
-
-    Raises:
-        InvalidFileError: the file is not what `write_volume` writes.
-    """
-    grids = _read_grids(path)
-    stop = (first_cell[0] + shape[0], first_cell[1] + shape[1], first_cell[2] + shape[2])
-    transform = grids["density"].transform
-    return Volume(
-        **{name: _dense(grid, first_cell, stop) for name, grid in grids.items()},
-        centre=tuple(transform.indexToWorld(first_cell)),
-        cell_size=transform.voxelSize()[0],
-        metadata={name: dict(grid.metadata) for name, grid in grids.items()},
-    )
 
 
 def _checked(name: str, values: ArrayLike, dimensions: int, first_cell: tuple[int, int, int]) -> Float32Array:

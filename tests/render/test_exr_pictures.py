@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from blender_scenes import BALL, RESOLUTION, read, redness, spec_of, sphere, write_mesh
 from blender_stand_in import write_blender_stand_in
+from checked_pictures import validate_picture
 from exr_channels import exr_channels
 from needed_blender import needs_bpy
 from warm_python import run_python
 
 from render.blender import open_renderer
 from render.errors import InvalidFileError
-from render.pictures import validate_exr, validate_picture
+from render.pictures import read_picture, validate_exr
 
 pytestmark = needs_bpy
 
@@ -125,4 +126,6 @@ def test_a_master_of_another_size_is_refused(folder):
 
 
 def test_a_png_of_sixteen_bits_has_them(tmp_path):
-    assert validate_picture(draw(tmp_path, format="png16") / "first.png", RESOLUTION).bit_depth == 16
+    path = draw(tmp_path, format="png16") / "first.png"
+    validate_picture(path, RESOLUTION)
+    assert read_picture(path).dtype == np.uint16

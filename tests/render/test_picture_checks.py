@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blender_scenes import RED, read, spec_of, sphere, still_camera, write_mesh
+from checked_pictures import validate_picture
 from drawn_jobs import job_of_the_ball, pose
 from inline_tasks import run_task
 from needed_blender import needs_bpy
@@ -23,7 +24,7 @@ from pipeline.store.cache import write_frame
 from render.camera_path import View, write_views
 from render.errors import InvalidFileError
 from render.parameters import CameraParameters
-from render.pictures import over_black, read_picture, require_more_than_set, validate_picture
+from render.pictures import over_black, read_picture, require_more_than_set
 from render.spec import MeshObject
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from checked_pictures import validate_picture
 from click.testing import Result
 from command_line import pipeline
 from exr_channels import exr_channels
@@ -14,7 +15,7 @@ from warm_blender import WarmRenderer
 
 from pipeline.base.layout import JobLayout
 from pipeline.stages import render_drawing
-from render.pictures import validate_exr, validate_picture
+from render.pictures import validate_exr
 
 
 @pytest.fixture(autouse=True)

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fresh_python import run_python as run_fresh_python
+from read_volumes import read_volume
 
 from render.errors import InvalidFileError, VolumeUnavailableError
 from render.parameters import VolumeParameters
-from render.volume import import_openvdb, read_volume, validate_volume, write_volume
+from render.volume import import_openvdb, validate_volume, write_volume
 
 SHAPE = (20, 24, 16)
 FULL_PRECISION = VolumeParameters(half_precision=False, tolerance=1.0e-4)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from inline_tasks import run_task
+from read_volumes import read_volume
 
 from pipeline.base.layout import JobLayout
 from pipeline.kinds.smoke import SMOKE
@@ -15,7 +16,7 @@ from pipeline.run.events import Failed, Finished, TaskEvent
 from pipeline.stages.product import ProductStage
 from pipeline.store.cache import write_frame
 from render.errors import VolumeUnavailableError
-from render.volume import import_openvdb, read_volume
+from render.volume import import_openvdb
 from sim.core.snapshots import Snapshot
 from sim.core.world import FrameReport
 
