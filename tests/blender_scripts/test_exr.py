@@ -73,10 +73,5 @@ def test_what_says_something_about_the_pixels_stays(picture):
 def test_a_truncated_header_is_refused(picture, kept):
     content = picture.read_bytes()
     assert kept < min(read_layout(content).offsets)
-    with pytest.raises(ValueError, match="EXR"):
+    with pytest.raises(ValueError, match="truncated EXR file" if kept > 3 else "not an EXR file"):
         read_layout(content[:kept])
-
-
-def test_another_kind_of_file_is_refused():
-    with pytest.raises(ValueError, match="not an EXR file"):
-        read_layout(b"\x89PNG\r\n\x1a\n" + bytes(100))

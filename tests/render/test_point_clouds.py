@@ -129,11 +129,3 @@ def test_another_layout_is_refused(file, old, new):
     file.write_bytes(content.replace(old, new))
     with pytest.raises(InvalidFileError, match="not a point cloud of the expected layout"):
         validate_point_cloud(file)
-
-
-def test_a_triangle_mesh_is_no_cloud(tmp_path):
-    from render.meshes import write_ply
-
-    write_ply(tmp_path / "mesh.ply", np.eye(3), [[0, 1, 2]])
-    with pytest.raises(InvalidFileError):
-        read_point_cloud(tmp_path / "mesh.ply")
