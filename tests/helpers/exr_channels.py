@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from fresh_python import run_python
+from warm_python import run_python
 
 _READ = """
     import sys
@@ -14,6 +14,7 @@ _READ = """
     python = "/python/lib/python%d.%d/site-packages" % sys.version_info[:2]
     sys.path.insert(0, bpy.utils.resource_path("LOCAL") + python)
     import OpenImageIO
+    sys.path.pop(0)
     picture = OpenImageIO.ImageInput.open(sys.argv[1])
     pixels = picture.read_image()
     np.savez(sys.argv[2], **{name: pixels[..., i] for i, name in enumerate(picture.spec().channelnames)})

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from blender_scenes import draw_all, spec_of, sphere, write_mesh
 from blender_stand_in import write_blender_stand_in
-from fresh_python import run_python
 from inline_tasks import run_task
 from needed_blender import needs_bpy
 from warm_blender import run_script
+from warm_python import run_python
 
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
@@ -78,6 +78,7 @@ WRITE = """
     text.write(f"open({proof!r}, 'w').write('ran')")
     text.use_module = True
     bpy.ops.wm.save_as_mainfile(filepath=file)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
 """
 
 
