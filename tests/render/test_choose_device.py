@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 
-from fresh_python import run_python
 from needed_blender import needs_bpy
+from warm_python import run_python
 
 pytestmark = needs_bpy
 
 # What Cycles lists on every machine, its processor, stands for the GPUs of a back end: choosing works alike.
 CHOOSE = """
     import json
+    from unittest.mock import patch
     import bpy
     from blender_scripts import gpus
 
@@ -19,7 +20,8 @@ CHOOSE = """
     preferences = bpy.context.preferences.addons["cycles"].preferences
     preferences.get_devices()
     there = {}
-    gpus.gpus_of = lambda backend: there.get(backend, [])
+    listed = patch.object(gpus, "gpus_of", lambda backend: there.get(backend, []))
+    listed.start()
 
     def choose(wanted, gpu):
         for device in preferences.devices:
@@ -40,6 +42,8 @@ CHOOSE = """
     there["CUDA"] = [card]
     for wanted, gpu in [*cases, ("cuda", 0), ("cuda", 1), ("auto", 1)]:
         answers["with"][f"{wanted} {gpu}"] = choose(wanted, gpu)
+    listed.stop()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
     print("ANSWERS", json.dumps(answers))
 """
 CPU = ["CPU", "CPU", False]
