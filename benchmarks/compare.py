@@ -77,33 +77,14 @@ def spread(values: Sequence[float], *, scale: float = 1.0) -> dict[str, float]:
 
 
 def child(command: Sequence[str], **how: Any) -> Any:
-    """The JSON that a Python process prints, whatever else its libraries print before and after it.
+    """The JSON that a Python process prints, whose libraries write elsewhere: see `keep_output_for_json`.
 
     Raises:
         subprocess.CalledProcessError: the process failed.
-        ValueError: there is no JSON in what it printed.
+        ValueError: what it printed is no JSON.
     """
-    return json_in(
-        subprocess.run([sys.executable, *command], stdout=subprocess.PIPE, text=True, check=True, **how).stdout
-    )
-
-
-def json_in(text: str) -> Any:
-    """The largest piece of JSON that begins at the beginning of a line. Raises ValueError where there is none."""
-    decoder, largest, found = json.JSONDecoder(), 0, None
-    start = 0
-    for line in text.splitlines(keepends=True):
-        if line[0] in "[{":
-            try:
-                value, end = decoder.raw_decode(text, start)
-            except json.JSONDecodeError:
-                end = start
-            if end - start > largest:
-                largest, found = end - start, value
-        start += len(line)
-    if not largest:
-        raise ValueError(f"no JSON in: {text[-500:]!r}")
-    return found
+    command = [sys.executable, *command]
+    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, **how).stdout)
 
 
 def keep_output_for_json() -> None:

@@ -18,7 +18,7 @@ def trees(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
         told = json.dumps({"runs": [step], "plan": [2.0, milliseconds], **more})
         (tmp_path / name / "benchmarks").mkdir(parents=True)
         (tmp_path / name / "benchmarks" / "swim.py").write_text(
-            f"print('Blender 5.0.1')\nprint({told!r})\nopen({str(tmp_path / 'turns')!r}, 'a').write('{name} ')\n"
+            f"print({told!r})\nopen({str(tmp_path / 'turns')!r}, 'a').write('{name} ')\n"
         )
     monkeypatch.setattr(compare, "HERE", tmp_path / "here")
     return tmp_path / "here", tmp_path / "there"
