@@ -70,25 +70,25 @@ def darkness_towards(picture: np.ndarray, *, x: float, y: float) -> np.ndarray:
     return 1.0 - luminance[rows, columns] / luminance[::35, ::63].mean()
 
 
-@pytest.mark.parametrize(("azimuth", "shadow"), [(0.0, (-1, 0)), (90.0, (0, -1)), (180.0, (1, 0)), (-90.0, (0, 1))])
-def test_the_shadow_falls_away_from_where_the_sun_is_put(azimuth, shadow, tmp_path):
-    picture = draw(tmp_path, camera=FROM_ABOVE, name="outdoor", sun_elevation_deg=45.0, sun_azimuth_deg=azimuth)
-    # The shadow of a ball of radius r reaches r / tan(e / 2) = 0.72 m; from above the ball itself hides 0.3 m.
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "shadow", "dark", "light"),
+    # The shadow of a ball of radius r reaches r / tan(e / 2): 0.72 m, 0.52 m, 1.7 m. From above the ball hides 0.3 m.
+    [
+        (0.0, 45.0, (-1, 0), np.s_[4:6], np.s_[8:]),
+        (90.0, 45.0, (0, -1), np.s_[4:6], np.s_[8:]),
+        (180.0, 60.0, (1, 0), np.s_[3:5], np.s_[6:]),
+        (-90.0, 20.0, (0, 1), np.s_[4:], np.s_[10:]),
+    ],
+)
+def test_the_shadow_falls_away_from_where_the_sun_is_put_the_farther_the_lower_it_stands(
+    azimuth, elevation, shadow, dark, light, tmp_path
+):
+    picture = draw(tmp_path, camera=FROM_ABOVE, name="outdoor", sun_elevation_deg=elevation, sun_azimuth_deg=azimuth)
     away = darkness_towards(picture, x=shadow[0], y=shadow[1])
-    assert (away[4:6] > 0.2).all()
-    assert (away[8:] < 0.1).all()
     towards = darkness_towards(picture, x=-shadow[0], y=-shadow[1])
+    assert (away[dark] > 0.2).all()
+    assert (away[light] < 0.1).all()
     assert (towards[4:] < 0.1).all()
-
-
-def test_a_low_sun_throws_a_longer_shadow(tmp_path):
-    high, low = (
-        draw(tmp_path, camera=FROM_ABOVE, name="outdoor", sun_elevation_deg=e, sun_azimuth_deg=0.0)
-        for e in (60.0, 20.0)
-    )
-    # 0.52 m and 1.7 m.
-    assert (darkness_towards(high, x=-1, y=0)[6:] < 0.1).all()
-    assert (darkness_towards(low, x=-1, y=0)[4:] > 0.2).all()
 
 
 def test_what_a_low_sun_lights_is_redder(tmp_path):
