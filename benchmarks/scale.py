@@ -33,8 +33,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.compare import HERE, arguments_of, child, run, timed
 from pipeline.base.fingerprint import task_fingerprint
+
+from benchmarks.compare import HERE, arguments_of, child, run, timed
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId, TaskState

@@ -1,6 +1,6 @@
 """Memory that a job's own pictures, an HDRI and those packed into .blend files, take in each renderer.
 
-Measured with bpy 5.0.1 as the growth of the largest resident memory (`python -m benchmarks.own_pictures`): 16 to 25
+Measured with bpy 5.0.1 as the growth of the largest resident memory: 16 to 25
 bytes a pixel of an HDRI, with the map of where light comes from; of textures in a .blend file, 9.7 bytes a pixel of
 bytes and 42 of floats. Blender and Cycles hold a picture each, and for a while the file as it was read.
 """
