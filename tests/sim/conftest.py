@@ -9,7 +9,7 @@ from sim.core.runtime import initialize
 DEVICE_VARIABLE = "PIPELINE_TEST_DEVICE"
 """Environment variable with the device to test on, where that is not the CPU: `PIPELINE_TEST_DEVICE=cuda pytest ...`.
 
-Tests that start processes of their own, to compare numbers of threads, keep to the CPU."""
+Tests that compare numbers of threads are for the CPU."""
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import taichi as ti
-from thread_counts import outputs_by_threads
+from thread_counts import result_on_threads
 
 from sim.core import scheduling
 from sim.core.arrays import Integers
@@ -53,23 +53,16 @@ def test_every_item_is_taken_once_by_each_loop_whatever_their_number(taichi_cpu,
         np.testing.assert_array_equal(visits.to_numpy(), np.repeat([11, 0], [count, SHARE]))
 
 
-MEET = """
-import sys
-from sim.core.runtime import initialize
-initialize("cpu", threads=int(sys.argv[1]))
-import taichi as ti
-from test_scheduling import meet
-from sim.core.scheduling import workers_for
-taken, marks = ti.ndarray(ti.i32, 1), ti.ndarray(ti.i32, 3)
-marks.fill(0)
-meet(workers_for(2), taken, marks)
-print(*marks.to_numpy())
-"""
+def marks_of_a_meeting() -> list[int]:
+    taken, marks = ti.ndarray(ti.i32, 1), ti.ndarray(ti.i32, 3)
+    marks.fill(0)
+    meet(workers_for(2), taken, marks)
+    return marks.to_numpy().tolist()
 
 
 def test_two_items_are_done_at_the_same_time_by_two_threads():
     """Taichi by itself gives a thread 512 items at least, so that one thread would have both, one after the other."""
-    assert outputs_by_threads(MEET, beside=__file__, counts=(2,)) == ["1 1 2\n"]
+    assert result_on_threads(2, marks_of_a_meeting) == [1, 1, 2]
 
 
 def test_a_loop_is_short_by_its_work_and_never_on_a_gpu(monkeypatch):
