@@ -1,4 +1,4 @@
-"""Every validation case at the size that a test can afford: all of its numbers are as they should be."""
+"""Every validation case at the size that a test can afford, and at night at full size: its numbers are right."""
 
 import pytest
 
@@ -14,8 +14,12 @@ RUNS = [
 ]
 
 
+NIGHTLY = pytest.param(False, marks=[pytest.mark.nightly, pytest.mark.timeout(3600)], id="full")
+
+
+@pytest.mark.parametrize("quick", [pytest.param(True, id="quick"), NIGHTLY])
 @pytest.mark.parametrize(("case", "solver"), RUNS)
-def test_every_number_of_the_case_is_within_its_tolerance(taichi_cpu, case, solver):
-    result = load_case(case).compute(solver, quick=True)
+def test_every_number_of_the_case_is_within_its_tolerance(taichi_cpu, case, solver, quick):
+    result = load_case(case).compute(solver, quick=quick)
     assert result.checks
     assert not result.failures, "\n".join(str(check) for check in result.checks)

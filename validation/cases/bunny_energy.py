@@ -102,4 +102,4 @@ def draw(results: Sequence[CaseResult]) -> Figure:
     return figure
 
 
-CASE = Case(find, draw, sizes={"spacing": (0.016, 0.032), "compared": (("wcsph",), ())})
+CASE = Case(find, draw, sizes={"spacing": (0.016, 0.04), "compared": (("wcsph",), ())})

@@ -51,12 +51,15 @@ def submerged_share(arrays, level: float) -> float:
     return float(np.mean(heights < level))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["dfsph", "pcisph"])
-def test_thrown_boxes_lose_their_energy_and_come_to_rest_floating_or_sunk(taichi_cpu, solver):
+@pytest.mark.parametrize(
+    "frames", [pytest.param(24, marks=pytest.mark.slow), pytest.param(180, marks=pytest.mark.nightly)]
+)
+def test_thrown_boxes_lose_their_energy_and_come_to_rest_floating_or_sunk(taichi_cpu, solver, frames):
+    """The heavy box is at rest on the floor after 24 frames; what floats bobs for 180."""
     world = build_world(tank(solver), frames_per_second=60)
     energies, not_converged = [], 0.0
-    for _ in range(180):
+    for _ in range(frames):
         diagnostics = world.advance_frame().diagnostics
         energies.append(mechanical_energy(diagnostics))
         not_converged += diagnostics["water"]["not_converged"]
@@ -69,10 +72,12 @@ def test_thrown_boxes_lose_their_energy_and_come_to_rest_floating_or_sunk(taichi
 
     bodies = world.snapshots()
     speeds = {name: float(np.linalg.norm(bodies[name].arrays["velocity"])) for name in DENSITIES}
-    # Water that still sways (16 mJ, 3 cm/s in the mean) carries what floats along.
-    assert max(speeds["light"], speeds["wood"]) < 0.05
     assert speeds["heavy"] < 1e-3
     assert bodies["heavy"].arrays["position"][2] == pytest.approx(0.5 * EDGE, abs=1e-3)
+    if frames < 180:
+        return
+    # Water that still sways (16 mJ, 3 cm/s in the mean) carries what floats along.
+    assert max(speeds["light"], speeds["wood"]) < 0.05
     displaced = (DENSITIES["light"] / 1000.0 + DENSITIES["wood"] / 1000.0 + 1.0) * EDGE**3
     level = DEPTH + displaced / AREA
     for name in ("light", "wood"):
