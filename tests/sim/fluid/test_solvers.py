@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from small_fluids import EVERY_FACE, lattice, make_fluid, run, steps
 
-from sim.build import build_world
 from sim.core.domain import DomainParameters
 from sim.fluid.pressure import filled_diagonal, iterations_ahead, largest_eigenvalue
 from sim.fluid.solve_record import SolveRecord
 from sim.fluid.solvers import SOLVERS
-from sim.scene import SceneParameters
 
 OPEN_SPACE = DomainParameters(min=(-1.0, -1.0, -1.0), max=(1.0, 1.0, 1.0), open_faces=EVERY_FACE)
 EVERY = pytest.mark.parametrize("solver", sorted(SOLVERS))
@@ -136,24 +134,6 @@ def test_energy_does_not_rise_in_a_tank_at_rest_whatever_the_step(taichi_cpu, so
         # The column starts compressed in its corners, by 6 %, which is worth 0.7 % of its energy. Without a limit on
         # how fast that is taken back, the particles there are kicked out: 6 % at 2 ms, 27 % at 1 ms.
         assert max(energies) < 1.01 * start
-
-
-@BOTH
-def test_a_fluid_of_a_tenth_of_the_density_stays_on_the_other(taichi_cpu, solver):
-    def fluid(name: str, density: float, height: float):
-        block = {"shape": {"type": "box", "size": (0.12, 0.12, 0.1)}, "position": (0, 0, height)}
-        return {"name": name, "solver": solver, "rest_density": density, "block": [block]}
-
-    tank = {"min": (-0.06, -0.06, 0.0), "max": (0.06, 0.06, 0.3)}
-    layers = [fluid("lower", 1000.0, 0.05), fluid("upper", 100.0, 0.15)]
-    scene = SceneParameters.model_validate({"domain": tank, "fluid": layers})
-    world = build_world(scene, frames_per_second=60)
-    for _ in range(30):
-        state = world.advance_frame().diagnostics["lower+upper"]
-    assert state["not_converged"] == 0.0
-    # Five layers of each: none has left its fluid by more than a particle.
-    assert world.snapshots()["lower"].arrays["position"][:, 2].max() < 0.1 + 0.02
-    assert world.snapshots()["upper"].arrays["position"][:, 2].min() > 0.1 - 0.02
 
 
 @EVERY
