@@ -159,6 +159,19 @@ def test_killed_in_the_middle_of_a_write_it_continues_to_the_same_frames(
     assert frames_of(layout, 6) == frames_of(undisturbed, 6)
 
 
+@pytest.mark.slow
+def test_frame_1_made_again_alone_is_the_same(layout: JobLayout) -> None:
+    """As after a kill between it and frame 0. Water with a sheet searches for neighbours where it is measured."""
+    sheet = '[[cloth]]\nname = "sheet"\nshape = {{ type = "rectangle", size = [0.2, 0.2], counts = [5, 5] }}\n'
+    job = f"{JOB}{sheet}position = [0.3, 0.0, 0.3]\n"
+    assert isinstance(simulate(layout, frames=3, job=job), Finished)
+    made_at_once = frames_of(layout, 3)
+    shutil.rmtree(layout.checkpoints)
+    layout.path(layout.frame_cache(1)).unlink()
+    assert isinstance(simulate(layout, frames=3, attempt=2, job=job), Finished)
+    assert frames_of(layout, 3) == made_at_once
+
+
 SMALL_DISK = """
 mount -t tmpfs -o size=400k tmpfs "$0" && head -c 250000 /dev/zero > "$0/ballast" &&
 exec "$1" "$2" "$0/drop" "$0/ballast"
