@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from films import Finished, Studio
+from films import SPLASH, Finished, Studio
 
 
 @pytest.fixture(scope="session")
@@ -21,6 +21,14 @@ def reference(first_submit: tuple[Studio, Finished]) -> Studio:
     return first_submit[0]
 
 
+@pytest.fixture(scope="session")
+def splash(tmp_path_factory: pytest.TempPathFactory) -> Studio:
+    """The undisturbed film of water and a ball alone. Look at it, but change nothing."""
+    studio = Studio.open(tmp_path_factory.mktemp("splash"), SPLASH)
+    studio.submit()
+    return studio
+
+
 @pytest.fixture
 def finished(reference: Studio, tmp_path: Path) -> Studio:
     """A finished film of one's own."""
@@ -29,5 +37,5 @@ def finished(reference: Studio, tmp_path: Path) -> Studio:
 
 @pytest.fixture
 def empty(tmp_path: Path) -> Studio:
-    """A job that was not submitted yet."""
-    return Studio.open(tmp_path)
+    """A job of water and a ball alone that was not submitted yet."""
+    return Studio.open(tmp_path, SPLASH)

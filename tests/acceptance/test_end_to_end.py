@@ -115,21 +115,21 @@ def test_another_camera_renders_again_and_simulates_nothing(finished: Studio) ->
 
 @pytest.mark.slow
 def test_a_longer_film_continues_the_shorter_one_and_equals_one_made_at_once_on_one_core(
-    finished: Studio, tmp_path: Path
+    splash: Studio, empty: Studio, tmp_path: Path
 ) -> None:
-    attempts, before, times = finished.attempts(), finished.artifacts(), finished.mtimes_ns()
-    finished.submit("--set", "frames=9")
+    film = splash.copy(tmp_path / "longer")
+    attempts, before, times = film.attempts(), film.artifacts(), film.mtimes_ns()
+    film.submit("--set", "frames=9")
     kept = {path for path in before if not path.startswith("movie")}
-    assert {path: finished.artifacts()[path] for path in kept} == {path: before[path] for path in kept}
-    assert {path: finished.mtimes_ns()[path] for path in kept} == {path: times[path] for path in kept}
-    assert "starting at frame 5" in finished.run("explain", "tiny", "simulate", "--log").out
-    assert not {task for task in finished.tasks_run_since(attempts) if task.endswith(("000000", "000005"))}
-    at_once = Studio.open(tmp_path / "at once")
-    at_once.submit("--set", "frames=9", "--cores", "1")  # neither how often it was begun nor their number matters
-    finished.assert_whole(like=at_once)
-    attempts = finished.attempts()
-    finished.submit()  # a shorter one again needs another film only
-    assert {stage_of(task) for task in finished.tasks_run_since(attempts)} == {"movie"}
+    assert {path: film.artifacts()[path] for path in kept} == {path: before[path] for path in kept}
+    assert {path: film.mtimes_ns()[path] for path in kept} == {path: times[path] for path in kept}
+    assert "starting at frame 5" in film.run("explain", "tiny", "simulate", "--log").out
+    assert not {task for task in film.tasks_run_since(attempts) if task.endswith(("000000", "000005"))}
+    empty.submit("--set", "frames=9", "--cores", "1")  # neither how often it was begun nor their number matters
+    film.assert_whole(like=empty)
+    attempts = film.attempts()
+    film.submit()  # a shorter one again needs another film only
+    assert {stage_of(task) for task in film.tasks_run_since(attempts)} == {"movie"}
 
 
 @pytest.mark.slow
@@ -162,10 +162,11 @@ def test_a_moved_folder_is_still_up_to_date(finished: Studio, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_preview_makes_a_smaller_film_beside_the_other(finished: Studio) -> None:
-    before = finished.artifacts()
-    finished.submit("--preview")
-    assert finished.artifacts() == before
-    with av.open(finished.folder / "renders/tiny-preview/movie.mp4") as film:
-        stream = film.streams.video[0]
+def test_preview_makes_a_smaller_film_beside_the_other(splash: Studio, tmp_path: Path) -> None:
+    film = splash.copy(tmp_path)
+    before = film.artifacts()
+    film.submit("--preview")
+    assert film.artifacts() == before
+    with av.open(film.folder / "renders/tiny-preview/movie.mp4") as movie:
+        stream = movie.streams.video[0]
         assert (stream.width, stream.height, stream.frames) == (32, 18, FRAMES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from blake3 import blake3
-from films import PATIENCE_S, PROJECT, Finished, Studio
+from films import PATIENCE_S, PROJECT, STAGE_NAMES, Finished, Studio
 
 # --- damaged files ---
 
@@ -62,26 +63,19 @@ def delete(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("damage", "options", "words", "kept_aside"),
+    ("damage", "options", "words"),
     [
-        (truncate, (), "truncated", True),
-        (flip_a_bit, (), "its hash differs", True),
-        (flip_a_bit_unseen, ("--deep",), "its hash differs", True),
-        (delete, (), "file is missing", False),
+        (truncate, (), "truncated"),
+        (flip_a_bit, (), "its hash differs"),
+        (flip_a_bit_unseen, ("--deep",), "its hash differs"),
+        (delete, (), "file is missing"),
     ],
 )
-def test_damaged_files_are_named_and_just_they_are_made_again(
-    finished: Studio,
-    reference: Studio,
-    damage: Callable[[Path], None],
-    options: tuple[str, ...],
-    words: str,
-    kept_aside: bool,
+def test_damaged_files_are_named_and_just_they_would_be_made_again(
+    finished: Studio, damage: Callable[[Path], None], options: tuple[str, ...], words: str
 ) -> None:
     for artifact in ONE_OF_EACH_KIND:
         damage(finished.layout.root / artifact)
-    damaged = finished.artifacts()
-    attempts = finished.attempts()
     verified = finished.run("verify", "tiny", *options).assert_code(1)
     lines = verified.out.splitlines()
     assert tuple(line.partition(": ")[0] for line in lines[: len(ONE_OF_EACH_KIND)]) == ONE_OF_EACH_KIND
@@ -93,14 +87,35 @@ def test_damaged_files_are_named_and_just_they_are_made_again(
     }
     assert planned.keys() == THEIR_TASKS
     assert all(len(reasons) == 1 for reasons in planned.values()), planned
+
+
+@pytest.mark.slow
+def test_damaged_files_are_made_again_and_kept_aside(finished: Studio, reference: Studio) -> None:
+    """Of each kind of file that has a frame each, one is damaged in each way; the others in one way each."""
+    ways = (truncate, flip_a_bit, flip_a_bit_unseen, delete)
+    damages = {
+        re.sub(r"00000\d", f"{frame:06d}", artifact): damage
+        for artifact in ONE_OF_EACH_KIND
+        if "/00000" in artifact
+        for frame, damage in enumerate(ways, start=1)
+    }
+    damages |= {"meshes/ball.ply": truncate, "movie.mp4": flip_a_bit_unseen, "movie/0000.mp4": delete}
+    for artifact, damage in damages.items():
+        damage(finished.layout.root / artifact)
+    damaged, attempts = finished.artifacts(), finished.attempts()
+    finished.run("verify", "tiny", "--deep").assert_code(1)
     finished.submit()
-    assert finished.tasks_run_since(attempts) == THEIR_TASKS
+    frames = [f"{frame:06d}" for frame in range(1, 1 + len(ways))]
+    assert finished.tasks_run_since(attempts) == {
+        *(task for task in THEIR_TASKS if "/00000" not in task),
+        *(f"{task[:-6]}{frame}" for task in THEIR_TASKS if "/00000" in task for frame in frames),
+    }
     finished.assert_whole(like=reference)
     finished.run("verify", "tiny", "--deep").assert_code(0)
-    for artifact in ONE_OF_EACH_KIND:
+    for artifact, damage in damages.items():
         edited = finished.layout.root / f"{artifact}.edited-1"
-        assert edited.exists() == kept_aside
-        if kept_aside:
+        assert edited.exists() == (damage is not delete), artifact
+        if edited.exists():
             assert blake3(edited.read_bytes()).hexdigest() == damaged[artifact]
 
 
@@ -125,6 +140,7 @@ def test_a_manifest_that_was_never_finished_is_made_anew_as_well(finished: Studi
 
 FILL_THE_DISK = """
     mount -t tmpfs -o size={size_kb}k films "$1" || exit 99
+    cp -a prepared/. "$1" || exit 98
     shift
     "$@" > first.out 2> first.err
     echo $? > first.code
@@ -142,11 +158,9 @@ def may_mount() -> bool:
     return subprocess.run(attempt, check=False, capture_output=True).returncode == 0
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not may_mount(), reason="only root may mount a small disk, in a namespace of its own")
-@pytest.mark.parametrize("size_kb", [60, 250, 700])
-def test_a_full_disk_pauses_the_job_and_loses_nothing(empty: Studio, reference: Studio, size_kb: int) -> None:
-    folder = empty.folder
+def assert_a_full_disk_loses_nothing(studio: Studio, size_kb: int, like: Studio) -> str:
+    """Submit what is in the folder `prepared` on a disk of this size, then on a larger one; returns what was said."""
+    folder = studio.folder
     (folder / "renders").mkdir()
     command = [sys.executable, "-m", "pipeline", "submit", "tiny.toml"]
     script = textwrap.dedent(FILL_THE_DISK).format(size_kb=size_kb)
@@ -159,11 +173,8 @@ def test_a_full_disk_pauses_the_job_and_loses_nothing(empty: Studio, reference: 
     )
     first, second = (
         Finished(
-            *(
-                int((folder / f"{which}.code").read_text()),
-                (folder / f"{which}.out").read_text(),
-                (folder / f"{which}.err").read_text(),
-            )
+            int((folder / f"{which}.code").read_text()),
+            *((folder / f"{which}.{s}").read_text() for s in ("out", "err")),
         )
         for which in ("first", "second")
     )
@@ -172,8 +183,33 @@ def test_a_full_disk_pauses_the_job_and_loses_nothing(empty: Studio, reference: 
     second.assert_code(0)
     (folder / "renders").rmdir()
     (folder / "kept").rename(folder / "renders")
-    empty.assert_whole(like=reference)
+    studio.assert_whole(like=like)
+    return first.err
+
+
+needs_mount = pytest.mark.skipif(not may_mount(), reason="only root may mount a small disk, in a namespace of its own")
+
+
+@pytest.mark.slow
+@needs_mount
+@pytest.mark.parametrize("size_kb", [60, 250])
+def test_a_full_disk_pauses_the_job_and_loses_nothing(empty: Studio, splash: Studio, size_kb: int) -> None:
+    (empty.folder / "prepared").mkdir()
+    assert_a_full_disk_loses_nothing(empty, size_kb, like=splash)
     empty.assert_nothing_done_twice()
+
+
+@pytest.mark.slow
+@needs_mount
+def test_a_disk_that_fills_after_the_simulation_loses_nothing(finished: Studio, reference: Studio) -> None:
+    stages = [stage for stage in STAGE_NAMES if stage not in ("bodies", "simulate")]
+    finished.run("clean", "tiny", *(word for stage in stages for word in ("--stage", stage)), "--yes").assert_code(0)
+    before = finished.attempts()
+    prepared = (finished.folder / "renders").rename(finished.folder / "prepared")
+    kept = int(subprocess.check_output(["du", "-sk", str(prepared)], text=True).split()[0])
+    said = assert_a_full_disk_loses_nothing(finished, kept + 250, like=reference)
+    assert "simulate 6/6" not in said
+    finished.assert_nothing_done_twice(since=before)
 
 
 @pytest.mark.parametrize("place", ["a file", "a file/films", "/proc/films"])
@@ -192,14 +228,12 @@ def test_a_place_that_cannot_be_written_to_is_refused_in_one_line(empty: Studio,
 
 
 @pytest.mark.slow
-def test_a_simulation_that_diverges_says_where_and_a_smaller_step_mends_it(empty: Studio, reference: Studio) -> None:
-    # The sheet shares its steps with the water, and would shorten them.
-    steps = ("--set", "fluid.water.dt=0.02", "--set", "cloth.sheet.substeps=1")
-    failed = empty.run("submit", "tiny.toml", *steps).assert_code(5)
+def test_a_simulation_that_diverges_says_where_and_a_smaller_step_mends_it(empty: Studio, splash: Studio) -> None:
+    failed = empty.run("submit", "tiny.toml", "--set", "fluid.water.dt=0.02").assert_code(5)
     assert "simulate (attempt 1) diverged" in failed.err
     assert '"water"' in failed.err
     assert "frame" in failed.err
     assert [history[-1].outcome for task, history in empty.histories().items() if task == "simulate"] == ["diverged"]
     assert '(simulate: "water" diverged at frame' in empty.run("status", "tiny").out
     empty.submit()
-    empty.assert_whole(like=reference)
+    empty.assert_whole(like=splash)

@@ -27,14 +27,14 @@ from pipeline.record.reader import SUCCEEDED, AttemptRow, ManifestReader
 from pipeline.stages import STAGES
 
 PATIENCE_S = 240.0
-"""A film takes some 15 s on two idle cores; only a hang, or a very busy machine, gets here."""
+"""A film takes some 20 s on two idle cores; only a hang, or a very busy machine, gets here."""
 
 FRAMES = 6
 STAGE_NAMES = [stage.name for stage in STAGES if stage.name != "bounds"]
 """Those that the small films have: their cameras do not frame the action."""
 ARTIFACT_SUFFIXES = {".h5", ".ply", ".vdb", ".png", ".mp4"}
 
-JOB = f"""\
+SPLASH = f"""\
 name = "tiny"
 frames = {FRAMES}
 device = "cpu"
@@ -59,6 +59,15 @@ velocity = [0.0, 0.0, -3.0]
 
 [whitewater.water]
 
+[render]
+resolution = [64, 36]
+quality = "draft"
+samples = 2
+"""
+"""Water on a ball: a simulation begins within two seconds, as it has few kernels."""
+
+JOB = f"""\
+{SPLASH}
 [[cloth]]                      # thrown into a corner: it meets the floor and two walls within these few frames
 name = "sheet"
 shape = {{ type = "rectangle", size = [0.2, 0.2], counts = [7, 7] }}
@@ -76,12 +85,8 @@ cell_size = 0.05
 shape = {{ type = "sphere", radius = 0.1 }}
 position = [-0.15, 0.1, 0.12]
 temperature = 420.0
-
-[render]
-resolution = [64, 36]
-quality = "draft"
-samples = 2
 """
+"""The same with a sheet and smoke, so that it has every stage: a simulation begins within twenty seconds."""
 
 
 @dataclass(frozen=True)
@@ -105,10 +110,10 @@ class Studio:
     folder: Path
 
     @classmethod
-    def open(cls, folder: Path) -> Studio:
+    def open(cls, folder: Path, job: str = JOB) -> Studio:
         """A studio where nothing was submitted yet."""
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "tiny.toml").write_text(JOB)
+        (folder / "tiny.toml").write_text(job)
         return cls(folder)
 
     def copy(self, folder: Path) -> Studio:
@@ -207,6 +212,13 @@ class Studio:
             time.sleep(0.01)
         return None
 
+    def wait_for_end(self, attempt: AttemptRow) -> None:
+        """Wait until the runner has noticed an attempt's end."""
+        until = time.monotonic() + PATIENCE_S
+        while any((each.task, each.number) == (attempt.task, attempt.number) for each in self.running()):
+            assert time.monotonic() < until, f"{attempt.task} never ended"
+            time.sleep(0.01)
+
     def _frames_simulated(self) -> int:
         return sum(1 for _ in (self.layout.receipts / "cache").glob("*.json"))
 
@@ -276,7 +288,7 @@ def assert_all_gone(processes: Iterable[psutil.Process]) -> None:
 
 
 def kill(process: subprocess.Popen[str]) -> None:
-    """kill -9, and nothing of it lives on."""
+    """Kill -9 a runner, and nothing of it lives on."""
     family = family_of(process)
     process.send_signal(signal.SIGKILL)
     process.communicate()
