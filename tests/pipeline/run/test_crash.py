@@ -78,7 +78,7 @@ def assert_like_undisturbed(root: Path, tmp_path: Path) -> None:
 
 
 def disturb(root: Path, seed: int, kills: int) -> list[str]:
-    """Kill the runner or a worker each time that one of a few random numbers of artifacts is reached.
+    """Kill the runner or a worker, as chance has it, each time that one of so many numbers of artifacts is reached.
 
     Returns who was killed, in order.
     """
@@ -111,9 +111,9 @@ def test_killed_at_random_moments_a_job_ends_like_an_undisturbed_one(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2, 8))
-def test_killed_often_at_random_moments_a_job_ends_like_an_undisturbed_one(tmp_path, seed):
-    assert len(disturb(tmp_path / "job", seed=seed, kills=8)) >= 4
+@pytest.mark.parametrize("seed", [2, 3])
+def test_killed_at_every_artifact_a_job_ends_like_an_undisturbed_one(tmp_path, seed):
+    assert len(disturb(tmp_path / "job", seed=seed, kills=ARTIFACTS - 1)) >= 12
     assert_like_undisturbed(tmp_path / "job", tmp_path)
 
 
