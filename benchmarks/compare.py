@@ -13,6 +13,7 @@ the record that it leaves.
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import sqlite3
@@ -239,6 +240,15 @@ MEASURED: dict[str, Callable[[Path], Numbers]] = {
     "film": lambda tree: film(tree, FILM),
 }
 """What `python -m benchmarks.compare` runs."""
+
+
+def array_bytes() -> int:
+    """What all arrays take on the device."""
+    import taichi as ti
+
+    gc.collect()
+    arrays = (found.arr for found in gc.get_objects() if isinstance(found, ti.Ndarray))
+    return sum(array.nelement() * array.element_size() for array in arrays)
 
 
 def main() -> None:

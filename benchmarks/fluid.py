@@ -10,7 +10,6 @@ all threads stands beside them, as other programs on the same cores do not enter
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 import statistics
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.compare import arguments_of, machine, run, spread, start_taichi, timed
+from benchmarks.compare import arguments_of, array_bytes, machine, run, spread, start_taichi, timed
 from sim.core.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.traits import TRAITS
@@ -114,20 +113,10 @@ def take_steps(fluid: SPHFluid, count: int) -> None:
 
 def mean_neighbors(fluid: SPHFluid) -> float:
     """Fluid particles within the support radius of a particle, without itself, on average."""
-    particles = fluid.particles
-    return (
-        particles.neighbors.pairs_within(fluid.discretization.support_radius, particles.position, particles.count)
-        / particles.count
-    )
+    from scipy.spatial import cKDTree
 
-
-def array_bytes() -> int:
-    """What all arrays take on the device."""
-    import taichi as ti
-
-    gc.collect()
-    arrays = (found.arr for found in gc.get_objects() if isinstance(found, ti.Ndarray))
-    return sum(array.nelement() * array.element_size() for array in arrays)
+    tree = cKDTree(fluid.particles.host(fluid.particles.position))
+    return tree.count_neighbors(tree, fluid.discretization.support_radius) / fluid.particle_count - 1.0
 
 
 def draw_cost(runs: list[dict[str, Any]], path: Path) -> None:

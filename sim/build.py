@@ -23,10 +23,9 @@ from sim.coupling.smoke_reach import too_thin_bodies
 from sim.coupling.smoke_rigid import SmokeRigidCoupling
 from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
-from sim.fluid.discretization import Discretization
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
-from sim.fluid.nozzles import opening_problem, pipes
-from sim.fluid.opening import Opening
+from sim.fluid.kernels import Discretization
+from sim.fluid.opening import Opening, opening_problem, pipes
 from sim.fluid.parameters import shared_conflicts
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from sim.core.domain import DomainParameters
 from sim.rigid.parameters import RigidBodyParameters
@@ -138,6 +139,22 @@ def state_of(fluid: SPHFluid) -> tuple[Curve, Curve]:
     """Positions [m] and velocities [m/s] by particle id, (n, 3) each, float64."""
     arrays = next(iter(fluid.snapshots().values())).arrays
     return arrays["position"].astype(np.float64), arrays["velocity"].astype(np.float64)
+
+
+def wall_forces(fluid: SPHFluid) -> tuple[Curve, Curve]:
+    """Samples of walls [m], and the pressure force on each, f_b = sum_i V V_b P_i grad_i W_ib [N], (m, 3) each."""
+    from sim.fluid.kernels import evaluate_slope
+
+    fluid.compute_density()
+    particles, samples, fixed = fluid.particles, fluid.boundary.samples, slice(fluid.boundary.fixed_count)
+    x_b, volume = (array.to_numpy()[fixed].astype(np.float64) for array in (samples.position, samples.volume))
+    x_i, pressure = (particles.host(array).astype(np.float64) for array in (particles.position, fluid.pressure_term))
+    support = fluid.discretization.support_radius
+    near = cKDTree(x_b).sparse_distance_matrix(cKDTree(x_i), support, output_type="coo_matrix")
+    b, i, distance = near.row, near.col, near.data
+    strength = fluid.particle_volume * volume[b] * pressure[i] * evaluate_slope(distance, support) / distance
+    pushes = strength[:, None] * (x_i[i] - x_b[b])
+    return x_b, np.stack([np.bincount(b, pushes[:, axis], len(x_b)) for axis in range(3)], axis=1)
 
 
 def momentum_of(fluid: SPHFluid, mass: float) -> tuple[Curve, Curve]:

@@ -19,7 +19,7 @@ from sim.cloth.state import ClothState
 from sim.core.arrays import Integers
 from sim.core.bundles import func
 from sim.core.launch import kernel
-from sim.core.motion.poses import Poses
+from sim.core.motion.paths import Poses
 from sim.core.reductions import runs_on_gpu
 from sim.core.scheduling import begin_sharing, is_short, next_item, workers_for
 from sim.core.walls import Wall

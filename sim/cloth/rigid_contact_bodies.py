@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.bundles import CollidingBodies, PushedBodies
 from sim.core.host_access import put, take
-from sim.core.motion.poses import Poses
+from sim.core.motion.paths import Poses
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.device_shapes import CAPSULE, SPHERE, TORUS, DeviceShapes
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import taichi as ti
 
-from sim.core.arrays import Integers, Vectors
+from sim.core.arrays import Integers
 from sim.core.bundles import bundle, func
 from sim.core.cells import CellGrid, Cells, Grid, SortedPoints, cell_of_point, row_of_cell
 from sim.core.launch import kernel
@@ -118,10 +118,6 @@ class NeighborList:
             room = min(int(self.length * GROWTH), MAX_LIST_LENGTH)
             self.lists = self.lists._replace(indices=ti.ndarray(ti.i32, room))
         list_neighbors(search, self.lists, slices)
-
-    def pairs_within(self, radius: float, positions: ti.Ndarray, count: int) -> int:
-        """Ordered pairs of particles that are now nearer than `radius` [m], at most that of the list."""
-        return int(count_pairs(positions, count, self.lists, radius * radius))
 
 
 def list_stride() -> int:
@@ -351,16 +347,3 @@ def list_neighbors(search: Search, lists: Neighbors, slices: Slices):
         lists.start[i] = first
         lists.fluid_count[i] = fluid_found
         lists.boundary_count[i] = found - fluid_found
-
-
-@kernel
-def count_pairs(positions: Vectors, count: ti.i32, lists: Neighbors, radius_squared: ti.f32) -> ti.i64:
-    """Entries of the list that are within the radius."""
-    pairs = ti.cast(0, ti.i64)
-    for i in range(count):
-        near = 0
-        for k in range(lists.fluid_count[i]):
-            x_ij = positions[i] - positions[lists.indices[lists.start[i] + k * lists.stride]]
-            near += ti.cast(x_ij.norm_sqr() < radius_squared, ti.i32)
-        pairs += near
-    return pairs

@@ -17,17 +17,10 @@ from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, wall_calibration
 if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver
 
-# Points at which a body's field is compared with the fluid that it displaces, at most.
-MOST_PROBES = 3000
-
-# Binary digits of the number of points in a cube around each; half of them are within the support.
-QUADRATURE_BITS = 8
-
-# The distances of some hundred points around each are asked for together: 6 MiB of points.
-PROBES_AT_A_TIME = 1000
-
-# Steps by which points of the surface are moved out to where particles touch it.
-OUTWARD_ROUNDS = 4
+MOST_PROBES = 3000  # points at which a body's field is compared with the fluid that it displaces, at most
+QUADRATURE_BITS = 8  # binary digits of the number of points in a cube around each; half of them are within the support
+PROBES_AT_A_TIME = 1000  # the distances of some hundred points around each are asked for together: 6 MiB of points
+OUTWARD_ROUNDS = 4  # steps by which points of the surface are moved out to where particles touch it
 
 LEAST_FACTOR = 0.25
 """Least factor at the usual support: with a quarter a particle amid the samples of a sheet still has 6/4 of the rest

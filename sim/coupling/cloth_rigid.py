@@ -9,7 +9,7 @@ import numpy as np
 
 from sim.core.domain import DomainParameters
 from sim.core.motion import rotation
-from sim.core.motion.poses import Poses
+from sim.core.motion.paths import Poses
 from sim.core.walls import walls_of
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.body_geometry import BodyGeometry
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver
 
 
-# Cloth that is laid onto a body, in decimal numbers, may be this deep in it [m].
-ROUND_OFF = 1.0e-6
+ROUND_OFF = 1.0e-6  # cloth that is laid onto a body, in decimal numbers, may be this deep in it [m]
 
 
 class ClothRigidCoupling:

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
     from sim.cloth.solver import ClothSolver
 
-# Longest edge of the part of a triangle that a sample stands for [spacings].
-LONGEST_EDGE = 1.5
+LONGEST_EDGE = 1.5  # longest edge of the part of a triangle that a sample stands for [spacings]
 
 
 @dataclass(frozen=True, eq=False)

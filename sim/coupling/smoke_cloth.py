@@ -150,7 +150,7 @@ class SmokeClothCoupling:
     def accelerate(self, dt: float) -> None:  # noqa: ARG002  (impulses are in place of forces)
         """Give the air what the last `exchange` collected."""
         if self._reaches_cloth:
-            _push_air(self._box.sums, self._smoke.openness, self._smoke.state.velocity)
+            _push_air(self._box.sums, self._smoke.air.openness, self._smoke.state.velocity)
 
 
 @func

@@ -14,14 +14,12 @@ from sim.core.neighbors import GROWTH, ROUNDING_MARGIN
 from sim.core.parameters import Vector3
 from sim.fluid.body_response import BodyResponse, SolveError, weigh_errors
 from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples
-from sim.fluid.device import Fluid
-from sim.fluid.discretization import Discretization
-from sim.fluid.kernels import TINY_DISTANCE, spline_slope
+from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline_slope
+from sim.fluid.particles import Fluid
 from sim.fluid.sheet_forces import SheetForces
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, Viscosity, viscous_factor
 
-# Samples of a body that one node of the sum takes together.
-CHUNK = 64
+CHUNK = 64  # samples of a body that one node of the sum takes together
 
 
 @bundle
@@ -196,28 +194,28 @@ def find_particles_near_samples(
 @kernel
 def gather_sample_forces(near: NearParticles, exerted: Exerted, force: Vectors):
     """The opposite of what each moving sample does to its particles [N]; terms as in the fluid's own sum."""
+    fluid, viscosity = ti.static((exerted.fluid, exerted.viscosity))
+    particles, samples = ti.static((fluid.particles, fluid.samples))
     for b in range(near.sample_count):
-        x_b, v_b = exerted.fluid.samples.position[near.first + b], exerted.fluid.samples.velocity[near.first + b]
+        x_b, v_b = samples.position[near.first + b], samples.velocity[near.first + b]
         total = ti.math.vec3(0.0)
         for k in range(near.start[b], near.start[b] + near.count[b]):
             i = near.particles[k]
-            x_ib = exerted.fluid.particles.position[i] - x_b
+            x_ib = particles.position[i] - x_b
             r_squared = x_ib.norm_sqr()
             r = ti.sqrt(r_squared)
             scale = 0.0
             if ti.static(exerted.with_pressure):
                 scale += exerted.pressure_term[i]
             if ti.static(exerted.with_friction):
-                own = exerted.fluid.particles.phase[i]
-                rho0 = exerted.fluid.materials.rest_density[own]
-                mu = LAPLACIAN_FACTOR * exerted.fluid.materials.dynamic_viscosity[own]
-                v_dot_x = (exerted.fluid.particles.velocity[i] - v_b).dot(x_ib)
-                viscous = viscous_factor(
-                    v_dot_x, r_squared, exerted.viscosity.softening, mu, exerted.viscosity.artificial * rho0
-                )
-                scale -= exerted.viscosity.wall_friction * viscous / exerted.fluid.particles.density[i]
-            total += scale * spline_slope(r * exerted.fluid.inverse_support) / (r + TINY_DISTANCE) * x_ib
-        force[b] = exerted.volume_gradient_factor * exerted.fluid.samples.volume[near.first + b] * total
+                own = particles.phase[i]
+                rho0 = fluid.materials.rest_density[own]
+                mu = LAPLACIAN_FACTOR * fluid.materials.dynamic_viscosity[own]
+                v_dot_x = (particles.velocity[i] - v_b).dot(x_ib)
+                viscous = viscous_factor(v_dot_x, r_squared, viscosity.softening, mu, viscosity.artificial * rho0)
+                scale -= viscosity.wall_friction * viscous / particles.density[i]
+            total += scale * spline_slope(r * fluid.inverse_support) / (r + TINY_DISTANCE) * x_ib
+        force[b] = exerted.volume_gradient_factor * samples.volume[near.first + b] * total
 
 
 @kernel

@@ -17,7 +17,7 @@ these velocities; linear in both together."""
 
 
 class BodyFriction:
-    """The bodies' rows of the matrix of `sim.fluid.viscosity_implicit`, and their share of its solution.
+    """The bodies' rows of the matrix of `sim.fluid.viscosity`, and their share of its solution.
 
     A change u = (dv, domega) of a body's velocities changes that of its sample b by J_b u = dv + domega x r_b. With the
     friction k_ib of the particles' rows, per volume V of a particle as there:

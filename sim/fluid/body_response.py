@@ -12,9 +12,8 @@ from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
 from sim.fluid.boundary import NO_BODY, STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples
-from sim.fluid.device import Fluid
-from sim.fluid.discretization import Discretization
-from sim.fluid.kernels import TINY_DISTANCE, spline, spline_slope
+from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline, spline_slope
+from sim.fluid.particles import Fluid
 
 # Numbers of a body's mobility: inverse mass, then the inverse inertia tensor row by row, in world axes.
 MOBILITY_WIDTH = 10
@@ -28,8 +27,7 @@ PARTICLES_PER_SAMPLE = 8
 # |sum_b V_b grad W_ib| of a particle that is pressed onto samples, over 1/d; it is 0.9 at rest beside them.
 LARGEST_PUSH = 6.0
 
-# Stands for an error that is infinite or not a number, which the larger of two numbers would hide.
-NOT_FINITE = 1.0e30
+NOT_FINITE = 1.0e30  # stands for an error that is infinite or not a number, which the larger of two numbers would hide
 
 
 @bundle

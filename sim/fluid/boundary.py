@@ -13,19 +13,12 @@ from sim.core.cells import CellGrid, CellSort, SortedPoints
 from sim.core.launch import kernel
 from sim.core.solver import Arrays
 from sim.fluid.boundary_akinci2012 import BoundarySamples
-from sim.fluid.discretization import Discretization
+from sim.fluid.kernels import Discretization
 
-EVERYWHERE = (-1.0e30,) * 3, (1.0e30,) * 3
-"""Corners of a box that holds every sample [m]."""
-
-STATE_WIDTH = 18
-"""Numbers of a body's state: centre of mass, rotation row by row, velocity, angular velocity."""
-
-NO_BODY = 2**31 - 1
-"""Stands for the number of a body where there is none."""
-
-WRENCH_WIDTH = 6
-"""Numbers of a force with its torque."""
+EVERYWHERE = (-1.0e30,) * 3, (1.0e30,) * 3  # corners of a box that holds every sample [m]
+STATE_WIDTH = 18  # numbers of a body's state: centre of mass, rotation row by row, velocity, angular velocity
+NO_BODY = 2**31 - 1  # stands for the number of a body where there is none
+WRENCH_WIDTH = 6  # numbers of a force with its torque
 
 
 @bundle
@@ -86,7 +79,7 @@ class Boundary:
     after them those of sheets, which the coupling with the sheets places.
 
     Attributes:
-        given_count, fixed_count: fixed samples given, and those of them near enough to the grid to matter.
+        fixed_count: fixed samples near enough to the grid to matter.
         moving_count: samples of moving bodies and of sheets, `body_sample_count` and `sheet_count`.
         body_count: moving bodies.
         samples: all samples on the device.
@@ -114,7 +107,7 @@ class Boundary:
         low = np.array(grid.origin)
         high = low + grid.cell_size * np.array(grid.shape)
         near = np.flatnonzero(((fixed.positions >= low) & (fixed.positions <= high)).all(axis=1))
-        self.given_count, self.fixed_count = len(fixed.positions), len(near)
+        self.fixed_count = len(near)
         self.body_sample_count, self.sheet_count = len(moving.positions), len(sheets.positions)
         self.moving_count = self.body_sample_count + self.sheet_count
         self.body_count = body_count

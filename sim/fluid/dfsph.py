@@ -5,10 +5,9 @@ import taichi as ti
 
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
-from sim.fluid.device import Fluid
 from sim.fluid.kernels import evaluate, lattice_offsets, particle_volume
-from sim.fluid.pressure import IncompressibleFluid
-from sim.fluid.pressure_kernels import PressureSystem, add_scaled, density_rate, not_negative
+from sim.fluid.particles import Fluid
+from sim.fluid.pressure import IncompressibleFluid, PressureSystem, add_scaled, density_rate, not_negative
 from sim.fluid.sheet_forces import DIVERGENCE
 from sim.fluid.tank import FluidStart
 
@@ -42,7 +41,7 @@ class DFSPHSolver(IncompressibleFluid):
     (`sim.fluid.pressure.momentum`). And of a compression that a particle has already, from walls or the error of
     linearization, a step takes back a part only (`IncompressibleFluid.correction`), as it turns into speed.
 
-    Momentum of fluid pairs is conserved to rounding. `pressures` and `boundary_forces` are those of the density solve;
+    Momentum of fluid pairs is conserved to rounding. The `pressure_term` is that of the density solve;
     the divergence solve adds impulses that are small but where fluid hits something.
 
     Attributes:

@@ -13,7 +13,7 @@ from sim.core.bundles import bundle
 from sim.core.cells import CellGrid, Grid, cell_of_point, row_of_cell
 from sim.core.launch import kernel
 from sim.core.scan import exclusive_scan, scan_scratch_length
-from sim.fluid.discretization import Discretization
+from sim.fluid.kernels import Discretization
 from sim.fluid.opening import Opening
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Layer, Particles, ParticleSet

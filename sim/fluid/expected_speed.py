@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from sim.core.domain import DomainParameters
 from sim.core.parameters import Vector3
 
-# Where neither gravity nor an initial velocity says what to expect [m/s].
-SLOWEST_EXPECTED_SPEED = 0.1
+SLOWEST_EXPECTED_SPEED = 0.1  # where neither gravity nor an initial velocity says what to expect [m/s]
 
 COHESION_SPEED_FACTOR = 10.0
 """Square of the speed to expect from cohesion over the stress with which that pulls a filled lattice together, per

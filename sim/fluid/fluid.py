@@ -11,16 +11,15 @@ import taichi as ti
 
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Remedies
-from sim.fluid.discretization import Discretization
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.forces import Forces
+from sim.fluid.kernels import Discretization
 from sim.fluid.opening import Opening
 from sim.fluid.phases import Phases
 from sim.fluid.solve_record import SolveRecord
 from sim.fluid.surface_tension import Cohesion
 from sim.fluid.tank import FluidStart, ParticleTank
-from sim.fluid.viscosity import LAPLACIAN_FACTOR
-from sim.fluid.viscosity_implicit import CARRIED, is_implicit
+from sim.fluid.viscosity import CARRIED, LAPLACIAN_FACTOR, is_implicit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,8 +31,7 @@ SQUEEZED = 0.2
 """Relative compression of a particle from which on a frame is counted as squeezed. A pressure solve converges by its
 mean error, which says nothing about single particles; those in corners of a filled box start at 0.06."""
 
-# As in a job file.
-LARGEST_CFL = 2.0
+LARGEST_CFL = 2.0  # as in a job file
 
 
 class SPHFluid(ABC):
@@ -54,6 +52,7 @@ class SPHFluid(ABC):
         expected_speed: largest speed to expect [m/s].
         signal_speed: speed of the signals that limit the time step [m/s].
         tank: the particles, and what is around them: `particles`, `boundary` and `body_forces`.
+        cohesion: surface tension, and what it asks of speeds and steps.
         forces: all but those of pressure.
         solves: the iterative solves of this frame, by what they are for.
     """
@@ -75,8 +74,8 @@ class SPHFluid(ABC):
         self.parameters = self.phases.shared
         self.name = "+".join(self.phases.names)
         self.discretization = Discretization(self.parameters.spacing, self.parameters.support_in_spacings)
-        self._cohesion = Cohesion.of(start.fluids, self.discretization)
-        self.expected_speed = _expected_speed(start, self.discretization, self._cohesion.stress)
+        self.cohesion = Cohesion.of(start.fluids, self.discretization)
+        self.expected_speed = _expected_speed(start, self.discretization, self.cohesion.stress)
         self.signal_speed = self.parameters.sound_speed or self.speed_ratio * self.expected_speed
         self._stiffest = float(self.phases.viscosities.max()) * max(1.0, self.parameters.wall_friction)
         with_implicit = is_implicit(self.parameters, self._stiffest, self.signal_speed)
@@ -94,9 +93,11 @@ class SPHFluid(ABC):
         self.gravity, self.spacing = start.gravity, self.discretization.spacing
         self.particle_volume = self.discretization.particle_volume
         self.forces = Forces(
-            self.tank, self.phases, self._cohesion, signal_speed=self.signal_speed, with_implicit=with_implicit
+            self.tank, self.phases, self.cohesion, signal_speed=self.signal_speed, with_implicit=with_implicit
         )
-        self.solves = {**self.forces.solves, **{name: SolveRecord() for name in self.solved_for}}
+        self.solves = {name: SolveRecord() for name in self.solved_for}
+        if self.forces.implicit_viscosity is not None:
+            self.solves = {"viscosity": self.forces.implicit_viscosity.record} | self.solves
         self._first_bad: str | None = None
 
     @property
@@ -143,11 +144,6 @@ class SPHFluid(ABC):
         physical = self._stiffest if self.forces.implicit_viscosity is None else 0.0
         return physical + self.forces.artificial_viscosity / LAPLACIAN_FACTOR * max(1.0, self.parameters.wall_friction)
 
-    @property
-    def cohesion_rate(self) -> float:
-        """Square of the frequency of a particle on the spring that its neighbours' cohesion is [1/s²]."""
-        return self._cohesion.rate
-
     def snapshots(self) -> dict[str, Snapshot]:
         """Positions, velocities, densities and pressures of the particles of each fluid, sorted by particle id."""
         self.compute_density()
@@ -169,11 +165,6 @@ class SPHFluid(ABC):
             attributes = {"particle_radius": fluid.particle_radius, "rest_density": fluid.rest_density}
             snapshots[fluid.name] = Snapshot(kind="fluid", arrays=own, attributes=attributes)
         return snapshots
-
-    def boundary_forces(self) -> NDArray[np.float32]:
-        """Pressure force of the fluid on each fixed boundary sample, in the order they were given [N], (m, 3)."""
-        self.compute_density()
-        return self.forces.boundary_forces(self.pressure_term)
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The state of the tank, of which the solver's own part is the carried scalars."""

@@ -6,22 +6,25 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, Vectors, on_device
+from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle
-from sim.core.cells import Grid, cell_of_point, row_of_cell
 from sim.core.launch import kernel
 from sim.fluid.body_forces import Exerted
 from sim.fluid.body_friction import BodyFriction
-from sim.fluid.device import Fluid
 from sim.fluid.kernels import inverse_distance, spline_slope
+from sim.fluid.particles import Fluid
 from sim.fluid.phases import Phases
 from sim.fluid.sheet_forces import DENSITY
-from sim.fluid.solve_record import SolveRecord
-from sim.fluid.surface_tension import Cohesion, cohesion_becker_teschner2007
-from sim.fluid.surface_tension_akinci2013 import SurfaceTensionAkinci2013
+from sim.fluid.surface_tension import Cohesion, SurfaceTensionAkinci2013, cohesion_becker_teschner2007
 from sim.fluid.tank import ParticleTank
-from sim.fluid.viscosity import LAPLACIAN_FACTOR, SOFTENING, Viscosity, pair_viscosity, viscous_factor
-from sim.fluid.viscosity_implicit import ImplicitViscosity
+from sim.fluid.viscosity import (
+    LAPLACIAN_FACTOR,
+    SOFTENING,
+    ImplicitViscosity,
+    Viscosity,
+    pair_viscosity,
+    viscous_factor,
+)
 
 
 @bundle
@@ -40,13 +43,12 @@ class Forces:
     a_i = g - 1/rho0 [sum_j V (P_i + P_j) grad W_ij + sum_b V_b P_i grad W_ib] + viscosity + cohesion
 
     with P = p/(rho/rho0)², Monaghan's viscosity (`sim.fluid.viscosity`) and the cohesion of Becker & Teschner 2007, or
-    implicit viscosity (`sim.fluid.viscosity_implicit`) and the surface tension of Akinci et al. 2013 in their place.
+    implicit viscosity (`sim.fluid.viscosity`) and the surface tension of Akinci et al. 2013 in their place.
 
     Attributes:
         acceleration: of each particle [m/s²], (capacity,) of 3-vectors.
         artificial_viscosity: alpha c h/2 [m²/s], which stands where 2 (d + 2) nu does.
         implicit_viscosity: the solve for stiff fluids; None where viscosity is explicit.
-        solves: that solve, by its name.
     """
 
     def __init__(
@@ -65,20 +67,16 @@ class Forces:
         self._volume_gradient_factor = d.particle_volume * d.sigma / support
         self._explicit_materials = phases.materials
         self.implicit_viscosity: ImplicitViscosity | None = None
-        self.solves: dict[str, SolveRecord] = {}
         if with_implicit:
             tank.body_forces.let_bodies_respond(tank.gravity, d)
             heaviest = float(phases.rest_densities.max())
             bodies = BodyFriction(tank.boundary, tank.body_forces.response, d.particle_volume, heaviest)
             self.implicit_viscosity = ImplicitViscosity(capacity, bodies, wall_friction, d)
-            self.solves["viscosity"] = self.implicit_viscosity.record
             nothing = on_device(np.zeros(len(phases)))
             self._explicit_materials = phases.materials._replace(dynamic_viscosity=nothing)
-        self._akinci2013 = (
-            SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, d)
-            if cohesion.is_akinci2013
-            else None
-        )
+        self._akinci2013: SurfaceTensionAkinci2013 | None = None
+        if cohesion.is_akinci2013:
+            self._akinci2013 = SurfaceTensionAkinci2013(capacity, phases.parameters, cohesion.akinci2013, d)
         density = tank.particles.density
         self._no_pressure = Elastic(density, density, 0.0, False)
 
@@ -94,16 +92,9 @@ class Forces:
 
     def compute(self, dt: float, elastic: Elastic | None = None) -> None:
         """Fill `acceleration` with all forces known before a step of dt [s], and count their reaction."""
-        tank = self._tank
-        compute_acceleration(
-            self._fluid,
-            self._no_pressure if elastic is None else elastic,
-            self._viscosity,
-            tank.gravity,
-            tank.discretization.spacing,
-            self._cohesion.is_becker_teschner2007,
-            self.acceleration,
-        )
+        tank, pressure, cohesion = self._tank, elastic or self._no_pressure, self._cohesion.is_becker_teschner2007
+        spacing = tank.discretization.spacing
+        compute_acceleration(self._fluid, pressure, self._viscosity, tank.gravity, spacing, cohesion, self.acceleration)
         if self._akinci2013 is not None:
             self._akinci2013.add_acceleration(tank.on_device, self.acceleration)
         self._begin_reaction(None if elastic is None else elastic.pressure_term, dt)
@@ -124,44 +115,28 @@ class Forces:
     def react(self, pressure_term: ti.Ndarray, dt: float) -> None:
         """Count the pressure of a step of dt [s], found after its other forces, as impulses on bodies.
 
-        Call it with the positions that the particles felt it at.
+        The particles must be where they felt it.
         """
         self._tank.body_forces.gather(self.exerted(pressure_term, with_friction=False), dt)
 
     def recoil_sheets(self, solve: int, dt: float) -> None:
         """Push the sheets' samples by the opposite of what acted on them in this solve of the last step."""
         if self._tank.body_forces.sheets is not None:
-            self._tank.body_forces.sheets.begin_solve(solve)
-            self._tank.body_forces.sheets.recoil(dt)
-
-    def boundary_forces(self, pressure_term: ti.Ndarray) -> NDArray[np.float32]:
-        """Pressure force of the fluid on each fixed boundary sample, in the order they were given [N], (m, 3).
-
-        The reaction to the pressure part of a_i, gathered per sample: f_b = sum_i V V_b P_i grad_i W_ib.
-        Samples beyond the reach of the fluid's grid feel nothing.
-        """
-        boundary = self._tank.boundary
-        forces = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
-        exerted = self.exerted(pressure_term, with_friction=False)
-        cell_start = self._tank.particles.cells.cell_start
-        gather_boundary_forces(exerted, boundary.fixed_count, cell_start, self._tank.grid.on_device, forces)
-        result = np.zeros((boundary.given_count, 3), dtype=np.float32)
-        result[boundary.index] = forces.to_numpy()[: boundary.fixed_count]
-        return result
+            self._tank.body_forces.sheets.recoil(dt, solve)
 
     def _begin_reaction(self, pressure_term: ti.Ndarray | None, dt: float) -> None:
         """Count what has acted so far on bodies and sheets; those that answer within the step then begin to fall."""
         body_forces = self._tank.body_forces
         sheets = body_forces.sheets
         if sheets is not None:
-            sheets.begin_solve(DENSITY)
+            sheets.solve = DENSITY
         if pressure_term is not None or self._viscosity.with_wall_friction:
             body_forces.gather(self.exerted(pressure_term, with_friction=True), dt)
         # After the gathering: the particles felt friction against samples that had not begun to fall or recoil.
         if body_forces.response is not None:
             body_forces.response.fall(dt)
         if sheets is not None:
-            sheets.recoil(dt)
+            sheets.recoil(dt, DENSITY)
             sheets.add_missing_weight(self._tank.on_device, body_forces.near, dt)
 
     def add_implicit_viscosity(self, dt: float) -> None:
@@ -173,13 +148,10 @@ class Forces:
         viscosity = self._viscosity._replace(artificial=0.0)
 
         def friction_at(velocity: ti.Ndarray, sample_velocity: ti.Ndarray) -> Exerted:
-            moving = fluid._replace(
-                particles=fluid.particles._replace(velocity=velocity),
-                samples=fluid.samples._replace(velocity=sample_velocity),
-            )
-            return self.exerted(None, with_friction=True)._replace(
-                fluid=moving, viscosity=viscosity, with_friction=True
-            )
+            particles = fluid.particles._replace(velocity=velocity)
+            moving = fluid._replace(particles=particles, samples=fluid.samples._replace(velocity=sample_velocity))
+            exerted = self.exerted(None, with_friction=True)
+            return exerted._replace(fluid=moving, viscosity=viscosity, with_friction=True)
 
         def friction(velocity: ti.Ndarray, sample_velocity: ti.Ndarray) -> NDArray[np.float64]:
             return body_forces.measure(friction_at(velocity, sample_velocity))
@@ -205,37 +177,38 @@ def compute_acceleration(
     displacement makes, dp/d(rho/rho0) A_ii with A_ii as in `sim.fluid.pressure`: high where a particle is squeezed, or
     close to boundary fluid.samples.
     """
+    particles, near, samples, materials = ti.static((fluid.particles, fluid.near, fluid.samples, fluid.materials))
     gradient_factor = fluid.sigma * fluid.inverse_support
     ti.loop_config(block_dim=128)
-    for i in range(fluid.particles.count):
-        x_i, v_i, rho_i = fluid.particles.position[i], fluid.particles.velocity[i], fluid.particles.density[i]
+    for i in range(particles.count):
+        x_i, v_i, rho_i = particles.position[i], fluid.particles.velocity[i], fluid.particles.density[i]
         pressure_i = 0.0
         if ti.static(elastic.is_given):
             pressure_i = elastic.pressure_term[i]
         own = 0
         if ti.static(fluid.materials.several):
-            own = fluid.particles.phase[i]
-        rho0, mu = fluid.materials.rest_density[own], LAPLACIAN_FACTOR * fluid.materials.dynamic_viscosity[own]
+            own = particles.phase[i]
+        rho0, mu = materials.rest_density[own], LAPLACIAN_FACTOR * materials.dynamic_viscosity[own]
         fluid_sum = ti.math.vec3(0.0)
         gradient_sum = ti.math.vec3(0.0)
         square_sum = 0.0
         cohesion_sum = ti.math.vec3(0.0)
-        first = fluid.near.start[i]
-        for k in range(fluid.near.fluid_count[i]):
-            j = fluid.near.indices[first + k * fluid.near.stride]
-            x_ij = x_i - fluid.particles.position[j]
+        first = near.start[i]
+        for k in range(near.fluid_count[i]):
+            j = near.indices[first + k * near.stride]
+            x_ij = x_i - particles.position[j]
             r_squared = x_ij.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             r = r_squared * inverse_r
-            v_dot_x = (v_i - fluid.particles.velocity[j]).dot(x_ij)
+            v_dot_x = (v_i - particles.velocity[j]).dot(x_ij)
             mu_ij, rho0_ij, alike = mu, rho0, 1.0
             if ti.static(fluid.materials.several):
-                other = fluid.particles.phase[j]
+                other = particles.phase[j]
                 alike = ti.cast(other == own, ti.f32)
-                mu_ij = pair_viscosity(mu, LAPLACIAN_FACTOR * fluid.materials.dynamic_viscosity[other])
-                rho0_ij = 0.5 * (rho0 + fluid.materials.rest_density[other])
+                mu_ij = pair_viscosity(mu, LAPLACIAN_FACTOR * materials.dynamic_viscosity[other])
+                rho0_ij = 0.5 * (rho0 + materials.rest_density[other])
             viscous = viscous_factor(v_dot_x, r_squared, viscosity.softening, mu_ij, viscosity.artificial * rho0_ij)
-            scale = 2.0 * viscous / (rho_i + fluid.particles.density[j])
+            scale = 2.0 * viscous / (rho_i + particles.density[j])
             if ti.static(elastic.is_given):
                 scale -= pressure_i + elastic.pressure_term[j]
             slope = spline_slope(r * fluid.inverse_support)
@@ -245,16 +218,16 @@ def compute_acceleration(
                 gradient_sum += gradient
                 lightness = 1.0
                 if ti.static(fluid.materials.several):
-                    lightness = rho0 / fluid.materials.rest_density[fluid.particles.phase[j]]
+                    lightness = rho0 / materials.rest_density[particles.phase[j]]
                 square_sum += slope * slope * lightness
             if ti.static(with_cohesion):
                 cohesion_sum += alike * cohesion_becker_teschner2007(r, fluid.inverse_support, spacing) * x_ij
         boundary_sum = ti.math.vec3(0.0)
         boundary_gradient = ti.math.vec3(0.0)
-        first += fluid.near.fluid_count[i] * fluid.near.stride
-        for k in range(fluid.near.boundary_count[i]):
-            b = fluid.near.indices[first + k * fluid.near.stride]
-            x_ib = x_i - fluid.samples.position[b]
+        first += near.fluid_count[i] * near.stride
+        for k in range(near.boundary_count[i]):
+            b = near.indices[first + k * near.stride]
+            x_ib = x_i - samples.position[b]
             r_squared = x_ib.norm_sqr()
             inverse_r = inverse_distance(r_squared)
             r = r_squared * inverse_r
@@ -262,20 +235,14 @@ def compute_acceleration(
             if ti.static(viscosity.with_wall_friction):
                 v_ib = v_i
                 if ti.static(fluid.samples.with_moving):
-                    v_ib -= fluid.samples.velocity[b]
+                    v_ib -= samples.velocity[b]
                 viscous = viscous_factor(
                     v_ib.dot(x_ib), r_squared, viscosity.softening, mu, viscosity.artificial * rho0
                 )
                 boundary_sum += (
-                    viscosity.wall_friction
-                    * viscous
-                    / rho_i
-                    * fluid.samples.friction_volume[b]
-                    * slope
-                    * inverse_r
-                    * x_ib
+                    viscosity.wall_friction * viscous / rho_i * samples.friction_volume[b] * slope * inverse_r * x_ib
                 )
-            gradient = fluid.samples.volume[b] * slope * inverse_r * x_ib
+            gradient = samples.volume[b] * slope * inverse_r * x_ib
             boundary_sum -= pressure_i * gradient
             boundary_gradient += gradient
         if ti.static(elastic.is_given):
@@ -285,25 +252,5 @@ def compute_acceleration(
             elastic.frequency_squared[i] = elastic.slope / rho0 * stiffer * stiffer * gradient_factor**2 * diagonal
         a_i = gravity + gradient_factor / rho0 * (fluid.volume * fluid_sum + boundary_sum)
         if ti.static(with_cohesion):
-            a_i -= fluid.materials.surface_tension[own] * fluid.sigma * cohesion_sum
+            a_i -= materials.surface_tension[own] * fluid.sigma * cohesion_sum
         acceleration[i] = a_i
-
-
-@kernel
-def gather_boundary_forces(exerted: Exerted, count: ti.i32, cell_start: Integers, grid: Grid, force: Vectors):
-    """Reaction to the pressure acceleration that each sample causes, summed in the order of the sorted particles."""
-    for b in range(count):
-        x_b = exerted.fluid.samples.position[b]
-        cell = cell_of_point(x_b, grid)
-        total = ti.math.vec3(0.0)
-        for dz in range(-grid.reach, grid.reach + 1):
-            for dy in range(-grid.reach, grid.reach + 1):
-                row = row_of_cell(cell, dy, dz, grid)
-                for i in range(cell_start[row - grid.reach], cell_start[row + grid.reach + 1]):
-                    x_ib = exerted.fluid.particles.position[i] - x_b
-                    inverse_r = inverse_distance(x_ib.norm_sqr())
-                    r = x_ib.norm_sqr() * inverse_r
-                    total += (
-                        exerted.pressure_term[i] * spline_slope(r * exerted.fluid.inverse_support) * inverse_r * x_ib
-                    )
-        force[b] = exerted.volume_gradient_factor * exerted.fluid.samples.volume[b] * total

@@ -10,7 +10,7 @@ which equals 1 - 6q² + 6q³ for q < 1/2, 2 (1 - q)³ for q < 1, and 0 beyond.
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import taichi as ti
@@ -20,11 +20,8 @@ from scipy.optimize import brentq
 from sim.core.bundles import func
 from sim.core.reductions import runs_on_gpu
 
-TINY_DISTANCE = 1.0e-12
-"""Keeps x/|x| finite where two particles coincide; their force is then 0 [m]."""
-
-SUPPORT_IN_SPACINGS = 2.0
-"""Usual support radius over lattice spacing: 4r over 2r."""
+TINY_DISTANCE = 1.0e-12  # keeps x/|x| finite where two particles coincide; their force is then 0 [m]
+SUPPORT_IN_SPACINGS = 2.0  # usual support radius over lattice spacing: 4r over 2r
 
 # Between these distances from the fluid is the first of two layers of samples, at every support up to 4.
 NEAR_LAYER_IN_SPACINGS = 0.3, 1.2
@@ -205,3 +202,41 @@ def _layer_field(distance: float, support_in_spacings: float, *, shifts: int = 8
 
     step = 1.0e-4
     return field(distance), (field(distance + step) - field(distance - step)) / (2.0 * step)
+
+
+@dataclass(frozen=True)
+class Discretization:
+    """Particles of one volume on a lattice, and a kernel over them.
+
+    Attributes:
+        spacing: of the lattice, d [m].
+        support_in_spacings: support radius h of the kernel over d [-].
+    """
+
+    spacing: float
+    support_in_spacings: float = SUPPORT_IN_SPACINGS
+
+    @cached_property
+    def support_radius(self) -> float:
+        """Support radius h [m]."""
+        return self.support_in_spacings * self.spacing
+
+    @cached_property
+    def inverse_support(self) -> float:
+        """1/h [1/m]."""
+        return 1.0 / self.support_radius
+
+    @cached_property
+    def particle_volume(self) -> float:
+        """Volume V of a particle [m³]."""
+        return particle_volume(self.spacing, self.support_in_spacings)
+
+    @cached_property
+    def sigma(self) -> float:
+        """Factor of the kernel, 8/(pi h³) [1/m³]."""
+        return normalization(self.support_radius)
+
+    @property
+    def gradient_factor(self) -> float:
+        """Factor of the kernel's gradient, sigma/h [1/m⁴]."""
+        return self.sigma / self.support_radius

@@ -12,6 +12,8 @@ from sim.core.bundles import bundle
 from sim.core.cells import CellGrid, CellSort, SortedPoints
 from sim.core.launch import kernel
 from sim.core.neighbors import NeighborList, Neighbors, list_stride
+from sim.fluid.boundary import Samples
+from sim.fluid.phases import Materials
 
 HOST_NAMES = ("position", "velocity", "particle_id", "phase")
 
@@ -193,3 +195,16 @@ def clear_scalars(values: Floats, first: ti.i32, count: ti.i32):
     """Zeros for a carried quantity of new particles."""
     for i in range(first, first + count):
         values[i] = 0.0
+
+
+@bundle
+class Fluid(NamedTuple):
+    """Particles with their neighbours, and the kernel over them: what sums over neighbours read."""
+
+    particles: Particles
+    near: Neighbors
+    samples: Samples  # of the boundary
+    materials: Materials
+    volume: ti.f32  # V of a particle [m³]
+    sigma: ti.f32  # factor of the kernel, 8/(pi h³) [1/m³]
+    inverse_support: ti.f32  # 1/h [1/m]

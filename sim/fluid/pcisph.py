@@ -9,19 +9,24 @@ from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import bundle
 from sim.core.launch import kernel
 from sim.core.solver import Diagnostics
-from sim.fluid.device import Fluid
 from sim.fluid.kernels import distance, spline
-from sim.fluid.particles import Particles
-from sim.fluid.pressure import IncompressibleFluid, Relax, momentum
-from sim.fluid.pressure_kernels import PressureSystem, add_scaled, copy_scalars, not_negative
+from sim.fluid.particles import Fluid, Particles
+from sim.fluid.pressure import (
+    IncompressibleFluid,
+    PressureSystem,
+    Relax,
+    add_scaled,
+    copy_scalars,
+    momentum,
+    not_negative,
+)
 from sim.fluid.solve_record import SolveRecord
 from sim.fluid.tank import FluidStart
 
 # Iterations in any case (Solenthaler & Pajarola 2009, algorithm 2): fewer let the pressure fluctuate.
 LEAST_ITERATIONS = 3
 
-# A solve whose error grows beyond this multiple diverges.
-LARGEST_ERROR_GROWTH = 2.0
+LARGEST_ERROR_GROWTH = 2.0  # a solve whose error grows beyond this multiple diverges
 
 LARGEST_DISPLACEMENT = 0.5
 """Displacement [spacings] beyond which a predicted position means nothing: two particles may have passed each other
@@ -170,27 +175,28 @@ def correct_pressure(
     Of a compression that is there already only a share counts. What remains of a particle that would go farther than
     the largest displacement is `ASTRAY`.
     """
+    particles, near, samples = ti.static((fluid.particles, fluid.near, fluid.samples))
     dt = correction.dt
     ti.loop_config(block_dim=128)
-    for i in range(fluid.particles.count):
+    for i in range(particles.count):
         x_i = predicted[i]
         own = 0
         if ti.static(fluid.materials.several):
-            own = fluid.particles.phase[i]
+            own = particles.phase[i]
         fluid_sum = 1.0  # w(0): the particle itself
-        first = fluid.near.start[i]
-        for k in range(fluid.near.fluid_count[i]):
-            x_j = predicted[fluid.near.indices[first + k * fluid.near.stride]]
+        first = near.start[i]
+        for k in range(near.fluid_count[i]):
+            x_j = predicted[near.indices[first + k * near.stride]]
             fluid_sum += spline(distance((x_i - x_j).norm_sqr()) * fluid.inverse_support)
         boundary_sum = 0.0
-        first += fluid.near.fluid_count[i] * fluid.near.stride
-        for k in range(fluid.near.boundary_count[i]):
-            b = fluid.near.indices[first + k * fluid.near.stride]
-            x_b = fluid.samples.position[b]
-            if ti.static(fluid.samples.with_moving):
-                x_b += dt * (fluid.samples.velocity[b] + dt * boundary_response[b])
-            boundary_sum += fluid.samples.volume[b] * spline(distance((x_i - x_b).norm_sqr()) * fluid.inverse_support)
-        excess = ti.max(fluid.particles.density[i] - 1.0, 0.0)
+        first += near.fluid_count[i] * near.stride
+        for k in range(near.boundary_count[i]):
+            b = near.indices[first + k * near.stride]
+            x_b = samples.position[b]
+            if ti.static(samples.with_moving):
+                x_b += dt * (samples.velocity[b] + dt * boundary_response[b])
+            boundary_sum += samples.volume[b] * spline(distance((x_i - x_b).norm_sqr()) * fluid.inverse_support)
+        excess = ti.max(particles.density[i] - 1.0, 0.0)
         density = fluid.sigma * (fluid.volume * fluid_sum + boundary_sum)
         left = density - 1.0 - (1.0 - correction.share) * excess
         stiffer = ti.min(system.inverse_diagonal[i], fluid.materials.rest_density[own] / correction.filled_diagonal)
@@ -198,5 +204,5 @@ def correct_pressure(
         relaxed = not_negative(pressure[i] + delta * left)
         next_pressure[i] = not_negative(relaxed + correction.momentum * (relaxed - system.relaxed_before[i]))
         system.relaxed_before[i] = relaxed
-        is_astray = (x_i - fluid.particles.position[i]).norm_sqr() > correction.largest_displacement_squared
+        is_astray = (x_i - particles.position[i]).norm_sqr() > correction.largest_displacement_squared
         system.remaining[i] = ti.select(is_astray, ASTRAY, left)

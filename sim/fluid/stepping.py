@@ -14,8 +14,7 @@ from sim.core.reductions import LaneReduction, Results, Share, is_finite, reduce
 
 MAXIMA, COUNTS = 4, 3
 
-# Coordinate that no particle reaches [m].
-UNLIMITED = 1.0e30
+UNLIMITED = 1.0e30  # coordinate that no particle reaches [m]
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,10 @@ from sim.core.neighbors import cells_per_radius
 from sim.fluid.body_forces import BodyForces
 from sim.fluid.boundary import BodyStates, Boundary
 from sim.fluid.boundary_akinci2012 import BoundarySamples
-from sim.fluid.device import Fluid
-from sim.fluid.discretization import Discretization
 from sim.fluid.emitter import Emission
-from sim.fluid.nozzles import is_felt_in_nozzles
-from sim.fluid.particles import HOST_NAMES, ParticleSet
+from sim.fluid.kernels import Discretization
+from sim.fluid.opening import is_felt_in_nozzles
+from sim.fluid.particles import HOST_NAMES, Fluid, ParticleSet
 from sim.fluid.sheet_forces import SheetForces
 from sim.fluid.stepping import Box, MotionSummary, ParticleStepper
 

@@ -8,17 +8,15 @@ import taichi as ti
 from sim.core.arrays import Floats
 from sim.core.launch import kernel
 from sim.core.solver import Diagnostics
-from sim.fluid.device import Fluid
 from sim.fluid.fluid import SPHFluid
 from sim.fluid.forces import Elastic
 from sim.fluid.kernels import distance, spline
+from sim.fluid.particles import Fluid
 from sim.fluid.pressure import largest_eigenvalue
 from sim.fluid.tank import FluidStart
-from sim.fluid.time_step import CFL_NUMBER, stable_time_step
-from sim.fluid.traits import TRAITS
+from sim.fluid.traits import CFL_NUMBER, TRAITS, stable_time_step
 
-# Exponent of Tait's equation; the kernel multiplies it out.
-GAMMA = 7
+GAMMA = 7  # exponent of Tait's equation; the kernel multiplies it out
 
 
 class WCSPHSolver(SPHFluid):
@@ -75,7 +73,7 @@ class WCSPHSolver(SPHFluid):
             signal_speed=sound_speed + max(motion.max_speed, self.tank.boundary_speed),
             acceleration=motion.max_acceleration,
             viscosity=self.limiting_viscosity,
-            cohesion_rate=self.cohesion_rate,
+            cohesion_rate=self.cohesion.rate,
             pressure_frequency=self.frequency_ratio * motion.max_frequency,
             cfl=cfl,
         )

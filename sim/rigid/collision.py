@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.core.motion.poses import Poses
+from sim.core.motion.paths import Poses
 from sim.core.walls import Wall
-from sim.rigid.contacts import AnchoredContacts, Array, Contacts, Indices, Key
-from sim.rigid.manifold import reduce_manifold
+from sim.rigid.contacts import AnchoredContacts, Array, Contacts, Indices, Key, reduce_manifold
 from sim.shapes.body_geometry import BodyGeometry
 
 CONTACT_BAND = 5.0e-3  # points this near, in shortest edges of the smaller body, belong to a contact

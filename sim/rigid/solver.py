@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sim.core.domain import DomainParameters
 from sim.core.motion import rotation
-from sim.core.motion.paths import Path, path_onwards
-from sim.core.motion.poses import Poses
+from sim.core.motion.paths import Path, Poses, path_onwards
 from sim.core.motion.rotation import Array
 from sim.core.parameters import Vector3
 from sim.core.snapshots import Snapshot
@@ -19,10 +18,9 @@ from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.core.walls import walls_of
 from sim.rigid.collision import CollisionDetector
 from sim.rigid.contact_response import ContactResponse, Surfaces
-from sim.rigid.free_motion import rotate_freely
 from sim.rigid.parameters import RigidBodyParameters
 from sim.rigid.paths import path_of
-from sim.rigid.states import MovingBodies
+from sim.rigid.states import MovingBodies, rotate_freely
 from sim.shapes.body_geometry import BodyGeometry
 
 LARGEST_DT = 2.0e-3

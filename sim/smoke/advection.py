@@ -14,12 +14,13 @@ from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.smoke.arrays import Faces, State
-from sim.smoke.balance import CorrectionBalance
+from sim.smoke.balance import restore_total
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.lanes import Grid, cell_counts, device_grid, fill_row, fill_row_pair, lane_items, lane_place, row_start
+from sim.smoke.lanes import Grid, cell_counts, fill_row, fill_row_pair, lane_items, lane_place, row_start
+from sim.smoke.obstacles import Air
+from sim.smoke.reductions import Rows
 
-FAR = 1.0e9
-"""Beyond every box [cells]."""
+FAR = 1.0e9  # beyond every box [cells]
 
 
 @bundle
@@ -40,26 +41,25 @@ class Advection:
 
     Args:
         grid: where the values live.
-        state: what is advected.
+        air: what is advected.
         work: six arrays to work in.
         maccormack: whether to correct the semi-Lagrangian result.
         wind: velocity of the air outside [m/s].
-        balance: keeps the totals of density and heat in spite of the limiter, if given.
+        balance: what `restore_total` reduces rows with to keep those of density and heat in spite of the limiter.
     """
 
     def __init__(
         self,
         grid: SmokeGrid,
-        state: State,
+        air: Air,
         work: tuple[ti.Ndarray, ...],
         *,
         maccormack: bool,
         wind: Vector3 = (0.0, 0.0, 0.0),
-        balance: CorrectionBalance | None = None,
+        balance: tuple[Rows, Rows] | None = None,
     ) -> None:
-        self._box, self._state = device_grid(grid.cells), state
+        self._air, self._cells_per_metre = air, 1.0 / grid.cell_size
         self._predicted, self._corrected = Faces(*work[:3]), Faces(*work[3:])
-        self._cells_per_metre = 1.0 / grid.cell_size
         self._maccormack, self._balance = maccormack, balance
         low = (1.0 if grid.lets_in(axis, 0) else -FAR for axis in range(3))
         high = (float(n) if grid.lets_in(axis, 1) else FAR for axis, n in enumerate(grid.cells))
@@ -68,14 +68,14 @@ class Advection:
     def advance(self, dt: float) -> None:
         """Advect everything by dt [s] with the present velocity."""
         step = dt * self._cells_per_metre
-        box, outside, state = self._box, self._outside, self._state
+        box, outside, state = self._air.box, self._outside, self._air.state
         predicted, corrected = self._predicted, self._corrected
         _predict_cells(box, outside, state, predicted, step)
         if self._maccormack:
             _correct_cells(box, outside, state, predicted, corrected, step)
             if self._balance is not None:
-                self._balance.restore(state.density, predicted.x, corrected.x, step)
-                self._balance.restore(state.excess, predicted.y, corrected.y, step)
+                restore_total(self._air, state.density, predicted.x, corrected.x, *self._balance, step)
+                restore_total(self._air, state.excess, predicted.y, corrected.y, *self._balance, step)
         result = corrected if self._maccormack else predicted
         _store_cells(box, state, result)
         for axis in range(3):

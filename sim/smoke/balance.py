@@ -18,47 +18,13 @@ from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.smoke.arrays import Faces
 from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
-from sim.smoke.obstacles import Obstacles, Solids, is_solid
-from sim.smoke.reductions import Rows, new_rows, partial_place, sum_up
-
-
-class CorrectionBalance:
-    """Weakens corrections of one advected cell array after another.
-
-    Exact for the total over all air cells of a closed box without moving obstacles, but for rounding and for steps in
-    which no factor in [0, 1] reaches it. What leaves through open sides is balanced to second order; through the sides
-    of moving solids flows what an upwind scheme has flow in the step, so their smoke is balanced to first order.
-
-    Attributes:
-        rows: what it reduces rows with.
-
-    Args:
-        obstacles: in the grid where the values live.
-        velocity: of the faces [m/s].
-    """
-
-    def __init__(self, obstacles: Obstacles, velocity: Faces) -> None:
-        self._obstacles, self._velocity = obstacles, velocity
-        self.rows = [new_rows(obstacles.box), new_rows(obstacles.box)]
-
-    def restore(self, values: ti.Ndarray, predicted: ti.Ndarray, corrected: ti.Ndarray, step: float) -> None:
-        """Bring the total of the corrected values to what it must be.
-
-        Args:
-            values: before the step.
-            predicted: the semi-Lagrangian result.
-            corrected: the limited result; changed.
-            step: length of the step over the edge of a cell [s/m].
-        """
-        box, solids = self._obstacles.box, self._obstacles.solids
-        _restore(box, solids, self._velocity, values, predicted, corrected, *self.rows, step)
+from sim.smoke.obstacles import Air, Solids, is_solid
+from sim.smoke.reductions import Rows, partial_place, sum_up
 
 
 @kernel
-def _restore(
-    box: Grid,
-    solids: Solids,
-    velocity: Faces,
+def restore_total(
+    air: Air,
     values: Floats,
     predicted: Floats,
     corrected: Floats,
@@ -66,6 +32,21 @@ def _restore(
     correction_rows: Rows,
     step: ti.f32,
 ):
+    """Bring the total of the corrected values of cells to what it must be.
+
+    Exact for the total over all air cells of a closed box without moving obstacles, but for rounding and for steps in
+    which no factor in [0, 1] reaches it. What leaves through open sides is balanced to second order; through the sides
+    of moving solids flows what an upwind scheme has flow in the step, so their smoke is balanced to first order.
+
+    Args:
+        air: as it flows in the step.
+        values: before the step.
+        predicted: the semi-Lagrangian result.
+        corrected: the limited result; changed.
+        missing_rows, correction_rows: what it reduces rows with.
+        step: length of the step over the edge of a cell [s/m].
+    """
+    box, solids, velocity = ti.static((air.box, air.solids, air.state.velocity))
     for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
         missing, raised, lowered = 0.0, 0.0, 0.0
         for n in range(lane_items(box, box.nz, lane)):

@@ -5,12 +5,12 @@ import math
 import taichi as ti
 
 from sim.core.launch import kernel
-from sim.smoke.arrays import State
-from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
+from sim.smoke.lanes import lane_items, lane_place, row_start
+from sim.smoke.obstacles import Air
 from sim.smoke.parameters import SmokeParameters
 
 
-def cool(box: Grid, state: State, parameters: SmokeParameters, dt: float) -> None:
+def cool(air: Air, parameters: SmokeParameters, dt: float) -> None:
     """Let dt [s] pass for density rho and excess e of the temperature, each solved exactly over a step.
 
     d rho/dt = -d rho with the dissipation d; de/dt = -c e - k (max(e, 0)/e_max)⁴ with the cooling c, the radiative
@@ -19,7 +19,7 @@ def cool(box: Grid, state: State, parameters: SmokeParameters, dt: float) -> Non
     density_factor = math.exp(-parameters.density_dissipation * dt)
     excess_factor = math.exp(-parameters.cooling * dt)
     radiates = parameters.radiative_cooling > 0.0
-    _cool(box, state, density_factor, excess_factor, radiated(parameters, dt), radiates)
+    _cool(air, density_factor, excess_factor, radiated(parameters, dt), radiates)
 
 
 def radiated(parameters: SmokeParameters, dt: float) -> float:
@@ -36,9 +36,8 @@ def radiated(parameters: SmokeParameters, dt: float) -> float:
 
 
 @kernel
-def _cool(
-    box: Grid, state: State, density_factor: ti.f32, excess_factor: ti.f32, radiated: ti.f32, radiates: ti.template()
-):
+def _cool(air: Air, density_factor: ti.f32, excess_factor: ti.f32, radiated: ti.f32, radiates: ti.template()):
+    box, state = ti.static((air.box, air.state))
     for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
         for n in range(lane_items(box, box.nz, lane)):
             at = row_start(box, i, j) + lane_place(box, n, lane)

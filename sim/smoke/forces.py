@@ -2,19 +2,18 @@
 
 import math
 
-import numpy as np
 import taichi as ti
 
 from sim.core.arrays import Floats
 from sim.core.bundles import func
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
-from sim.smoke.arrays import Faces, State
+from sim.smoke.arrays import Faces
 from sim.smoke.lanes import Grid, fill_row, lane_items, lane_place, row_start, steps
-from sim.smoke.obstacles import Obstacles, Solids, face_velocity
+from sim.smoke.obstacles import Air, face_velocity
+from sim.smoke.parameters import SmokeParameters
 
-TINY_GRADIENT = 1.0e-6
-"""Keeps N = eta / (|eta| + tiny) finite where the vorticity is even [1/(m s)]."""
+TINY_GRADIENT = 1.0e-6  # keeps N = eta / (|eta| + tiny) finite where the vorticity is even [1/(m s)]
 
 
 def upward(gravity: Vector3) -> tuple[float, float, float]:
@@ -24,52 +23,27 @@ def upward(gravity: Vector3) -> tuple[float, float, float]:
     return x, y, z
 
 
-class Forces:
-    """Accelerates the air: f = (-alpha rho + beta (T - T_air)) up + epsilon h (N x omega).
+def accelerate(
+    air: Air, parameters: SmokeParameters, gravity: Vector3, work: tuple[ti.Ndarray, ...], dt: float
+) -> None:
+    """Add dt [s] times f = (-alpha rho + beta (T - T_air)) up + epsilon h (N x omega) to the velocity of open faces.
 
-    The confinement is evaluated at cell centres, three cells and more away from the sides of the box, where the
-    gradient of the vorticity is not made up by the boundary, and averaged onto faces.
-
-    Args:
-        obstacles: in the grid where the values live; closed faces get the velocity of the solid behind them.
-        openness: positive on faces that air passes.
-        state: of the smoke.
-        work: four arrays to work in.
-        gravity: [m/s²]; only its direction matters, as alpha and beta are accelerations.
-        buoyancy_density: alpha [m/s²].
-        buoyancy_temperature: beta [m/(s² K)].
-        confinement: epsilon [1/s]: with h [m] and omega [1/s] its force is an acceleration.
+    On closed faces air moves as the solid behind them does. Of gravity only the direction matters, as alpha and beta
+    are accelerations. The confinement is evaluated at cell centres, three cells and more away from the sides of the
+    box, where the gradient of the vorticity is not made up by the boundary, and averaged onto faces. There are four
+    arrays to work in.
     """
-
-    def __init__(
-        self,
-        obstacles: Obstacles,
-        openness: Faces,
-        state: State,
-        work: tuple[ti.Ndarray, ...],
-        *,
-        gravity: Vector3,
-        buoyancy_density: float,
-        buoyancy_temperature: float,
-        confinement: float,
-    ) -> None:
-        self._obstacles, self._openness, self._state = obstacles, openness, state
-        self._confinement, self._vorticity = Faces(*work[:3]), work[3]
-        up = np.asarray(upward(gravity))
-        self._sink = ti.math.vec3((-buoyancy_density * up).tolist())
-        self._lift = ti.math.vec3((buoyancy_temperature * up).tolist())
-        self._half_per_cell = 0.5 / obstacles.grid.cell_size
-        self._strength = confinement * obstacles.grid.cell_size
-
-    def accelerate(self, dt: float) -> None:
-        """Add dt [s] times the acceleration to open faces; on closed ones air moves as the solid does."""
-        box, velocity, force = self._obstacles.box, self._state.velocity, self._confinement
-        for values in (*force, self._vorticity):
-            values.fill(0.0)
-        if self._strength > 0.0:
-            _compute_vorticity(box, velocity, force, self._vorticity, self._half_per_cell)
-            _compute_confinement(box, force, self._vorticity, self._half_per_cell, self._strength)
-        _apply(box, self._obstacles.solids, self._openness, self._state, force, self._sink, self._lift, dt)
+    confinement, vorticity = Faces(*work[:3]), work[3]
+    for values in (*confinement, vorticity):
+        values.fill(0.0)
+    strength, half_per_cell = parameters.vorticity_confinement * parameters.cell_size, 0.5 / parameters.cell_size
+    if strength > 0.0:
+        _compute_vorticity(air.box, air.state.velocity, confinement, vorticity, half_per_cell)
+        _compute_confinement(air.box, confinement, vorticity, half_per_cell, strength)
+    x, y, z = upward(gravity)
+    alpha, beta = parameters.buoyancy_density, parameters.lift_per_kelvin(gravity)
+    sink, lift = ti.math.vec3(-alpha * x, -alpha * y, -alpha * z), ti.math.vec3(beta * x, beta * y, beta * z)
+    _apply(air, confinement, sink, lift, dt)
 
 
 @func
@@ -122,27 +96,19 @@ def _compute_confinement(box: Grid, omega: Faces, magnitude: Floats, half_per_ce
 
 
 @kernel
-def _apply(
-    box: Grid,
-    solids: Solids,
-    openness: Faces,
-    state: State,
-    confinement: Faces,
-    sink: ti.math.vec3,
-    lift: ti.math.vec3,
-    dt: ti.f32,
-):
+def _apply(air: Air, confinement: Faces, sink: ti.math.vec3, lift: ti.math.vec3, dt: ti.f32):
     # Ghost cells have no density, no excess and no confinement: half of what the cell inside has acts on a side.
+    box, velocity, openness = ti.static((air.box, air.state.velocity, air.openness))
     for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
         row = row_start(box, i, j)
         for axis, face, is_open, force in ti.static(
             (
-                (0, state.velocity.x, openness.x, confinement.x),
-                (1, state.velocity.y, openness.y, confinement.y),
-                (2, state.velocity.z, openness.z, confinement.z),
+                (0, velocity.x, openness.x, confinement.x),
+                (1, velocity.y, openness.y, confinement.y),
+                (2, velocity.z, openness.z, confinement.z),
             )
         ):
-            given = ti.static((row, axis, box, solids, face, is_open, force, state, sink[axis], lift[axis], dt))
+            given = ti.static((row, axis, air, face, is_open, force, sink[axis], lift[axis], dt))
             fill_row(box, face, row, box.nz + 1, lane, _accelerated, given)
 
 
@@ -151,19 +117,18 @@ def _accelerated(
     k: ti.i32,
     row: ti.i32,
     axis: ti.template(),
-    box: Grid,
-    solids: Solids,
+    air: Air,
     face: Floats,
     openness: Floats,
     confinement: Floats,
-    state: State,
     sink: ti.f32,
     lift: ti.f32,
     dt: ti.f32,
 ):
     """Velocity of a face: with the mean force of the cells beside it, or that of the solid where it is closed."""
+    density, excess = ti.static((air.state.density, air.state.excess))
     at = row + k
-    below = at - steps(box)[axis]
-    force = confinement[at] + sink * state.density[at] + lift * state.excess[at]
-    force += confinement[below] + sink * state.density[below] + lift * state.excess[below]
-    return ti.select(openness[at] == 0.0, face_velocity(box, solids, axis, at), face[at] + 0.5 * dt * force)
+    below = at - steps(air.box)[axis]
+    force = confinement[at] + sink * density[at] + lift * excess[at]
+    force += confinement[below] + sink * density[below] + lift * excess[below]
+    return ti.select(openness[at] == 0.0, face_velocity(air.box, air.solids, axis, at), face[at] + 0.5 * dt * force)

@@ -23,8 +23,7 @@ from sim.smoke.parameters import WHOLE, SmokeParameters
 
 Index3 = tuple[int, int, int]
 
-CENTRE = (0.5, 0.5, 0.5)
-"""Of a cell, in cells off its lower corner."""
+CENTRE = (0.5, 0.5, 0.5)  # of a cell, in cells off its lower corner
 
 
 class SolidRegion(Protocol):

@@ -23,11 +23,8 @@ from sim.core.arrays import Floats
 from sim.core.bundles import bundle, func
 from sim.core.reductions import runs_on_gpu
 
-GPU_LANES = 32
-"""As many as the threads of a GPU that run in step: together they read whole lines of memory."""
-
-RUN = 16
-"""Cells of a run: two vectors of eight, few enough that short rows have some."""
+GPU_LANES = 32  # as many as the threads of a GPU that run in step: together they read whole lines of memory
+RUN = 16  # cells of a run: two vectors of eight, few enough that short rows have some
 
 
 @bundle

@@ -36,8 +36,7 @@ SMOOTHED_SPECTRUM = (0.4, 2.0)
 """Eigenvalues of D^-1 A that the smoother has to damp: 2 is the largest that a stencil of this kind has; modes below
 1/3 to 1/2 are smooth enough for the coarse grid. The lower end was chosen by counting iterations."""
 
-CELL_NS = 2.5
-"""Work of one loop over a level a cell [ns], roughly."""
+CELL_NS = 2.5  # work of one loop over a level a cell [ns], roughly
 
 
 def chebyshev_weights(count: int, spectrum: tuple[float, float]) -> tuple[float, ...]:

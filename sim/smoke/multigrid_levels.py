@@ -23,14 +23,9 @@ from sim.smoke.grid import Index3, SmokeGrid
 from sim.smoke.lanes import Grid, cell_counts, device_grid, lane_items, lane_place, row_start, steps
 from sim.smoke.obstacles import Obstacles, Solids, is_solid
 
-COARSEST_CELLS = 64
-"""At most this many cells are solved directly, by a dense inverse."""
-
-LARGEST_INDEX = 2**31 - 1
-"""Flat indices in kernels are 32 bits wide."""
-
-DIRICHLET_GHOST = -1.0
-"""Mark in the ghosts of `inverse_diagonal`: beyond this side pressure changes sign."""
+COARSEST_CELLS = 64  # at most this many cells are solved directly, by a dense inverse
+LARGEST_INDEX = 2**31 - 1  # flat indices in kernels are 32 bits wide
+DIRICHLET_GHOST = -1.0  # mark in the ghosts of `inverse_diagonal`: beyond this side pressure changes sign
 
 
 @dataclass(frozen=True)
@@ -135,7 +130,7 @@ class Coefficients:
         boxes: the same for kernels.
         operator: `faces` has open area over distance of each face, in units of the finest cell; 0 where closed, and 2
             on an open side of the box, where pressure is 0 half a cell away, or less on the finest level where air
-            comes in (`OpenSides`). `inverse_diagonal` is 0 in cells without an open face, `DIRICHLET_GHOST` beyond open
+            comes in (`sides`). `inverse_diagonal` is 0 in cells without an open face, `DIRICHLET_GHOST` beyond open
             sides.
     """
 

@@ -27,13 +27,12 @@ from numpy.typing import NDArray
 from sim.core.arrays import Floats, Integers
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
-from sim.smoke.arrays import Faces, new_faces
+from sim.smoke.arrays import Faces, State, new_faces
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid, device_grid, lane_items, lane_place, row_start, steps
 from sim.smoke.reductions import Pair, Rows, new_rows, partial_place, sum_up
 
-AIR, MOVING, STATIC = range(3)
-"""What a cell is. Beyond closed sides of the box all is static, beyond open ones air."""
+AIR, MOVING, STATIC = range(3)  # what a cell is. Beyond closed sides of the box all is static, beyond open ones air.
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def time_of_travel(distance: float, speed: float, acceleration: float) -> float:
 
 @bundle
 class Solids(NamedTuple):
-    """The solid cells as kernels take them."""
+    """The solid cells."""
 
     state: Integers  # AIR, MOVING or STATIC
     velocity: Faces  # components at the centres of MOVING cells [m/s]; of no meaning elsewhere
@@ -83,10 +82,20 @@ class Solids(NamedTuple):
 
 @bundle
 class Marks(NamedTuple):
-    """The solid cells of the next commit, as kernels mark them."""
+    """The solid cells of the next commit."""
 
     state: Integers
     velocity: Faces
+
+
+@bundle
+class Air(NamedTuple):
+    """The air of a smoke, and what is in its way, as kernels take it."""
+
+    box: Grid
+    solids: Solids
+    openness: Faces  # positive on faces that air passes
+    state: State
 
 
 class Obstacles:
@@ -99,7 +108,6 @@ class Obstacles:
         movers: who does; steps are cut to follow them.
         solids: the cells now; their velocities are there only if `moving`.
         marks: likewise, of the next commit.
-        rows: what it reduces rows with.
     """
 
     def __init__(self, grid: SmokeGrid, *, moving: bool = False) -> None:
@@ -109,15 +117,10 @@ class Obstacles:
         velocity = new_faces(grid.size if moving else 1)
         self.solids = Solids(ti.ndarray(ti.i32, grid.size), velocity, moving)
         self.marks = Marks(ti.ndarray(ti.i32, grid.size if moving else 1), velocity)
-        self.rows = [new_rows(self.box)] if moving else []
+        self._rows = new_rows(self.box) if moving else None
         self.solids.state.from_numpy(self._static)
         if moving:
             self.marks.state.from_numpy(self._static)
-
-    @property
-    def arrays(self) -> list[ti.Ndarray]:
-        """All arrays over cells, four bytes a value."""
-        return [self.solids.state, *((self.marks.state, *self.marks.velocity) if self.moving else ())]
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no solid crosses more than a cell, so that none leaps over the smoke in its way.
@@ -139,8 +142,8 @@ class Obstacles:
         """
         if not self.moving:
             return NO_CHANGE
-        cells = int(_swap(self.box, self.solids.state, self.marks.state, density, *self.rows))
-        return Change(cells, *map(float, _sum_changes(*self.rows))) if cells else NO_CHANGE
+        cells = int(_swap(self.box, self.solids.state, self.marks.state, density, self._rows))
+        return Change(cells, *map(float, _sum_changes(self._rows))) if cells else NO_CHANGE
 
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """Which cells are moving solids, if any may be; their velocities have gone into the faces."""
@@ -229,3 +232,13 @@ def _static_state(grid: SmokeGrid) -> NDArray[np.int32]:
                 state[tuple(ghosts)] = AIR
     state[inner] = np.where(grid.solid, STATIC, AIR)
     return state.ravel()
+
+
+class AirForce(Protocol):
+    """Something in the air that pushes it, such as cloth."""
+
+    def stable_dt(self) -> float:
+        """Largest step [s] that it bears."""
+
+    def accelerate(self, dt: float) -> None:
+        """Add what it gives in a step of dt [s] to the velocities of open faces, after the air was carried along."""

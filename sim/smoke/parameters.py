@@ -14,14 +14,12 @@ from sim.core.motion.parameters import KeyframeParameters, placed_at_first_keyfr
 from sim.core.parameters import Fraction, NonNegative, Parameters, Positive, Vector3
 from sim.shapes.parameters import Placement
 
-WHOLE = 1.0e-6
-"""Part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001."""
+WHOLE = 1.0e-6  # part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001
 
 MOST_CELLS = 2**30
 """Of one smoke: 1024 along each edge. A job with more is refused, a file that claims more was never written."""
 
-CELLS_PER_EDDY = 2.0
-"""Eddies of gusts are at least so many cells wide: the grid carries nothing finer."""
+CELLS_PER_EDDY = 2.0  # eddies of gusts are at least so many cells wide: the grid carries nothing finer
 
 Seed = Annotated[int, Field(ge=0, le=1_000_000_000)]
 

@@ -28,8 +28,7 @@ from sim.smoke.obstacles import Obstacles, Solids, is_solid
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place, sum_up
 from sim.smoke.regions import ClosedRegions
 
-SAFETY = 0.7
-"""The recursion aims below the tolerance, as correcting the velocity adds rounding errors."""
+SAFETY = 0.7  # the recursion aims below the tolerance, as correcting the velocity adds rounding errors
 
 
 @dataclass(frozen=True)
@@ -51,8 +50,7 @@ class ProjectionReport:
     converged: bool
 
 
-ALPHA, BETA, R_Z = range(3)
-"""Numbers of the conjugate gradients that stay on the device."""
+ALPHA, BETA, R_Z = range(3)  # numbers of the conjugate gradients that stay on the device
 
 
 @bundle
@@ -74,7 +72,6 @@ class PressureProjection:
         multigrid: the preconditioner; its coefficients say which faces are open.
         regions: the closed regions of air.
         work: six float32 arrays of at least the grid's size, free between two projections.
-        rows: what it reduces rows with.
     """
 
     def __init__(self, obstacles: Obstacles, velocity: Faces, *, tolerance: float, max_iterations: int) -> None:
@@ -86,7 +83,6 @@ class PressureProjection:
         equation, size = self.multigrid.equation, obstacles.grid.size
         correction, direction, image = (new_floats(size) for _ in range(3))
         self._search = Search(equation, correction, direction, image, new_floats(3), new_rows(self._box))
-        self.rows = [self._search.rows]
         self.work = (correction, direction, image, equation.right_hand_side, equation.solution, equation.spare)
 
     def update(self) -> None:

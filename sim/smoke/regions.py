@@ -16,14 +16,9 @@ from sim.core.launch import kernel
 from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
 from sim.smoke.obstacles import AIR, Obstacles
 
-NO_REGION = -1
-"""Number of what is in no closed region: solids, and air that is connected with an open side."""
-
-OUTSIDE = 0
-"""Root of the air that is connected with an open side; the index is that of a ghost, so of no cell."""
-
-SUM_BITS = 30
-"""Sums count in units of 2^-30 of the largest speed: that is below single precision, and 2^29 cells fit."""
+NO_REGION = -1  # number of what is in no closed region: solids, and air that is connected with an open side
+OUTSIDE = 0  # root of the air that is connected with an open side; the index is that of a ghost, so of no cell
+SUM_BITS = 30  # sums count in units of 2^-30 of the largest speed: that is below single precision, and 2^29 cells fit
 
 
 class ClosedRegions:

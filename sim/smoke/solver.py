@@ -14,25 +14,21 @@ from sim.core.reductions import is_finite
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
 from sim.smoke.advection import Advection
-from sim.smoke.air_force import AirForce
-from sim.smoke.arrays import Faces, State, new_state
-from sim.smoke.balance import CorrectionBalance
+from sim.smoke.arrays import new_state
 from sim.smoke.cooling import cool
 from sim.smoke.extrapolation import Extrapolation
-from sim.smoke.forces import Forces, upward
+from sim.smoke.forces import accelerate, upward
 from sim.smoke.grid import SmokeGrid, SolidRegion
-from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
-from sim.smoke.obstacles import Obstacles, time_of_travel
-from sim.smoke.open_sides import OpenSides
+from sim.smoke.lanes import lane_items, lane_place, row_start
+from sim.smoke.obstacles import Air, AirForce, Obstacles, time_of_travel
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.projection import PressureProjection
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
+from sim.smoke.sides import blow_in, brake_inflow, start_wind
 from sim.smoke.sources import build_sources
 from sim.smoke.turbulence import Turbulence
-from sim.smoke.wind import Wind
 
-RUNAWAY_SPEED = 1.0e4
-"""No smoke of this kind moves at thirty times the speed of sound [m/s]."""
+RUNAWAY_SPEED = 1.0e4  # no smoke of this kind moves at thirty times the speed of sound [m/s]
 
 
 class SmokeSolver:
@@ -42,10 +38,10 @@ class SmokeSolver:
     Incompressible air of constant density (Boussinesq): smoke and heat act through buoyancy alone.
 
     Exact: smoke is added by sources only, and what they add is counted. Approximate: MacCormack advection keeps the
-    total of smoke and of heat (`CorrectionBalance`), but at moving solids to first order only, and semi-Lagrangian
+    total of smoke and of heat (`restore_total`), but at moving solids to first order only, and semi-Lagrangian
     advection does not, so `mass` is a measured quantity. Not supported: expansion by heat.
 
-    Air that comes in through open sides was at rest outside, or moved with the wind, and is clean (`OpenSides`).
+    Air that comes in through open sides was at rest outside, or moved with the wind, and is clean (`sim.smoke.sides`).
 
     Solids that move drive air by the velocity of their surface (`Obstacles`), and take whole cells from time to time:
     in between, air flows through the sides of their cells at the speed of the solid. So the smoke of a cell that they
@@ -60,6 +56,8 @@ class SmokeSolver:
     Attributes:
         grid: the cells, with the solids that stand still.
         obstacles: all solids, and how others put some in that move.
+        air, state: the fields, with and without what is in their way.
+        time_s: simulated time [s].
         air_forces: what pushes the air from outside, in this order in every substep.
         sources: where smoke comes from, in the order of the parameters.
 
@@ -95,65 +93,35 @@ class SmokeSolver:
             tolerance=parameters.projection_tolerance,
             max_iterations=parameters.projection_max_iterations,
         )
-        coefficients, work = self._projection.multigrid.coefficients, self._projection.work
-        self.openness: Faces = coefficients.operator.faces
-        self._open_sides = OpenSides(self.obstacles, self.state.velocity, coefficients)
-        self._balance = CorrectionBalance(self.obstacles, self.state.velocity)
+        operator, work = self._projection.multigrid.coefficients.operator, self._projection.work
+        self.air = Air(self.obstacles.box, self.obstacles.solids, operator.faces, self.state)
         self._advection = Advection(
             self.grid,
-            self.state,
+            self.air,
             work,
             maccormack=parameters.advection == "maccormack",
             wind=parameters.wind,
-            balance=self._balance,
+            balance=(new_rows(self.air.box), new_rows(self.air.box)),
         )
-        self._has_gravity = any(upward(gravity))
+        self._open_sides = tuple((axis, side) for axis in range(3) for side in (0, 1) if self.grid.is_open(axis, side))
+        self._gravity, self._has_gravity = gravity, any(upward(gravity))
         self._lift = parameters.lift_per_kelvin(gravity)
-        self._forces = Forces(
-            self.obstacles,
-            self.openness,
-            self.state,
-            work[:4],
-            gravity=gravity,
-            buoyancy_density=parameters.buoyancy_density,
-            buoyancy_temperature=self._lift,
-            confinement=parameters.vorticity_confinement,
-        )
         self._extrapolation = Extrapolation(self.obstacles, self.state, reach=parameters.cfl)
-        self._rows = new_rows(self.obstacles.box)
-        self.sources = build_sources(parameters, self.obstacles, self.openness, self.state)
-        self._turbulence = self._build_turbulence()
-        self._wind = self._build_wind()
+        self._rows = new_rows(self.air.box)
+        self.sources = build_sources(parameters, self.grid, self.air)
+        self._turbulence: Turbulence | None = None
+        if parameters.turbulence.strength > 0.0:
+            self._turbulence = Turbulence(self.grid, parameters.turbulence, parameters.wind)
         self.air_forces: list[AirForce] = []
-        self._time_s = 0.0
         self._emitted_mass = self._covered_mass = self._uncovered_mass = 0.0
         self.begin_frame(0.0)
-        if self._wind is not None:
-            self._wind.fill()
+        if any(parameters.wind):
+            if cut_off := self.grid.cut_off_faces():
+                raise ValueError(f'smoke "{self.name}": wind {parameters.cut_off_problem(cut_off)}')
+            start_wind(self.air, parameters.wind, parameters.windward_faces)
             self._project()
             self._extrapolation.fill()
             self.begin_frame(0.0)
-
-    @property
-    def time_s(self) -> float:
-        """Simulated time [s]."""
-        return self._time_s
-
-    @property
-    def device_bytes(self) -> int:
-        """Memory of the state, the work arrays, the coefficients, the obstacles and the reductions [bytes]."""
-        arrays = [
-            *self._arrays.values(),
-            *self._projection.work,
-            *self.openness,
-            self._projection.multigrid.coefficients.operator.inverse_diagonal,
-            *self.obstacles.arrays,
-            *filter(None, (self._projection.regions.number, self._extrapolation.words)),
-        ]
-        for rows in (self._rows, *self._projection.rows, *self._balance.rows, *self.obstacles.rows):
-            arrays += [rows.partial, rows.nodes]
-        gusts = 0 if self._turbulence is None else self._turbulence.device_bytes
-        return gusts + sum(array.arr.nelement() * array.arr.element_size() for array in arrays)
 
     @property
     def _arrays(self) -> dict[str, ti.Ndarray]:
@@ -171,7 +139,7 @@ class SmokeSolver:
         gusts = 0.0 if self._turbulence is None else self._turbulence.acceleration
         without_sources = self._largest_step(speed, acceleration + gusts)
         for source in self.sources:
-            if source.parameters.emits_during(self._time_s, self._time_s + without_sources):
+            if source.parameters.emits_during(self.time_s, self.time_s + without_sources):
                 speed = max(speed, source.speed)
                 acceleration = max(acceleration, self._buoyancy_bound(source.target_excess, source.target_density))
         limits = [self.obstacles.stable_dt(), *(force.stable_dt() for force in self.air_forces)]
@@ -185,19 +153,15 @@ class SmokeSolver:
         """Advance by dt [s]; the cells that obstacles fill at its end have been marked."""
         self._advection.advance(dt)
         self.move_obstacles()
-        self._forces.accelerate(dt)
-        if self._turbulence is not None:
-            self._turbulence.accelerate(self._time_s + 0.5 * dt, dt)
-        for force in self.air_forces:
-            force.accelerate(dt)
-        if self._wind is not None:
-            self._wind.blow_in()
+        self._accelerate(dt)
+        blow_in(self.air, self.parameters.wind, self.parameters.windward_faces)
         self._emit(dt)
-        self._open_sides.brake_inflow(dt)
+        operator, step = self._projection.multigrid.coefficients.operator, dt / self.grid.cell_size
+        brake_inflow(self.air, operator, self._open_sides, self.grid.cells, step)
         self._project()
-        cool(self.obstacles.box, self.state, self.parameters, dt)
+        cool(self.air, self.parameters, dt)
         self._extrapolation.fill()
-        self._time_s += dt
+        self.time_s += dt
 
     def move_obstacles(self) -> None:
         """Take the marked cells for the obstacles from now on; each step does so."""
@@ -210,7 +174,7 @@ class SmokeSolver:
 
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
-        self._time_s = time_s
+        self.time_s = time_s
         self._iterations = self._not_converged = 0
         self._residual = self._divergence = self._compression = 0.0
 
@@ -237,7 +201,7 @@ class SmokeSolver:
     def checkpoint(self) -> dict[str, NDArray[np.generic]]:
         """The state with its ghosts, the obstacles that move, the time and the counted masses."""
         arrays = {name: values.to_numpy().reshape(self.grid.padded) for name, values in self._arrays.items()}
-        clock = np.array([self._time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass])
+        clock = np.array([self.time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass])
         return {**arrays, **self.obstacles.checkpoint(), "clock": clock}
 
     def restore(self, arrays: Arrays) -> None:
@@ -257,9 +221,8 @@ class SmokeSolver:
         if moving:
             self.obstacles.restore(arrays["obstacles"])
             self._follow_obstacles()
-        self._time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass = (
-            float(value) for value in arrays["clock"]
-        )
+        clock = arrays["clock"].tolist()
+        self.time_s, self._emitted_mass, self._covered_mass, self._uncovered_mass = clock
 
     def diagnostics(self) -> Diagnostics:
         """Totals of the state, and the projections of the frame.
@@ -304,10 +267,17 @@ class SmokeSolver:
         speed, _ = self._find_speed_and_acceleration()
         return f"max_speed is {speed:.3g} m/s" if speed > RUNAWAY_SPEED else None
 
+    def _accelerate(self, dt: float) -> None:
+        accelerate(self.air, self.parameters, self._gravity, self._projection.work[:4], dt)
+        if self._turbulence is not None:
+            self._turbulence.accelerate(self.air, self.time_s + 0.5 * dt, dt)
+        for force in self.air_forces:
+            force.accelerate(dt)
+
     def _emit(self, dt: float) -> None:
         for source in self.sources:
-            if source.parameters.emits_during(self._time_s, self._time_s + dt):
-                self._emitted_mass += source.emit(self._time_s, dt) * self.grid.cell_size**3
+            if source.parameters.emits_during(self.time_s, self.time_s + dt):
+                self._emitted_mass += source.emit(self.time_s, dt) * self.grid.cell_size**3
 
     def _project(self) -> None:
         report = self._projection.project()
@@ -332,38 +302,24 @@ class SmokeSolver:
             return 0.0
         return self._lift * abs(excess) + self.parameters.buoyancy_density * density
 
-    def _build_turbulence(self) -> Turbulence | None:
-        parameters = self.parameters.turbulence
-        if parameters.strength == 0.0:
-            return None
-        return Turbulence(self.grid, parameters, self.parameters.wind, self.openness, self.state.velocity)
-
-    def _build_wind(self) -> Wind | None:
-        if not any(self.parameters.wind):
-            return None
-        windward = self.parameters.windward_faces
-        if cut_off := self.grid.cut_off_faces():
-            raise ValueError(f'smoke "{self.name}": wind {self.parameters.cut_off_problem(cut_off)}')
-        return Wind(self.obstacles, self.parameters.wind, windward, self.openness, self.state.velocity)
-
     def _find_speed_and_acceleration(self) -> tuple[float, float]:
         """Largest face velocity [m/s] and a bound of the largest buoyant acceleration [m/s²]."""
         alpha = self.parameters.buoyancy_density if self._has_gravity else 0.0
         beta = self._lift if self._has_gravity else 0.0
-        speed, acceleration = _find_speed_and_acceleration(self.obstacles.box, self.state, alpha, beta, self._rows)
+        speed, acceleration = _find_speed_and_acceleration(self.air, alpha, beta, self._rows)
         return speed, acceleration
 
 
 @kernel
-def _find_speed_and_acceleration(box: Grid, state: State, alpha: ti.f32, beta: ti.f32, rows: Rows) -> Pair:
+def _find_speed_and_acceleration(air: Air, alpha: ti.f32, beta: ti.f32, rows: Rows) -> Pair:
+    box, state, velocity = ti.static((air.box, air.state, air.state.velocity))
     for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):
         speed = 0.0
         acceleration = 0.0
         for n in range(lane_items(box, box.nz, lane)):
             at = row_start(box, i, j) + lane_place(box, n, lane)
-            u, v, w = state.velocity.x[at], state.velocity.y[at], state.velocity.z[at]
-            u_next, v_next = state.velocity.x[at + box.step_x], state.velocity.y[at + box.step_y]
-            w_next = state.velocity.z[at + 1]
+            u, v, w = velocity.x[at], velocity.y[at], velocity.z[at]
+            u_next, v_next, w_next = velocity.x[at + box.step_x], velocity.y[at + box.step_y], velocity.z[at + 1]
             lower = ti.max(ti.abs(u), ti.abs(v), ti.abs(w))
             upper = ti.max(ti.abs(u_next), ti.abs(v_next), ti.abs(w_next))
             speed = ti.max(speed, lower, upper)

@@ -2,36 +2,40 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
 from sim.core.arrays import Floats, Integers
-from sim.core.bundles import func
+from sim.core.bundles import bundle, func
 from sim.core.hashed_numbers import hash_to_unit, smooth_noise, spread
 from sim.core.launch import kernel
 from sim.core.motion import rotation
 from sim.shapes.placement import build_solid
-from sim.smoke.arrays import Faces, State
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid
-from sim.smoke.obstacles import Obstacles, Solids, is_solid
+from sim.smoke.obstacles import Air, is_solid
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 from sim.smoke.source_motion import SourceMotion, motion_of
 from sim.smoke.sweep import CELLS, SweptShape
 
-BLOCK = 256
-"""Cells whose emission one thread adds up."""
-
-FLUCTUATION_CELLS = 4
-"""Edge of the blocks of cells that fluctuate together: smaller ones are averaged away by the flow."""
-
-FLUCTUATION_RATE_HZ = 20.0
-"""How often the fluctuation changes."""
+BLOCK = 256  # cells whose emission one thread adds up
+FLUCTUATION_CELLS = 4  # edge of the blocks of cells that fluctuate together: smaller ones are averaged away by the flow
+FLUCTUATION_RATE_HZ = 20.0  # how often the fluctuation changes
 
 POSES_PER_CELL = 4.0
 """A source that moves emits at poses of which none is farther than a quarter of a cell from the next."""
+
+
+@bundle
+class Noise(NamedTuple):
+    """How the heat of a source fluctuates."""
+
+    tick: ti.i32  # number of the present pattern
+    salt: ti.i32  # of the seed
+    strength: ti.f32  # how far the heat falls short [-]
 
 
 class _Places:
@@ -72,20 +76,12 @@ class Source:
     """
 
     def __init__(
-        self,
-        parameters: SmokeSourceParameters,
-        obstacles: Obstacles,
-        *,
-        ambient_temperature: float,
-        openness: Faces,
-        state: State,
+        self, parameters: SmokeSourceParameters, grid: SmokeGrid, air: Air, *, ambient_temperature: float
     ) -> None:
         self.parameters = parameters
         self.target_density = parameters.density
         self.target_excess = parameters.temperature - ambient_temperature
-        grid = obstacles.grid
-        self._grid, self._obstacles = grid, obstacles
-        self._openness, self._state = openness, state
+        self._grid, self._air = grid, air
         self._cells, self._faces = _Places(), [_Places() for _ in range(3)]
         self._emitted = ti.ndarray(ti.f32, 1)
         # Random numbers of other seeds are others; seed 0 leaves the key of a patch as it is.
@@ -99,7 +95,7 @@ class Source:
                 rotation.conjugate(rotation.from_degrees(parameters.rotation_deg)), start
             )
         else:
-            self._stay(grid)
+            self._stay()
 
     @property
     def cell_count(self) -> int:
@@ -130,29 +126,19 @@ class Source:
         blocks = -(-max(1, self._cells.count) // BLOCK)
         if self._emitted.shape[0] < blocks:
             self._emitted = ti.ndarray(ti.f32, blocks)
-        tick = int(time_s * FLUCTUATION_RATE_HZ)
+        noise = Noise(int(time_s * FLUCTUATION_RATE_HZ), self._salt, self.parameters.fluctuation)
         targets = ti.math.vec2(strength * self.target_density, strength * self.target_excess)
-        _raise_cells(
-            self._obstacles.box,
-            self._obstacles.solids,
-            self._state,
-            self._cells.indices,
-            self._cells.count,
-            tick,
-            self._salt,
-            self.parameters.fluctuation,
-            targets,
-            self.target_excess >= 0.0,
-            blocks,
-            self._emitted,
-        )
+        is_hot, count = self.target_excess >= 0.0, self._cells.count
+        _raise_cells(self._air, self._cells.indices, count, noise, targets, is_hot, blocks, self._emitted)
         if self.parameters.velocity is not None:
-            for faces, openness, velocity in zip(self._faces, self._openness, self._state.velocity, strict=True):
+            for faces, openness, velocity in zip(
+                self._faces, self._air.openness, self._air.state.velocity, strict=True
+            ):
                 _set_faces(faces.indices, faces.values, openness, velocity, faces.count)
         return float(self._emitted.to_numpy()[:blocks].sum(dtype=np.float64))
 
-    def _stay(self, grid: SmokeGrid) -> None:
-        region = build_solid(self.parameters)
+    def _stay(self) -> None:
+        grid, region = self._grid, build_solid(self.parameters)
         self._cells.put(_flat_indices(grid, grid.cells_inside(region) & ~grid.solid))
         if self.parameters.velocity is not None:
             for axis, speed in enumerate(self.parameters.velocity):
@@ -180,45 +166,41 @@ class Source:
 
 @kernel
 def _raise_cells(
-    box: Grid,
-    solids: Solids,
-    state: State,
+    air: Air,
     cells: Integers,
     count: ti.i32,
-    tick: ti.i32,
-    salt: ti.i32,
-    fluctuation: ti.f32,
+    noise: Noise,
     targets: ti.math.vec2,
     is_hot: ti.template(),
     blocks: ti.i32,
     added: Floats,
 ):
     """Raise density and heat to their targets, and lower the excess of what is colder than the air."""
+    density, excess = ti.static((air.state.density, air.state.excess))
     for block in range(blocks):
         emitted = 0.0
         for n in range(block * BLOCK, ti.min((block + 1) * BLOCK, count)):
             at = cells[n]
-            if not is_solid(solids, at):
-                before = state.density[at]
+            if not is_solid(air.solids, at):
+                before = density[at]
                 after = ti.max(before, targets[0])
-                state.density[at] = after
+                density[at] = after
                 emitted += after - before
-                target = (1.0 - fluctuation * _fluctuate(box, at, tick, salt)) * targets[1]
-                excess = state.excess[at]
-                state.excess[at] = ti.max(excess, target) if ti.static(is_hot) else ti.min(excess, target)
+                target = (1.0 - noise.strength * _fluctuate(air.box, at, noise)) * targets[1]
+                excess[at] = ti.max(excess[at], target) if ti.static(is_hot) else ti.min(excess[at], target)
         added[block] = emitted
 
 
 @func
-def _fluctuate(box: Grid, at: ti.i32, tick: ti.i32, salt: ti.i32):
+def _fluctuate(box: Grid, at: ti.i32, noise: Noise):
     """A number in [0, 1) that a few neighbouring cells share."""
     patch_i = at // box.step_x // FLUCTUATION_CELLS
     patch_j = at // box.step_y % (box.ny + 2) // FLUCTUATION_CELLS
     patch_k = at % box.step_y // FLUCTUATION_CELLS
     patch = (patch_i * 1024 + patch_j) * 1024 + patch_k
     # The odd factor (Knuth's) spreads ticks over all bits, so that they do not shift the pattern.
-    key = ti.cast(patch, ti.u32) ^ (ti.cast(tick, ti.u32) * ti.u32(2654435769))
-    return hash_to_unit(key ^ ti.cast(salt, ti.u32))
+    key = ti.cast(patch, ti.u32) ^ (ti.cast(noise.tick, ti.u32) * ti.u32(2654435769))
+    return hash_to_unit(key ^ ti.cast(noise.salt, ti.u32))
 
 
 @kernel
@@ -228,24 +210,16 @@ def _set_faces(faces: Integers, speeds: Floats, openness: Floats, velocity: Floa
             velocity[faces[n]] = speeds[n]
 
 
-def build_sources(parameters: SmokeParameters, obstacles: Obstacles, openness: Faces, state: State) -> Sequence[Source]:
+def build_sources(parameters: SmokeParameters, grid: SmokeGrid, air: Air) -> Sequence[Source]:
     """The sources of a smoke.
-
-    Args:
-        parameters: of the smoke.
-        obstacles: in its grid.
-        openness: positive on faces that air passes.
-        state: of the smoke.
 
     Raises:
         ValueError: a source that stays contains no open cell: it lies outside the box, in a solid, or is smaller than
             a cell.
     """
     sources = [
-        Source(source, obstacles, ambient_temperature=parameters.ambient_temperature, openness=openness, state=state)
-        for source in parameters.source
+        Source(source, grid, air, ambient_temperature=parameters.ambient_temperature) for source in parameters.source
     ]
-    grid = obstacles.grid
     for number, source in enumerate(sources):
         if source.motion is None and source.cell_count == 0:
             raise ValueError(

@@ -15,17 +15,10 @@ from sim.shapes.parameters import BunnyShape, DuckShape, MeshShape, Placement
 from sim.shapes.placement import PlacedSolid, build_solid
 from sim.smoke.grid import Index3, SmokeGrid
 
-COSTLY_SHAPES = (DuckShape, BunnyShape, MeshShape)
-"""Their distances take long, and so are looked up."""
-
-LOOKUPS_PER_CELL = 2.0
-"""Nodes of such a table along the edge of a cell."""
-
-ROUND_OFF = 1.0e-9
-"""Of ways and distances, in parts of them and in cells, at most."""
-
-CELLS = 3
-"""Stands for cells where the axis of faces is asked for."""
+COSTLY_SHAPES = (DuckShape, BunnyShape, MeshShape)  # their distances take long, and so are looked up
+LOOKUPS_PER_CELL = 2.0  # nodes of such a table along the edge of a cell
+ROUND_OFF = 1.0e-9  # of ways and distances, in parts of them and in cells, at most
+CELLS = 3  # stands for cells where the axis of faces is asked for
 
 
 @dataclass(frozen=True)

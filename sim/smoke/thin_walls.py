@@ -28,17 +28,13 @@ PROBES = 1000
 POINTS_DRAWN = 64 * PROBES
 """Of the whole surface if the box cuts some off: of one of which less than a 64th lies in it fewer are looked at."""
 
-DEPTHS = 8
-"""Along the ray inwards, up to the edge of a cell, where it is seen whether it is still in the body."""
-
-HALVINGS = 5
-"""Of the interval in which a ray leaves the body."""
+DEPTHS = 8  # along the ray inwards, up to the edge of a cell, where it is seen whether it is still in the body
+HALVINGS = 5  # of the interval in which a ray leaves the body
 
 OPPOSITE = np.cos(np.deg2rad(45.0))
 """Cosine of the angle between a ray and the surface's normal where it leaves a wall, at least."""
 
-LUCK = (0.0, 1.0 / 3.0, 2.0 / 3.0)
-"""Where in a cell a body that moves may be, for an average [cells]."""
+LUCK = (0.0, 1.0 / 3.0, 2.0 / 3.0)  # where in a cell a body that moves may be, for an average [cells]
 
 
 @dataclass(frozen=True)

@@ -12,19 +12,17 @@ from sim.core.bundles import bundle
 from sim.core.hashed_numbers import hash_bits, hash_to_unit, spread
 from sim.core.launch import kernel
 from sim.core.parameters import Vector3
-from sim.smoke.arrays import Faces
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.lanes import Grid, device_grid, lane_items, lane_place, row_start
+from sim.smoke.lanes import Grid, lane_items, lane_place, row_start
+from sim.smoke.obstacles import Air
 from sim.smoke.parameters import CELLS_PER_EDDY, TurbulenceParameters
 
-REACH = 4
-"""Nodes of the lattice along an axis that a cell and its faces depend on."""
+REACH = 4  # nodes of the lattice along an axis that a cell and its faces depend on
 
 PEAK = 3.0
 """Largest acceleration that steps are cut for, over the root mean square: a bell curve exceeds it by chance only."""
 
-SUMS = 5
-"""Numbers that a face along z needs of a row of the lattice."""
+SUMS = 5  # numbers that a face along z needs of a row of the lattice
 
 FACE, CENTRE, SLOPE = range(3)
 """Weights of the lattice's nodes: at a lower face, at a cell's centre, and their difference across the cell."""
@@ -62,23 +60,18 @@ class Turbulence:
         grid: where the faces are.
         parameters: strength, size, rate, seed.
         wind: [m/s].
-        openness: positive on faces that air passes.
-        velocity: of the faces [m/s].
 
     Raises:
         ValueError: the eddies are smaller than cells can carry.
     """
 
-    def __init__(
-        self, grid: SmokeGrid, parameters: TurbulenceParameters, wind: Vector3, openness: Faces, velocity: Faces
-    ) -> None:
+    def __init__(self, grid: SmokeGrid, parameters: TurbulenceParameters, wind: Vector3) -> None:
         if parameters.size < CELLS_PER_EDDY * grid.cell_size * (1.0 - 1.0e-9):
             raise ValueError(
                 f"turbulence.size: {parameters.size:g} m is less than two cells of {grid.cell_size:g} m, which carry "
                 "no such eddies; enlarge it or use a smaller cell_size"
             )
         self._grid, self._parameters, self._wind = grid, parameters, wind
-        self._openness, self._velocity, self._box = openness, velocity, device_grid(grid.cells)
         # Nodes that a box can reach, wherever it lies on the lattice.
         nodes = [math.ceil(n * grid.cell_size / parameters.size) + REACH for n in grid.cells]
         self._lattice = Lattice(
@@ -93,16 +86,11 @@ class Turbulence:
         self._amplitude = parameters.strength * parameters.size / math.sqrt(6.0 * 0.55**2) * math.sqrt(3.0)
 
     @property
-    def device_bytes(self) -> int:
-        """Memory that it has allocated [bytes]; the sums of rows are nearly all of it."""
-        return sum(array.arr.nelement() * array.arr.element_size() for array in self._lattice[3:])
-
-    @property
     def acceleration(self) -> float:
         """What to expect of the largest acceleration [m/s²]."""
         return PEAK * self._parameters.strength
 
-    def accelerate(self, time_s: float, dt: float) -> None:
+    def accelerate(self, air: Air, time_s: float, dt: float) -> None:
         """Add dt [s] times the acceleration at a simulated time [s] to the velocities of open faces."""
         if any(self._wind):
             self._origin = self._place(time_s)
@@ -112,8 +100,8 @@ class Turbulence:
         now, later = self._amplitude * math.cos(turn), self._amplitude * math.sin(turn)
         salt = int(np.uint32(spread(self._parameters.seed)).view(np.int32))
         _draw(self._lattice, ti.math.ivec3(self._origin), tick, salt, now, later)
-        _sum_rows(self._box, self._lattice)
-        _apply(self._box, self._lattice, self._openness, self._velocity, dt)
+        _sum_rows(air.box, self._lattice)
+        _apply(air, self._lattice, dt)
 
     def _place(self, time_s: float) -> list[int]:
         """Set the weights of all faces and cells for a lattice that has drifted so long [s]; returns its first node."""
@@ -179,7 +167,8 @@ def _sum_rows(box: Grid, lattice: Lattice):
 
 
 @kernel
-def _apply(box: Grid, lattice: Lattice, openness: Faces, velocity: Faces, dt: ti.f32):
+def _apply(air: Air, lattice: Lattice, dt: ti.f32):
+    box, openness, velocity = ti.static((air.box, air.openness, air.state.velocity))
     for i, j, lane in ti.ndrange((1, box.nx + 2), (1, box.ny + 2), box.lanes):
         first_sum = ((i - 1) * (box.ny + 1) + j - 1) * lattice.nodes_z
         for n in range(lane_items(box, box.nz + 1, lane)):

@@ -1,18 +1,19 @@
 """The fluid at one moment, sorted into cells: its potentials, and its flow at any points."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import on_device
-from sim.core.cells import CellGrid, CellSort
-from sim.whitewater.kernels import Fluid, compute_normals, compute_potentials, sample_flow
+from sim.core.arrays import Floats, Integers, Vectors, on_device
+from sim.core.bundles import bundle
+from sim.core.cells import CellGrid, CellSort, Grid, cell_of_point, row_of_cell
+from sim.core.launch import kernel
 from sim.whitewater.motion import FluidState
 
-SUPPORT_IN_SPACINGS = 2.0
-"""Support radius h over the lattice spacing, as in the simulation."""
+SUPPORT_IN_SPACINGS = 2.0  # support radius h over the lattice spacing, as in the simulation
 
 FULL_NEIGHBORHOOD = 4.0 / 3.0 * math.pi * SUPPORT_IN_SPACINGS**3
 """Particles within h of a point in the bulk: 33.5; beside a flat surface half as many."""
@@ -80,3 +81,131 @@ class FluidField:
         flow, neighbors = ti.Vector.ndarray(3, ti.f32, count), ti.ndarray(ti.i32, count)
         sample_flow(on_device(points), count, self._fluid, flow, neighbors)
         return flow.to_numpy(), neighbors.to_numpy()
+
+
+TINY = 1.0e-6  # two particles closer than this share of h have no direction to each other
+
+SURFACE_ASYMMETRY = 0.25
+"""Length of the mean weighted direction away from the neighbours from which a particle counts as one of the surface:
+0 in the bulk, 0.53 on the flat face of a lattice, 0.2 in the layer below, up to 1 beyond."""
+
+CREST_DIRECTION = 0.6
+"""Least cosine between velocity and normal on a crest (their eq. 6): the wave moves against its own surface."""
+
+
+@bundle
+class Fluid(NamedTuple):
+    """Particles of the fluid, sorted by cells as wide as h."""
+
+    x: Vectors  # positions [m], (n,)
+    v: Vectors  # velocities [m/s], (n,)
+    count: ti.i32
+    cell_start: Integers  # first particle of each cell, (cells + 2,)
+    grid: Grid
+    h: ti.f32  # support radius [m]
+
+
+@kernel
+def compute_normals(fluid: Fluid, normal: Vectors):
+    """Unit normal out of the fluid of each surface particle, zero for the others.
+
+    n_i = sum_j W_ij x_ij/|x_ij| / sum_j W_ij, kept where it is longer than `SURFACE_ASYMMETRY`.
+    """
+    closest_squared = (TINY * fluid.h) ** 2
+    for i in range(fluid.count):
+        x_i = fluid.x[i]
+        cell = cell_of_point(x_i, fluid.grid)
+        n_i = ti.math.vec3(0.0)
+        weight = 0.0
+        for dz in range(-1, 2):
+            for dy in range(-1, 2):
+                row = row_of_cell(cell, dy, dz, fluid.grid)
+                for j in range(fluid.cell_start[row - 1], fluid.cell_start[row + 2]):
+                    x_ij = x_i - fluid.x[j]
+                    r_squared = x_ij.norm_sqr()
+                    if r_squared < fluid.h * fluid.h and r_squared > closest_squared:
+                        r = ti.sqrt(r_squared)
+                        W_ij = 1.0 - r / fluid.h
+                        n_i += W_ij / r * x_ij
+                        weight += W_ij
+        length = n_i.norm()
+        if length > SURFACE_ASYMMETRY * weight and weight > 0.0:
+            normal[i] = n_i / length
+        else:
+            normal[i] = ti.math.vec3(0.0)
+
+
+@kernel
+def compute_potentials(
+    fluid: Fluid,
+    normal: Vectors,
+    min_speed: ti.f32,
+    full_weight: ti.f32,
+    full_surface_weight: ti.f32,
+    trapped_air: Floats,
+    wave_crest: Floats,
+):
+    """Trapped air [m/s] and wave crest [-] of each particle that is faster than `min_speed`, 0 for the others.
+
+    Trapped air (eq. 2): sum_j |v_ij| (1 - v_ij/|v_ij| . x_ij/|x_ij|) W_ij, over twice the weight of a full
+    neighbourhood: the mean speed at which neighbours close in, if they do so head on.
+    Wave crest (eq. 4-6): sum_j (1 - n_i . n_j) W_ij over surface neighbours below the tangent plane, over the weight of
+    a full disc of them, where the particle moves outwards.
+    """
+    closest_squared = (TINY * fluid.h) ** 2
+    for i in range(fluid.count):
+        x_i, v_i, n_i = fluid.x[i], fluid.v[i], normal[i]
+        closing = 0.0
+        curvature = 0.0
+        speed = v_i.norm()
+        if speed > min_speed:
+            on_crest = n_i.norm_sqr() > 0.5 and v_i.dot(n_i) >= CREST_DIRECTION * speed
+            cell = cell_of_point(x_i, fluid.grid)
+            for dz in range(-1, 2):
+                for dy in range(-1, 2):
+                    row = row_of_cell(cell, dy, dz, fluid.grid)
+                    for j in range(fluid.cell_start[row - 1], fluid.cell_start[row + 2]):
+                        x_ij = x_i - fluid.x[j]
+                        r_squared = x_ij.norm_sqr()
+                        if r_squared < fluid.h * fluid.h and r_squared > closest_squared:
+                            r = ti.sqrt(r_squared)
+                            W_ij = 1.0 - r / fluid.h
+                            v_ij = v_i - fluid.v[j]
+                            closing += (v_ij.norm() - v_ij.dot(x_ij) / r) * W_ij
+                            n_j = normal[j]
+                            if on_crest and n_j.norm_sqr() > 0.5 and x_ij.dot(n_i) > 0.0:
+                                curvature += (1.0 - n_i.dot(n_j)) * W_ij
+        trapped_air[i] = 0.5 * closing / full_weight
+        wave_crest[i] = curvature / full_surface_weight
+
+
+@kernel
+def sample_flow(points: Vectors, point_count: ti.i32, fluid: Fluid, flow: Vectors, neighbors: Integers):
+    """Velocity of the fluid at points, and how many fluid particles are within h of each.
+
+    v~ = sum_f v_f K(x - x_f) / sum_f K(x - x_f) (eq. 8), K the cubic spline; zero where there is no fluid.
+    """
+    for p in range(point_count):
+        x_p = points[p]
+        cell = cell_of_point(x_p, fluid.grid)
+        momentum = ti.math.vec3(0.0)
+        weight = 0.0
+        near = 0
+        for dz in range(-1, 2):
+            for dy in range(-1, 2):
+                row = row_of_cell(cell, dy, dz, fluid.grid)
+                for j in range(fluid.cell_start[row - 1], fluid.cell_start[row + 2]):
+                    r_squared = (x_p - fluid.x[j]).norm_sqr()
+                    if r_squared < fluid.h * fluid.h:
+                        q = ti.sqrt(r_squared) / fluid.h
+                        K = 2.0 * (1.0 - q) ** 3
+                        if q < 0.5:
+                            K = 1.0 - 6.0 * q * q * (1.0 - q)
+                        momentum += K * fluid.v[j]
+                        weight += K
+                        near += 1
+        flow[p] = ti.math.vec3(0.0)
+        # A single particle just inside h weighs so little that dividing by it would overflow.
+        if weight > 1.0e-20:
+            flow[p] = momentum / weight
+        neighbors[p] = near

@@ -12,8 +12,7 @@ from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.motion import FluidState
 from sim.whitewater.parameters import WhitewaterParameters
 
-_COUNTS, _PLACES, _FATES = 0, 1, 2
-"""Streams of random numbers."""
+_COUNTS, _PLACES, _FATES = 0, 1, 2  # streams of random numbers
 
 Float64Array = NDArray[np.float64]
 

@@ -18,8 +18,7 @@ from sim.whitewater.motion import FluidMotion, FluidState
 from sim.whitewater.obstacles import MovingObstacle, Obstacles
 from sim.whitewater.parameters import WhitewaterParameters
 
-# A frame has as many substeps as support radii that the fastest fluid goes, up to this.
-MAX_SUBSTEPS = 64
+MAX_SUBSTEPS = 64  # A frame has as many substeps as support radii that the fastest fluid goes, up to this
 
 Float64Array = NDArray[np.float64]
 

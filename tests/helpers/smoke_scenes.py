@@ -6,9 +6,9 @@ import taichi as ti
 from sim.core.domain import Face
 from sim.shapes.parameters import Placement, SphereShape
 from sim.shapes.placement import build_solid
-from sim.smoke.arrays import Faces, new_faces
+from sim.smoke.arrays import Faces, new_faces, new_state
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.obstacles import MOVING, Obstacles
+from sim.smoke.obstacles import MOVING, Air, Obstacles
 
 OPEN_BOX: tuple[Face, ...] = ("x-", "x+", "y-", "y+", "z+")
 CLOSED_BOX: tuple[Face, ...] = ()
@@ -40,6 +40,12 @@ def openness_of(grid: SmokeGrid) -> Faces:
     openness = new_faces(grid.size)
     set_faces(grid, openness, (1.0, 1.0, 1.0))
     return openness
+
+
+def air_in(grid: SmokeGrid) -> Air:
+    """Air at rest in a grid, without the solver around it."""
+    obstacles = Obstacles(grid)
+    return Air(obstacles.box, obstacles.solids, openness_of(grid), new_state(grid.size))
 
 
 class Bytes:

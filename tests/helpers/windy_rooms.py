@@ -138,5 +138,5 @@ def duct(cloth: dict[str, Any], *, length: float = 0.4, width: float = 0.1, cell
         cell_size=cell_size,
         open_faces=("x-", "x+"),
     )
-    room.smoke._open_sides.brake_inflow = lambda _dt: None
+    room.smoke._open_sides = ()
     return room

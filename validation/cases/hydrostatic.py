@@ -9,11 +9,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sim.core.domain import DomainParameters
-from sim.fluid.boundary_akinci2012 import domain_wall_samples
 from validation.cases import Case, Found
 from validation.checks import CaseResult, Check, fitted_order
 from validation.figures import THEORY, draw_refinement, label_axes, make_panels, refinement_of, style_of
-from validation.scenes import GRAVITY, WATER, advance, lattice, make_fluid, state_of
+from validation.scenes import GRAVITY, WATER, advance, lattice, make_fluid, state_of, wall_forces
 
 HEIGHT, SIDE, DURATION = 0.2, 0.1, 2.0  # of the column [m], and how long it stands [s]
 SETTLED = 1.0  # from here on the sound of the start is averaged away [s]
@@ -25,7 +24,6 @@ def stand(solver: str, layers: int) -> dict[str, Any]:
     spacing = HEIGHT / layers
     domain = DomainParameters(min=(0.0, 0.0, 0.0), max=(SIDE, SIDE, 2.0 * HEIGHT))
     fluid = make_fluid(solver, domain, lattice((0.0,) * 3, (SIDE, SIDE, HEIGHT), spacing), spacing=spacing)
-    floor = domain_wall_samples(domain, spacing).positions[:, 2] < 0.0
     before = fluid.diagnostics()
     weight = before["mass"] * GRAVITY
     surface = before["mass"] / (WATER * SIDE**2)
@@ -34,7 +32,8 @@ def stand(solver: str, layers: int) -> dict[str, Any]:
         position, velocity = state_of(fluid)
         times.append(time)
         speeds.append(float(np.sqrt((velocity**2).sum(axis=1).mean())))
-        forces.append(-float(fluid.boundary_forces()[floor, 2].sum()) / weight)
+        samples, pushes = wall_forces(fluid)
+        forces.append(-float(pushes[samples[:, 2] < 0.0, 2].sum()) / weight)
         if time > SETTLED:
             heights.append(position[:, 2])
             pressures.append(fluid.snapshots()[fluid.name].arrays["pressure"])

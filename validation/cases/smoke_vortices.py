@@ -214,7 +214,7 @@ def _confinement_torque(n: int) -> float:
     solver = build_box((n, n, 8), 1.0 / n, vorticity_confinement=1.0)
     set_flow(solver, lone_vortex)
     before = faces_of(solver)
-    solver._forces.accelerate(1.0)
+    solver._accelerate(1.0)
     gained = [after - old for after, old in zip(faces_of(solver), before, strict=True)]
     torque = 0.0
     for axis, sign in ((0, -1.0), (1, 1.0)):

@@ -10,8 +10,7 @@ from pipeline.kinds.cloth import count_cloth_nodes
 from pipeline.model.job import Job
 from sim.cloth.parameters import DEFAULT_SUBSTEPS
 from sim.fluid.expected_speed import expected_speed
-from sim.fluid.time_step import VISCOUS_NUMBER
-from sim.fluid.traits import TRAITS
+from sim.fluid.traits import TRAITS, VISCOUS_NUMBER
 
 NODE_SUBSTEP_S = 1.4e-6
 """Core time of a node in a substep of cloth in contact [s], with room for page and browser (docs/guide/live.md)."""
@@ -74,7 +73,7 @@ def steps_a_frame(job: Job) -> float:
 
 def _is_implicit(job: Job) -> bool:
     """Whether viscosity is solved for."""
-    from sim.fluid.viscosity_implicit import is_implicit
+    from sim.fluid.viscosity import is_implicit
 
     shared = job.fluid[0]
     signal_speed = shared.sound_speed or TRAITS[shared.solver].speed_ratio * _fall_speed(job)

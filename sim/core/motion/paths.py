@@ -226,3 +226,11 @@ def path_through(keyframes: Sequence[KeyframeParameters], *, linear: bool) -> Ke
         np.stack([rotation.from_degrees(keyframe.rotation_deg) for keyframe in keyframes]),
         linear=linear,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Where all bodies are: the moving ones, the static ones, and last the domain, which walls belong to."""
+
+    position: Array  # centres of mass [m], (n, 3)
+    rotation: Array  # body axes to world axes, (n, 3, 3)

@@ -10,7 +10,7 @@ from device_distances import measure_distances
 from sim.cloth.continuous_contacts import ContinuousContacts
 from sim.cloth.rigid_contact import RigidContact
 from sim.cloth.rigid_contact_bodies import CollisionBodies
-from sim.core.motion.poses import Poses
+from sim.core.motion.paths import Poses
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.body_geometry import BodyGeometry
 from validation.crossing_triangles import crossings

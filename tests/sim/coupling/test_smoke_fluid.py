@@ -5,7 +5,7 @@ import pytest
 from half_full_rooms import SILENT_SOURCE, SPACING, HalfFullRoom, lattice
 
 from sim.core.domain import DomainParameters
-from sim.coupling.water_room import room_for_water
+from sim.coupling.smoke_fluid import room_for_water
 from sim.smoke.grid import SmokeGrid
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")

@@ -10,8 +10,7 @@ from small_fluids import EVERY_FACE, lattice, make_fluid, run
 
 from sim.core.domain import DomainParameters
 from sim.fluid.parameters import FluidParameters
-from sim.fluid.surface_tension import cohesion_rate, cohesion_stress
-from sim.fluid.surface_tension_akinci2013 import cohesion_stress_akinci2013
+from sim.fluid.surface_tension import cohesion_rate, cohesion_stress, cohesion_stress_akinci2013
 
 SPACING = 1.0e-3
 SPACE = DomainParameters(min=(-0.02,) * 3, max=(0.02,) * 3, open_faces=EVERY_FACE)

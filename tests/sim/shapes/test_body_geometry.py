@@ -6,8 +6,7 @@ import trimesh
 from rigid_scenes import ball, body, cube
 
 from sim.core.motion import rotation
-from sim.rigid.contacts import Contacts, tangent_basis
-from sim.rigid.manifold import reduce_manifold
+from sim.rigid.contacts import Contacts, reduce_manifold, tangent_basis
 from sim.shapes.body_geometry import BodyGeometry
 
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from smoke_scenes import CLOSED_BOX, get_faces, set_faces, unit_grid
+from smoke_scenes import CLOSED_BOX, air_in, get_faces, set_faces, unit_grid
 
 from sim.smoke.advection import Advection
-from sim.smoke.arrays import new_floats, new_state
+from sim.smoke.arrays import new_floats
 from sim.smoke.grid import SmokeGrid
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -14,9 +14,10 @@ class Laboratory:
 
     def __init__(self, grid: SmokeGrid, *, maccormack: bool) -> None:
         self.grid, self.maccormack = grid, maccormack
-        self.velocity, self.density, self.excess = state = new_state(grid.size)
+        air = air_in(grid)
+        self.velocity, self.density, self.excess = air.state
         work = tuple(new_floats(grid.size) for _ in range(6))
-        self.advection = Advection(grid, state, work, maccormack=maccormack)
+        self.advection = Advection(grid, air, work, maccormack=maccormack)
 
     def set_cells(self, field, values) -> None:
         field.from_numpy(self.grid.pad(values.reshape(self.grid.cells).astype(np.float32)).ravel())

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
-from smoke_scenes import CLOSED_BOX, OPEN_BOX, unit_grid
+from smoke_scenes import CLOSED_BOX, OPEN_BOX, air_in, unit_grid
 
 from sim.core.domain import DomainParameters
-from sim.smoke.arrays import new_faces, new_floats
-from sim.smoke.balance import CorrectionBalance
-from sim.smoke.obstacles import Obstacles
+from sim.smoke.arrays import new_floats
+from sim.smoke.balance import restore_total
 from sim.smoke.parameters import SmokeParameters
+from sim.smoke.reductions import new_rows
 from sim.smoke.solver import SmokeSolver
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
@@ -20,16 +20,15 @@ class Bench:
     def __init__(self, grid, velocity=(0.0, 0.0, 0.0)) -> None:
         self.grid = grid
         self.before, self.predicted, self.corrected = (new_floats(grid.size) for _ in range(3))
-        faces = new_faces(grid.size)
-        for array, speed in zip(faces, velocity, strict=True):
+        self.air = air_in(grid)
+        for array, speed in zip(self.air.state.velocity, velocity, strict=True):
             array.fill(speed)
-        self.balance = CorrectionBalance(Obstacles(grid), faces)
 
     def restore(self, before, predicted, corrected, *, step: float = 0.0) -> np.ndarray:
         fields = (self.before, self.predicted, self.corrected)
         for field, values in zip(fields, (before, predicted, corrected), strict=True):
             field.from_numpy(self.grid.pad(values.astype(np.float32)).ravel())
-        self.balance.restore(*fields, step)
+        restore_total(self.air, *fields, new_rows(self.air.box), new_rows(self.air.box), step)
         return self.grid.trim(self.corrected.to_numpy(), self.grid.cells).astype(np.float64)
 
 

@@ -39,7 +39,7 @@ def test_fire_cools_by_the_fourth_power_of_its_heat_whatever_the_steps(cooling):
         solver.restore(state)
         dt = end_s / steps
         for _ in range(steps):
-            cool(solver.obstacles.box, solver.state, solver.parameters, dt)
+            cool(solver.air, solver.parameters, dt)
         # Both laws together are solved exactly, so only single precision is left, of a power in every step.
         assert solver.checkpoint()["excess_temperature"][4, 4, 1:6] == pytest.approx(expected, rel=2e-5)
     # A fire of 1500 K is down to a third of its heat in that time, smoke of 300 K excess hardly cools by it.

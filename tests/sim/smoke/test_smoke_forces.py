@@ -1,33 +1,29 @@
 import numpy as np
 import pytest
-from smoke_scenes import CLOSED_BOX, OPEN_BOX, get_faces, openness_of, set_faces, unit_grid
+from smoke_scenes import CLOSED_BOX, OPEN_BOX, air_in, get_faces, set_faces, unit_grid
 
-from sim.smoke.arrays import new_floats, new_state
-from sim.smoke.forces import Forces, upward
-from sim.smoke.obstacles import Obstacles
+from sim.smoke.arrays import new_floats
+from sim.smoke.forces import accelerate, upward
+from sim.smoke.parameters import SmokeParameters
 
 pytestmark = pytest.mark.usefixtures("taichi_cpu")
 
 
-def build(grid, *, confinement: float, gravity=(0.0, 0.0, -9.81)):
-    state = new_state(grid.size)
-    forces = Forces(
-        Obstacles(grid),
-        openness_of(grid),
-        state,
-        tuple(new_floats(grid.size) for _ in range(4)),
-        gravity=gravity,
-        buoyancy_density=0.5,
-        buoyancy_temperature=0.03,
-        confinement=confinement,
-    )
-    return forces, state.velocity, (state.density, state.excess)
+SOURCE = {"shape": {"type": "sphere", "radius": 0.1}, "position": (0.5, 0.5, 0.5)}
+
+
+def build(grid, *, confinement: float):
+    """The air of a grid, and what accelerates it for a time [s]."""
+    strengths = {"vorticity_confinement": confinement, "buoyancy_density": 0.5, "buoyancy_temperature": 0.03}
+    parameters = SmokeParameters(name="air", source=[SOURCE], cell_size=grid.cell_size, **strengths)
+    air, work = air_in(grid), tuple(new_floats(grid.size) for _ in range(4))
+    return air.state, lambda dt: accelerate(air, parameters, (0.0, 0.0, -9.81), work, dt)
 
 
 def test_confinement_spins_a_lone_vortex_up_by_what_the_formula_says():
     n, epsilon, dt, core = 32, 0.5, 0.01, 0.1
     grid = unit_grid((n, n, 8), CLOSED_BOX)
-    forces, velocity, _ = build(grid, confinement=epsilon)
+    (velocity, _, _), advance = build(grid, confinement=epsilon)
 
     def vortex(axis):
         """Lamb and Oseen's, of circulation 2 pi: all its vorticity turns the same way."""
@@ -38,7 +34,7 @@ def test_confinement_spins_a_lone_vortex_up_by_what_the_formula_says():
 
     set_faces(grid, velocity, [vortex(axis) for axis in range(3)])
     before = get_faces(grid, velocity)
-    forces.accelerate(dt)
+    advance(dt)
     gained = [after - old for after, old in zip(get_faces(grid, velocity), before, strict=True)]
     torque = 0.0
     for axis, sign in ((0, -1.0), (1, 1.0)):
@@ -58,11 +54,11 @@ def test_confinement_spins_a_lone_vortex_up_by_what_the_formula_says():
 
 def test_buoyancy_is_alpha_and_beta_along_gravity_and_stops_at_walls():
     grid = unit_grid((8, 8, 8), OPEN_BOX)
-    forces, velocity, (density, excess) = build(grid, confinement=0.2)
+    (velocity, density, excess), advance = build(grid, confinement=0.2)
     set_faces(grid, velocity, [np.zeros(grid.face_shape(axis)) for axis in range(3)])
     density.from_numpy(grid.pad(np.full(grid.cells, 0.4, np.float32)).ravel())
     excess.from_numpy(grid.pad(np.full(grid.cells, 50.0, np.float32)).ravel())
-    forces.accelerate(0.1)
+    advance(0.1)
     u, v, w = get_faces(grid, velocity)
     assert not u.any()
     assert not v.any()

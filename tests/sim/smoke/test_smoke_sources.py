@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 import trimesh
-from smoke_scenes import openness_of
+from smoke_scenes import air_in
 
 from sim.core.domain import DomainParameters
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid
-from sim.smoke.arrays import new_state
 from sim.smoke.grid import SmokeGrid
-from sim.smoke.obstacles import Obstacles
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
 from sim.smoke.sources import Source
 
@@ -34,15 +32,9 @@ class Emission:
 
     def __init__(self, source: dict) -> None:
         self.grid = SmokeGrid.build(SmokeParameters(name="trail", cell_size=CELL, source=[source]), DOMAIN)
-        state = new_state(self.grid.size)
-        self.arrays = [*state.velocity, state.density, state.excess]
-        self.source = Source(
-            SmokeSourceParameters(**source),
-            Obstacles(self.grid),
-            ambient_temperature=293.0,
-            openness=openness_of(self.grid),
-            state=state,
-        )
+        air = air_in(self.grid)
+        self.arrays = [*air.state.velocity, air.state.density, air.state.excess]
+        self.source = Source(SmokeSourceParameters(**source), self.grid, air, ambient_temperature=293.0)
         self.emitted = 0.0
 
     def run(self, steps: int, begin_s: float = 0.0, end_s: float = 1.0) -> np.ndarray:

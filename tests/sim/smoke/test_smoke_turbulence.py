@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from smoke_scenes import get_faces, openness_of
+from smoke_scenes import air_in, get_faces
 from thread_counts import digest_of, result_on_any_threads
 
 from sim.core.domain import DomainParameters
-from sim.smoke.arrays import new_faces
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters, TurbulenceParameters
 from sim.smoke.turbulence import Turbulence
@@ -25,16 +24,16 @@ class Gusts:
     def __init__(self, *, low_x: float = 0.0, wind: tuple[float, float, float] = (0.0, 0.0, 0.0), **changes) -> None:
         box = SmokeParameters(name="air", cell_size=CELL, source=[SOURCE], open_faces=ALL_OPEN, min=(low_x, 0.0, 0.0))
         self.grid = SmokeGrid.build(box, DOMAIN)
-        self.velocity = new_faces(self.grid.size)
+        self.air = air_in(self.grid)
         parameters = TurbulenceParameters(**{"strength": 2.0, "size": 0.2, "rate": 4.0, **changes})
-        self.turbulence = Turbulence(self.grid, parameters, wind, openness_of(self.grid), self.velocity)
+        self.turbulence = Turbulence(self.grid, parameters, wind)
 
     def at(self, time_s: float) -> list[np.ndarray]:
         """The acceleration by axis [m/s²], in the shape of the faces."""
-        for array in self.velocity:
+        for array in self.air.state.velocity:
             array.fill(0.0)
-        self.turbulence.accelerate(time_s, 1.0)
-        return [face.astype(np.float64) for face in get_faces(self.grid, self.velocity)]
+        self.turbulence.accelerate(self.air, time_s, 1.0)
+        return [face.astype(np.float64) for face in get_faces(self.grid, self.air.state.velocity)]
 
 
 def test_its_acceleration_is_as_strong_as_asked_for_and_has_no_divergence():

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 from whitewater_scenes import RADIUS, SPACING, fluid, lattice
 
-from sim.whitewater.fluid_field import FULL_NEIGHBORHOOD, FluidField
-from sim.whitewater.kernels import CREST_DIRECTION, SURFACE_ASYMMETRY
+from sim.whitewater.fluid_field import CREST_DIRECTION, FULL_NEIGHBORHOOD, SURFACE_ASYMMETRY, FluidField
 from sim.whitewater.motion import FluidMotion, FluidState
 from sim.whitewater.parameters import WhitewaterParameters
 
