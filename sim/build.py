@@ -25,7 +25,7 @@ from sim.coupling.smoke_sources import SmokeSourcesOnBodies, with_sources_on
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples, sink_samples
 from sim.fluid.filling import NO_POINTS, fill_fluids, particle_capacity
 from sim.fluid.kernels import Discretization
-from sim.fluid.opening import Opening, opening_problem, pipes
+from sim.fluid.opening import Opening, opening_problem, openings_of, pipes
 from sim.fluid.parameters import shared_conflicts
 from sim.fluid.solvers import SOLVERS
 from sim.fluid.tank import FluidStart
@@ -47,12 +47,9 @@ if TYPE_CHECKING:
 
 
 def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Sequence[Solver] = ()) -> World:
-    """The solvers of a scene in their initial state; `sim.core.runtime.initialize` must have run.
+    """The solvers of a scene in their initial state, coupled; `sim.core.runtime.initialize` must have run.
 
-    Args:
-        scene: rigid bodies, fluids, smoke and cloth, which are coupled.
-        frames_per_second: [1/s].
-        solvers: others that share the world, and meet nobody.
+    Further solvers may share the world, and meet nobody.
 
     Raises:
         ShapeError: a shape cannot be built.
@@ -134,14 +131,12 @@ def _build_fluids(
 
 def _build_openings(scene: SceneParameters, solids: list[Solid], spacing: float, volume: float) -> list[Opening]:
     """The openings of all fluids, which must be free, and not in each other's way."""
+    names = [f'fluid "{fluid.name}" emitter[{number}]' for fluid in scene.fluid for number in range(len(fluid.emitter))]
     openings: dict[str, Opening] = {}
-    for fluid in scene.fluid:
-        for number, emitter in enumerate(fluid.emitter):
-            name = f'fluid "{fluid.name}" emitter[{number}]'
-            opening = Opening.of(emitter, spacing, volume, fluid.support_in_spacings)
-            if reason := opening_problem(opening, spacing, scene.domain, solids, openings):
-                raise ValueError(f"{name}: {reason}")
-            openings[name] = opening
+    for name, (_, opening) in zip(names, openings_of(scene.fluid, volume), strict=True):
+        if reason := opening_problem(opening, spacing, scene.domain, solids, openings):
+            raise ValueError(f"{name}: {reason}")
+        openings[name] = opening
     return list(openings.values())
 
 

@@ -84,8 +84,8 @@ class Solver(Protocol):
         """The first non-finite or runaway quantity of the state, in words, or None."""
 
 
-class Coupling(Protocol):
-    """Exchanges momentum between two solvers.
+class Coupling:
+    """Exchanges momentum between two solvers; one that works one way only has nothing to do in `follow` and `resume`.
 
     Attributes:
         bodies: names of the two; the first takes its substep before the second.
@@ -94,10 +94,11 @@ class Coupling(Protocol):
     """
 
     bodies: tuple[str, str]
-    is_loose: bool
+    is_loose = False
 
     def exchange(self, dt: float) -> None:
         """Right before the second's step of dt [s], which the first has made: hand the impulses of the first to it."""
+        raise NotImplementedError
 
     def follow(self, dt: float) -> None:
         """After both have made a step of dt [s]: tell the first where the second is now."""

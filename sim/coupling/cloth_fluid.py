@@ -13,6 +13,7 @@ from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, reduced_tree
+from sim.core.solver import Coupling
 from sim.coupling.cloth_samples import ClothSamples
 from sim.fluid.boundary import Samples, Sheets
 from sim.fluid.fluid import SPHFluid
@@ -56,7 +57,7 @@ class Felt(NamedTuple):
     push: Vectors  # u_b - v_b [m/s]
 
 
-class ClothFluidCoupling:
+class ClothFluidCoupling(Coupling):
     """The fluid pushes the cloths and is held by them, and moves along where it touches.
 
     A coupled step (`sim.fluid.sheet_forces` says why): the fluid steps, its samples of the cloths answering as if they
@@ -69,11 +70,7 @@ class ClothFluidCoupling:
     the samples and u_b. With sum_n beta_bn = 1 linear momentum of fluid and free cloth is kept to rounding. Angular
     momentum is not quite: masses are lumped into nodes, and fluid takes part at some distance from the samples.
 
-    Attributes:
-        bodies: names of the fluid's and of the cloth solver.
     """
-
-    is_loose = False
 
     def __init__(self, fluid: SPHFluid, cloth: ClothSolver, samples: ClothSamples) -> None:
         """Couple the two; places the samples of the cloths, which the fluid was made with, where these are."""
@@ -115,9 +112,6 @@ class ClothFluidCoupling:
             self._fluid.tank.take_sheet_motion(self._change, change, dt)
         place_sheets(self._samples, nodes, boundary.samples, boundary.sheets)
         self._fluid.tank.sheets_moved(distance, speed, elapsed_s=dt)
-
-    def resume(self) -> None:
-        """Nothing to make up for: the fluid saves where the samples are, and what it expects of them."""
 
 
 @func

@@ -10,6 +10,7 @@ import numpy as np
 from sim.core.domain import DomainParameters
 from sim.core.motion import rotation
 from sim.core.motion.paths import Poses
+from sim.core.solver import Coupling
 from sim.core.walls import walls_of
 from sim.rigid.parameters import RigidBodyParameters
 from sim.shapes.body_geometry import BodyGeometry
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 ROUND_OFF = 1.0e-6  # cloth that is laid onto a body, in decimal numbers, may be this deep in it [m]
 
 
-class ClothRigidCoupling:
+class ClothRigidCoupling(Coupling):
     """Bodies push cloth, and cloth pushes bodies.
 
     A coupled step: contacts of the cloth's substep foresee how bodies move in it, gravity included, and push both sides
@@ -35,11 +36,7 @@ class ClothRigidCoupling:
     Approximate: contacts among bodies in the same step are not foreseen. Cloth carries a heavy body over what stands
     (`sim.cloth.continuous_response`), but gives way between two bodies that both move, or in several layers.
 
-    Attributes:
-        bodies: names of the cloth's and of the rigid solver.
     """
-
-    is_loose = False
 
     def __init__(self, cloth: ClothSolver, rigid: RigidSolver, contacts: ContinuousContacts) -> None:
         """Couple the two; `contacts` are those of the cloth, with the bodies of the rigid solver first."""

@@ -22,19 +22,12 @@ LONGEST_EDGE = 1.5  # longest edge of the part of a triangle that a sample stand
 
 @dataclass(frozen=True, eq=False)
 class ClothSamples:
-    """Samples of all cloths as fixed points of their triangles.
+    """Samples of all cloths as fixed points of their triangles."""
 
-    Attributes:
-        sheets: what the fluid takes.
-        nodes: corners of the triangle that each sample is on, numbered as the cloth solver does, (m, 3) int32.
-        weights: its barycentric coordinates there, at least 0, of sum 1, (m, 3).
-        start: where the samples are at the start [m], (m, 3).
-    """
-
-    sheets: SheetSamples
-    nodes: NDArray[np.int32]
-    weights: NDArray[np.float64]
-    start: NDArray[np.float64]
+    sheets: SheetSamples  # what the fluid takes
+    nodes: NDArray[np.int32]  # corners of the triangle of each sample, numbered as the cloth solver does, (m, 3)
+    weights: NDArray[np.float64]  # its barycentric coordinates there, at least 0, of sum 1, (m, 3)
+    start: NDArray[np.float64]  # where the samples are at the start [m], (m, 3)
 
     @classmethod
     def of(cls, cloth: ClothSolver, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> ClothSamples:

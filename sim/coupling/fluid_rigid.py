@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.core.solver import Coupling
 from sim.fluid.boundary import BodyStates
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from sim.rigid.solver import RigidSolver
 
 
-class FluidRigidCoupling:
+class FluidRigidCoupling(Coupling):
     """The fluid pushes the bodies, and the bodies displace and push the fluid.
 
     A coupled step: the fluid steps with the bodies where they are and sums its impulses on them; the bodies take the
@@ -23,11 +24,8 @@ class FluidRigidCoupling:
     Kinematic bodies push the fluid and feel nothing.
 
     Attributes:
-        bodies: names of the fluid's and of the rigid solver.
         force: mean force of the fluid on each body in the last step [N], (n, 3); kinematic bodies have one too.
     """
-
-    is_loose = False
 
     def __init__(self, fluid: SPHFluid, rigid: RigidSolver) -> None:
         """Couple the two; places the fluid's samples where the bodies are."""

@@ -10,6 +10,7 @@ from sim.cloth.air import WIND, Triangles
 from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
+from sim.core.solver import Coupling
 from sim.smoke.arrays import Faces, new_floats
 from sim.smoke.lanes import Grid, cell_counts, row_start
 from sim.smoke.obstacles import time_of_travel
@@ -58,7 +59,7 @@ class Hanging(NamedTuple):
     place: Vectors  # of the middle in the smoke's box [cells]
 
 
-class SmokeClothCoupling:
+class SmokeClothCoupling(Coupling):
     """Moving smoke drags cloth, and cloth slows the smoke.
 
     A coupled step of the smoke: cloth takes its own, shorter steps in the air as the smoke left it, and sums the
@@ -80,20 +81,12 @@ class SmokeClothCoupling:
     drag coefficient applies to the air at the sheet, which the sheet has slowed already. The air's density is that of
     the cloth's parameters; outside of the smoke's box air is the cloth's wind, and inside the wind does not blow.
 
-    Attributes:
-        bodies: names of the cloth's solver and of the smoke.
     """
 
     is_loose = True
 
     def __init__(self, cloth: "ClothSolver", smoke: "SmokeSolver", *, number: int = 0) -> None:
-        """Couple the two.
-
-        Args:
-            cloth: the cloths.
-            smoke: in whose air they hang.
-            number: of the smoke, its own among those that are coupled to these cloths; their boxes do not overlap.
-        """
+        """Couple the two; the smoke's number is its own among those of these cloths, whose boxes do not overlap."""
         self.bodies = (cloth.name, smoke.name)
         self._cloth, self._smoke, self._number = cloth, smoke, number
         grid, triangles = smoke.grid, cloth.state.triangle_count

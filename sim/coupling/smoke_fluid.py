@@ -11,6 +11,7 @@ from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
 from sim.core.bundles import bundle
 from sim.core.domain import DomainParameters
 from sim.core.launch import kernel
+from sim.core.solver import Coupling
 from sim.smoke.arrays import new_floats
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid, cell_counts, row_start
@@ -54,7 +55,7 @@ class Reach(NamedTuple):
     volume: ti.f32  # of a particle over R³
 
 
-class SmokeFluidCoupling:
+class SmokeFluidCoupling(Coupling):
     """Air cannot enter water, and moves with its surface.
 
     A coupled step of the smoke: the fluid takes its own, shorter steps; then the cells that hold water are marked as
@@ -75,20 +76,12 @@ class SmokeFluidCoupling:
     gravity. What pressure gives it in a step of the smoke is not foreseen, nor are particles that an emitter has yet to
     let in: they count from the next step on.
 
-    Attributes:
-        bodies: names of the fluid's solver and of the smoke.
     """
 
     is_loose = True
 
     def __init__(self, fluid: "SPHFluid", smoke: "SmokeSolver", *, domain: DomainParameters) -> None:
-        """Couple the two; the first water is marked, and is there once the smoke has moved its obstacles.
-
-        Args:
-            fluid: all fluids of the tank.
-            smoke: made for obstacles that move.
-            domain: its closed faces hold the fluid.
-        """
+        """Couple the two; the first water is marked, and is there once the smoke has moved its obstacles."""
         self.bodies = (fluid.name, smoke.name)
         self._fluid, self._smoke = fluid, smoke
         grid = smoke.grid
@@ -124,12 +117,6 @@ class SmokeFluidCoupling:
         box, marks = self._smoke.obstacles.box, self._smoke.obstacles.marks
         _splat(self._reach, box, self._sums, particles.position, particles.velocity, particles.count)
         _mark_water(box, self._sums, marks)
-
-    def follow(self, dt: float) -> None:
-        """Water does not feel the air."""
-
-    def resume(self) -> None:
-        """Which cells were water the smoke has saved itself."""
 
 
 @kernel
@@ -197,14 +184,10 @@ def _mark_water(box: Grid, sums: Sums, marks: Marks):
 def room_for_water(grid: SmokeGrid, domain: DomainParameters, reach: float) -> NDArray[np.float64]:
     """Part of the weight prod_a max(0, 1 - |q_a|) at each cell's centre that walls and static bodies leave, `cells`.
 
-    Walls count exactly, bodies as the cells that they fill. `BEYOND` where a centre is beyond a wall.
-
-    Args:
-        grid: the cells.
-        domain: whose closed faces are walls.
-        reach: half-width of the weight along an axis [m].
+    Walls count exactly, bodies as the cells that they fill. `BEYOND` where a centre is beyond a wall. The half-width of
+    the weight along an axis is `reach` [m].
     """
-    x, y, z = (parts_inside(grid.origin, grid.cell_size, grid.cells, domain, reach, axis) for axis in range(3))
+    x, y, z = (parts_inside(grid, domain, reach, axis) for axis in range(3))
     room: NDArray[np.float64] = x[:, None, None].astype(np.float64) * y[None, :, None] * z[None, None, :]
     is_beyond = room >= BEYOND * LEAST_ROOM
     solid = np.where(is_beyond, 0.0, grid.solid)  # what is behind a wall is missing already
@@ -233,27 +216,12 @@ def _weighted_sum(values: NDArray[np.float64], weights: NDArray[np.float64], axi
     return total
 
 
-def parts_inside(
-    origin: tuple[float, float, float],
-    cell_size: float,
-    cells: tuple[int, int, int],
-    domain: DomainParameters,
-    reach: float,
-    axis: int,
-) -> NDArray[np.float32]:
+def parts_inside(grid: SmokeGrid, domain: DomainParameters, reach: float, axis: int) -> NDArray[np.float32]:
     """Part of the weight max(0, 1 - |q|) along an axis that lies within the domain's closed faces, by cell, (n,).
 
     `BEYOND` where a cell's centre is beyond a closed face: no fraction of water makes it water.
-
-    Args:
-        origin: lower corner of the cells [m].
-        cell_size: [m].
-        cells: how many along each axis.
-        domain: whose open faces end nothing.
-        reach: half-width of the weight [m].
-        axis: 0, 1 or 2.
     """
-    centres = origin[axis] + (np.arange(cells[axis]) + 0.5) * cell_size
+    centres = grid.origin[axis] + (np.arange(grid.cells[axis]) + 0.5) * grid.cell_size
     parts, is_beyond = np.ones(len(centres)), np.zeros(len(centres), bool)
     for face, distance in (
         (f"{'xyz'[axis]}-", centres - domain.min[axis]),

@@ -21,13 +21,9 @@ def too_thin_bodies(
     geometries: Sequence[BodyGeometry],
     domain: DomainParameters,
 ) -> list[tuple[int, str]]:
-    """Number and a sentence for each body that would fall between the cells of a smoke that it can come to.
+    """Number and a sentence for each of the moving bodies that would fall between the cells of a smoke it can come to.
 
-    Args:
-        smoke: whose box it is.
-        bodies: the dynamic and kinematic ones.
-        geometries: of each of them.
-        domain: which holds the dynamic ones, and is the box of a smoke without its own.
+    The domain holds the dynamic ones, and is the box of a smoke without its own.
     """
     return [
         (

@@ -10,6 +10,7 @@ from sim.core.arrays import Matrices, Vectors
 from sim.core.bundles import bundle
 from sim.core.launch import kernel
 from sim.core.motion.paths import ArcLength, Path
+from sim.core.solver import Coupling
 from sim.shapes.device_shapes import DeviceShapes, Shapes, distance_to
 from sim.smoke.lanes import Grid, row_start
 from sim.smoke.obstacles import Marks, mark, time_of_travel
@@ -31,7 +32,7 @@ class Bodies(NamedTuple):
     spin: Vectors  # [1/s]
 
 
-class SmokeRigidCoupling:
+class SmokeRigidCoupling(Coupling):
     """Bodies are obstacles for the air, and push it with the velocity of their surface, v + omega x r.
 
     One way: bodies do not feel the air. Its density is a thousandth of theirs, and a smoke of constant density has no
@@ -42,8 +43,6 @@ class SmokeRigidCoupling:
     velocity and gravity if it is dynamic; one outside has the way to the box to go first. What collisions, water and
     cloth add to a dynamic body in a step of the smoke is not foreseen: it may leap over cells in that one.
 
-    Attributes:
-        bodies: names of the rigid solver and of the smoke.
     """
 
     is_loose = True
@@ -120,12 +119,6 @@ class SmokeRigidCoupling:
                     obstacles.marks,
                     self._bodies,
                 )
-
-    def follow(self, dt: float) -> None:
-        """Bodies do not feel the air."""
-
-    def resume(self) -> None:
-        """Where the bodies are the smoke has saved itself."""
 
 
 @kernel

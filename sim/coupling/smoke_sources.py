@@ -9,6 +9,7 @@ import numpy as np
 
 from sim.core.motion import rotation
 from sim.core.motion.paths import Motion
+from sim.core.solver import Coupling
 from sim.smoke.source_motion import BodyMotion
 
 if TYPE_CHECKING:
@@ -18,14 +19,12 @@ if TYPE_CHECKING:
     from sim.smoke.solver import SmokeSolver
 
 
-class SmokeSourcesOnBodies:
+class SmokeSourcesOnBodies(Coupling):
     """Takes the sources of a smoke along with the bodies that they follow.
 
     The smoke takes its own steps; before each, bodies go ahead to its end, and a source emits all along the way of its
     body in the step. One way: what it blows out does not push the body.
 
-    Attributes:
-        bodies: names of the rigid solver and of the smoke.
     """
 
     is_loose = True
@@ -46,9 +45,6 @@ class SmokeSourcesOnBodies:
         begin_s = self._smoke.time_s
         for number, motion in self._sources:
             motion.carry(self._body(number), begin_s, begin_s + dt)
-
-    def follow(self, dt: float) -> None:
-        """Bodies do not feel their sources."""
 
     def resume(self) -> None:
         """Sources are where their bodies are now."""

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, layer_field, particle_volume, wall_calibration, wall_layers
@@ -28,12 +28,8 @@ if TYPE_CHECKING:
 
 SignedDistance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-# Rounds in which samples sink into a body, each by this part of what is left: 0.4 % of the depth is left then.
-SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6
-
-# Part of the second layer's depth at which its samples still do what they should; less in a body has one layer.
-DEEP_ENOUGH = 0.95
-
+SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6  # by which samples sink into a body: 0.4 % of the depth is left then
+DEEP_ENOUGH = 0.95  # part of the second layer's depth at which its samples still do what they should
 FACES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
@@ -43,63 +39,47 @@ class BoundarySamples:
 
     Fluid at rest keeps D = 1.45 spacings from a sample. So samples 0.95 spacings inside the solid let the fluid fill
     the space right up to the surface; from samples on the surface it keeps that much of a gap.
-
-    Attributes:
-        positions: samples [m], (m, 3), float32.
-        body: number of the body of each sample, (m,), int32; the domain's walls are one body.
-        factor: on the volume of each sample [-], (m,); 1 if omitted.
-        layer: samples of one body count each other in their volumes if they have the same number here, (m,), int32;
-            all of them if omitted.
-        known_volume: volume where it is known [m³], else 0, (m,); unknown if omitted.
     """
 
-    positions: NDArray[np.float32]
-    body: NDArray[np.int32]
-    factor: NDArray[np.float64] | None = None
-    layer: NDArray[np.int32] | None = None
-    known_volume: NDArray[np.float64] | None = None
+    positions: NDArray[np.float32]  # samples [m], (m, 3), float32
+    body: NDArray[np.int32]  # number of the body of each sample, (m,), int32; the domain's walls are one body
+    factor: NDArray[np.float64]  # on the volume of each sample [-], (m,)
+    layer: NDArray[np.int32]  # samples of one body and layer count each other in their volumes, (m,)
+    known_volume: NDArray[np.float64]  # volume where it is known [m³], else 0, (m,)
 
     def __post_init__(self) -> None:
-        if self.positions.ndim != 2 or self.positions.shape[1] != 3 or self.body.shape != self.positions.shape[:1]:
-            raise ValueError(
-                f"boundary samples must be (m, 3) with bodies (m,), got {self.positions.shape} and {self.body.shape}"
-            )
         if not np.isfinite(self.positions).all():
             raise ValueError("boundary samples must be finite numbers")
-        if self.factor is not None and not np.isfinite(self.factor).all():
+        if not np.isfinite(self.factor).all():
             raise ValueError("factors of boundary samples must be finite numbers")
+
+    @classmethod
+    def of_points(
+        cls, points: NDArray[np.floating], *, factor: ArrayLike = 1.0, layer: ArrayLike = 0, known: ArrayLike = 0.0
+    ) -> BoundarySamples:
+        """Samples of one body [m], (m, 3), with factors, layers and known volumes of all, or of each, (m,)."""
+        positions = np.asarray(points, dtype=np.float32).reshape(-1, 3)
+        factors, layers, volumes = (np.full(len(positions), value) for value in (factor, layer, known))
+        return cls(positions, np.zeros(len(positions), np.int32), factors, layers.astype(np.int32), volumes)
 
     @classmethod
     def of_bodies(cls, *bodies: NDArray[np.floating] | BoundarySamples) -> BoundarySamples:
         """Samples of several bodies, each (m_k, 3) [m] or samples of one body already, numbered in this order."""
-        own = [body if isinstance(body, BoundarySamples) else cls._of_points(body) for body in bodies]
-        if not own:
-            return cls._of_points(np.empty((0, 3)))
-        return cls(
-            np.concatenate([each.positions for each in own]),
-            np.concatenate([np.full(len(each.positions), number, dtype=np.int32) for number, each in enumerate(own)]),
-            factor=np.concatenate([_or_filled(each.factor, 1.0, len(each.positions)) for each in own]),
-            layer=np.concatenate([_or_filled(each.layer, 0, len(each.positions)).astype(np.int32) for each in own]),
-            known_volume=np.concatenate([_or_filled(each.known_volume, 0.0, len(each.positions)) for each in own]),
-        )
-
-    @classmethod
-    def _of_points(cls, points: NDArray[np.floating]) -> BoundarySamples:
-        positions = np.asarray(points, dtype=np.float32).reshape(-1, 3)
-        return cls(positions, np.zeros(len(positions), dtype=np.int32))
+        own = [body if isinstance(body, BoundarySamples) else cls.of_points(body) for body in bodies]
+        own = [replace(each, body=np.full_like(each.body, number)) for number, each in enumerate(own)]
+        arrays = [[getattr(each, field.name) for field in fields(cls)] for each in own or [cls.of_points(np.empty(0))]]
+        return cls(*(np.concatenate(parts) for parts in zip(*arrays, strict=True)))
 
     def scaled(self, factor: float | NDArray[np.float64]) -> BoundarySamples:
         """The same samples with so many times their volumes [-], all of them or each, (m,)."""
-        return replace(self, factor=factor * _or_filled(self.factor, 1.0, len(self.positions)))
+        return replace(self, factor=factor * self.factor)
 
     def volumes(self, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> NDArray[np.float64]:
         """Volume V_b of each sample [m³], (m,); a fluid's Psi_b is rho0 V_b."""
         support = support_in_spacings * spacing
-        count = len(self.positions)
-        known = _or_filled(self.known_volume, 0.0, count)
-        volumes = np.array(known, dtype=np.float64)
-        layers = np.stack([self.body, _or_filled(self.layer, 0, count)], axis=1)
-        unknown = known == 0.0
+        volumes = self.known_volume.copy()
+        layers = np.stack([self.body, self.layer], axis=1)
+        unknown = volumes == 0.0
         for own in np.unique(layers[unknown], axis=0):
             members = np.flatnonzero((layers == own).all(axis=1) & unknown)
             tree = cKDTree(self.positions[members])
@@ -110,7 +90,7 @@ class BoundarySamples:
             for end in (0, 1):
                 sums += np.bincount(pairs[:, end], weights=weights, minlength=len(members))
             volumes[members] = wall_calibration(support_in_spacings).volume_factor / sums
-        return volumes if self.factor is None else self.factor * volumes
+        return self.factor * volumes
 
 
 def domain_wall_samples(
@@ -136,7 +116,7 @@ def domain_wall_samples(
     faces = [_face_indices(face, intervals) for face in FACES if face not in domain.open_faces]
     indices = np.unique(np.concatenate([np.empty((0, 3), dtype=int), *faces]), axis=0)
     samples = np.stack([axes[axis][indices[:, axis]] for axis in range(3)], axis=1)
-    return BoundarySamples._of_points(samples)
+    return BoundarySamples.of_points(samples)
 
 
 def sink_samples(
@@ -167,7 +147,7 @@ def sink_samples(
         near_factor = np.where(is_deep, near.volume_factor / alone.volume_factor, 1.0)
         factor = np.concatenate([near_factor, far.volume_factor / alone.volume_factor * weakened])
         layer = np.repeat(np.arange(2, dtype=np.int32), [len(samples), np.count_nonzero(is_deep)])
-    return BoundarySamples(positions, np.zeros(len(positions), dtype=np.int32), factor=factor, layer=layer)
+    return BoundarySamples.of_points(positions, factor=factor, layer=layer)
 
 
 def outward_normals(signed_distance: SignedDistance, points: NDArray[np.float64], step: float) -> NDArray[np.float64]:
@@ -201,41 +181,30 @@ def _weakened(standoff: NDArray[np.float64], wanted_standoff: float, support_in_
 
 
 def _product_wall_samples(domain: DomainParameters, spacing: float, support_in_spacings: float) -> BoundarySamples:
-    lines = [_wall_line(domain, axis, spacing, support_in_spacings) for axis in range(3)]
+    lines = (_wall_line(domain, axis, spacing, support_in_spacings) for axis in range(3))
+    insides, walls = zip(*lines, strict=True)
     points, weights = [np.empty((0, 3))], [np.empty(0)]
     # Walls across x with all of y and z; then those across y, and across z, that are not among them.
     for across in range(3):
-        chosen = [line.inside if axis < across else line.all for axis, line in enumerate(lines)]
-        chosen[across] = lines[across].walls
+        chosen = [insides[a] if a < across else np.concatenate([insides[a], walls[a]]) for a in range(3)]
+        chosen[across] = walls[across]
         points.append(np.stack(np.meshgrid(*(c[:, 0] for c in chosen), indexing="ij"), axis=-1).reshape(-1, 3))
         products = np.meshgrid(*(c[:, 1] for c in chosen), indexing="ij")
         weights.append((products[0] * products[1] * products[2]).ravel())
     positions, weight = np.concatenate(points), np.concatenate(weights)
     outside = np.maximum(np.maximum(domain.min - positions, positions - domain.max), 0.0)
     near = np.linalg.norm(outside, axis=1) < support_in_spacings * spacing
-    return BoundarySamples(
-        positions[near].astype(np.float32),
-        np.zeros(np.count_nonzero(near), dtype=np.int32),
-        known_volume=weight[near] * particle_volume(spacing, support_in_spacings),
-    )
+    known = weight[near] * particle_volume(spacing, support_in_spacings)
+    return BoundarySamples.of_points(positions[near], known=known)
 
 
-@dataclass(frozen=True)
-class _WallLine:
+def _wall_line(
+    domain: DomainParameters, axis: int, spacing: float, support_in_spacings: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coordinates along an axis [m] with their weights in particles [-]: of fluid, and of the walls across it, (n, 2).
 
     Beyond an open face the fluid's points go on for half of the support.
     """
-
-    inside: NDArray[np.float64]
-    walls: NDArray[np.float64]
-
-    @property
-    def all(self) -> NDArray[np.float64]:
-        return np.concatenate([self.inside, self.walls])
-
-
-def _wall_line(domain: DomainParameters, axis: int, spacing: float, support_in_spacings: float) -> _WallLine:
     low, high = domain.min[axis], domain.max[axis]
     count = max(round((high - low) / spacing), 1)
     stretched = (high - low) / count
@@ -250,12 +219,7 @@ def _wall_line(domain: DomainParameters, axis: int, spacing: float, support_in_s
         for layer in wall_layers(support_in_spacings)
     ]
     weights = np.full(len(inside), stretched / spacing)
-    return _WallLine(np.stack([inside, weights], axis=1), np.array(walls).reshape(-1, 2))
-
-
-def _or_filled(values: NDArray[np.generic] | None, value: float, count: int) -> NDArray[np.generic]:
-    """The values, or as many equal ones where there are none."""
-    return np.full(count, value) if values is None else values
+    return np.stack([inside, weights], axis=1), np.array(walls).reshape(-1, 2)
 
 
 def _face_indices(face: str, intervals: NDArray[np.integer]) -> NDArray[np.integer]:

@@ -14,7 +14,7 @@ from sim.core.cells import CellGrid, Grid, cell_of_point, row_of_cell
 from sim.core.launch import kernel
 from sim.core.scan import exclusive_scan, scan_scratch_length
 from sim.fluid.kernels import Discretization
-from sim.fluid.opening import Opening
+from sim.fluid.opening import Opening, openings_of
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Layer, Particles, ParticleSet
 
@@ -63,16 +63,12 @@ class Emission:
         self.time_s = 0.0
         self.emitted = self.blocked = self.capped = 0
         self._fluids, self._grid = tuple(fluids), grid
-        spacing = self._spacing = discretization.spacing
-        self._phase = [number for number, fluid in enumerate(fluids) for _ in fluid.emitter]
-        self.openings = [
-            Opening.of(emitter, spacing, discretization.particle_volume, fluid.support_in_spacings)
-            for fluid in fluids
-            for emitter in fluid.emitter
-        ]
+        self._spacing = discretization.spacing
+        openings = openings_of(fluids, discretization.particle_volume)
+        self._phase, self.openings = [number for number, _ in openings], [opening for _, opening in openings]
         # Where emitters share a nozzle, the newest rules.
         self._oldest_first = [
-            (opening, _nozzle(opening, EDGE_IN_SPACINGS * spacing))
+            (opening, _nozzle(opening, EDGE_IN_SPACINGS * self._spacing))
             for opening in sorted(self.openings, key=lambda opening: opening.start_s)
         ]
         self._places = [on_device(opening.points) for opening in self.openings]
@@ -147,22 +143,14 @@ class Emission:
             self._layers[:] = arrays["emission_layers"]
 
     def _emit_layer(self, number: int, layer: int, particles: ParticleSet, sorted_count: int, first_id: int) -> None:
-        opening, phase, places = self.openings[number], self._phase[number], self._places[number]
+        opening, phase = self.openings[number], self._phase[number]
         count = len(opening.points)
         if count > self._room(phase, particles):
             self.capped += count
             return
-        moved = opening.layer_at(layer, self.time_s)[0] - opening.points[0]
-        candidates = Layer(
-            places=places,
-            count=count,
-            moved=(moved[0], moved[1], moved[2]),
-            velocity=tuple(opening.velocity),
-            phase=phase,
-            free=self._free,
-            order=self._order,
-            first_id=first_id,
-        )
+        moved = tuple(opening.layer_at(layer, self.time_s)[0] - opening.points[0])
+        places = self._places[number], count, moved, tuple(opening.velocity), phase
+        candidates = Layer(*places, free=self._free, order=self._order, first_id=first_id)
         clearance = BLOCKED_IN_SPACINGS * min(self._spacing, opening.layer_distance)
         find_free_places(
             candidates, particles.arrays, particles.cells.cell_start, self._grid.on_device, sorted_count, clearance
@@ -178,24 +166,17 @@ class Emission:
         cap = self._fluids[phase].max_particles
         if cap is None:
             return room
-        present = (
-            count_phase(particles.arrays.phase, particles.count, phase) if len(self._fluids) > 1 else particles.count
-        )
-        return min(room, cap - int(present))
+        present = particles.count
+        if len(self._fluids) > 1:
+            present = int(count_phase(particles.arrays.phase, particles.count, phase))
+        return min(room, cap - present)
 
 
 def _nozzle(opening: Opening, edge: float) -> Nozzle:
     """The nozzle of an opening, wider than that by an edge [m]."""
-    return Nozzle(
-        tuple(opening.centre),
-        tuple(opening.velocity),
-        tuple(opening.axes[0]),
-        tuple(opening.axes[1]),
-        opening.half_size[0] + edge,
-        opening.half_size[1] + edge,
-        int(opening.is_round),
-        opening.nozzle_depth * opening.speed,
-    )
+    vectors = (tuple(vector) for vector in (opening.centre, opening.velocity, *opening.axes))
+    first, second = opening.half_size
+    return Nozzle(*vectors, first + edge, second + edge, int(opening.is_round), opening.nozzle_depth * opening.speed)
 
 
 @kernel

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sim.fluid.opening import Opening, pipe_clearance
+from sim.fluid.opening import openings_of, pipe_clearance
 from sim.shapes.placement import build_solid
 from sim.shapes.sampling import fill_with_particles
 
@@ -36,17 +36,11 @@ body has its first layer exactly at the clearance."""
 
 @dataclass(frozen=True)
 class FluidFilling:
-    """The particles that the fluids of a tank start with.
+    """The particles that the fluids of a tank start with."""
 
-    Attributes:
-        positions: (n, 3) float32 [m].
-        velocities: (n, 3) float32 [m/s].
-        phase: which of the fluids each particle is of, (n,) int32.
-    """
-
-    positions: NDArray[np.float32]
-    velocities: NDArray[np.float32]
-    phase: NDArray[np.int32]
+    positions: NDArray[np.float32]  # (n, 3) float32 [m]
+    velocities: NDArray[np.float32]  # (n, 3) float32 [m/s]
+    phase: NDArray[np.int32]  # which of the fluids each particle is of, (n,) int32
 
 
 def fill_fluids(
@@ -64,9 +58,8 @@ def fill_fluids(
         ShapeError: a block's shape cannot be built.
         ValueError: a block is left without a particle.
     """
-    positions: list[NDArray[np.float32]] = [np.empty((0, 3), dtype=np.float32)]
-    velocities: list[NDArray[np.float32]] = [np.empty((0, 3), dtype=np.float32)]
-    phase: list[NDArray[np.int32]] = [np.empty(0, dtype=np.int32)]
+    positions, velocities = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.float32)]
+    phase = [np.empty(0, np.int32)]
     for index, fluid in enumerate(fluids):
         spacing = fluid.spacing
         for number, block in enumerate(fluid.block):
@@ -103,12 +96,11 @@ def particle_capacity(
     fluids: Sequence[FluidParameters], domain: DomainParameters, filling: FluidFilling, particle_volume: float
 ) -> int:
     """Most particles that there can be: those at the start, and what emitters may add to a domain that is not full."""
-    total = 0.0
-    for fluid, count in zip(fluids, np.bincount(filling.phase, minlength=len(fluids)).tolist(), strict=True):
-        openings = [
-            Opening.of(each, fluid.spacing, particle_volume, fluid.support_in_spacings) for each in fluid.emitter
-        ]
-        most = count + sum(opening.total_particles() for opening in openings)
-        total += max(count, min(most, math.inf if fluid.max_particles is None else fluid.max_particles))
+    counts = np.bincount(filling.phase, minlength=len(fluids))
+    most = counts.astype(np.float64)
+    for number, opening in openings_of(fluids, particle_volume):
+        most[number] += opening.total_particles()
+    caps = [math.inf if fluid.max_particles is None else fluid.max_particles for fluid in fluids]
+    total = float(np.maximum(counts, np.minimum(most, caps)).sum())
     full = FULL_DOMAIN * math.prod(np.subtract(domain.max, domain.min)) / particle_volume
     return max(len(filling.phase), int(min(total, full)))

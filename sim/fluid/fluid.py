@@ -14,7 +14,7 @@ from sim.core.solver import Remedies
 from sim.fluid.expected_speed import expected_speed
 from sim.fluid.forces import Forces
 from sim.fluid.kernels import Discretization
-from sim.fluid.opening import Opening
+from sim.fluid.opening import openings_of
 from sim.fluid.phases import Phases
 from sim.fluid.solve_record import SolveRecord
 from sim.fluid.surface_tension import Cohesion
@@ -75,7 +75,7 @@ class SPHFluid(ABC):
         self.name = "+".join(self.phases.names)
         self.discretization = Discretization(self.parameters.spacing, self.parameters.support_in_spacings)
         self.cohesion = Cohesion.of(start.fluids, self.discretization)
-        self.expected_speed = _expected_speed(start, self.discretization, self.cohesion.stress)
+        self.expected_speed = _expected_speed(start, self.cohesion.stress)
         self.signal_speed = self.parameters.sound_speed or self.speed_ratio * self.expected_speed
         self._stiffest = float(self.phases.viscosities.max()) * max(1.0, self.parameters.wall_friction)
         with_implicit = is_implicit(self.parameters, self._stiffest, self.signal_speed)
@@ -277,14 +277,9 @@ class SPHFluid(ABC):
         return None
 
 
-def _expected_speed(start: FluidStart, discretization: Discretization, stress: float) -> float:
+def _expected_speed(start: FluidStart, stress: float) -> float:
     """Largest speed to expect [m/s] of the particles at the start, of those that will flow in, and of bodies."""
-    spacing = discretization.spacing
-    openings = [
-        Opening.of(each, spacing, spacing**3, fluid.support_in_spacings)
-        for fluid in start.fluids
-        for each in fluid.emitter
-    ]
+    openings = [opening for _, opening in openings_of(start.fluids)]
     inflow = [np.broadcast_to(opening.velocity, opening.points.shape) for opening in openings]
     return expected_speed(
         np.concatenate([start.positions, *(opening.points for opening in openings)]),

@@ -95,17 +95,11 @@ def particle_volume(spacing: float, support_in_spacings: float = SUPPORT_IN_SPAC
 
 @dataclass(frozen=True)
 class WallCalibration:
-    """What makes a layer of boundary samples act like more fluid, alone or with other layers.
+    """What makes a layer of boundary samples act like more fluid, alone or with other layers."""
 
-    Attributes:
-        standoff_in_spacings: distance from the samples at which a lattice of fluid is at rest.
-        volume_factor: gamma, on the volume 1 / sum_k W_bk of a sample.
-        volume_in_particles: volume of a sample of a square layer of the lattice's spacing over that of a particle.
-    """
-
-    standoff_in_spacings: float
-    volume_factor: float
-    volume_in_particles: float
+    standoff_in_spacings: float  # distance from the samples at which a lattice of fluid is at rest
+    volume_factor: float  # gamma, on the volume 1 / sum_k W_bk of a sample
+    volume_in_particles: float  # volume of a sample of a square layer of the lattice's spacing over that of a particle
 
 
 @cache
@@ -206,15 +200,10 @@ def _layer_field(distance: float, support_in_spacings: float, *, shifts: int = 8
 
 @dataclass(frozen=True)
 class Discretization:
-    """Particles of one volume on a lattice, and a kernel over them.
+    """Particles of one volume on a lattice, and a kernel over them."""
 
-    Attributes:
-        spacing: of the lattice, d [m].
-        support_in_spacings: support radius h of the kernel over d [-].
-    """
-
-    spacing: float
-    support_in_spacings: float = SUPPORT_IN_SPACINGS
+    spacing: float  # of the lattice, d [m]
+    support_in_spacings: float = SUPPORT_IN_SPACINGS  # support radius h of the kernel over d [-]
 
     @cached_property
     def support_radius(self) -> float:

@@ -16,7 +16,7 @@ from sim.fluid.parameters import DiscOpening
 
 if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
-    from sim.fluid.parameters import EmitterParameters
+    from sim.fluid.parameters import EmitterParameters, FluidParameters
     from sim.shapes.solid import Solid
 
 
@@ -32,32 +32,18 @@ CELL_MISMATCH = 0.05  # by how much the area of a disc and that of the lattice c
 
 @dataclass(frozen=True)
 class Opening:
-    """A layer of particles in an opening, from which one layer after the other moves off.
+    """A layer of particles in an opening, from which one layer after the other moves off."""
 
-    Attributes:
-        centre: of the opening [m], (3,).
-        axes: unit vectors along its sides, (3,) each.
-        half_size: half the lengths of the sides of what a layer fills, or twice its radius [m].
-        is_round: it is a disc.
-        points: centres of the particles of a layer as it is in the opening [m], (n, 3).
-        velocity: of the inflow [m/s], (3,).
-        layer_distance: from one layer to the next [m]: the volume of a layer over the area of the opening, so that the
-            flow is exactly speed times area.
-        support_in_spacings: support radius of the fluid's kernel.
-        start_s: when the first layer leaves [s].
-        end_s: no layer leaves from then on [s].
-    """
-
-    centre: NDArray[np.float64]
-    axes: tuple[NDArray[np.float64], NDArray[np.float64]]
-    half_size: tuple[float, float]
-    is_round: bool
-    points: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    layer_distance: float
-    support_in_spacings: float
-    start_s: float
-    end_s: float
+    centre: NDArray[np.float64]  # of the opening [m], (3,)
+    axes: tuple[NDArray[np.float64], NDArray[np.float64]]  # unit vectors along its sides, (3,) each
+    half_size: tuple[float, float]  # half the lengths of the sides of what a layer fills, or twice its radius [m]
+    is_round: bool  # it is a disc
+    points: NDArray[np.float64]  # centres of the particles of a layer as it is in the opening [m], (n, 3)
+    velocity: NDArray[np.float64]  # of the inflow [m/s], (3,)
+    layer_distance: float  # a layer's volume over the opening's area [m], so that the flow is exactly speed times area
+    support_in_spacings: float  # support radius of the fluid's kernel
+    start_s: float  # when the first layer leaves [s]
+    end_s: float  # no layer leaves from then on [s]
 
     @classmethod
     def of(
@@ -165,6 +151,19 @@ class Opening:
     def total_particles(self) -> float:
         """Particles of all its layers; infinite where it never ends."""
         return math.inf if math.isinf(self.end_s) else float(len(self.points) * self.layers_due(self.end_s))
+
+
+def openings_of(fluids: Sequence[FluidParameters], particle_volume: float | None = None) -> list[tuple[int, Opening]]:
+    """Number of its fluid and opening of each emitter, for particles of a volume [m³]; that of the lattice if omitted.
+
+    Raises:
+        ValueError: one is too narrow.
+    """
+    return [
+        (number, Opening.of(emitter, fluid.spacing, particle_volume or fluid.lattice_volume, fluid.support_in_spacings))
+        for number, fluid in enumerate(fluids)
+        for emitter in fluid.emitter
+    ]
 
 
 def pipe_clearance(support_in_spacings: float) -> float:

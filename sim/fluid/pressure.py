@@ -47,6 +47,17 @@ Relax = Callable[[ti.Ndarray, int], None]
 """From a pressure that is tried, and the number of the iteration, to the compression left and the next pressure."""
 
 
+@bundle
+class PressureSystem(NamedTuple):
+    """Linear system of a pressure solve, (capacity,) each."""
+
+    compression: Floats  # s_i that a step without pressure leads to [-]
+    inverse_diagonal: Floats  # 1/A_ii [kg/m], alpha_i of Bender & Koschier 2015 in the unit of this P
+    relaxed_before: Floats  # P of the iteration before without its momentum [Pa]
+    remaining: Floats  # compression that is left [-]
+    relaxation: ti.f32  # omega
+
+
 class IncompressibleFluid(SPHFluid):
     """A fluid whose pressure keeps particles from being compressed in a step.
 
@@ -104,9 +115,8 @@ class IncompressibleFluid(SPHFluid):
         self.forces.begin_sheets()
         sheets = self.body_forces.sheets
         if sheets is not None:
-            sheets.add_to_diagonal(
-                self.tank.on_device, self.body_forces.near, self.relaxation, self.system.inverse_diagonal
-            )
+            fluid, inverse_diagonal = self.tank.on_device, self.system.inverse_diagonal
+            sheets.add_to_diagonal(fluid, self.body_forces.near, self.relaxation, inverse_diagonal)
 
     def correction(self, dt: float) -> float:
         """Share of the compression a particle has that a step of dt [s] takes back.
@@ -120,14 +130,9 @@ class IncompressibleFluid(SPHFluid):
 
         The velocities that it leads to stand in `pressure_acceleration` until the solve needs that.
         """
-        predict_compression(
-            self.tank.on_device,
-            self.forces.acceleration,
-            dt,
-            self.correction(dt),
-            self.pressure_acceleration,
-            self.system.compression,
-        )
+        predicted, compression = self.pressure_acceleration, self.system.compression
+        fluid, acceleration = self.tank.on_device, self.forces.acceleration
+        predict_compression(fluid, acceleration, dt, self.correction(dt), predicted, compression)
 
     def start_from(self, pressure: ti.Ndarray) -> None:
         """Note the first guess of a solve, from which its first change of pressure counts."""
@@ -152,17 +157,16 @@ class IncompressibleFluid(SPHFluid):
             dt: the step [s].
             least: iterations to make in any case.
             tolerance: mean compression that may be left [-].
-            error_growth: give up, not converged, where the error is more than so many times the first one, or ten
-                times the tolerance, whichever is larger [-].
-            relax: fills `system.remaining` with the compression that the accelerations leave, and `next_pressure`; as
-                the linear system has it if omitted.
+            error_growth: of the first error, or of ten times the tolerance, at which to give up, not converged [-].
+            relax: fills `system.remaining` and `next_pressure`; as the linear system has it if omitted.
         """
         limit = max(self.parameters.max_iterations, least)
         iteration, next_look, bound = 0, least, math.inf
         while True:
             self.accelerate_by(pressure)
             if relax is None:
-                self._relax_linearly(pressure, dt, iteration)
+                beta, left = momentum(iteration), (self.pressure_acceleration, self.boundary_response)
+                relax_pressure(self.tank.on_device, self.system, *left, dt**2, beta, pressure, self.next_pressure)
             else:
                 relax(pressure, iteration)
             iteration += 1
@@ -185,19 +189,6 @@ class IncompressibleFluid(SPHFluid):
         self.boundary_response = response.no_acceleration
         if self.body_forces.answer:
             self.boundary_response = self.body_forces.respond(self.forces.exerted(pressure, with_friction=False))
-
-    def _relax_linearly(self, pressure: ti.Ndarray, dt: float, iteration: int) -> None:
-        """Compression left, s - dt² A P with s from `system.compression`, and the pressure to try next."""
-        relax_pressure(
-            self.tank.on_device,
-            self.system,
-            self.pressure_acceleration,
-            self.boundary_response,
-            dt**2,
-            momentum(iteration),
-            pressure,
-            self.next_pressure,
-        )
 
     def mean_error(self, pressure: ti.Ndarray, dt: float, remaining: ti.Ndarray | None = None) -> float:
         """Mean error over all particles, or ten times that among those near a moving body, whichever is larger.
@@ -277,17 +268,6 @@ def momentum(iteration: int) -> float:
     """
     k = iteration + 7.0
     return (k - 1.0) / (k + 2.0)
-
-
-@bundle
-class PressureSystem(NamedTuple):
-    """Linear system of a pressure solve, (capacity,) each."""
-
-    compression: Floats  # s_i that a step without pressure leads to [-]
-    inverse_diagonal: Floats  # 1/A_ii [kg/m], alpha_i of Bender & Koschier 2015 in the unit of this P
-    relaxed_before: Floats  # P of the iteration before without its momentum [Pa]
-    remaining: Floats  # compression that is left [-]
-    relaxation: ti.f32  # omega
 
 
 @func

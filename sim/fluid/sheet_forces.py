@@ -15,6 +15,7 @@ from sim.fluid.boundary import Boundary, NearParticles, Samples, Sheets
 from sim.fluid.kernels import TINY_DISTANCE, Discretization, distance, spline, spline_slope
 from sim.fluid.particles import Fluid
 from sim.fluid.sheet_samples import SheetSamples, one_sided_field, one_sided_tilt, resting_field
+from sim.fluid.stepping import Box
 
 # Solves of a step whose forces last apart from each other: of divergence, and of density with all other forces.
 DIVERGENCE, DENSITY = 0, 1
@@ -134,12 +135,12 @@ class SheetForces:
             self.impulse,
         )
 
-    def take_motion(self, fluid: Fluid, change: ti.Ndarray, dt: float, walls: tuple[Vector3, Vector3]) -> None:
+    def take_motion(self, fluid: Fluid, change: ti.Ndarray, dt: float, box: Box) -> None:
         """Give the fluid that touched at the start of the step of dt [s] the changes of velocity of the samples [m/s].
 
-        Positions follow as if it had been so during the step, up to the walls, two corners [m].
+        Positions follow as if it had been so during the step, up to the walls of the box.
         """
-        take_sheet_motion(fluid, self._contacts, self._boundary.sheets, change, dt, *walls)
+        take_sheet_motion(fluid, self._contacts, self._boundary.sheets, change, dt, box)
 
     def checkpoint(self) -> dict[str, NDArray[np.float32]]:
         """The forces of the last step, which the next one expects."""
@@ -320,15 +321,7 @@ def add_missing_weight(
 
 
 @kernel
-def take_sheet_motion(
-    fluid: Fluid,
-    contacts: Contacts,
-    sheets: Sheets,
-    change: Vectors,
-    dt: ti.f32,
-    wall_low: ti.math.vec3,
-    wall_high: ti.math.vec3,
-):
+def take_sheet_motion(fluid: Fluid, contacts: Contacts, sheets: Sheets, change: Vectors, dt: ti.f32, box: Box):
     """v_i += sum_b phi_ib dv_b with m_i phi_ib = contact_i V_b W_ib, as if it had been so during the step.
 
     Who would pass a wall is put back onto it, as at the end of the fluid's own step.
@@ -347,7 +340,7 @@ def take_sheet_motion(
             dv = fluid.sigma * contacts.mass[i] / mass * total
             v_i = fluid.particles.velocity[i] + dv
             free = fluid.particles.position[i] + dt * dv
-            x_end = ti.min(ti.max(free, wall_low), wall_high)
+            x_end = ti.min(ti.max(free, box.wall_low), box.wall_high)
             for axis in ti.static(range(3)):
                 if x_end[axis] != free[axis]:
                     v_i[axis] = 0.0

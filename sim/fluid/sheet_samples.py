@@ -28,17 +28,11 @@ through, and no more than that, so that fluid at rest comes near."""
 
 @dataclass(frozen=True, eq=False)
 class SheetSamples:
-    """One layer of samples of each sheet.
+    """One layer of samples of each sheet."""
 
-    Attributes:
-        boundary: samples of the sheets at rest, with volumes that let nothing through, (m, 3).
-        own_mass: of the sheet's part that each stands for [kg], (m,).
-        missing_volume: of fluid that stays away from that part although the part is not there, as fluid on both of its
-            sides keeps its distance [m³], (m,).
-    """
-
-    boundary: BoundarySamples
-    own_mass: NDArray[np.float64]
+    boundary: BoundarySamples  # samples of the sheets at rest, with volumes that let nothing through, (m, 3)
+    own_mass: NDArray[np.float64]  # of the sheet's part that each stands for [kg], (m,)
+    # of fluid that keeps its distance on both sides of that part without being displaced [m³], (m,)
     missing_volume: NDArray[np.float64]
 
 

@@ -6,19 +6,12 @@ from dataclasses import dataclass
 
 @dataclass
 class SolveRecord:
-    """Counters of the solves of one kind in a frame.
+    """Counters of the solves of one kind in a frame."""
 
-    Attributes:
-        solves: their number.
-        iterations: of all of them.
-        worst_error: largest error with which one ended [-].
-        not_converged: number of those that ended before their error was below the tolerance.
-    """
-
-    solves: int = 0
-    iterations: int = 0
-    worst_error: float = 0.0
-    not_converged: int = 0
+    solves: int = 0  # their number
+    iterations: int = 0  # of all of them
+    worst_error: float = 0.0  # largest error with which one ended [-]
+    not_converged: int = 0  # number of those that ended before their error was below the tolerance
 
     def add(self, iterations: int, error: float, *, converged: bool) -> None:
         """Count one solve."""

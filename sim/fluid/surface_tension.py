@@ -25,21 +25,13 @@ from sim.fluid.particles import Fluid
 
 @dataclass(frozen=True, eq=False)
 class Cohesion:
-    """Surface tension of the fluids of a tank: its model, its strength, and what it asks of speeds and steps.
+    """Surface tension of the fluids of a tank: its model, its strength, and what it asks of speeds and steps."""
 
-    Attributes:
-        is_becker_teschner2007: whether there is that of Becker & Teschner 2007.
-        is_akinci2013: whether there is that of Akinci et al. 2013.
-        akinci2013: its cohesion c of each fluid [m/s²], (k,).
-        stress: with which it pulls a filled lattice together, over the density [m²/s²].
-        rate: square of the frequency of a particle on the spring that its neighbours' cohesion is [1/s²].
-    """
-
-    is_becker_teschner2007: bool
-    is_akinci2013: bool
-    akinci2013: NDArray[np.float64]
-    stress: float
-    rate: float
+    is_becker_teschner2007: bool  # whether there is that of Becker & Teschner 2007
+    is_akinci2013: bool  # whether there is that of Akinci et al. 2013
+    akinci2013: NDArray[np.float64]  # its cohesion c of each fluid [m/s²], (k,)
+    stress: float  # with which it pulls a filled lattice together, over the density [m²/s²]
+    rate: float  # square of the frequency of a particle on the spring that its neighbours' cohesion is [1/s²]
 
     @classmethod
     def of(cls, fluids: tuple[FluidParameters, ...], discretization: Discretization) -> "Cohesion":

@@ -18,7 +18,7 @@ from sim.fluid.kernels import Discretization
 from sim.fluid.opening import is_felt_in_nozzles
 from sim.fluid.particles import HOST_NAMES, Fluid, ParticleSet
 from sim.fluid.sheet_forces import SheetForces
-from sim.fluid.stepping import Box, MotionSummary, ParticleStepper
+from sim.fluid.stepping import MotionSummary, ParticleStepper, box_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,34 +37,20 @@ MEASURES = ("max_speed", "max_acceleration", "max_frequency", "max_displacement"
 
 @dataclass(frozen=True, eq=False)
 class FluidStart:
-    """A tank of fluids as it starts.
+    """A tank of fluids as it starts; whoever moves bodies and sheets in it places them before the first step."""
 
-    Attributes:
-        fluids: parameters of each fluid in the tank.
-        domain: the box they live in.
-        gravity: acceleration [m/s²].
-        positions, velocities: of the particles [m], [m/s], (n, 3), float32.
-        boundary: samples of walls and of bodies that never move.
-        phase: number of the fluid of each particle, (n,); 0 for all if omitted.
-        moving: samples of moving bodies, relative to the centre of mass and in the axes of each.
-        sheets: samples of sheets, which whoever moves these has to place before the first step.
-        body_count: number of moving bodies; `ParticleTank.move_bodies` has to place them before the first step.
-        body_speed: largest speed of moving bodies to expect [m/s].
-        capacity: most particles that there can ever be; those at the start if omitted.
-    """
-
-    fluids: tuple[FluidParameters, ...]
-    domain: DomainParameters
-    gravity: Vector3
-    positions: NDArray[np.float32]
-    velocities: NDArray[np.float32]
-    boundary: BoundarySamples
-    phase: NDArray[np.int32] | None = None
-    moving: BoundarySamples = field(default_factory=BoundarySamples.of_bodies)
+    fluids: tuple[FluidParameters, ...]  # parameters of each fluid in the tank
+    domain: DomainParameters  # the box they live in
+    gravity: Vector3  # [m/s²]
+    positions: NDArray[np.float32]  # of the particles [m], (n, 3), float32
+    velocities: NDArray[np.float32]  # [m/s], (n, 3), float32
+    boundary: BoundarySamples  # of walls and of bodies that never move
+    phase: NDArray[np.int32] | None = None  # number of the fluid of each particle, (n,); 0 for all if omitted
+    moving: BoundarySamples = field(default_factory=BoundarySamples.of_bodies)  # about the centre of mass of each body
     sheets: SheetSamples | None = None
-    body_count: int = 0
-    body_speed: float = 0.0
-    capacity: int | None = None
+    body_count: int = 0  # moving bodies
+    body_speed: float = 0.0  # largest speed of them to expect [m/s]
+    capacity: int | None = None  # most particles that there can ever be; those at the start if omitted
 
 
 class ParticleTank:
@@ -107,22 +93,17 @@ class ParticleTank:
         self.removed = 0
         self._travelled = self._boundary_travelled = 0.0
         self.body_speed = self.sheet_speed = 0.0
-        self._box = Box.of_domain(start.domain)
+        self._box = box_of(start.domain)
         self._stepper = ParticleStepper(self._box)
         self._search_radius = (1.0 + skin) * discretization.support_radius
-        self.grid = CellGrid.covering(
-            np.array(start.domain.min),
-            np.array(start.domain.max),
-            self._search_radius,
-            reach=cells_per_radius(discretization.support_in_spacings),
-        )
+        reach, domain = cells_per_radius(discretization.support_in_spacings), start.domain
+        self.grid = CellGrid.covering(np.array(domain.min), np.array(domain.max), self._search_radius, reach=reach)
         self.emission = Emission(start.fluids, discretization, self.grid)
+        support = discretization.support_radius
         self.boundary = Boundary(
             start.boundary,
             start.moving,
-            is_smooth=is_felt_in_nozzles(
-                start.boundary.positions, self.emission.openings, discretization.support_radius
-            ),
+            is_smooth=is_felt_in_nozzles(start.boundary.positions, self.emission.openings, support),
             sheets=BoundarySamples.of_bodies() if start.sheets is None else start.sheets.boundary,
             body_count=start.body_count,
             grid=self.grid,
@@ -151,9 +132,8 @@ class ParticleTank:
                 "phase": np.zeros(count, np.int32) if start.phase is None else start.phase.astype(np.int32),
             }
         )
-        largest = float(np.sqrt((np.asarray(start.velocities, np.float64) ** 2).sum(axis=1).max(initial=0.0)))
-        self.motion = MotionSummary(max_speed=largest, max_acceleration=float(np.linalg.norm(start.gravity)))
-        self.last_speed = largest
+        self.last_speed = float(np.sqrt((np.asarray(start.velocities, np.float64) ** 2).sum(axis=1).max(initial=0.0)))
+        self.motion = MotionSummary(self.last_speed, float(np.linalg.norm(start.gravity)))
         self._expect_inflow()
         self.begin_frame()
         self.find_neighbors()
@@ -162,15 +142,8 @@ class ParticleTank:
     def on_device(self) -> Fluid:
         """The fluid as kernels read it."""
         particles, d = self.particles, self.discretization
-        return Fluid(
-            particles.arrays,
-            particles.near,
-            self.boundary.samples,
-            self._materials,
-            d.particle_volume,
-            d.sigma,
-            d.inverse_support,
-        )
+        arrays = particles.arrays, particles.near, self.boundary.samples, self._materials
+        return Fluid(*arrays, d.particle_volume, d.sigma, d.inverse_support)
 
     @property
     def boundary_speed(self) -> float:
@@ -208,7 +181,7 @@ class ParticleTank:
         """
         sheets = self.body_forces.sheets
         assert sheets is not None
-        sheets.take_motion(self.on_device, change, dt, self._box.walls)
+        sheets.take_motion(self.on_device, change, dt, self._box)
         self._travelled += dt * largest_change
         self.motion = replace(self.motion, max_speed=self.motion.max_speed + largest_change)
 
@@ -243,7 +216,7 @@ class ParticleTank:
     def find_neighbors(self) -> None:
         """Sort the particles, drop those that left, and list the neighbours of all others."""
         particles = self.particles
-        self.removed += particles.sort(*self._box.openings)
+        self.removed += particles.sort(self._box.keep_low, self._box.keep_high)
         particles.neighbors.build(
             self._search_radius,
             particles.sorted_points,

@@ -17,31 +17,16 @@ COHESION_NUMBER = 0.25  # fraction of the inverse frequency of a particle on the
 
 @dataclass(frozen=True, slots=True)
 class SolverTraits:
-    """Traits of one solver.
+    """Traits of one solver."""
 
-    Attributes:
-        skin: reach of the neighbour list beyond the support [support radii]. More means fewer searches, and more pairs
-            in every step.
-        cfl_number: largest displacement of a particle in a step [spacings]; where there is a speed of sound, that of
-            a signal.
-        gravity_number: largest step over sqrt(d/g), whatever the speed [-].
-        buoyancy_error: error of the buoyancy of a thin sheet, in the mass of a layer of particles per area
-            (docs/decisions/0023-cloth-and-fluid.md) [-].
-        speed_ratio: speed of sound over the largest expected speed; 1 where there is none.
-        particle_step_s: core time of a particle in a step at a support of two spacings (docs/guide/live.md) [s].
-        step_s: time of launching a step's kernels, however few particles and however many cores there are [s].
-        splash_factor: largest speed over that of a fall from the top [-]: jets are faster, and squeezed particles of
-            WCSPH are stiffer.
-    """
-
-    skin: float
-    cfl_number: float
-    gravity_number: float
-    buoyancy_error: float
-    particle_step_s: float
-    step_s: float
-    splash_factor: float
-    speed_ratio: float = 1.0
+    skin: float  # reach of the neighbour list beyond the support [support radii]; more: fewer searches, more pairs
+    cfl_number: float  # largest displacement of a particle, or of a signal at a speed of sound, in a step [spacings]
+    gravity_number: float  # largest step over sqrt(d/g), whatever the speed [-]
+    buoyancy_error: float  # of a thin sheet, in the mass of a layer of particles per area (docs/decisions/0023) [-]
+    particle_step_s: float  # core time of a particle in a step at a support of two spacings (docs/guide/live.md) [s]
+    step_s: float  # time of launching a step's kernels, however few particles and however many cores there are [s]
+    splash_factor: float  # largest speed over that of a fall from the top [-]: jets are faster; WCSPH squeezes harder
+    speed_ratio: float = 1.0  # speed of sound over the largest expected speed; 1 where there is none
 
     @property
     def has_sound_speed(self) -> bool:
@@ -96,14 +81,9 @@ def stable_time_step(
 ) -> float:
     """Largest stable step [s]: the smallest of the limits by signals, forces, viscosity, cohesion and pressure.
 
-    Args:
-        spacing: particle spacing d [m].
-        signal_speed: speed of sound plus largest speed; the largest speed alone where pressure is implicit [m/s].
-        acceleration: largest acceleration [m/s²].
-        viscosity: kinematic viscosity, the artificial one included [m²/s].
-        cohesion_rate: square of the frequency of a particle on the springs of its neighbours' cohesion [1/s²].
-        cfl: the user's factor on the limit by signals [-].
-        pressure_frequency: highest frequency of particles against each other's pressure [1/s], where it is explicit.
+    Signals have the speed of sound plus the largest speed, or that alone where pressure is implicit [m/s]. Viscosity is
+    kinematic, the artificial one included [m²/s]. The cohesion of its neighbours is a spring on which a particle has a
+    frequency of that square [1/s²]; against each other's explicit pressure particles have another one [1/s].
     """
     limits = [math.inf]
     if signal_speed > 0.0:

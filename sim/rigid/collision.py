@@ -25,16 +25,12 @@ class CollisionDetector:
     examined again when its surfaces may have moved by more than `TRUSTED_MOTION`; until then its contacts are followed
     (`AnchoredContacts`), all within that distance included.
 
-    Args:
-        geometries: of all bodies but the domain.
-        can_move: which of them forces move, (n,) bool; pairs without one have no contacts.
-        walls: walls of the domain.
-
     Attributes:
         followed: the contacts that are being followed.
     """
 
     def __init__(self, geometries: Sequence[BodyGeometry], can_move: NDArray[np.bool_], walls: Sequence[Wall]) -> None:
+        """Take all bodies but the domain, and which of them forces move, (n,): pairs without one have no contacts."""
         self._geometries, self._walls = tuple(geometries), tuple(walls)
         self._domain = len(geometries)
         self._closed = np.array([[-np.inf] * 3, [np.inf] * 3])

@@ -50,11 +50,7 @@ class Outcome:
 
 
 class ContactResponse:
-    """Resolves the contacts of a step, starting from the impulses of the step before.
-
-    Args:
-        surfaces: of all bodies.
-        gravity: [m/s²].
+    """Resolves the contacts of a step, starting from the impulses of the step before; gravity is in m/s².
 
     Attributes:
         last_keys: the contacts of the last step.

@@ -59,12 +59,6 @@ class RigidSolver:
         walls: closed faces of the domain.
         paths, time_s, gravity: of each kinematic body, by its number; simulated time [s]; [m/s²].
 
-    Args:
-        parameters: the moving bodies, in the order of the job.
-        obstacles: the static ones.
-        domain: its closed faces are walls.
-        gravity: [m/s²].
-
     Raises:
         ShapeError: a shape cannot be built.
     """

@@ -126,7 +126,7 @@ _SIZES = {
 
 
 class DeviceShapes:
-    """Primitives by their formulas and meshes by grids, one shape a body.
+    """Primitives by their formulas and meshes by grids, one shape a body; those that share a geometry share its grid.
 
     Attributes:
         count: number of bodies, b.
@@ -135,9 +135,6 @@ class DeviceShapes:
         centre_of_mass: in the frame of the shape [m], (b,) vec3.
         radius: that of a sphere around the centre of mass that holds the body [m], (b,).
         step: half width of differences for normals [m], (b,).
-
-    Args:
-        geometries: of the bodies; those that share one share its grid.
     """
 
     def __init__(self, geometries: Sequence[BodyGeometry]) -> None:

@@ -242,12 +242,9 @@ def _velocity_at_face(box: Grid, velocity: Faces, axis: ti.template(), i: ti.i32
 
 @func
 def _locate(box: Grid, position, axis: ti.template()):
-    """The lowest of the eight places around a position, and the position's offset from it in cells.
+    """The lowest of the eight places around a position in cells, and the position's offset from it.
 
-    Args:
-        box: the grid.
-        position: in cells, in the index space of what is looked up.
-        axis: across which its faces lie; 3 for cell values.
+    Positions are in the index space of the faces across an axis, or of cells for axis 3.
     """
     place = ti.Vector([0, 0, 0])
     offset = ti.Vector([0.0, 0.0, 0.0])

@@ -29,14 +29,10 @@ class Extrapolation:
 
     Attributes:
         words: the layers of each place, int32; None without solids, where there is nothing to fill.
-
-    Args:
-        obstacles: in the grid where the values live.
-        state: what is continued into them.
-        reach: how many cells into a solid a look-up may come.
     """
 
     def __init__(self, obstacles: Obstacles, state: State, *, reach: float) -> None:
+        """Prepare for look-ups that come so many cells into solids."""
         self._obstacles, self._state = obstacles, state
         self._layers = range(1, math.ceil(reach) + 2)
         self.words: ti.Ndarray | None = None

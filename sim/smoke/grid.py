@@ -43,22 +43,14 @@ class SmokeGrid:
 
     Solids are voxelized: a cell is solid if its centre lies inside a solid, and a face of a solid cell is closed. The
     surface is thus a staircase, wrong by up to half a cell; flow along it slips.
-
-    Attributes:
-        origin: lower corner [m].
-        cell_size: edge of a cell [m].
-        cells: how many cells along x, y, z.
-        open_faces: sides of the box that air passes freely; the others are walls.
-        solid: (nx, ny, nz) bool, which cells are in solids that stand still.
-        inflow_faces: sides through which wind comes in at a given speed; walls to the pressure.
     """
 
-    origin: tuple[float, float, float]
-    cell_size: float
-    cells: Index3
-    open_faces: frozenset[Face]
-    solid: NDArray[np.bool_]
-    inflow_faces: frozenset[Face] = frozenset()
+    origin: tuple[float, float, float]  # lower corner [m]
+    cell_size: float  # edge of a cell [m]
+    cells: Index3  # how many cells along x, y, z
+    open_faces: frozenset[Face]  # sides of the box that air passes freely; the others are walls
+    solid: NDArray[np.bool_]  # (nx, ny, nz) bool, which cells are in solids that stand still
+    inflow_faces: frozenset[Face] = frozenset()  # where wind comes in at a given speed; walls to the pressure
 
     @classmethod
     def build(

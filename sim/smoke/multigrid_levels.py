@@ -30,19 +30,12 @@ DIRICHLET_GHOST = -1.0  # mark in the ghosts of `inverse_diagonal`: beyond this 
 
 @dataclass(frozen=True)
 class Level:
-    """One of the grids; the arrays of all levels stand one after another in one flat array.
+    """One of the grids; the arrays of all levels stand one after another in one flat array."""
 
-    Attributes:
-        cells: how many cells along x, y, z.
-        offset: where its flat arrays, with ghosts, begin.
-        widths: of its cells along each axis, in units of the finest cell.
-        distance_offsets: by axis, where the distances of its centres across its faces begin.
-    """
-
-    cells: Index3
-    offset: int
-    widths: tuple[NDArray[np.float64], ...]
-    distance_offsets: Index3
+    cells: Index3  # how many cells along x, y, z
+    offset: int  # where its flat arrays, with ghosts, begin
+    widths: tuple[NDArray[np.float64], ...]  # of its cells along each axis, in units of the finest cell
+    distance_offsets: Index3  # by axis, where the distances of its centres across its faces begin
 
     @property
     def padded(self) -> Index3:
@@ -92,11 +85,7 @@ def plan_levels(cells: Index3) -> list[Level]:
 def operator_matrix(conductance: tuple[NDArray[np.float32], ...]) -> NDArray[np.float64]:
     """The operator (A p)_i = sum over faces of conductance * (p_i - p_neighbour) as a dense symmetric matrix.
 
-    Args:
-        conductance: by axis, padded, as the arrays of `Coefficients`.
-
-    Returns:
-        Over the cells in C order.
+    It is over the cells in C order; conductances are by axis, padded, as the arrays of `Coefficients`.
     """
     cells = tuple(n - 2 for n in conductance[0].shape)
     count = math.prod(cells)

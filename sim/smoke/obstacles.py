@@ -37,17 +37,11 @@ AIR, MOVING, STATIC = range(3)  # what a cell is. Beyond closed sides of the box
 
 @dataclass(frozen=True)
 class Change:
-    """What a commit changed.
+    """What a commit changed."""
 
-    Attributes:
-        cells: how many cells became air or solid.
-        covered: density that was in cells that are solid now, summed over cells [-].
-        uncovered: density in the cells that are air now, likewise.
-    """
-
-    cells: int
-    covered: float
-    uncovered: float
+    cells: int  # how many cells became air or solid
+    covered: float  # density that was in cells that are solid now, summed over cells [-]
+    uncovered: float  # density in the cells that are air now, likewise
 
 
 NO_CHANGE = Change(0, 0.0, 0.0)
@@ -135,11 +129,7 @@ class Obstacles:
         return air
 
     def commit(self, density: ti.Ndarray) -> Change:
-        """Take the marked cells for the obstacles from now on, and clear the marks.
-
-        Args:
-            density: of smoke [-], flat; what covered and uncovered cells hold is summed up.
-        """
+        """Take the marked cells for the obstacles from now on; sums up the smoke of those covered and uncovered."""
         if not self.moving:
             return NO_CHANGE
         cells = int(_swap(self.box, self.solids.state, self.marks.state, density, self._rows))

@@ -33,21 +33,13 @@ SAFETY = 0.7  # the recursion aims below the tolerance, as correcting the veloci
 
 @dataclass(frozen=True)
 class ProjectionReport:
-    """What one projection took.
+    """What one projection took."""
 
-    Attributes:
-        iterations: applications of the preconditioner.
-        residual: max|div u - c| h / max|u| that was reached, with the compression c of each region; 0 at rest.
-        divergence: max|div u - c| that was reached [1/s].
-        compression: largest |c|, the rate at which obstacles change the volume of a closed region [1/s].
-        converged: whether the tolerance was met.
-    """
-
-    iterations: int
-    residual: float
-    divergence: float
-    compression: float
-    converged: bool
+    iterations: int  # applications of the preconditioner
+    residual: float  # max|div u - c| h / max|u| that was reached, with the compression c of each region; 0 at rest
+    divergence: float  # max|div u - c| that was reached [1/s]
+    compression: float  # largest |c|, the rate at which obstacles change the volume of a closed region [1/s]
+    converged: bool  # whether the tolerance was met
 
 
 ALPHA, BETA, R_Z = range(3)  # numbers of the conjugate gradients that stay on the device

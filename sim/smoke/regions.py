@@ -64,14 +64,9 @@ class ClosedRegions:
         _number_cells(self._obstacles.box, self.number, self.count, self._roots, self._cells)
 
     def subtract_means(self, values: ti.Ndarray, largest: float) -> float:
-        """Take the mean over each region off the values in it.
+        """Take the mean over each region off the values in it, 0 in solid cells; returns the largest |mean|.
 
-        Args:
-            values: flat; 0 in solid cells.
-            largest: a bound of their magnitude.
-
-        Returns:
-            The largest magnitude of a mean.
+        The magnitude of the values is `largest` at most.
         """
         if self.number is None or self.count == 0 or not 0.0 < largest < math.inf:
             return 0.0

@@ -37,14 +37,10 @@ class SourceMotion(Protocol):
 
 
 class PathMotion:
-    """Along a path that is known ahead.
-
-    Args:
-        path: of its shape's origin.
-        reach: largest distance of its points from there [m].
-    """
+    """Along a path that is known ahead."""
 
     def __init__(self, path: KeyframePath, reach: float) -> None:
+        """Take the path of the shape's origin, from which its points are no farther than the reach [m]."""
         self._path, self._way, self._speed = path, path.arc_length(reach), path.largest_speed(reach)
 
     def poses(self, begin_s: float, end_s: float, *, spacing: float) -> list[Motion]:
@@ -71,14 +67,10 @@ class BodyMotion:
     """Fixed to a rigid body, which someone else tells the motion of, step by step.
 
     Between the two ends of a step the body is taken to go straight and to turn about one axis.
-
-    Args:
-        offset: of the source's origin from that of the body's shape, along the body's axes [m], (3,).
-        orientation: unit quaternion, the source's axes to those of the body, (4,).
-        reach: largest distance of the source's points from its origin [m].
     """
 
     def __init__(self, offset: Array, orientation: Array, reach: float) -> None:
+        """Take the source's origin from that of the body's shape [m], (3,), its turn, (4,), and its reach [m]."""
         self._offset, self._orientation = offset, orientation
         self._arm = reach + float(np.linalg.norm(offset))
         self.stay(Motion(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3)))

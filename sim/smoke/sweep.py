@@ -23,17 +23,11 @@ CELLS = 3  # stands for cells where the axis of faces is asked for
 
 @dataclass(frozen=True)
 class Swept:
-    """The places that a shape passed over.
+    """The places that a shape passed over."""
 
-    Attributes:
-        indices: of the places in flat arrays, ascending, (n,).
-        places: their positions [m], (n, 3).
-        poses: which of the poses was the last to cover each, (n,).
-    """
-
-    indices: NDArray[np.int32]
-    places: NDArray[np.float64]
-    poses: NDArray[np.int64]
+    indices: NDArray[np.int32]  # of the places in flat arrays, ascending, (n,)
+    places: NDArray[np.float64]  # their positions [m], (n, 3)
+    poses: NDArray[np.int64]  # which of the poses was the last to cover each, (n,)
 
 
 class SweptShape:

@@ -39,15 +39,10 @@ LUCK = (0.0, 1.0 / 3.0, 2.0 / 3.0)  # where in a cell a body that moves may be, 
 
 @dataclass(frozen=True)
 class ThinWalls:
-    """What the cells miss of a body.
+    """What the cells miss of a body."""
 
-    Attributes:
-        share: of its surface in the box [-], as far as it is thinner than a cell below.
-        thickness: its median there [m]; 0 where nothing is missed.
-    """
-
-    share: float
-    thickness: float
+    share: float  # of its surface in the box [-], as far as it is thinner than a cell below
+    thickness: float  # its median there [m]; 0 where nothing is missed
 
 
 def thin_walls(
@@ -55,13 +50,8 @@ def thin_walls(
 ) -> ThinWalls:
     """What a smoke's cells miss of a body that stands still in its box.
 
-    What lies on a closed side counts as seen, and so does what has a cell of another body right beside it.
-
-    Args:
-        solid: the body.
-        smoke: whose box and cells they are.
-        domain: the box of a smoke without its own.
-        others: further bodies that stand still.
+    What lies on a closed side counts as seen, and so does what has a cell of another body, which stands still as well,
+    right beside it.
     """
     low, high = (np.asarray(corner) for corner in smoke.corners(domain))
     # A face that lies in a side of the box, but for round-off, is not in it.

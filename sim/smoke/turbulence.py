@@ -56,11 +56,6 @@ class Turbulence:
 
     The pattern drifts with the wind. It is a function of place, time and seed alone.
 
-    Args:
-        grid: where the faces are.
-        parameters: strength, size, rate, seed.
-        wind: [m/s].
-
     Raises:
         ValueError: the eddies are smaller than cells can carry.
     """

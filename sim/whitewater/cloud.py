@@ -19,21 +19,13 @@ class WhitewaterKind(IntEnum):
 
 @dataclass(frozen=True)
 class WhitewaterCloud:
-    """All particles, in the order in which they were made: all that the next frame needs to know.
+    """All particles, in the order in which they were made: all that the next frame needs to know."""
 
-    Attributes:
-        position: [m], (n, 3), float32.
-        velocity: [m/s], (n, 3), float32.
-        radius: drawn radius [m], (n,), float32.
-        lifetime: what is left of it as foam [s], (n,), float32.
-        kind: values of `WhitewaterKind`, (n,), uint8.
-    """
-
-    position: NDArray[np.float32]
-    velocity: NDArray[np.float32]
-    radius: NDArray[np.float32]
-    lifetime: NDArray[np.float32]
-    kind: NDArray[np.uint8]
+    position: NDArray[np.float32]  # [m], (n, 3), float32
+    velocity: NDArray[np.float32]  # [m/s], (n, 3), float32
+    radius: NDArray[np.float32]  # drawn radius [m], (n,), float32
+    lifetime: NDArray[np.float32]  # what is left of it as foam [s], (n,), float32
+    kind: NDArray[np.uint8]  # values of `WhitewaterKind`, (n,), uint8
 
     def __len__(self) -> int:
         return len(self.position)

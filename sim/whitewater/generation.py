@@ -59,16 +59,9 @@ def generate(
     """The whitewater of one substep: in the cylinder that each fluid particle sweeps (their section 3.2).
 
     The number is rate dt, rounded up or down at random so that its mean is right. A place is r = r_V sqrt(X) across and
-    X |v| dt along the velocity; the velocity is the fluid's, and `spread` of it outwards.
-
-    Args:
-        state: the fluid at the end of the substep.
-        rate: of each fluid particle [1/s], (n,).
-        dt: length of the substep [s].
-        particle_radius: of the fluid [m].
-        room: most particles to make; says how many were not.
-        moment: which substep this is.
-        parameters: sizes, lifetimes and the seed.
+    X |v| dt along the velocity; the velocity is the fluid's, and `spread` of it outwards. Where there is no room for so
+    many, fewer are made, and the number of those left out is returned as well. The state is that at the end of the
+    substep of dt [s], the rate of each of its particles [1/s], (n,).
     """
     source, sample = _sources(state, rate * dt, moment, parameters.seed)
     wanted = len(source)

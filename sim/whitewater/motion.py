@@ -15,17 +15,11 @@ Float32Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FluidState:
-    """Particles of a fluid, or of all fluids of a tank, at one moment.
+    """Particles of a fluid, or of all fluids of a tank, at one moment."""
 
-    Attributes:
-        particle_id: (n,) int32, ascending.
-        position: [m], (n, 3), float32.
-        velocity: [m/s], (n, 3), float32.
-    """
-
-    particle_id: NDArray[np.int32]
-    position: Float32Array
-    velocity: Float32Array
+    particle_id: NDArray[np.int32]  # (n,) int32, ascending
+    position: Float32Array  # [m], (n, 3), float32
+    velocity: Float32Array  # [m/s], (n, 3), float32
 
     @classmethod
     def of_snapshots(cls, fluids: Sequence[Snapshot]) -> FluidState:

@@ -26,15 +26,10 @@ _PUSHES = 3
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a body is: its mesh at rest is turned, then moved.
+    """Where a body is: its mesh at rest is turned, then moved."""
 
-    Attributes:
-        position: [m], (3,), float64.
-        orientation: unit quaternion w, x, y, z, (4,), float64.
-    """
-
-    position: Float64Array
-    orientation: Float64Array
+    position: Float64Array  # [m], (3,), float64
+    orientation: Float64Array  # unit quaternion w, x, y, z, (4,), float64
 
     @classmethod
     def of_snapshot(cls, snapshot: Snapshot) -> Pose:
@@ -69,17 +64,11 @@ def sample_at_rest(body: Placement, particle_radius: float) -> LevelSet:
 
 @dataclass(frozen=True)
 class MovingObstacle:
-    """A rigid body between two frames.
+    """A rigid body between two frames."""
 
-    Attributes:
-        level_set: signed distances at rest [m].
-        begin: pose at the earlier frame.
-        end: pose at the later frame.
-    """
-
-    level_set: LevelSet
-    begin: Pose
-    end: Pose
+    level_set: LevelSet  # signed distances at rest [m]
+    begin: Pose  # pose at the earlier frame
+    end: Pose  # pose at the later frame
 
     def pose(self, share: float) -> Pose:
         """The pose when a share of the time between the frames has passed: straight and by the shortest turn."""

@@ -25,17 +25,11 @@ Float64Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WhitewaterReport:
-    """What a frame did.
+    """What a frame did."""
 
-    Attributes:
-        substeps: into which it was divided.
-        generated: new particles.
-        not_generated: particles that there was no room for.
-    """
-
-    substeps: int
-    generated: int
-    not_generated: int
+    substeps: int  # into which it was divided
+    generated: int  # new particles
+    not_generated: int  # particles that there was no room for
 
 
 class WhitewaterSolver:

@@ -16,7 +16,7 @@ def device(rows: list[list[float]]) -> ti.Ndarray:
 
 def advance(position: ti.Ndarray, velocity: ti.Ndarray, acceleration: ti.Ndarray) -> MotionSummary:
     """One step in the box 0 ... 1 m, open at the upper end of z."""
-    box = Box(walls=((0.0, 0.0, 0.0), (1.0, 1.0, FAR)), openings=((-FAR, -FAR, -FAR), (FAR, FAR, 1.0)))
+    box = Box((0.0, 0.0, 0.0), (1.0, 1.0, FAR), (-FAR, -FAR, -FAR), (FAR, FAR, 1.0))
     return ParticleStepper(box).advance(position, velocity, acceleration, position.shape[0], DT)
 
 
