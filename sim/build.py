@@ -11,12 +11,10 @@ from sim.cloth.solver import SOLVER_NAME as CLOTH_NAME
 from sim.cloth.solver import ClothSolver
 from sim.core.solver import Coupling, Solver
 from sim.core.world import World
-from sim.coupling.body_samples import samples_of_moving_bodies
 from sim.coupling.body_speed import expected_body_speed, expected_cloth_speed
-from sim.coupling.cloth_fluid import ClothFluidCoupling
+from sim.coupling.cloth_fluid import ClothFluidCoupling, ClothSamples
 from sim.coupling.cloth_rigid import ClothRigidCoupling, contacts_of_cloths
-from sim.coupling.cloth_samples import ClothSamples
-from sim.coupling.fluid_rigid import FluidRigidCoupling
+from sim.coupling.fluid_rigid import FluidRigidCoupling, samples_of_moving_bodies
 from sim.coupling.smoke_cloth import SmokeClothCoupling
 from sim.coupling.smoke_fluid import SmokeFluidCoupling
 from sim.coupling.smoke_reach import too_thin_bodies
@@ -32,7 +30,7 @@ from sim.fluid.tank import FluidStart
 from sim.rigid.solver import SOLVER_NAME as RIGID_NAME
 from sim.rigid.solver import RigidSolver
 from sim.rigid.start import check_start
-from sim.rigid.static import StaticBody
+from sim.rigid.states import StaticBody
 from sim.shapes.placement import build_solid
 from sim.smoke.parameters import SmokeParameters, boxes_overlap
 from sim.smoke.solver import SmokeSolver
@@ -58,7 +56,12 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
     _refuse_names(scene)
     static = [StaticBody(parameters) for parameters in scene.rigid if parameters.kind == "static"]
     rigid = _build_rigid(scene)
-    cloths = [_build_cloths(scene, frames_per_second)] if scene.cloth else []
+    cloths = []
+    if scene.cloth:  # one solver for all, as they collide with each other
+        solver = ClothSolver(
+            scene.cloth, domain=scene.domain, gravity=scene.gravity, frames_per_second=frames_per_second
+        )
+        cloths = [solver]
     samples = None
     if cloths and scene.fluid:
         samples = ClothSamples.of(cloths[0], scene.fluid[0].spacing, scene.fluid[0].support_in_spacings)
@@ -72,7 +75,8 @@ def build_world(scene: SceneParameters, *, frames_per_second: float, solvers: Se
         couplings += [] if rigid is None else [ClothRigidCoupling(cloth, rigid, contacts)]
         couplings += [] if samples is None else [ClothFluidCoupling(fluid, cloth, samples) for fluid in fluids]
     couplings += _couple_smokes(smokes, scene, fluids=fluids, cloths=cloths, rigid=rigid)
-    return World([*coupled, *solvers], frames_per_second=frames_per_second, couplings=couplings, static_bodies=static)
+    standing = {body.name: body.snapshot() for body in static}
+    return World([*coupled, *solvers], frames_per_second=frames_per_second, couplings=couplings, standing=standing)
 
 
 def _refuse_names(scene: SceneParameters) -> None:
@@ -155,11 +159,6 @@ def _build_rigid(scene: SceneParameters) -> RigidSolver | None:
     solver = RigidSolver(moving, obstacles=obstacles, domain=scene.domain, gravity=scene.gravity)
     check_start(solver)
     return solver
-
-
-def _build_cloths(scene: SceneParameters, frames_per_second: float) -> ClothSolver:
-    """One solver for all cloths, as they collide with each other."""
-    return ClothSolver(scene.cloth, domain=scene.domain, gravity=scene.gravity, frames_per_second=frames_per_second)
 
 
 def _build_smoke(smoke: SmokeParameters, scene: SceneParameters, static: Sequence[StaticBody]) -> SmokeSolver:

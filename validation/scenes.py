@@ -224,9 +224,8 @@ class Tank:
         **material: float,
     ) -> None:
         """Fill the tank around the bodies, up to a depth [m] or between two corners of a block [m]."""
-        from sim.coupling.body_samples import samples_of_moving_bodies
         from sim.coupling.body_speed import expected_body_speed
-        from sim.coupling.fluid_rigid import FluidRigidCoupling
+        from sim.coupling.fluid_rigid import FluidRigidCoupling, samples_of_moving_bodies
         from sim.rigid.solver import RigidSolver
         from sim.shapes.placement import build_solid
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim.cloth.parameters import RectangleSheet
 from sim.shapes.mesh_file import read_upright_triangles
-from sim.shapes.mesh_repair import drop_collapsed_and_repeated_faces, merge_vertices
+from sim.shapes.mesh_solid import drop_collapsed_and_repeated_faces, merge_vertices
 from sim.shapes.parameters import MeshShape
 from sim.shapes.solid import ShapeError
 

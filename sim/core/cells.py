@@ -3,6 +3,7 @@
 The cells are numbered along x first, so that the cells of a row are one contiguous range of the sorted points.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from sim.core.arrays import Floats, Integers, Vectors
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
+from sim.core.parameters import Vector3
 from sim.core.scan import scan_in_parallel, scan_scratch_length
 
 Cells = ti.types.vector(3, ti.i32)
@@ -56,7 +58,7 @@ class SortArrays(NamedTuple):
 class CellGrid:
     """Cubic cells that cover a box, and a search radius around it."""
 
-    origin: tuple[float, float, float]  # lower corner of the outermost cells [m]
+    origin: Vector3  # lower corner of the outermost cells [m]
     cell_size: float  # edge of a cell, at least the search radius over `reach` [m]
     shape: tuple[int, int, int]  # number of cells along x, y, z
     reach: int = 1  # cells to either side that a search looks into
@@ -94,8 +96,7 @@ class CellGrid:
     @property
     def cell_count(self) -> int:
         """Number of cells, the outer layers included."""
-        nx, ny, nz = self.shape
-        return nx * ny * nz
+        return math.prod(self.shape)
 
 
 class CellSort:
@@ -109,29 +110,17 @@ class CellSort:
     def __init__(self, grid: CellGrid, capacity: int) -> None:
         self.grid = grid
         # One cell more than the grid has takes the points that are dropped.
-        self.cell_start = ti.ndarray(ti.i32, grid.cell_count + 2)
-        self.order = ti.ndarray(ti.i32, max(capacity, 1))
-        self._arrays = SortArrays(
-            cell_of=ti.ndarray(ti.i32, max(capacity, 1)),
-            cursor=ti.ndarray(ti.i32, grid.cell_count + 1),
-            scratch=ti.ndarray(ti.i32, scan_scratch_length(grid.cell_count + 1)),
-            cell_start=self.cell_start,
-            order=self.order,
-        )
+        cells, points = grid.cell_count + 1, max(capacity, 1)
+        lengths = points, cells, scan_scratch_length(cells), cells + 1, points
+        self._arrays = SortArrays(*(ti.ndarray(ti.i32, length) for length in lengths))
+        self.cell_start, self.order = self._arrays.cell_start, self._arrays.order
 
-    def sort(
-        self,
-        positions: ti.Ndarray,
-        ids: ti.Ndarray,
-        count: int,
-        keep_low: tuple[float, float, float],
-        keep_high: tuple[float, float, float],
-    ) -> int:
+    def sort(self, positions: ti.Ndarray, ids: ti.Ndarray, count: int, low: Vector3, high: Vector3) -> int:
         """Order the first `count` points by cell, then by distinct ids; returns how many of them are kept.
 
-        Points [m] below `keep_low` or above `keep_high` [m] on any axis are dropped.
+        Those [m] that are not in the box between two corners [m] are dropped.
         """
-        dropped = sort_points_by_cell(positions, ids, count, self.grid.on_device, keep_low, keep_high, self._arrays)
+        dropped = sort_points_by_cell(positions, ids, count, self.grid.on_device, low, high, self._arrays)
         return count - int(dropped)
 
 

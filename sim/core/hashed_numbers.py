@@ -2,11 +2,20 @@
 
 import math
 
+import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike, NDArray
 
 ALL_BITS = 0xFFFFFFFF
 
 GOLDEN = 2654435769  # an odd factor that spreads small numbers over all 32 bits (Knuth)
+
+UInt32Array = NDArray[np.uint32]
+_MULTIPLIERS = (np.uint64(0xD2511F53), np.uint64(0xCD9E8D57))
+_WEYL = (0x9E3779B9, 0xBB67AE85)
+_ROUNDS = 10
+_LOW = np.uint64(0xFFFFFFFF)
+_SHIFT = np.uint64(32)
 
 
 @ti.func
@@ -40,3 +49,27 @@ def _hash_to_unit(key: int) -> float:
     state = (key * 747796405 + 2891336453) & ALL_BITS
     word = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & ALL_BITS
     return (((word >> 22) ^ word) >> 8) / 16777216.0
+
+
+def philox(counter: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike], key: tuple[int, int]) -> UInt32Array:
+    """Four random words for each counter, (4, n), the same in whatever order they are drawn (Salmon et al. 2011).
+
+    Philox4x32-10: counters are arrays (n,) or numbers, all words are below 2^32.
+    """
+    words = [np.asarray(word, dtype=np.uint64) for word in np.broadcast_arrays(*map(np.atleast_1d, counter))]
+    first, second = key
+    for _ in range(_ROUNDS):
+        left, right = _MULTIPLIERS[0] * words[0], _MULTIPLIERS[1] * words[2]
+        words = [
+            (right >> _SHIFT) ^ words[1] ^ np.uint64(first),
+            right & _LOW,
+            (left >> _SHIFT) ^ words[3] ^ np.uint64(second),
+            left & _LOW,
+        ]
+        first, second = (first + _WEYL[0]) & 0xFFFFFFFF, (second + _WEYL[1]) & 0xFFFFFFFF
+    return np.stack(words).astype(np.uint32)
+
+
+def uniforms(counter: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike], key: tuple[int, int]) -> NDArray[np.float64]:
+    """Four numbers in [0, 1) for each counter, (4, n); see `philox`."""
+    return philox(counter, key) * 2.0**-32

@@ -142,10 +142,6 @@ class FastKernel:
             return [get((0, axis)) for axis in range(kind.n)]
         return self._primal.construct_kernel_ret(context, kind, (0,))
 
-    def __get__(self, owner: Any, kind: type | None = None) -> Any:
-        """As a method of a `ti.data_oriented` class: the owner is its first compile-time value."""
-        return self if owner is None else functools.partial(self, owner)
-
     def _sort_arguments(self) -> None:
         """Note how each argument that is used is passed, and at which place among those that are no templates."""
         self._templates: list[int] = []
@@ -199,7 +195,3 @@ class FastKernel:
 def kernel(function: Callable[..., Any]) -> FastKernel:
     """Decorator in place of `ti.kernel`: the kernel may take bundles, and its launches are fast."""
     return FastKernel(ti.kernel(with_fields_as_arguments(function)))
-
-
-fast_launch = FastKernel
-"""Decorator that stands above `ti.kernel`, for methods: Taichi looks at the frame that calls it for their class."""

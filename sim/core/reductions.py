@@ -93,10 +93,6 @@ class LaneReduction:
         """The reduction over `count` numbers, as a kernel takes it."""
         return Share(self.lanes.items(count), self.lanes.lane_step(count), self.lanes.item_step(), self.tree)
 
-    def result(self) -> NDArray[np.float32]:
-        """The maxima, then the sums, (maxima + sums,); waits for the device."""
-        return self.unpack(reduce_lanes(self.tree))
-
     def unpack(self, results: Sequence[float]) -> NDArray[np.float32]:
         """The maxima, then the sums, (maxima + sums,), of what a kernel returned from `reduced`."""
         return np.array(results[: self._quantities], dtype=np.float32)
@@ -168,12 +164,6 @@ def reduced(partial: Floats, lanes: ti.i32, quantities: ti.i32, maxima: ti.i32, 
 def reduced_tree(tree: Tree) -> Results:
     """As `reduced`."""
     return reduced(tree.partial, tree.lanes, tree.quantities, tree.maxima, tree.nodes)
-
-
-@kernel
-def reduce_lanes(tree: Tree) -> Results:
-    """The tree alone."""
-    return reduced_tree(tree)
 
 
 @kernel

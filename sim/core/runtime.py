@@ -64,11 +64,8 @@ class DeviceUnavailableError(RuntimeError):
 def initialize(device: Device = "auto", *, threads: int | None = None) -> str:
     """Start Taichi on a device and return its back end, such as "cpu"; the only `ti.init` of the project.
 
-    A second call that asks for what runs already (or for "auto") changes nothing.
-
-    Args:
-        device: where to run; "auto" takes the first of `PREFERENCE` that works.
-        threads: CPU threads; those that the process may use if omitted. Results do not depend on it.
+    A second call that asks for what runs already (or for "auto") changes nothing. "auto" takes the first of
+    `PREFERENCE` that works; threads are all that the process may use if omitted, and results do not depend on them.
 
     Raises:
         DeviceUnavailableError: that device does not work here, or Taichi itself does not load.

@@ -14,13 +14,9 @@ def scan_scratch_length(length: int) -> int:
     """Numbers that a scan over so many values needs to work with."""
     total, level = 0, length
     for _ in range(LEVELS):
-        level = _runs_of(level)
+        level = (level + RUN - 1) // RUN
         total += level
     return max(total, 1)
-
-
-def _runs_of(length: int) -> int:
-    return (length + RUN - 1) // RUN
 
 
 @func

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from types import MappingProxyType
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +27,6 @@ class FrameReport:
     substeps: Mapping[str, int]  # number of substeps of this frame, by solver
     smallest_dt_s: Mapping[str, float]  # smallest substep of this frame [s], by solver
     diagnostics: Mapping[str, Diagnostics]  # physics and numerics after the frame, by solver
-
-
-class StaticBody(Protocol):
-    """What stands in the world and never moves."""
-
-    name: str
-
-    def snapshot(self) -> Snapshot:
-        """Where it stands: the same at every frame."""
 
 
 class World:
@@ -63,7 +53,7 @@ class World:
         *,
         frames_per_second: float,
         couplings: Sequence[Coupling] = (),
-        static_bodies: Sequence[StaticBody] = (),
+        standing: Mapping[str, Snapshot] | None = None,
     ) -> None:
         self.frame = 0
         self.max_substeps_per_frame = MAX_SUBSTEPS_PER_FRAME
@@ -71,7 +61,7 @@ class World:
         self._frames_per_second = frames_per_second
         self._solvers = {solver.name: solver for solver in solvers}
         self._couplings = tuple(couplings)
-        self._static_bodies = tuple(static_bodies)
+        self._standing = dict(standing or {})  # what never moves: the same at every frame
         order = list(self._solvers)
         for first, second in (coupling.bodies for coupling in self._couplings):
             if order.index(first) >= order.index(second):
@@ -121,7 +111,7 @@ class World:
 
     def snapshots(self) -> dict[str, Snapshot]:
         """What rendering needs, by body."""
-        snapshots = {body.name: body.snapshot() for body in self._static_bodies}
+        snapshots = dict(self._standing)
         for solver in self._solvers.values():
             snapshots |= solver.snapshots()
         return snapshots
@@ -156,7 +146,8 @@ class World:
                 self._advance_team(team.ahead, dt, elapsed_s)
             team.substep(dt)
             remaining = remaining - dt if left > 1 else 0.0
-            self._ask_watch(team, start_s + (duration_s - remaining))
+            if (finding := self.watch and self.watch()) is not None:
+                raise self._divergence(team.names, start_s + (duration_s - remaining), finding)
             if team.taken % SUBSTEPS_BETWEEN_CHECKS == 0 or remaining == 0.0:
                 self._check(team, start_s + (duration_s - remaining))
 
@@ -167,11 +158,6 @@ class World:
             finding = f"the stable time step fell to {stable_dt:.3g} s"
             raise self._divergence(team.names, elapsed_s, finding, shortest.remedies().short_steps)
         return max(1, math.ceil(remaining / stable_dt * (1.0 - 1.0e-9)))
-
-    def _ask_watch(self, team: _Team, elapsed_s: float) -> None:
-        finding = None if self.watch is None else self.watch()
-        if finding is not None:
-            raise self._divergence(team.names, elapsed_s, finding)
 
     def _check(self, team: _Team, elapsed_s: float) -> None:
         for solver in team.solvers:
@@ -184,15 +170,9 @@ class World:
 
 
 class _Team:
-    """Solvers that take the same substeps, and the couplings by which they get impulses.
+    """Solvers that take the same substeps in turn, and the couplings whose second solver is one of them.
 
-    Attributes:
-        solvers: in the order of their turns.
-        names: of all of them, for messages.
-        couplings: those whose second solver is one of them.
-        ahead: solvers that have to get to the end of a step before these take it.
-        taken: substeps in this frame.
-        smallest_dt_s: smallest of them [s].
+    Those ahead have to get to the end of a step before these take it.
     """
 
     def __init__(self, solvers: Sequence[Solver], couplings: Sequence[Coupling], ahead: _Team | None = None) -> None:
@@ -203,7 +183,7 @@ class _Team:
         self.begin_frame()
 
     def begin_frame(self) -> None:
-        self.taken, self.smallest_dt_s = 0, math.inf
+        self.taken, self.smallest_dt_s = 0, math.inf  # substeps in this frame, and the smallest of them [s]
 
     def substep(self, dt: float) -> None:
         for solver in self.solvers:

@@ -1,6 +1,7 @@
-"""Two-way coupling of cloths and the particle fluid that they are in."""
+"""Two-way coupling of cloths and the particle fluid that they are in, and the samples of cloths that it feels."""
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -8,19 +9,93 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from sim.cloth.load import NodeLoad
+from sim.cloth.sheet import RestSheet, build_sheet, triangle_areas
 from sim.cloth.solver import ClothSolver
 from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
 from sim.core.reductions import LaneReduction, Results, Share, reduced_tree
 from sim.core.solver import Coupling
-from sim.coupling.cloth_samples import ClothSamples
 from sim.fluid.boundary import Samples, Sheets
+from sim.fluid.boundary_akinci2012 import BoundarySamples
 from sim.fluid.fluid import SPHFluid
+from sim.fluid.kernels import SUPPORT_IN_SPACINGS
+from sim.fluid.sheets import SheetSamples, kept_away, sheet_factor
 
 MAXIMA = 3
+LONGEST_EDGE = 1.5  # of the part of a triangle that a sample stands for [spacings]
 
 Corners = ti.types.ndarray(dtype=ti.math.ivec3, ndim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class ClothSamples:
+    """Samples of all cloths as fixed points of their triangles."""
+
+    sheets: SheetSamples  # what the fluid takes
+    nodes: NDArray[np.int32]  # corners of the triangle of each sample, numbered as the cloth solver does, (m, 3)
+    weights: NDArray[np.float64]  # its barycentric coordinates there, at least 0, of sum 1, (m, 3)
+    start: NDArray[np.float64]  # where the samples are at the start [m], (m, 3)
+
+    @classmethod
+    def of(cls, cloth: ClothSolver, spacing: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> "ClothSamples":
+        """One sample for each triangle, or several where it is large against the spacing [m].
+
+        Raises:
+            ShapeError: a mesh file is missing or unreadable, or its mesh is no sheet.
+        """
+        margin = kept_away(support_in_spacings) * spacing
+        rest, mass, missing, nodes, weights = [], [], [], [], []
+        for each, first in zip(cloth.parameters, cloth.state.host.first_node[:-1], strict=True):
+            sheet = build_sheet(each.shape)
+            triangle, places = _points_of(sheet, spacing)
+            share = 1.0 / np.bincount(triangle)[triangle]
+            area = share * triangle_areas(sheet.vertices, sheet.triangles)[triangle]
+            rim = 0.5 * np.pi * margin**2 * _rim_lengths(sheet)[triangle] * share
+            rest.append(np.einsum("mc,mcx->mx", places, sheet.vertices[sheet.triangles[triangle]]))
+            mass.append(area * each.mass_per_area)
+            missing.append(area * (2.0 * margin - each.thickness) + rim)
+            nodes.append(sheet.triangles[triangle] + first)
+            weights.append(places)
+        boundary = BoundarySamples.of_bodies(*rest).scaled(sheet_factor(support_in_spacings))
+        sheets = SheetSamples(boundary, np.concatenate(mass), np.concatenate(missing))
+        all_nodes, all_weights = np.concatenate(nodes).astype(np.int32), np.concatenate(weights)
+        start = np.einsum("mc,mcx->mx", all_weights, cloth.state.host.position[all_nodes])
+        return cls(sheets, all_nodes, all_weights, start)
+
+
+def _points_of(sheet: RestSheet, spacing: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Centres of equal parts of all triangles, small enough: triangle of each, (m,), and barycentric coordinates."""
+    corners = sheet.vertices[sheet.triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    divisions = np.maximum(np.ceil(longest / (LONGEST_EDGE * spacing)), 1).astype(int)
+    triangles, weights = [], []
+    for count in np.unique(divisions).tolist():
+        own = np.flatnonzero(divisions == count)
+        parts = _parts(count)
+        triangles.append(np.repeat(own, len(parts)))
+        weights.append(np.tile(parts, (len(own), 1)))
+    return np.concatenate(triangles), np.concatenate(weights)
+
+
+def _parts(count: int) -> NDArray[np.float64]:
+    """Barycentric coordinates of the centres of count² equal parts of a triangle, (count², 3)."""
+    i, j = (each.ravel() for each in np.mgrid[0:count, 0:count])
+    upright = np.stack([i, j], axis=1)[i + j < count] + 1.0 / 3.0
+    inverted = np.stack([i, j], axis=1)[i + j < count - 1] + 2.0 / 3.0
+    two = np.concatenate([upright, inverted]) / count
+    return np.concatenate([two, 1.0 - two.sum(axis=1, keepdims=True)], axis=1)
+
+
+def _rim_lengths(sheet: RestSheet) -> NDArray[np.float64]:
+    """Length of the sides of each triangle that are the sheet's rim [m], (k,)."""
+    sides = np.stack([sheet.triangles, np.roll(sheet.triangles, -1, axis=1)], axis=2)
+    _, inverse, counts = np.unique(
+        np.sort(sides.reshape(-1, 2), axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    lengths = np.linalg.norm(sheet.vertices[sides[..., 0]] - sheet.vertices[sides[..., 1]], axis=2)
+    rim: NDArray[np.float64] = (lengths * (counts[inverse].reshape(lengths.shape) == 1)).sum(axis=1)
+    return rim
 
 
 @bundle
@@ -60,7 +135,7 @@ class Felt(NamedTuple):
 class ClothFluidCoupling(Coupling):
     """The fluid pushes the cloths and is held by them, and moves along where it touches.
 
-    A coupled step (`sim.fluid.sheet_forces` says why): the fluid steps, its samples of the cloths answering as if they
+    A coupled step (`sim.fluid.sheets` says why): the fluid steps, its samples of the cloths answering as if they
     had the mass of the fluid that touches them; nodes take the impulses, and in their own step have the mass of the
     touching fluid m_b as well, of velocity u_b where their own is v_b = sum_n beta_bn v_n,
 

@@ -19,11 +19,8 @@ if TYPE_CHECKING:
     from sim.cloth.solver import ClothSolver
     from sim.smoke.solver import SmokeSolver
 
-QUANTUM = 2.0**-40
-"""Unit of the sums over triangles [m/s, m²/kg]: far below what float32 tells of any of them; sums reach 8e6."""
-
-MOST_CELLS_PASSED = 1.0
-"""Most cells of air that may pass a cloth in a step of the smoke: what it takes from them is taken where they are."""
+QUANTUM = 2.0**-40  # unit of the sums over triangles [m/s, m²/kg]: far below what float32 tells; sums reach 8e6
+MOST_CELLS_PASSED = 1.0  # of air past a cloth in a step of the smoke: what it takes from them is taken where they are
 
 
 @bundle
@@ -103,17 +100,8 @@ class SmokeClothCoupling(Coupling):
     @property
     def _hanging(self) -> Hanging:
         air = self._cloth.air
-        return Hanging(
-            self._cloth.state.triangles,
-            air.density,
-            air.source,
-            air.velocity,
-            air.inverse_mass,
-            air.impulse,
-            self._place,
-        )
-
-    # --- the coupling -----------------------------------------------------------------------------------------------
+        told = air.density, air.source, air.velocity, air.inverse_mass, air.impulse
+        return Hanging(self._cloth.state.triangles, *told, self._place)
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Collect the impulses that the air of the cells gave, for `accelerate`."""
@@ -131,8 +119,6 @@ class SmokeClothCoupling(Coupling):
     def resume(self) -> None:
         """Tell the restored cloth of the restored air."""
         self.follow(0.0)
-
-    # --- what it is to the smoke ------------------------------------------------------------------------------------
 
     def stable_dt(self) -> float:
         """Step [s] in which the air passes a cloth that falls by `MOST_CELLS_PASSED` cells."""

@@ -7,11 +7,12 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, LongIntegers, Vectors
+from sim.core.arrays import Floats, Integers, LongIntegers
 from sim.core.bundles import bundle
 from sim.core.domain import DomainParameters
 from sim.core.launch import kernel
 from sim.core.solver import Coupling
+from sim.fluid.particles import Particles
 from sim.smoke.arrays import new_floats
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid, cell_counts, row_start
@@ -21,10 +22,9 @@ if TYPE_CHECKING:
     from sim.fluid.fluid import SPHFluid
     from sim.smoke.solver import SmokeSolver
 
-REACH_IN_SPACINGS = 2.0
-"""Least half-width of the weight of a particle: a lone one then fills an eighth of the place where it is, and leaves no
-holes between it and its neighbours, however small the cells."""
-
+REACH_IN_SPACINGS = (
+    2.0  # least half-width of a particle's weight: a lone one fills an eighth of its place, without holes
+)
 WATER = 0.5  # fraction of water above which a cell is water: where a flat surface cuts the cell's centre
 NEVER = 1.0e30  # time in which weightless particles at rest get anywhere [s]
 FRACTION_QUANTUM = 2.0**-20  # unit of the sums of volume fractions [-]; they hold up to 2048
@@ -86,13 +86,8 @@ class SmokeFluidCoupling(Coupling):
         self._fluid, self._smoke = fluid, smoke
         grid = smoke.grid
         reach = max(REACH_IN_SPACINGS * fluid.spacing, grid.cell_size)
-        self._reach = Reach(
-            ti.math.vec3(grid.origin),
-            ti.math.vec3(grid.upper),
-            grid.cell_size,
-            reach / grid.cell_size,
-            (fluid.spacing / reach) ** 3,
-        )
+        corners, volume = (ti.math.vec3(grid.origin), ti.math.vec3(grid.upper)), (fluid.spacing / reach) ** 3
+        self._reach = Reach(*corners, grid.cell_size, reach / grid.cell_size, volume)
         momentum = (ti.ndarray(ti.i64, grid.size) for _ in range(3))
         self._sums = Sums(ti.ndarray(ti.i32, grid.size), *momentum, new_floats(grid.size))
         self._sums.inside.from_numpy(grid.pad(room_for_water(grid, domain, reach)).astype(np.float32).ravel())
@@ -103,50 +98,44 @@ class SmokeFluidCoupling(Coupling):
 
     def stable_dt(self) -> float:
         """Largest step [s] in which no particle gets farther than a cell in the box, as far as is foreseen."""
-        particles = self._fluid.particles
-        count = particles.count
-        _find_shortest_time(
-            self._reach, self._gravity, particles.position, particles.velocity, count, self._shortest_time
-        )
+        particles = self._fluid.particles.arrays
+        _find_shortest_time(self._reach, self._gravity, particles, self._shortest_time)
         time_s = float(self._shortest_time[0])
         return time_s if time_s < NEVER else math.inf
 
     def exchange(self, dt: float) -> None:  # noqa: ARG002  (the coupling's protocol)
         """Mark the cells that hold water now, after the steps of the fluid."""
-        particles = self._fluid.particles
         box, marks = self._smoke.obstacles.box, self._smoke.obstacles.marks
-        _splat(self._reach, box, self._sums, particles.position, particles.velocity, particles.count)
+        _splat(self._reach, box, self._sums, self._fluid.particles.arrays)
         _mark_water(box, self._sums, marks)
 
 
 @kernel
-def _find_shortest_time(
-    reach: Reach, gravity: ti.f32, position: Vectors, velocity: Vectors, count: ti.i32, shortest: Floats
-):
+def _find_shortest_time(reach: Reach, gravity: ti.f32, particles: Particles, shortest: Floats):
     """Least time in which a particle comes to the box and a cell into it, v t + g t² = d (`time_of_travel`)."""
     margin = reach.in_cells * reach.cell_size
     shortest[0] = NEVER
-    for n in range(count):
-        x_n = position[n]
+    for n in range(particles.count):
+        x_n = particles.position[n]
         outside = ti.max(reach.low - margin - x_n, x_n - (reach.high + margin), 0.0)
         distance = outside.norm() + reach.cell_size
-        speed = velocity[n].norm()
+        speed = particles.velocity[n].norm()
         root = speed + ti.sqrt(speed * speed + 4.0 * gravity * distance)
         if root > 0.0:
             ti.atomic_min(shortest[0], 2.0 * distance / root)
 
 
 @kernel
-def _splat(reach: Reach, box: Grid, sums: Sums, position: Vectors, velocity: Vectors, count: ti.i32):
+def _splat(reach: Reach, box: Grid, sums: Sums, particles: Particles):
     """Add every particle to the cells whose centres it reaches, in sums that begin at zero."""
     for at in range(sums.fraction.shape[0]):
         sums.fraction[at] = 0
         for momentum in ti.static((sums.momentum_x, sums.momentum_y, sums.momentum_z)):
             momentum[at] = ti.cast(0, ti.i64)
-    for n in range(count):
+    for n in range(particles.count):
         cells, width = cell_counts(box), reach.in_cells
         # In cells, such that the centre of cell i, counted from 1, is at i.
-        x_n = (position[n] - reach.low) / reach.cell_size + 0.5
+        x_n = (particles.position[n] - reach.low) / reach.cell_size + 0.5
         if (x_n > 1.0 - width).all() and (x_n < ti.cast(cells, ti.f32) + width).all():
             low = ti.max(ti.cast(ti.floor(x_n - width), ti.i32) + 1, 1)
             high = ti.min(ti.cast(ti.ceil(x_n + width), ti.i32) - 1, cells)
@@ -159,7 +148,7 @@ def _splat(reach: Reach, box: Grid, sums: Sums, position: Vectors, velocity: Vec
                         at = row_start(box, i, j) + k
                         ti.atomic_add(sums.fraction[at], ti.round(weight / FRACTION_QUANTUM, ti.i32))
                         for axis, momentum in ti.static(enumerate((sums.momentum_x, sums.momentum_y, sums.momentum_z))):
-                            share = weight * velocity[n][axis]
+                            share = weight * particles.velocity[n][axis]
                             ti.atomic_add(momentum[at], ti.round(share / MOMENTUM_QUANTUM, ti.i64))
 
 

@@ -108,17 +108,8 @@ class SmokeRigidCoupling(Coupling):
             low = [int(n) for n in np.clip(first, 1, np.add(grid.cells, 1))]
             high = [int(n) for n in np.clip(last, 0, grid.cells)]
             if all(begin <= end for begin, end in zip(low, high, strict=True)):
-                origin = ti.math.vec3(grid.origin)
-                _mark_body(
-                    number,
-                    ti.math.ivec3(low),
-                    ti.math.ivec3(high),
-                    origin,
-                    grid.cell_size,
-                    obstacles.box,
-                    obstacles.marks,
-                    self._bodies,
-                )
+                window = ti.math.ivec3(low), ti.math.ivec3(high), ti.math.vec3(grid.origin), grid.cell_size
+                _mark_body(number, *window, obstacles.box, obstacles.marks, self._bodies)
 
 
 @kernel

@@ -16,7 +16,7 @@ from sim.fluid.body_response import BodyResponse, SolveError, weigh_errors
 from sim.fluid.boundary import STATE_WIDTH, WRENCH_WIDTH, Bodies, Boundary, NearParticles, Samples
 from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline_slope
 from sim.fluid.particles import Fluid
-from sim.fluid.sheet_forces import SheetForces
+from sim.fluid.sheets import SheetForces
 from sim.fluid.viscosity import LAPLACIAN_FACTOR, Viscosity, viscous_factor
 
 CHUNK = 64  # samples of a body that one node of the sum takes together

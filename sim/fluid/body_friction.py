@@ -32,6 +32,7 @@ class BodyFriction:
 
     Attributes:
         changes: J_b u of each boundary sample for the vector that was spread last [m/s]; 0 for the fixed ones.
+        preconditioned: u, the preconditioned residual, (bodies, 6).
     """
 
     def __init__(self, boundary: Boundary, response: BodyResponse | None, volume: float, rest_density: float) -> None:
@@ -42,7 +43,7 @@ class BodyFriction:
         self._found = ti.Vector.ndarray(3, ti.f32, max(boundary.count, 1))
         self.changes.fill(0.0)
         self._change = self._residual = self._product = np.zeros((boundary.body_count, WRENCH_WIDTH))
-        self._direction = self._direction_product = self._preconditioned = self._given = self._change
+        self._direction = self._direction_product = self.preconditioned = self._given = self._change
 
     @property
     def are_free(self) -> bool:
@@ -58,6 +59,7 @@ class BodyFriction:
         self._friction, self._weight = friction, dt / self._volume
         self._inverse_mass = self._volume * self._response.inverse_masses
         is_free = self._inverse_mass[:, 0, 0] > 0.0
+        self._free_weight = self._weight * is_free[:, None]
         self._mass = np.zeros_like(self._inverse_mass)
         self._mass[is_free] = np.linalg.inv(self._inverse_mass[is_free])
         blocks = self._mass.copy()
@@ -67,14 +69,12 @@ class BodyFriction:
         self._inverse = np.zeros_like(blocks)
         # Both halves are rounded sums of the same numbers.
         self._inverse[is_free] = np.linalg.inv(0.5 * (blocks + blocks.transpose(0, 2, 1))[is_free])
-        self._given = self._projected(self._weight * friction(velocity, self._boundary.samples.velocity))
+        self._given = self._free_weight * friction(velocity, self._boundary.samples.velocity)
 
     def guess(self, change: ti.Ndarray) -> None:
         """Begin with the change of the bodies at which their own rows hold, for this one of the particles [m/s]."""
         self.spread(np.zeros_like(self._change))
-        self._change = _times(
-            self._inverse, self._given + self._projected(self._weight * self._friction(change, self.changes))
-        )
+        self._change = _times(self._inverse, self._given + self._free_weight * self._friction(change, self.changes))
         self.spread(self._change)
 
     def forget(self) -> None:
@@ -86,7 +86,7 @@ class BodyFriction:
         """Find the residual for a change of the particles [m/s], and that of the bodies so far, which is spread."""
         self.spread(self._change)
         self._residual = self._given - self._multiplied(self._change, change)
-        self._preconditioned = _times(self._inverse, self._residual)
+        self.preconditioned = _times(self._inverse, self._residual)
         self._direction = self._direction_product = np.zeros_like(self._change)
 
     def norms(self) -> tuple[float, float, float]:
@@ -95,29 +95,22 @@ class BodyFriction:
         asked_squared = _dot(asked, _times(self._mass, asked)) / self._rest_density
         return self._square(self._residual), self._square(self._given), asked_squared
 
-    def spread_preconditioned(self) -> None:
-        """Fill `changes` with u, the preconditioned residual."""
-        self.spread(self._preconditioned)
-
     def multiply(self, preconditioned: ti.Ndarray) -> None:
         """The bodies' rows times u, which is spread, and this one of the particles [m/s]."""
-        self._product = self._multiplied(self._preconditioned, preconditioned)
+        self._product = self._multiplied(self.preconditioned, preconditioned)
 
     def products(self) -> tuple[float, float, float]:
         """The bodies' part in what `sum_products` sums."""
-        return (
-            _dot(self._residual, self._preconditioned),
-            _dot(self._product, self._preconditioned),
-            self._square(self._residual),
-        )
+        u = self.preconditioned
+        return _dot(self._residual, u), _dot(self._product, u), self._square(self._residual)
 
     def advance(self, alpha: float, beta: float) -> None:
         """As `advance_solve` for the particles."""
-        self._direction = self._preconditioned + beta * self._direction
+        self._direction = self.preconditioned + beta * self._direction
         self._direction_product = self._product + beta * self._direction_product
         self._change = self._change + alpha * self._direction
         self._residual = self._residual - alpha * self._direction_product
-        self._preconditioned = _times(self._inverse, self._residual)
+        self.preconditioned = _times(self._inverse, self._residual)
 
     def found_velocity(self) -> ti.Ndarray:
         """Velocity of each boundary sample with the change found [m/s]."""
@@ -135,12 +128,7 @@ class BodyFriction:
         spread_twists(self._boundary.samples, self._boundary.bodies, self._twists, self.changes)
 
     def _multiplied(self, twists: NDArray[np.float64], vector: ti.Ndarray) -> NDArray[np.float64]:
-        friction = self._friction(vector, self.changes)
-        return _times(self._mass, twists) - self._projected(self._weight * friction)
-
-    def _projected(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Rows of the bodies that are unknowns, zeros for others."""
-        return rows * (self._inverse_mass[:, :1, 0] > 0.0)
+        return _times(self._mass, twists) - self._free_weight * self._friction(vector, self.changes)
 
     def _square(self, rows: NDArray[np.float64]) -> float:
         """Square of the velocities that such an impulse would give the bodies, with the weight of their mass."""

@@ -15,18 +15,10 @@ from sim.fluid.boundary import NO_BODY, STATE_WIDTH, WRENCH_WIDTH, Bodies, Bound
 from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline, spline_slope
 from sim.fluid.particles import Fluid
 
-# Numbers of a body's mobility: inverse mass, then the inverse inertia tensor row by row, in world axes.
-MOBILITY_WIDTH = 10
-
-# Sums over particles are of 32-bit integers, which are exact in any order; one bit is the sign's, one is spare.
-LARGEST_SHARE = 2**30
-
-# More particles than this cannot be within the support of a sample for each of them: they lie in three layers.
-PARTICLES_PER_SAMPLE = 8
-
-# |sum_b V_b grad W_ib| of a particle that is pressed onto samples, over 1/d; it is 0.9 at rest beside them.
-LARGEST_PUSH = 6.0
-
+MOBILITY_WIDTH = 10  # numbers of a body: inverse mass, then the inverse inertia tensor row by row, in world axes
+LARGEST_SHARE = 2**30  # of sums of int32, which are exact in any order; one bit is the sign's, one is spare
+PARTICLES_PER_SAMPLE = 8  # most that are within the support of a sample for each of them: they lie in three layers
+LARGEST_PUSH = 6.0  # |sum_b V_b grad W_ib| of a particle pressed onto samples, over 1/d; 0.9 at rest beside them
 NOT_FINITE = 1.0e30  # stands for an error that is infinite or not a number, which the larger of two numbers would hide
 
 
@@ -101,11 +93,12 @@ class BodyResponse:
 
     def fall(self, dt: float) -> None:
         """Let gravity act on the samples' velocities for dt [s]."""
-        self._push(self._no_wrench, dt, 1.0)
+        self.push_samples(self._no_wrench, dt, gravity_share=1.0)
 
-    def push_samples(self, wrench: ti.Ndarray, dt: float) -> None:
-        """Let forces and torques on the bodies act on the samples' velocities for dt [s]."""
-        self._push(wrench, dt, 0.0)
+    def push_samples(self, wrench: ti.Ndarray, dt: float, *, gravity_share: float = 0.0) -> None:
+        """Let forces and torques on the bodies, and a share of gravity, act on the samples' velocities for dt [s]."""
+        gravity = gravity_share * self._gravity
+        push_samples(self._boundary.samples, self._boundary.bodies, wrench, self._mobility.inverse_mass, gravity, dt)
 
     def accelerate_samples(self, wrench: ti.Ndarray) -> ti.Ndarray:
         """Accelerations of all boundary samples by forces and torques on the bodies [m/s²]; 0 for the fixed ones."""
@@ -128,10 +121,6 @@ class BodyResponse:
         add_bodies_to_diagonal(
             fluid, self._boundary.bodies, self._mobility, d.gradient_factor, weight, inverse_diagonal
         )
-
-    def _push(self, wrench: ti.Ndarray, dt: float, gravity_share: float) -> None:
-        gravity = gravity_share * self._gravity
-        push_samples(self._boundary.samples, self._boundary.bodies, wrench, self._mobility.inverse_mass, gravity, dt)
 
 
 @func

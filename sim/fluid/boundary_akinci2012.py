@@ -13,7 +13,6 @@ layer, whose push alone lets nothing pass.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -22,11 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from sim.fluid.kernels import SUPPORT_IN_SPACINGS, evaluate, layer_field, particle_volume, wall_calibration, wall_layers
+from sim.shapes.solid import SignedDistance, outward_normals
 
 if TYPE_CHECKING:
     from sim.core.domain import DomainParameters
-
-SignedDistance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 SINKING_ROUNDS, SINKING_FRACTION = 6, 0.6  # by which samples sink into a body: 0.4 % of the depth is left then
 DEEP_ENOUGH = 0.95  # part of the second layer's depth at which its samples still do what they should
@@ -58,7 +56,9 @@ class BoundarySamples:
         cls, points: NDArray[np.floating], *, factor: ArrayLike = 1.0, layer: ArrayLike = 0, known: ArrayLike = 0.0
     ) -> BoundarySamples:
         """Samples of one body [m], (m, 3), with factors, layers and known volumes of all, or of each, (m,)."""
-        positions = np.asarray(points, dtype=np.float32).reshape(-1, 3)
+        positions = np.asarray(points, dtype=np.float32)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise ValueError(f"boundary samples must be (m, 3), got {positions.shape}")
         factors, layers, volumes = (np.full(len(positions), value) for value in (factor, layer, known))
         return cls(positions, np.zeros(len(positions), np.int32), factors, layers.astype(np.int32), volumes)
 
@@ -67,7 +67,9 @@ class BoundarySamples:
         """Samples of several bodies, each (m_k, 3) [m] or samples of one body already, numbered in this order."""
         own = [body if isinstance(body, BoundarySamples) else cls.of_points(body) for body in bodies]
         own = [replace(each, body=np.full_like(each.body, number)) for number, each in enumerate(own)]
-        arrays = [[getattr(each, field.name) for field in fields(cls)] for each in own or [cls.of_points(np.empty(0))]]
+        arrays = [
+            [getattr(each, field.name) for field in fields(cls)] for each in own or [cls.of_points(np.empty((0, 3)))]
+        ]
         return cls(*(np.concatenate(parts) for parts in zip(*arrays, strict=True)))
 
     def scaled(self, factor: float | NDArray[np.float64]) -> BoundarySamples:
@@ -150,13 +152,6 @@ def sink_samples(
     return BoundarySamples.of_points(positions, factor=factor, layer=layer)
 
 
-def outward_normals(signed_distance: SignedDistance, points: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """Unit vectors along the gradient of a distance, by differences over twice a step [m], (n, 3)."""
-    shifts = [np.eye(3)[axis] * step for axis in range(3)]
-    gradient = np.stack([signed_distance(points + shift) - signed_distance(points - shift) for shift in shifts], axis=1)
-    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
-
-
 def _sunk(
     samples: NDArray[np.floating], signed_distance: SignedDistance, spacing: float, depth: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
@@ -176,7 +171,7 @@ def _sunk(
 def _weakened(standoff: NDArray[np.float64], wanted_standoff: float, support_in_spacings: float) -> NDArray[np.float64]:
     """Factor on volumes at a smaller distance from the fluid than wanted [spacings] that keeps their field the same."""
     distances = np.linspace(0.0, wanted_standoff, 65)
-    fields = np.array([layer_field(distance, support_in_spacings) for distance in distances])
+    fields = np.array([layer_field(distance, support_in_spacings)[0] for distance in distances])
     return fields[-1] / np.interp(standoff, distances, fields)
 
 

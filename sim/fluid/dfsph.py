@@ -8,14 +8,11 @@ from sim.core.launch import kernel
 from sim.fluid.kernels import evaluate, lattice_offsets, particle_volume
 from sim.fluid.particles import Fluid
 from sim.fluid.pressure import IncompressibleFluid, PressureSystem, add_scaled, density_rate, not_negative
-from sim.fluid.sheet_forces import DIVERGENCE
+from sim.fluid.sheets import DIVERGENCE
 from sim.fluid.tank import FluidStart
 
-# Iterations of the density and the divergence solve in any case (Bender & Koschier 2015, algorithms 3 and 2).
-LEAST_ITERATIONS, LEAST_DIVERGENCE_ITERATIONS = 2, 1
-
-# Relative compression of a particle that takes no part in a solve: so much room that its pressure stays 0.
-NOT_SOLVED = -1.0e6
+LEAST_ITERATIONS, LEAST_DIVERGENCE_ITERATIONS = 2, 1  # in any case (Bender & Koschier 2015, algorithms 3 and 2)
+NOT_SOLVED = -1.0e6  # relative compression of what takes no part in a solve: so much room that its pressure stays 0
 
 AT_SURFACE = 0.8
 """A particle that lacks more than this share of what the first layer at a flat surface lacks of the rest density is at

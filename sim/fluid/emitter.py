@@ -18,11 +18,8 @@ from sim.fluid.opening import Opening, openings_of
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Layer, Particles, ParticleSet
 
-# How much wider than its opening a nozzle is: the outermost places of a layer may lie on its edge.
-EDGE_IN_SPACINGS = 0.1
-
-# No particle is put nearer to another one than this share of a spacing, or of the distance of layers if less.
-BLOCKED_IN_SPACINGS = 0.9
+EDGE_IN_SPACINGS = 0.1  # how much wider than its opening a nozzle is: places of a layer may lie on its edge
+BLOCKED_IN_SPACINGS = 0.9  # of a spacing, or the distance of layers if less: nearer to another one no particle is put
 
 
 @bundle

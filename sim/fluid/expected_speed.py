@@ -9,7 +9,6 @@ from sim.core.domain import DomainParameters
 from sim.core.parameters import Vector3
 
 SLOWEST_EXPECTED_SPEED = 0.1  # where neither gravity nor an initial velocity says what to expect [m/s]
-
 COHESION_SPEED_FACTOR = 10.0
 """Square of the speed to expect from cohesion over the stress with which that pulls a filled lattice together, per
 density: at rest it compresses the lattice by 0.1 %, and a cube that collapses to a drop by 1 to 2 %."""

@@ -20,18 +20,12 @@ if TYPE_CHECKING:
     from sim.fluid.parameters import FluidParameters
     from sim.shapes.solid import Solid
 
+
 CLEARANCE_IN_SPACINGS = 0.5  # a particle's centre keeps half a lattice spacing, its radius, from walls and solids
-
-# A place is taken where a particle is nearer than this; particles as near as that push each other apart at once.
-TAKEN_IN_SPACINGS = 0.9
-
+TAKEN_IN_SPACINGS = 0.9  # a place is taken where a particle is nearer: they would push each other apart at once
 NO_POINTS = np.empty((0, 3))
-
 FULL_DOMAIN = 1.1  # particles that a domain holds at most over those that fill it at rest; emitters stop there
-
-ROUNDING = 1.0e-3
-"""Share of the clearance that a particle may come nearer: lattice points are float32, and a block that rests on a
-body has its first layer exactly at the clearance."""
+ROUNDING = 1.0e-3  # of the clearance: lattice points are float32, and the first layer on a body is exactly that far
 
 
 @dataclass(frozen=True)

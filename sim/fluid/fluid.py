@@ -15,8 +15,8 @@ from sim.fluid.expected_speed import expected_speed
 from sim.fluid.forces import Forces
 from sim.fluid.kernels import Discretization
 from sim.fluid.opening import openings_of
-from sim.fluid.phases import Phases
-from sim.fluid.solve_record import SolveRecord
+from sim.fluid.particles import Phases
+from sim.fluid.stepping import SolveRecord
 from sim.fluid.surface_tension import Cohesion
 from sim.fluid.tank import FluidStart, ParticleTank
 from sim.fluid.viscosity import CARRIED, LAPLACIAN_FACTOR, is_implicit

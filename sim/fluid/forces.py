@@ -12,9 +12,8 @@ from sim.core.launch import kernel
 from sim.fluid.body_forces import Exerted
 from sim.fluid.body_friction import BodyFriction
 from sim.fluid.kernels import inverse_distance, spline_slope
-from sim.fluid.particles import Fluid
-from sim.fluid.phases import Phases
-from sim.fluid.sheet_forces import DENSITY
+from sim.fluid.particles import Fluid, Phases
+from sim.fluid.sheets import DENSITY
 from sim.fluid.surface_tension import Cohesion, SurfaceTensionAkinci2013, cohesion_becker_teschner2007
 from sim.fluid.tank import ParticleTank
 from sim.fluid.viscosity import (
@@ -102,15 +101,10 @@ class Forces:
 
     def exerted(self, pressure_term: ti.Ndarray | None, *, with_friction: bool) -> Exerted:
         """Forces on bodies by pressure, by explicit friction or by both."""
-        fluid = self._fluid
-        return Exerted(
-            fluid=fluid,
-            pressure_term=fluid.particles.density if pressure_term is None else pressure_term,
-            volume_gradient_factor=self._volume_gradient_factor,
-            viscosity=self._viscosity,
-            with_pressure=pressure_term is not None,
-            with_friction=with_friction and self._viscosity.with_wall_friction,
-        )
+        fluid, with_pressure = self._fluid, pressure_term is not None
+        pressure = pressure_term if with_pressure else fluid.particles.density
+        friction = with_friction and self._viscosity.with_wall_friction
+        return Exerted(fluid, pressure, self._volume_gradient_factor, self._viscosity, with_pressure, friction)
 
     def react(self, pressure_term: ti.Ndarray, dt: float) -> None:
         """Count the pressure of a step of dt [s], found after its other forces, as impulses on bodies.

@@ -22,9 +22,7 @@ from sim.core.reductions import runs_on_gpu
 
 TINY_DISTANCE = 1.0e-12  # keeps x/|x| finite where two particles coincide; their force is then 0 [m]
 SUPPORT_IN_SPACINGS = 2.0  # usual support radius over lattice spacing: 4r over 2r
-
-# Between these distances from the fluid is the first of two layers of samples, at every support up to 4.
-NEAR_LAYER_IN_SPACINGS = 0.3, 1.2
+NEAR_LAYER_IN_SPACINGS = 0.3, 1.2  # between them, from the fluid, is the first of two layers, at any support up to 4
 
 
 @func
@@ -121,9 +119,9 @@ def wall_calibration(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> WallCa
     target = 2.0 * fluid_slope / fluid_field
     for _ in range(60):
         middle = 0.5 * (low + high)
-        field, slope = _layer_field(middle, support_in_spacings)
+        field, slope = layer_field(middle, support_in_spacings)
         low, high = (low, middle) if slope / field < target else (middle, high)
-    field, _ = _layer_field(low, support_in_spacings)
+    field, _ = layer_field(low, support_in_spacings)
     return _calibration(low, fluid_field / field, support_in_spacings)
 
 
@@ -140,12 +138,12 @@ def wall_layers(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> tuple[WallC
     far = support_in_spacings - 0.5
 
     def volumes(near: float) -> NDArray[np.float64]:
-        fields = np.array([_layer_field(distance, support_in_spacings) for distance in (near, far)])
+        fields = np.array([layer_field(distance, support_in_spacings) for distance in (near, far)])
         field, slope = _missing_field(1, support_in_spacings)
         return np.linalg.solve(fields.T, [field, 2.0 * slope])
 
     def excess_of_second_layer(near: float) -> float:
-        fields = [_layer_field(distance + 1.0, support_in_spacings)[0] for distance in (near, far)]
+        fields = [layer_field(distance + 1.0, support_in_spacings)[0] for distance in (near, far)]
         return float(volumes(near) @ fields) - _missing_field(2, support_in_spacings)[0]
 
     near = float(brentq(excess_of_second_layer, *NEAR_LAYER_IN_SPACINGS, xtol=1.0e-9))
@@ -155,13 +153,8 @@ def wall_layers(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> tuple[WallC
     )
 
 
-def layer_field(distance_in_spacings: float, support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
-    """Sum of W over a square layer of spacing 1 at a distance, averaged over its sideways shift."""
-    return _layer_field(distance_in_spacings, support_in_spacings)[0]
-
-
 def _calibration(standoff: float, volume_in_particles: float, support_in_spacings: float) -> WallCalibration:
-    samples_sum, _ = _layer_field(0.0, support_in_spacings, shifts=1)
+    samples_sum, _ = layer_field(0.0, support_in_spacings, shifts=1)
     factor = volume_in_particles * samples_sum * particle_volume(1.0, support_in_spacings)
     return WallCalibration(standoff, float(factor), float(volume_in_particles))
 
@@ -169,7 +162,7 @@ def _calibration(standoff: float, volume_in_particles: float, support_in_spacing
 def _missing_field(layer: int, support_in_spacings: float) -> tuple[float, float]:
     """Sum of W over the layers that a wall takes from a layer of fluid, 1 for the one next to it, and its slope."""
     missing = [
-        _layer_field(distance, support_in_spacings, shifts=1)
+        layer_field(distance, support_in_spacings, shifts=1)
         for distance in np.arange(float(layer), support_in_spacings)
     ]
     field, slope = np.sum([(0.0, 0.0), *missing], axis=0)
@@ -181,7 +174,7 @@ def _lattice_axis(half_width: float) -> NDArray[np.float64]:
     return np.arange(-math.ceil(half_width), math.ceil(half_width) + 1, dtype=np.float64)
 
 
-def _layer_field(distance: float, support_in_spacings: float, *, shifts: int = 8) -> tuple[float, float]:
+def layer_field(distance: float, support_in_spacings: float, *, shifts: int = 8) -> tuple[float, float]:
     """Sum of W over one square lattice layer at a distance [spacings], and its slope.
 
     Averaged over so many sideways shifts along each side, as fluid beside a wall lies anywhere between its samples.

@@ -1,4 +1,4 @@
-"""The opening of an emitter: where in it the particles of a layer are, and how far layers are apart."""
+"""The openings of emitters: the layers of particles in them, the pipes around their nozzles, and what is in the way."""
 
 from __future__ import annotations
 
@@ -19,15 +19,12 @@ if TYPE_CHECKING:
     from sim.fluid.parameters import EmitterParameters, FluidParameters
     from sim.shapes.solid import Solid
 
-
-# How near particles of a layer, and layers, may be to each other: nearer, they would burst from the opening.
-NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35
-
-# How much nearer to a pipe than at rest particles may start: the lattice of a block lies anywhere beside it.
-PIPE_PLAY_IN_SPACINGS = 0.05
-
+NEAREST_IN_SPACINGS, FARTHEST_IN_SPACINGS = 0.82, 1.35  # of particles and of layers: nearer, they would burst out
+PIPE_PLAY_IN_SPACINGS = 0.05  # how much nearer to a pipe than at rest a block may start, whose lattice lies anywhere
 LATTICES_TRIED = 41  # lattice constants between 0.9 and 1.1 spacings that are tried for a disc
 CELL_MISMATCH = 0.05  # by how much the area of a disc and that of the lattice cells in it may differ
+
+SAME_IN_SPACINGS = 1.0e-3  # nozzles whose particles, and whose sides, differ by less are one
 
 
 @dataclass(frozen=True)
@@ -61,18 +58,18 @@ class Opening:
             raise ValueError(
                 f"is too narrow for particles {spacing:g} m apart; enlarge it or use a smaller particle_radius"
             )
-        axes = _axes_across(direction)
+        axes, (places, distance) = _axes_across(direction), layer
         # A particle begins half a layer in front of the opening: its volume is then wholly inside the domain.
         centre = np.array(emitter.position, dtype=np.float64)
-        points = centre + 0.5 * layer.distance * direction + layer.places @ np.stack(axes)
+        points = centre + 0.5 * distance * direction + places @ np.stack(axes)
         return cls(
             centre=centre,
             axes=axes,
-            half_size=_half_size(emitter, layer.places, spacing),
+            half_size=_half_size(emitter, places, spacing),
             is_round=isinstance(emitter.shape, DiscOpening),
             points=points,
             velocity=emitter.speed * direction,
-            layer_distance=layer.distance,
+            layer_distance=distance,
             support_in_spacings=support_in_spacings,
             start_s=emitter.start_s,
             end_s=math.inf if emitter.end_s is None else emitter.end_s,
@@ -194,29 +191,24 @@ def _wall_standoff(support_in_spacings: float) -> float:
     return wall_calibration(support_in_spacings).standoff_in_spacings
 
 
-@dataclass(frozen=True)
-class _Layer:
-    """Places in the plane of an opening [m], (n, 2), and how near neighbours in it are; distance of the layers [m]."""
+def _best_layer(
+    emitter: EmitterParameters, spacing: float, particle_volume: float
+) -> tuple[NDArray[np.float64], float] | None:
+    """Places in the plane of the opening [m], (n, 2), and distance of layers [m], which keep particles farthest apart.
 
-    places: NDArray[np.float64]
-    nearest: float
-    distance: float
-
-
-def _best_layer(emitter: EmitterParameters, spacing: float, particle_volume: float) -> _Layer | None:
-    """The layer whose particles, and layers, keep farthest apart; None where all are too near or too far."""
+    None where all are too near or too far.
+    """
     shape = emitter.shape
     if isinstance(shape, DiscOpening):
         layers, area = _disc_layers(shape.radius, spacing), math.pi * shape.radius**2
     else:
         layers, area = _rectangle_layers(shape.size, spacing), shape.size[0] * shape.size[1]
-    best = None
+    best, farthest = None, 0.0
     for places, nearest in layers:
         distance = len(places) * particle_volume / area
         is_possible = min(nearest, distance) >= NEAREST_IN_SPACINGS * spacing
-        if is_possible and distance <= FARTHEST_IN_SPACINGS * spacing:
-            layer = _Layer(places, nearest, distance)
-            best = max(best or layer, layer, key=lambda each: min(each.nearest, each.distance))
+        if is_possible and distance <= FARTHEST_IN_SPACINGS * spacing and min(nearest, distance) > farthest:
+            best, farthest = (places, distance), min(nearest, distance)
     return best
 
 
@@ -270,9 +262,6 @@ def _axes_across(direction: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
         sideways = np.array([0.0, 1.0, 0.0])
     first = sideways / np.linalg.norm(sideways)
     return first, np.cross(direction, first)
-
-
-SAME_IN_SPACINGS = 1.0e-3  # nozzles whose particles, and whose sides, differ by less are one
 
 
 def is_same_nozzle(one: Opening, other: Opening, spacing: float) -> bool:

@@ -1,19 +1,20 @@
-"""Arrays of the particles of a tank: physically sorted by cell, compacted when particles leave."""
+"""The particles of a tank: sorted by cell, compacted when particles leave, and of one material or several."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle
 from sim.core.cells import CellGrid, CellSort, SortedPoints
 from sim.core.launch import kernel
 from sim.core.neighbors import NeighborList, Neighbors, list_stride
+from sim.core.parameters import Vector3
 from sim.fluid.boundary import Samples
-from sim.fluid.phases import Materials
+from sim.fluid.parameters import FluidParameters
 
 HOST_NAMES = ("position", "velocity", "particle_id", "phase")
 
@@ -101,11 +102,6 @@ class ParticleSet:
         """Densities relative to the rest density [-], (capacity,)."""
         return self.arrays.density
 
-    @property
-    def near(self) -> Neighbors:
-        """The neighbour list as kernels read it."""
-        return self.neighbors.lists
-
     def load(self, arrays: Mapping[str, NDArray[np.generic]]) -> None:
         """Take `position` and `velocity` (n, 3), `particle_id` and `phase` (n,) from the host, n at most the capacity.
 
@@ -130,7 +126,7 @@ class ParticleSet:
         arrays = {name: getattr(self.arrays, name) for name in HOST_NAMES} | self.carried
         return {name: self.host(array) for name, array in arrays.items()}
 
-    def sort(self, keep_low: tuple[float, float, float], keep_high: tuple[float, float, float]) -> int:
+    def sort(self, keep_low: Vector3, keep_high: Vector3) -> int:
         """Sort the particles by cell and id and drop those outside; returns how many were dropped."""
         before = self.arrays
         count = self.cells.sort(before.position, before.particle_id, before.count, keep_low, keep_high)
@@ -195,6 +191,58 @@ def clear_scalars(values: Floats, first: ti.i32, count: ti.i32):
     """Zeros for a carried quantity of new particles."""
     for i in range(first, first + count):
         values[i] = 0.0
+
+
+@bundle
+class Materials(NamedTuple):
+    """Materials by number, (k,) each."""
+
+    rest_density: Floats  # rho0 [kg/m³]
+    dynamic_viscosity: Floats  # mu = rho0 nu [Pa s]
+    surface_tension: Floats  # coefficient, in the unit of its model
+    several: ti.template()  # whether there is more than one
+
+
+class Phases:
+    """Materials by number, one of which each particle has as its `phase`.
+
+    Attributes:
+        parameters: of each fluid.
+        names: of each fluid.
+        rest_densities: rho0 of each [kg/m³], (k,), float64, on the host.
+        viscosities: nu of each [m²/s], (k,), float64, on the host.
+        materials: of all of them on the device, float32.
+    """
+
+    def __init__(self, parameters: Sequence[FluidParameters]) -> None:
+        self.parameters = tuple(parameters)
+        self.names = tuple(fluid.name for fluid in parameters)
+        self.rest_densities = np.array([fluid.rest_density for fluid in parameters])
+        self.viscosities = np.array([fluid.viscosity for fluid in parameters])
+        self.materials = Materials(
+            rest_density=on_device(self.rest_densities),
+            dynamic_viscosity=on_device(self.rest_densities * self.viscosities),
+            surface_tension=on_device(np.array([fluid.surface_tension for fluid in parameters])),
+            several=len(self.parameters) > 1,
+        )
+
+    def set_viscosities(self, viscosities: NDArray[np.float64]) -> None:
+        """Change nu of each fluid [m²/s], (k,), in the arrays that solvers hold."""
+        self.viscosities[:] = viscosities
+        self.materials.dynamic_viscosity.from_numpy((self.rest_densities * viscosities).astype(np.float32))
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def shared(self) -> FluidParameters:
+        """The first fluid, for what all fluids of a tank have in common: solver, particle radius, time step."""
+        return self.parameters[0]
+
+    @property
+    def density_contrast(self) -> float:
+        """Largest rest density over the smallest."""
+        return float(self.rest_densities.max() / self.rest_densities.min())
 
 
 @bundle

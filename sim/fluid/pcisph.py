@@ -20,20 +20,17 @@ from sim.fluid.pressure import (
     momentum,
     not_negative,
 )
-from sim.fluid.solve_record import SolveRecord
+from sim.fluid.stepping import SolveRecord
 from sim.fluid.tank import FluidStart
 
-# Iterations in any case (Solenthaler & Pajarola 2009, algorithm 2): fewer let the pressure fluctuate.
-LEAST_ITERATIONS = 3
-
+LEAST_ITERATIONS = 3  # in any case (Solenthaler & Pajarola 2009, algorithm 2): fewer let the pressure fluctuate
 LARGEST_ERROR_GROWTH = 2.0  # a solve whose error grows beyond this multiple diverges
 
 LARGEST_DISPLACEMENT = 0.5
 """Displacement [spacings] beyond which a predicted position means nothing: two particles may have passed each other
 unseen, or one has left the neighbours that it knows and finds no compression where it is. Steps are made for 0.2."""
 
-# Stands for the compression left of a particle that goes farther; no solve with one of them has a small mean error.
-ASTRAY = 1.0e10
+ASTRAY = 1.0e10  # stands for the compression left of a particle that goes farther: no mean error with it is small
 
 
 @bundle
@@ -95,11 +92,7 @@ class PCISPHSolver(IncompressibleFluid):
         """Find the pressure of a step of dt [s], if need be the linear one, and add its acceleration."""
         particles = self.particles
         copy_scalars(particles.carried["pressure"], particles.count, self._first_guess)
-
-        def predict_and_correct(pressure: ti.Ndarray, iteration: int) -> None:
-            self.predict_and_correct(pressure, dt, iteration)
-
-        found, given_up = self._solve(dt, error_growth=LARGEST_ERROR_GROWTH, relax=predict_and_correct), 0
+        found, given_up = self._solve(dt, error_growth=LARGEST_ERROR_GROWTH, relax=self.predict_and_correct), 0
         if found.not_converged:
             given_up = found.iterations
             copy_scalars(self._first_guess, particles.count, particles.carried["pressure"])
@@ -113,14 +106,9 @@ class PCISPHSolver(IncompressibleFluid):
     def _solve(self, dt: float, *, error_growth: float = math.inf, relax: Relax | None = None) -> SolveRecord:
         carried, record = self.particles.carried, SolveRecord()
         self.start_from(carried["pressure"])
+        pressure, least, tolerance = carried["pressure"], LEAST_ITERATIONS, self.parameters.density_tolerance
         carried["pressure"] = self.solve(
-            record,
-            carried["pressure"],
-            dt,
-            least=LEAST_ITERATIONS,
-            tolerance=self.parameters.density_tolerance,
-            error_growth=error_growth,
-            relax=relax,
+            record, pressure, dt, least=least, tolerance=tolerance, error_growth=error_growth, relax=relax
         )
         return record
 
@@ -128,16 +116,9 @@ class PCISPHSolver(IncompressibleFluid):
         """Predict positions and densities with a pressure [Pa] for a step of dt [s], and correct it by them."""
         fluid = self.tank.on_device
         predict_positions(fluid.particles, self.forces.acceleration, self.pressure_acceleration, dt, self._predicted)
-        correction = Correction(
-            dt=dt,
-            share=self.correction(dt),
-            momentum=momentum(iteration),
-            filled_diagonal=self.filled_diagonal,
-            largest_displacement_squared=(LARGEST_DISPLACEMENT * self.spacing) ** 2,
-        )
-        correct_pressure(
-            fluid, self.system, self._predicted, self.boundary_response, correction, pressure, self.next_pressure
-        )
+        farthest, response = (LARGEST_DISPLACEMENT * self.spacing) ** 2, self.boundary_response
+        correction = Correction(dt, self.correction(dt), momentum(iteration), self.filled_diagonal, farthest)
+        correct_pressure(fluid, self.system, self._predicted, response, correction, pressure, self.next_pressure)
 
     def begin_frame(self, time_s: float) -> None:
         """Restart the counters of the frame."""

@@ -23,28 +23,19 @@ from sim.fluid.body_response import SolveError, error_left
 from sim.fluid.fluid import SPHFluid
 from sim.fluid.kernels import distance, evaluate_slope, inverse_distance, lattice_offsets, spline, spline_slope
 from sim.fluid.particles import Fluid
-from sim.fluid.solve_record import SolveRecord
+from sim.fluid.stepping import SolveRecord
 from sim.fluid.tank import FluidStart
 from sim.fluid.traits import CFL_NUMBER, TRAITS, stable_time_step
 
-# Share of a particle's compression that is taken back while the largest expected speed crosses a spacing.
-CORRECTED_PER_CROSSING = 0.5
-
+CORRECTED_PER_CROSSING = 0.5  # of a compression is taken back while the largest expected speed crosses a spacing
 MOST_ITERATIONS_AHEAD = 4  # most iterations from one look at the error to the next
-
-# Largest eigenvalue of A over its diagonal in disorder and at walls, over that of a lattice; 1.26 is measured.
-DISORDER = 1.3
-
-# Share of a filled neighbourhood's A_ii below which a particle can have no pressure: it has no neighbour.
-LEAST_DIAGONAL = 1.0e-6
-
+DISORDER = 1.3  # largest eigenvalue of A over its diagonal at worst, over that of a lattice; 1.26 is measured
+LEAST_DIAGONAL = 1.0e-6  # of a filled neighbourhood's A_ii: below it a particle has no neighbour and no pressure
 LARGEST_ERROR = 1.0e20  # means of errors beyond it contain one of a particle that is `NOT_FINITE`
+CARE_NEAR_BODIES = 10.0  # how much smaller the error is kept near bodies: it accelerates a light one for many steps
 
-# How much smaller the error is kept near moving bodies: a light one is accelerated by it for many steps.
-CARE_NEAR_BODIES = 10.0
-
-Relax = Callable[[ti.Ndarray, int], None]
-"""From a pressure that is tried, and the number of the iteration, to the compression left and the next pressure."""
+Relax = Callable[[ti.Ndarray, float, int], None]
+"""From a pressure that is tried, the step and the iteration to the compression left and the next pressure."""
 
 
 @bundle
@@ -113,8 +104,7 @@ class IncompressibleFluid(SPHFluid):
     def begin_sheets(self) -> None:
         """Find the fluid that touches sheets, and add their share in A to its diagonal."""
         self.forces.begin_sheets()
-        sheets = self.body_forces.sheets
-        if sheets is not None:
+        if (sheets := self.body_forces.sheets) is not None:
             fluid, inverse_diagonal = self.tank.on_device, self.system.inverse_diagonal
             sheets.add_to_diagonal(fluid, self.body_forces.near, self.relaxation, inverse_diagonal)
 
@@ -168,7 +158,7 @@ class IncompressibleFluid(SPHFluid):
                 beta, left = momentum(iteration), (self.pressure_acceleration, self.boundary_response)
                 relax_pressure(self.tank.on_device, self.system, *left, dt**2, beta, pressure, self.next_pressure)
             else:
-                relax(pressure, iteration)
+                relax(pressure, dt, iteration)
             iteration += 1
             if iteration >= min(next_look, limit):
                 error = self.mean_error(pressure, dt)

@@ -1,4 +1,4 @@
-"""Surface tension as cohesion between particles."""
+"""Surface tension: cohesion (Becker & Teschner 2007), or that with area forces and adhesion (Akinci et al. 2013)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,6 +21,12 @@ from sim.fluid.kernels import (
 )
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid
+
+COHESION_PER_TENSION = 100.0  # c [m/s²] over sigma/(rho0 h²) of drops that oscillate as Rayleigh's do; measured
+RATE_PER_COHESION = 1.0  # squared frequency on cohesion's springs over c/h: six neighbours, each of 0.135/h at most
+AREA_SHARE = 1.0e-3
+"""Coefficient of the area forces over that of cohesion, both as accelerations. The paper has one gamma for both: its
+cohesion is gamma rho0 V C, its area force gamma (n_i - n_j), and rho0 is 1000 in its units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,19 +80,6 @@ def _neighbor_distances(support_in_spacings: float) -> np.ndarray:
     """Of the neighbours in a filled lattice [spacings]; none is nearer than the lower limit."""
     distances = np.linalg.norm(lattice_offsets(support_in_spacings), axis=1)
     return distances[distances > 0.0]
-
-
-COHESION_PER_TENSION = 100.0
-"""Cohesion c [m/s²] over sigma/(rho0 h²) with which a drop oscillates as one of surface tension sigma does (Rayleigh);
-measured."""
-
-RATE_PER_COHESION = 1.0
-"""Square of the frequency of a particle on the springs of its neighbours' cohesion over c/h [-]: the slope of V C is at
-most 0.135/h between two particles of a lattice, and six are as near as that."""
-
-AREA_SHARE = 1.0e-3
-"""Coefficient of the area forces over that of cohesion, both as accelerations. The paper has one gamma for both: its
-cohesion is gamma rho0 V C, its area force gamma (n_i - n_j), and rho0 is 1000 in its units."""
 
 
 @bundle

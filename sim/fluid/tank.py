@@ -17,7 +17,7 @@ from sim.fluid.emitter import Emission
 from sim.fluid.kernels import Discretization
 from sim.fluid.opening import is_felt_in_nozzles
 from sim.fluid.particles import HOST_NAMES, Fluid, ParticleSet
-from sim.fluid.sheet_forces import SheetForces
+from sim.fluid.sheets import SheetForces
 from sim.fluid.stepping import MotionSummary, ParticleStepper, box_of
 
 if TYPE_CHECKING:
@@ -27,12 +27,11 @@ if TYPE_CHECKING:
     from sim.core.parameters import Vector3
     from sim.core.solver import Arrays
     from sim.fluid.parameters import FluidParameters
-    from sim.fluid.phases import Phases
-    from sim.fluid.sheet_samples import SheetSamples
+    from sim.fluid.particles import Phases
+    from sim.fluid.sheets import SheetSamples
 
 
-# What a checkpoint has of the last motion of the particles.
-MEASURES = ("max_speed", "max_acceleration", "max_frequency", "max_displacement")
+MEASURES = ("max_speed", "max_acceleration", "max_frequency", "max_displacement")  # of the last step, in a checkpoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +141,7 @@ class ParticleTank:
     def on_device(self) -> Fluid:
         """The fluid as kernels read it."""
         particles, d = self.particles, self.discretization
-        arrays = particles.arrays, particles.near, self.boundary.samples, self._materials
+        arrays = particles.arrays, particles.neighbors.lists, self.boundary.samples, self._materials
         return Fluid(*arrays, d.particle_volume, d.sigma, d.inverse_support)
 
     @property
@@ -217,14 +216,9 @@ class ParticleTank:
         """Sort the particles, drop those that left, and list the neighbours of all others."""
         particles = self.particles
         self.removed += particles.sort(self._box.keep_low, self._box.keep_high)
-        particles.neighbors.build(
-            self._search_radius,
-            particles.sorted_points,
-            particles.count,
-            self.boundary.fixed_points,
-            self.boundary.sort_moving(),
-            self.boundary.moving_index,
-        )
+        points, count, fixed = particles.sorted_points, particles.count, self.boundary.fixed_points
+        moving = self.boundary.sort_moving(), self.boundary.moving_index
+        particles.neighbors.build(self._search_radius, points, count, fixed, *moving)
         self.body_forces.find_particles(particles.sorted_points)
         self._travelled = self._boundary_travelled = 0.0
         self._without_neighbors = False

@@ -7,11 +7,7 @@ from dataclasses import dataclass
 CFL_NUMBER = 0.4  # fraction of the particle spacing that a signal may cross in a step (Monaghan 1992)
 FORCE_NUMBER = 0.25  # fraction of sqrt(d / |a|) (Monaghan 1992, section 10.3)
 VISCOUS_NUMBER = 0.125  # fraction of d² / nu (Morris, Fox & Zhu 1997, eq. 20)
-
-# Fraction of the inverse of the highest frequency of particles against each other's pressure; symplectic Euler is
-# stable up to 2. Particles that are squeezed, or pressed against boundary samples, are the stiffest.
-PRESSURE_NUMBER = 1.0
-
+PRESSURE_NUMBER = 1.0  # fraction of the inverse frequency against others' pressure; symplectic Euler is stable up to 2
 COHESION_NUMBER = 0.25  # fraction of the inverse frequency of a particle on the spring that its neighbours' cohesion is
 
 
@@ -81,9 +77,8 @@ def stable_time_step(
 ) -> float:
     """Largest stable step [s]: the smallest of the limits by signals, forces, viscosity, cohesion and pressure.
 
-    Signals have the speed of sound plus the largest speed, or that alone where pressure is implicit [m/s]. Viscosity is
-    kinematic, the artificial one included [m²/s]. The cohesion of its neighbours is a spring on which a particle has a
-    frequency of that square [1/s²]; against each other's explicit pressure particles have another one [1/s].
+    Signals have the speed of sound plus the largest speed, or that alone where pressure is implicit. Viscosity is the
+    kinematic one with the artificial one; rate and frequency are of springs by cohesion [1/s²] and by pressure [1/s].
     """
     limits = [math.inf]
     if signal_speed > 0.0:

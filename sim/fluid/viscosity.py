@@ -1,7 +1,7 @@
-"""Viscous forces between particles, shared by all particle fluids."""
+"""Viscous forces between particles: explicit, or for stiff fluids from a linear system (Weiler et al. 2018)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import taichi as ti
@@ -9,16 +9,21 @@ import taichi as ti
 from sim.core.arrays import Floats, Vectors
 from sim.core.bundles import bundle, func
 from sim.core.launch import kernel
-from sim.core.reductions import LaneReduction, Share
+from sim.core.reductions import LaneReduction, Results, Share, reduced_tree
 from sim.fluid.body_friction import BodyFriction, Friction
 from sim.fluid.kernels import TINY_DISTANCE, Discretization, spline_slope
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.particles import Fluid, Particles, ParticleSet
-from sim.fluid.solve_record import SolveRecord
+from sim.fluid.stepping import SolveRecord
 from sim.fluid.traits import CFL_NUMBER, VISCOUS_NUMBER
 
 LAPLACIAN_FACTOR = 10.0  # 2 (d + 2) of Monaghan's viscosity in d = 3 dimensions
 SOFTENING = 0.01  # keeps |x_ij|² + 0.01 h² away from zero for particles that meet
+TOLERANCE = 1.0e-3  # where a solve stops: residual over the velocity changes that viscosity asks for, root mean squares
+MAX_ITERATIONS = 200  # a solve that needs more is counted as not converged; its velocities are used as they are
+STAGNATION = 0.5  # of the residual of the restart before: with more left the limits of float32 are met
+LEAST_SQUARE = 1.0e-24  # velocity changes whose squares add up to less are nothing, and no reason to iterate [m²/s²]
+CARRIED = ("viscous_change_x", "viscous_change_y", "viscous_change_z")  # of each particle, where the next solve starts
 
 
 @bundle
@@ -53,23 +58,6 @@ def pair_viscosity(mu_i: ti.f32, mu_j: ti.f32) -> ti.f32:
     Cleary & Monaghan 1999, "Conduction modelling using smoothed particle hydrodynamics", eq. 14, for viscosity.
     """
     return 2.0 * mu_i * mu_j / ti.max(mu_i + mu_j, 1.0e-30)
-
-
-TOLERANCE = 1.0e-3
-"""Where the iteration stops: the residual as a velocity, over the velocity changes that viscosity asks for, both as
-root mean squares."""
-
-MAX_ITERATIONS = 200  # a solve that needs more is counted as not converged; its velocities are used as they are
-
-CARRIED = ("viscous_change_x", "viscous_change_y", "viscous_change_z")
-"""Velocity change of each particle in the step before [m/s], from which the next solve starts."""
-
-# A restart whose residual is more than this share of that of the restart before has met the limits of float32.
-STAGNATION = 0.5
-
-LEAST_SQUARE = 1.0e-24  # velocity changes whose squares add up to less are nothing, and no reason to iterate [m²/s²]
-
-SUMS = 3
 
 
 def is_implicit(parameters: FluidParameters, viscosity: float, speed: float) -> bool:
@@ -114,16 +102,11 @@ class ImplicitViscosity:
         self.record = SolveRecord()
         self.bodies = bodies
         self._wall_friction, self._discretization = wall_friction, discretization
-        self._reduction = LaneReduction(maxima=0, sums=SUMS)
+        self._reduction = LaneReduction(maxima=0, sums=3)
         self.velocity, *vectors = (ti.Vector.ndarray(3, ti.f32, capacity) for _ in range(9))
         self._iterate, self._blocks = Iterate(*vectors[:6]), Blocks(*vectors[6:])
         # The right-hand side has been read when the first direction is written.
         self._given = self._iterate.direction_product
-
-    @property
-    def change(self) -> ti.Ndarray:
-        """Change of the particles' velocities that the last solve found [m/s]."""
-        return self._iterate.change
 
     def add_acceleration(
         self, particles: ParticleSet, fluid: Fluid, friction: Friction, acceleration: ti.Ndarray, dt: float
@@ -169,7 +152,7 @@ class ImplicitViscosity:
             left, _, _ = self._start()
         self.record.add(iterations, math.sqrt(left / asked), converged=left <= wanted)
 
-    def _start(self) -> tuple[float, float, float]:
+    def _start(self) -> tuple[float, ...]:
         """Find the true residual of the change so far; squares of it, of the right-hand side and of what that asks for.
 
         Squares are sums over the particles [m²/s²]: |r/rho0|², |b/rho0|² and |D⁻¹ b|².
@@ -178,8 +161,8 @@ class ImplicitViscosity:
         if self._with_bodies:
             bodies.restart(iterate.change)
         start_solve(self._matrix, self.velocity, bodies.changes, self._blocks, iterate, self._given)
-        sum_norms(self._matrix, iterate.residual, self._given, self._blocks, self._share)
-        return self._with_share_of(bodies.norms)
+        sums = sum_norms(self._matrix, iterate.residual, self._given, self._blocks, self._share)
+        return self._with_share_of(bodies.norms, sums)
 
     def _advance(self, wanted: float, most: int) -> int:
         """Conjugate gradients until the residual they carry along is as small as wanted; returns the iterations."""
@@ -187,12 +170,11 @@ class ImplicitViscosity:
         alpha = gamma_before = 0.0
         for iteration in range(most):
             if self._with_bodies:
-                bodies.spread_preconditioned()
+                bodies.spread(bodies.preconditioned)
             multiply(self._matrix, iterate.preconditioned, bodies.changes, iterate.product)
             if self._with_bodies:
                 bodies.multiply(iterate.preconditioned)
-            sum_products(self._matrix, iterate, self._share)
-            gamma, delta, left = self._with_share_of(bodies.products)
+            gamma, delta, left = self._with_share_of(bodies.products, sum_products(self._matrix, iterate, self._share))
             beta = gamma / gamma_before if iteration else 0.0
             curvature = delta - beta * gamma / alpha if iteration else delta
             # Of a positive matrix both are positive; rounding, or velocities that are not finite, end the iteration.
@@ -204,13 +186,11 @@ class ImplicitViscosity:
                 bodies.advance(alpha, beta)
         return most
 
-    def _with_share_of(self, bodies_share: Callable[[], tuple[float, float, float]]) -> tuple[float, float, float]:
+    def _with_share_of(self, bodies: Callable[[], tuple[float, ...]], sums: Sequence[float]) -> tuple[float, ...]:
         """The sums over all particles, and the bodies' share in them."""
-        first, second, third = (float(value) for value in self._reduction.result())
-        if self._with_bodies:
-            shares = bodies_share()
-            return first + shares[0], second + shares[1], third + shares[2]
-        return first, second, third
+        first, second, third = self._reduction.unpack(sums).tolist()
+        shares = bodies() if self._with_bodies else (0.0, 0.0, 0.0)
+        return first + shares[0], second + shares[1], third + shares[2]
 
 
 @bundle
@@ -376,7 +356,7 @@ def multiply(matrix: ViscousMatrix, vector: Vectors, boundary_vector: Vectors, p
 
 
 @kernel
-def sum_norms(matrix: ViscousMatrix, residual: Vectors, given: Vectors, blocks: Blocks, share: Share):
+def sum_norms(matrix: ViscousMatrix, residual: Vectors, given: Vectors, blocks: Blocks, share: Share) -> Results:
     """|r/rho0|², |b/rho0|² and |D⁻¹ b|²; over the rest density of its own fluid all are of one size."""
     particles, materials = ti.static((matrix.fluid.particles, matrix.fluid.materials))
     for lane in range(share.tree.lanes):
@@ -393,10 +373,11 @@ def sum_norms(matrix: ViscousMatrix, residual: Vectors, given: Vectors, blocks: 
         share.tree.partial[lane] = left
         share.tree.partial[share.tree.lanes + lane] = right
         share.tree.partial[2 * share.tree.lanes + lane] = asked
+    return reduced_tree(share.tree)
 
 
 @kernel
-def sum_products(matrix: ViscousMatrix, iterate: Iterate, share: Share):
+def sum_products(matrix: ViscousMatrix, iterate: Iterate, share: Share) -> Results:
     """r . u, u . A u and |r/rho0|²."""
     particles, materials = ti.static((matrix.fluid.particles, matrix.fluid.materials))
     for lane in range(share.tree.lanes):
@@ -412,6 +393,7 @@ def sum_products(matrix: ViscousMatrix, iterate: Iterate, share: Share):
         share.tree.partial[lane] = gamma
         share.tree.partial[share.tree.lanes + lane] = delta
         share.tree.partial[2 * share.tree.lanes + lane] = norm
+    return reduced_tree(share.tree)
 
 
 @kernel

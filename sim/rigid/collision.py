@@ -55,15 +55,10 @@ class CollisionDetector:
         self.followed = AnchoredContacts.joined([])
 
     def find(self, poses: Poses, motion: Array, last: frozenset[Key]) -> Contacts:
-        """The contacts of a pose.
+        """The contacts of all bodies in poses, by pair, in order of their numbers, then those at walls.
 
-        Args:
-            poses: of all bodies and the domain.
-            motion: how far the surface of each may get in the coming step if nothing stops it [m], (n + 1,).
-            last: keys of the last step's contacts, which are preferred among equals.
-
-        Returns:
-            Contacts by pair of bodies, in order of their numbers, then those at walls.
+        The surface of each may get so far in the coming step if nothing stops it [m], (n + 1,). Those of the last step,
+        by their keys, are preferred among equals.
         """
         ahead = motion[self._first] + motion[self._second]
         stale = np.flatnonzero(ahead > self._budget)

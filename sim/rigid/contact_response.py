@@ -14,9 +14,7 @@ from sim.rigid.contacts import Array, Contacts, Indices, Key
 from sim.rigid.restitution import Bounces, solve_impacts
 from sim.rigid.states import MovingBodies
 
-SEPARATION_TIME_S, LARGEST_SEPARATION = 0.02, 0.2
-"""Overlaps decay within about this time, and by this share a step at most."""
-
+SEPARATION_TIME_S, LARGEST_SEPARATION = 0.02, 0.2  # in which overlaps decay, and by what share a step at most
 SLOP = 1.0e-6  # overlap that stays [m]: below what anybody sees, above what rounding makes
 WEIGHT_TOLERANCE = 1.0e-4  # of the speed that gravity gives in a step: what the last sweep may still change
 

@@ -1,4 +1,4 @@
-"""Contacts: points where two bodies touch, fixed to the bodies so that they can be followed."""
+"""Contacts: points where two bodies touch, fixed to the bodies so that they can be followed, and how few of them do."""
 
 from __future__ import annotations
 
@@ -15,6 +15,13 @@ Indices = NDArray[np.int64]
 
 Key = tuple[int, int, int]  # of a contact from step to step: the two bodies, and which ball of which of them
 FEATURE_BITS = 32
+
+SAME_PATCH = 0.9  # normals closer than this cosine (26°) belong to one patch of contact
+MOST_PATCHES = 4  # patches of one pair that are kept, deepest first: more normals than three hold a body in any pose
+KEPT_BONUS = 2.0e-3  # head start, in extents of the patch, of points of the last step: equal ones must not take turns
+_ANGLES = 2.0 * np.pi * (np.arange(8) + 0.29) / 8.0
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+"""Eight directions find every corner of a convex patch with an angle under 135°; the offset avoids symmetry axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,22 +110,10 @@ def tangent_basis(normal: Array) -> Array:
     return tangents
 
 
-SAME_PATCH = 0.9  # normals closer than this cosine (26°) belong to one patch of contact
-MOST_PATCHES = 4  # patches of one pair that are kept, deepest first: more normals than three hold a body in any pose
-KEPT_BONUS = 2.0e-3  # head start, in extents of the patch, of points of the last step: equal ones must not take turns
-
-_ANGLES = 2.0 * np.pi * (np.arange(8) + 0.29) / 8.0
-_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
-"""Eight directions find every corner of a convex patch with an angle under 135°; the offset avoids symmetry axes."""
-
-
 def reduce_manifold(contacts: Contacts, last: frozenset[Key], *, margin: float) -> Indices:
-    """Rows of the contacts to keep: by patches of like normals, deepest first; ascending within a patch.
+    """Rows of the contacts of a pair, one at least, to keep: by patches of like normals, deepest first; then ascending.
 
-    Args:
-        contacts: of one pair, one at least.
-        last: keys of the last step's contacts, which are preferred among equals.
-        margin: the largest gap that was looked for [m].
+    Those of the last step, by their keys, are preferred among equals; gaps up to a margin were looked for [m].
     """
     kept = []
     remaining = np.arange(len(contacts))

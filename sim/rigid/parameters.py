@@ -70,9 +70,5 @@ class RigidBodyParameters(WeightedPlacement):
                 raise ValueError(f"{key} of a body with keyframes comes from them; remove {key}")
         if "interpolation" in given and not self.keyframe:
             raise ValueError("interpolation has no meaning without keyframes; remove it or add [[rigid.keyframe]]")
-        return self
-
-    @model_validator(mode="after")
-    def _keyframes_are_in_order(self) -> Self:
         require_ascending_times(self.keyframe)
         return self

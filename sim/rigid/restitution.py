@@ -36,15 +36,8 @@ class Bounces:
 
         Against what cannot move the instant of the impact counts, as gravity acts before and after it: else a ball
         would come back to e² h0 only to first order in dt. Between free bodies gravity cancels, and an impulse at the
-        start of the step keeps all momenta exactly.
-
-        Args:
-            contacts: of the step.
-            bodies: that move.
-            approach: normal velocities with all of the step's gravity, without impulses [m/s], (k,).
-            restitution: of the pairs [-], (k,).
-            gravity: [m/s²].
-            dt: the step [s].
+        start of the step keeps all momenta exactly. The approach is the normal velocity with all of the step's gravity,
+        without impulses [m/s], (k,).
         """
         first_free, second_free = bodies.are_free(contacts.first), bodies.are_free(contacts.second)
         one_sided = first_free != second_free

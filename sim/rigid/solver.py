@@ -40,7 +40,7 @@ class RigidSolver:
     """All dynamic and kinematic bodies of a scene; static bodies and the domain's closed faces are obstacles.
 
     State in float64 on the host. One substep: gravity, contact impulses from the poses at its start, then the poses.
-    Free flight is exact for constant gravity, and angular momentum is kept to round-off (`free_motion`). Impulses of
+    Free flight is exact for constant gravity, and angular momentum is kept to round-off (`rotate_freely`). Impulses of
     contacts are equal and opposite at one point, so that contacts change neither the linear nor the angular momentum
     of bodies that nothing else holds.
 

@@ -1,4 +1,4 @@
-"""The state of the bodies that move."""
+"""The state of the bodies that move, and of those that never do."""
 
 from __future__ import annotations
 
@@ -9,6 +9,16 @@ from numpy.typing import NDArray
 
 from sim.core.motion import rotation
 from sim.core.motion.rotation import Array
+from sim.core.snapshots import Snapshot
+from sim.rigid.parameters import RigidBodyParameters
+from sim.shapes.placement import build_solid
+
+_SEQUENCE = ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
+"""Principal axes and shares of the step; the same forwards and backwards, hence second order and reversible."""
+
+_COMPONENTS = ([1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0])
+_SIGNS = np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]])
+"""q i, q j and q k: the components of q in another order, with signs."""
 
 
 class MovingBodies:
@@ -108,14 +118,6 @@ class MovingBodies:
         self.angular_velocity = self.angular_velocity + np.einsum("nij,nj->ni", self.inverse_inertia(), angular)
 
 
-_SEQUENCE = ((0, 0.5), (1, 0.5), (2, 1.0), (1, 0.5), (0, 0.5))
-"""Principal axes and shares of the step; the same forwards and backwards, hence second order and reversible."""
-
-_COMPONENTS = ([1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0])
-_SIGNS = np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]])
-"""q i, q j and q k: the components of q in another order, with signs."""
-
-
 def rotate_freely(bodies: MovingBodies, dt: float) -> None:
     """Turn the free bodies by I domega/dt = -omega x (I omega) for dt [s].
 
@@ -138,3 +140,28 @@ def rotate_freely(bodies: MovingBodies, dt: float) -> None:
     q = rotation.normalized(rotation.product(q, rotation.conjugate(bodies.principal_orientation)))
     bodies.orientation = np.where(bodies.is_free[:, None], q, bodies.orientation)
     bodies.set_angular_momentum(spin)
+
+
+class StaticBody:
+    """A rigid body that stays where its placement puts it.
+
+    Attributes:
+        name: its name in the job.
+        solid: its region of the world.
+
+    Raises:
+        ShapeError: its shape cannot be built.
+    """
+
+    def __init__(self, parameters: RigidBodyParameters) -> None:
+        self.name, self.solid = parameters.name, build_solid(parameters)
+
+    def snapshot(self) -> Snapshot:
+        """Its pose: the same at every frame."""
+        arrays = {
+            "position": self.solid.position.copy(),
+            "orientation": self.solid.orientation,
+            "velocity": np.zeros(3),
+            "angular_velocity": np.zeros(3),
+        }
+        return Snapshot("rigid", arrays, {})

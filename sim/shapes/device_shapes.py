@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
 
-from sim.core.arrays import Floats, Integers, Vectors
+from sim.core.arrays import Floats, Integers, Vectors, on_device
 from sim.core.bundles import bundle, func
 from sim.shapes.body_geometry import BodyGeometry
 from sim.shapes.distance_grids import sampled_distances
@@ -162,21 +161,13 @@ class DeviceShapes:
             first[number], level_set = sampled[id(geometry)]
             kind[number], shape[number], origin[number] = GRID, level_set.values.shape, level_set.origin
             spacing[number], step[number] = level_set.spacing, 0.5 * level_set.spacing
-        self.centre_of_mass, self.radius, self.step = _on_device(centre), _on_device(radius), _on_device(step)
+        self.centre_of_mass, self.radius, self.step = on_device(centre), on_device(radius), on_device(step)
         self.on_device = Shapes(
-            kind=_on_device(kind),
-            size=_on_device(size),
-            grid_values=_on_device(np.concatenate(values)),
-            grid_first=_on_device(first),
-            grid_origin=_on_device(origin),
-            grid_spacing=_on_device(spacing),
-            grid_shape=_on_device(shape),
+            kind=on_device(kind),
+            size=on_device(size),
+            grid_values=on_device(np.concatenate(values)),
+            grid_first=on_device(first),
+            grid_origin=on_device(origin),
+            grid_spacing=on_device(spacing),
+            grid_shape=on_device(shape),
         )
-
-
-def _on_device(values: NDArray[np.generic]) -> ti.Ndarray:
-    """Numbers (n,) or vectors (n, 3) as int32 or float32."""
-    dtype, kind = (np.int32, ti.i32) if values.dtype == np.int32 else (np.float32, ti.f32)
-    array = ti.ndarray(kind, len(values)) if values.ndim == 1 else ti.Vector.ndarray(3, kind, len(values))
-    array.from_numpy(values.astype(dtype))
-    return array

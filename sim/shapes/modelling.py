@@ -85,12 +85,8 @@ def mesh_parts(
     """Closed mesh of the union of named parts, cut along their seams: no triangle belongs to two parts.
 
     Marching cubes, then a few rounds in which vertices move towards the mean of their neighbours and back onto the
-    surface, which evens out the triangles. Seams are filleted over a cell: smooth shading finds no crease there.
-
-    Args:
-        parts: the distance of every part at points (n, 3), by name.
-        lower, upper: corners of a box around the surface, with a cell of margin.
-        cell: edge of a cell.
+    surface, which evens out the triangles. Seams are filleted over a cell: smooth shading finds no crease there. The
+    box around the surface has a cell of margin.
     """
 
     def union(points: Points) -> Distances:

@@ -12,19 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sim.core.parameters import Parameters
-from sim.shapes.parameters import (
-    BoxShape,
-    BunnyShape,
-    CapsuleShape,
-    ConeShape,
-    CylinderShape,
-    DuckShape,
-    MeshShape,
-    Placement,
-    SphereShape,
-    TorusShape,
-)
+from sim.shapes.parameters import Placement, TorusShape
 from sim.shapes.primitives import Box, Capsule, Cone, Cylinder, Sphere, Torus
 from sim.shapes.sampling import sample_surface
 from sim.shapes.solid import Points, RestShape, ShapeError, TriangleMesh
@@ -95,7 +83,7 @@ def build_solid(placement: Placement) -> PlacedSolid:
     # Lower-case "xyz" are rotations about fixed world axes: R = Rz Ry Rx.
     rotation = Rotation.from_euler("xyz", placement.rotation_deg, degrees=True).as_matrix()
     position = np.asarray(placement.position, dtype=np.float64)
-    return PlacedSolid(_BUILDERS[type(placement.shape)](placement.shape), placement.scale, rotation, position)
+    return PlacedSolid(_BUILDERS[placement.shape.type](placement.shape), placement.scale, rotation, position)
 
 
 def _build_torus(shape: TorusShape) -> Torus:
@@ -112,15 +100,15 @@ def _module(name: str) -> Any:
     return import_module(f"sim.shapes.{name}")
 
 
-_BUILDERS: Mapping[type[Parameters], Callable[..., RestShape]] = {
-    BoxShape: lambda shape: Box(shape.size),
-    SphereShape: lambda shape: Sphere(shape.radius),
-    CylinderShape: lambda shape: Cylinder(shape.radius, shape.height),
-    CapsuleShape: lambda shape: Capsule(shape.radius, shape.height),
-    TorusShape: _build_torus,
-    ConeShape: lambda shape: Cone(shape.radius, shape.height),
-    DuckShape: lambda shape: _module("procedural").build_duck(shape.length),
-    BunnyShape: lambda shape: _module("procedural").build_bunny(shape.height),
-    MeshShape: lambda shape: _module("mesh_file").load_mesh_solid(shape),
+_BUILDERS: Mapping[str, Callable[..., RestShape]] = {
+    "box": lambda shape: Box(shape.size),
+    "sphere": lambda shape: Sphere(shape.radius),
+    "cylinder": lambda shape: Cylinder(shape.radius, shape.height),
+    "capsule": lambda shape: Capsule(shape.radius, shape.height),
+    "torus": _build_torus,
+    "cone": lambda shape: Cone(shape.radius, shape.height),
+    "duck": lambda shape: _module("procedural").build_duck(shape.length),
+    "bunny": lambda shape: _module("procedural").build_bunny(shape.height),
+    "mesh": lambda shape: _module("mesh_file").load_mesh_solid(shape),
 }
 """How each type of shape is built: one line for a new shape."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Points = NDArray[np.float64]  # (n, 3) positions or directions
+SignedDistance = Callable[[Points], NDArray[np.float64]]
 
 
 class ShapeError(ValueError):
@@ -75,6 +77,13 @@ def boundary_edges(faces: NDArray[np.integer]) -> NDArray[np.int64]:
     undirected = np.stack([low[first], high[first]], axis=1)
     open_edges = np.where(net[:, None] >= 0, undirected, undirected[:, ::-1])
     return np.repeat(open_edges, np.abs(net), axis=0)
+
+
+def outward_normals(signed_distance: SignedDistance, points: Points, step: float) -> Points:
+    """Unit vectors along the gradient of a distance, by differences over twice a step [m], (n, 3)."""
+    shifts = [np.eye(3)[axis] * step for axis in range(3)]
+    gradient = np.stack([signed_distance(points + shift) - signed_distance(points - shift) for shift in shifts], axis=1)
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
 
 
 class HasSignedDistance(Protocol):

@@ -39,13 +39,8 @@ class Advection:
     velocity of the air outside along the side; across it that on the side itself, which the pressure gives it. Beyond
     walls everything has the value of the nearest place inside.
 
-    Args:
-        grid: where the values live.
-        air: what is advected.
-        work: six arrays to work in.
-        maccormack: whether to correct the semi-Lagrangian result.
-        wind: velocity of the air outside [m/s].
-        balance: what `restore_total` reduces rows with to keep those of density and heat in spite of the limiter.
+    With MacCormack the semi-Lagrangian result is corrected; with rows to reduce for `restore_total`, the totals of
+    density and heat are kept in spite of the limiter.
     """
 
     def __init__(
@@ -58,6 +53,7 @@ class Advection:
         wind: Vector3 = (0.0, 0.0, 0.0),
         balance: tuple[Rows, Rows] | None = None,
     ) -> None:
+        """Take the air of a grid, six arrays to work in, and the velocity of the air outside [m/s]."""
         self._air, self._cells_per_metre = air, 1.0 / grid.cell_size
         self._predicted, self._corrected = Faces(*work[:3]), Faces(*work[3:])
         self._maccormack, self._balance = maccormack, balance

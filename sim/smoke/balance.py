@@ -38,13 +38,8 @@ def restore_total(
     which no factor in [0, 1] reaches it. What leaves through open sides is balanced to second order; through the sides
     of moving solids flows what an upwind scheme has flow in the step, so their smoke is balanced to first order.
 
-    Args:
-        air: as it flows in the step.
-        values: before the step.
-        predicted: the semi-Lagrangian result.
-        corrected: the limited result; changed.
-        missing_rows, correction_rows: what it reduces rows with.
-        step: length of the step over the edge of a cell [s/m].
+    Values are those before the step, of a length over the edge of a cell [s/m], `predicted` the semi-Lagrangian result
+    and `corrected` the limited one, which is changed.
     """
     box, solids, velocity = ti.static((air.box, air.solids, air.state.velocity))
     for i, j, lane in ti.ndrange((1, box.nx + 1), (1, box.ny + 1), box.lanes):

@@ -19,9 +19,7 @@ from sim.smoke.obstacles import Obstacles, Solids, is_solid
 
 KNOWN = 0  # layer of what has a value of its own: cells of air, and faces with air on at least one side
 NOWHERE, DEEP = 254, 255  # layers of what is not in the grid, and of what lies deeper in a solid than the last layer
-
-FACES_X, FACES_Y, FACES_Z, CELLS = range(4)
-"""The byte of a place's word that holds the layer of its three faces and of its cell."""
+FACES_X, FACES_Y, FACES_Z, CELLS = range(4)  # byte of a place's word with the layer of its faces and of its cell
 
 
 class Extrapolation:

@@ -12,29 +12,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from sim.core.domain import DomainParameters, Face
+from sim.shapes.solid import HasSignedDistance
 from sim.smoke.parameters import WHOLE, SmokeParameters
 
 Index3 = tuple[int, int, int]
 
 CENTRE = (0.5, 0.5, 0.5)  # of a cell, in cells off its lower corner
-
-
-class SolidRegion(Protocol):
-    """A region of space that smoke cannot enter, or that a source fills."""
-
-    @property
-    def bounds(self) -> NDArray[np.float64]:
-        """Lower and upper corner of a box around it [m], (2, 3)."""
-
-    def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance [m] of points (n, 3) from the surface, negative inside, (n,)."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +43,7 @@ class SmokeGrid:
 
     @classmethod
     def build(
-        cls, parameters: SmokeParameters, domain: DomainParameters, solids: Sequence[SolidRegion] = ()
+        cls, parameters: SmokeParameters, domain: DomainParameters, solids: Sequence[HasSignedDistance] = ()
     ) -> SmokeGrid:
         """The grid of a smoke: its own box, or the domain's where it names none.
 
@@ -63,9 +52,7 @@ class SmokeGrid:
         Raises:
             ValueError: the box is empty, solids fill it, or its sides cannot take the wind.
         """
-        lower = parameters.min if parameters.min is not None else domain.min
-        upper = parameters.max if parameters.max is not None else domain.max
-        for axis, low, high in zip("xyz", lower, upper, strict=True):
+        for axis, low, high in zip("xyz", parameters.min or domain.min, parameters.max or domain.max, strict=True):
             if high <= low:
                 raise ValueError(
                     f'smoke "{parameters.name}": max must be above min on every axis, '
@@ -92,13 +79,11 @@ class SmokeGrid:
     @classmethod
     def of_box(cls, parameters: SmokeParameters, domain: DomainParameters) -> SmokeGrid:
         """The cells of a smoke's box, of which none is solid; the box must not be empty."""
-        nx, ny, nz = parameters.cell_counts(domain)
-        inflow = frozenset(parameters.windward_faces)
-        lower = parameters.min if parameters.min is not None else domain.min
-        is_open = frozenset(parameters.open_faces) - inflow
-        return cls(lower, parameters.cell_size, (nx, ny, nz), is_open, np.zeros((nx, ny, nz), bool), inflow)
+        cells, inflow = parameters.cell_counts(domain), frozenset(parameters.windward_faces)
+        is_open, lower = frozenset(parameters.open_faces) - inflow, parameters.min or domain.min
+        return cls(lower, parameters.cell_size, cells, is_open, np.zeros(cells, bool), inflow)
 
-    def misses(self, region: SolidRegion) -> bool:
+    def misses(self, region: HasSignedDistance) -> bool:
         """Whether a region that reaches into the box is thinner than a cell, and holds no centre of one.
 
         On a closed side one counts from the first layer of centres on: below that the side is there in its place.
@@ -131,6 +116,11 @@ class SmokeGrid:
         """Whether air passes the lower (side 0) or upper (side 1) side of the box along an axis as it likes."""
         return f"{'xyz'[axis]}{'-+'[side]}" in self.open_faces
 
+    @property
+    def open_sides(self) -> tuple[tuple[int, int], ...]:
+        """Axis and side, 0 or 1, of those that air passes as it likes."""
+        return tuple((axis, side) for axis in range(3) for side in (0, 1) if self.is_open(axis, side))
+
     def lets_in(self, axis: int, side: int) -> bool:
         """Whether air from outside may come in through a side: one that is open, or that wind blows in through."""
         return self.is_open(axis, side) or f"{'xyz'[axis]}{'-+'[side]}" in self.inflow_faces
@@ -140,10 +130,8 @@ class SmokeGrid:
         number, count = ndimage.label(~self.solid)
         is_open = np.zeros(count + 1, bool)
         is_open[0] = True  # solids
-        for axis in range(3):
-            for side in (0, 1):
-                if self.is_open(axis, side):
-                    is_open[np.moveaxis(number, axis, 0)[-side]] = True
+        for axis, side in self.open_sides:
+            is_open[np.moveaxis(number, axis, 0)[-side]] = True
         return [
             face
             for face in sorted(self.inflow_faces)
@@ -163,11 +151,11 @@ class SmokeGrid:
         nx, ny, nz = (n + (a == axis) for a, n in enumerate(self.cells))
         return nx, ny, nz
 
-    def cells_inside(self, region: SolidRegion) -> NDArray[np.bool_]:
+    def cells_inside(self, region: HasSignedDistance) -> NDArray[np.bool_]:
         """Cells whose centre lies in a region, (nx, ny, nz)."""
         return self._inside(region, self.cells, CENTRE)
 
-    def faces_inside(self, region: SolidRegion, axis: int) -> NDArray[np.bool_]:
+    def faces_inside(self, region: HasSignedDistance, axis: int) -> NDArray[np.bool_]:
         """Faces whose centre lies in a region, `face_shape(axis)`."""
         return self._inside(region, self.face_shape(axis), _face_offset(axis))
 
@@ -193,7 +181,7 @@ class SmokeGrid:
             for low, n, shift in zip(self.origin, shape, offset, strict=True)
         ]
 
-    def _inside(self, region: SolidRegion, shape: Index3, offset: Sequence[float]) -> NDArray[np.bool_]:
+    def _inside(self, region: HasSignedDistance, shape: Index3, offset: Sequence[float]) -> NDArray[np.bool_]:
         """Which places lie inside a region."""
         inside = np.zeros(shape, bool)
         spans, near = self._near(region, shape, offset)
@@ -201,7 +189,7 @@ class SmokeGrid:
         return inside
 
     def _near(
-        self, region: SolidRegion, shape: Index3, offset: Sequence[float]
+        self, region: HasSignedDistance, shape: Index3, offset: Sequence[float]
     ) -> tuple[tuple[slice, ...], NDArray[np.bool_]]:
         """The places within a region's bounds, and which of them lie inside: distances are dear for meshes."""
         axes = self._axes(shape, offset)

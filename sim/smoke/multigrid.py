@@ -145,10 +145,7 @@ def _cycle(eq: Equation, grids: Integers, levels: ti.template(), lanes: ti.templ
 def _cycle_short(eq: Equation, grids: Integers, first: ti.i32, last: ti.i32):
     """The part of the cycle from one level to the last and back, by the thread that launches it.
 
-    Args:
-        eq: the equation.
-        grids: by level, where its arrays begin and its cells along x, y, z.
-        first, last: the levels.
+    Grids have by level where its arrays begin, and its cells along x, y, z.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):

@@ -223,8 +223,6 @@ def _copy_faces(conductance: Faces, offset: ti.i32, size: ti.i32, faces: Floats)
 def _marks_of_open_sides(grid: SmokeGrid, level: Level) -> NDArray[np.float32]:
     """`DIRICHLET_GHOST` in the ghosts beyond open sides, else 0; flat."""
     marks = np.zeros(level.padded, np.float32)
-    for axis in range(3):
-        for side in (0, 1):
-            if grid.is_open(axis, side):
-                np.moveaxis(marks, axis, 0)[-side] = DIRICHLET_GHOST
+    for axis, side in grid.open_sides:
+        np.moveaxis(marks, axis, 0)[-side] = DIRICHLET_GHOST
     return marks.ravel()

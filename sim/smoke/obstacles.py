@@ -214,12 +214,10 @@ def _static_state(grid: SmokeGrid) -> NDArray[np.int32]:
     """Flat state of a grid with its static solids alone."""
     state = np.full(grid.padded, STATIC, np.int32)
     inner = (slice(1, -1),) * 3
-    for axis in range(3):
-        for side in (0, 1):
-            if grid.is_open(axis, side):
-                ghosts = list(inner)
-                ghosts[axis] = slice(-1, None) if side else slice(0, 1)
-                state[tuple(ghosts)] = AIR
+    for axis, side in grid.open_sides:
+        ghosts = list(inner)
+        ghosts[axis] = slice(-1, None) if side else slice(0, 1)
+        state[tuple(ghosts)] = AIR
     state[inner] = np.where(grid.solid, STATIC, AIR)
     return state.ravel()
 

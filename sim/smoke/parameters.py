@@ -15,10 +15,7 @@ from sim.core.parameters import Fraction, NonNegative, Parameters, Positive, Vec
 from sim.shapes.parameters import Placement
 
 WHOLE = 1.0e-6  # part of a cell by which a box may be longer than its cells: 1 m / 0.02 m are 50, not 50.00000000000001
-
-MOST_CELLS = 2**30
-"""Of one smoke: 1024 along each edge. A job with more is refused, a file that claims more was never written."""
-
+MOST_CELLS = 2**30  # of one smoke, 1024 along each edge: a job with more is refused, a file of more was never written
 CELLS_PER_EDDY = 2.0  # eddies of gusts are at least so many cells wide: the grid carries nothing finer
 
 Seed = Annotated[int, Field(ge=0, le=1_000_000_000)]
@@ -85,13 +82,9 @@ class SmokeSourceParameters(Placement):
         return placed_at_first_keyframe(data, "source")
 
     @model_validator(mode="after")
-    def _ends_after_start(self) -> Self:
+    def _is_possible(self) -> Self:
         if self.end_s is not None and self.end_s <= self.start_s:
             raise ValueError(f"end_s must be after start_s = {self.start_s:g} s, got {self.end_s:g} s")
-        return self
-
-    @model_validator(mode="after")
-    def _moves_in_one_way(self) -> Self:
         require_ascending_times(self.keyframe)
         if self.keyframe and self.follow is not None:
             raise ValueError(f'it follows "{self.follow}" and has keyframes; remove one of them')
@@ -99,10 +92,6 @@ class SmokeSourceParameters(Placement):
             raise ValueError(
                 "interpolation has no meaning without keyframes; remove it or add [[smoke.source.keyframe]]"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _ramp_is_in_order(self) -> Self:
         for number, (before, after) in enumerate(pairwise(self.ramp), start=1):
             if after.time_s <= before.time_s:
                 raise ValueError(

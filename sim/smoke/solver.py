@@ -13,16 +13,16 @@ from sim.core.parameters import Vector3
 from sim.core.reductions import is_finite
 from sim.core.snapshots import Snapshot
 from sim.core.solver import Arrays, Diagnostics, Remedies
+from sim.shapes.solid import HasSignedDistance
 from sim.smoke.advection import Advection
 from sim.smoke.arrays import new_state
-from sim.smoke.cooling import cool
 from sim.smoke.extrapolation import Extrapolation
-from sim.smoke.forces import accelerate, upward
-from sim.smoke.grid import SmokeGrid, SolidRegion
+from sim.smoke.forces import accelerate, cool, upward
+from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import lane_items, lane_place, row_start
 from sim.smoke.obstacles import Air, AirForce, Obstacles, time_of_travel
 from sim.smoke.parameters import SmokeParameters
-from sim.smoke.projection import PressureProjection
+from sim.smoke.projection import PressureProjection, ProjectionReport
 from sim.smoke.reductions import Pair, Rows, find_maxima, new_rows, partial_place
 from sim.smoke.sides import blow_in, brake_inflow, start_wind
 from sim.smoke.sources import build_sources
@@ -39,7 +39,8 @@ class SmokeSolver:
 
     Exact: smoke is added by sources only, and what they add is counted. Approximate: MacCormack advection keeps the
     total of smoke and of heat (`restore_total`), but at moving solids to first order only, and semi-Lagrangian
-    advection does not, so `mass` is a measured quantity. Not supported: expansion by heat.
+    advection does not, so `mass` is a measured quantity. Heat lets air rise by the strength of gravity, unless the
+    parameters say how fast, and does not expand it.
 
     Air that comes in through open sides was at rest outside, or moved with the wind, and is clean (`sim.smoke.sides`).
 
@@ -61,13 +62,6 @@ class SmokeSolver:
         air_forces: what pushes the air from outside, in this order in every substep.
         sources: where smoke comes from, in the order of the parameters.
 
-    Args:
-        parameters: the smoke of a job.
-        domain: the box that is used where the smoke names none.
-        gravity: [m/s²]; its direction is down, and heat rises by its strength unless the parameters say how fast.
-        solids: static obstacles, voxelized on the grid.
-        moving: whether there will be obstacles that move.
-
     Raises:
         ValueError: the box is empty or full of solids, a source contains no open cell, or solids shut air in that
             wind blows into.
@@ -79,9 +73,10 @@ class SmokeSolver:
         *,
         domain: DomainParameters,
         gravity: Vector3,
-        solids: Sequence[SolidRegion] = (),
+        solids: Sequence[HasSignedDistance] = (),
         moving: bool = False,
     ) -> None:
+        """Take a smoke, which may have the domain for its box, static solids, and room for obstacles that move."""
         self.name = parameters.name
         self.parameters = parameters
         self.grid = SmokeGrid.build(parameters, domain, solids)
@@ -103,7 +98,7 @@ class SmokeSolver:
             wind=parameters.wind,
             balance=(new_rows(self.air.box), new_rows(self.air.box)),
         )
-        self._open_sides = tuple((axis, side) for axis in range(3) for side in (0, 1) if self.grid.is_open(axis, side))
+        self._open_sides = self.grid.open_sides
         self._gravity, self._has_gravity = gravity, any(upward(gravity))
         self._lift = parameters.lift_per_kelvin(gravity)
         self._extrapolation = Extrapolation(self.obstacles, self.state, reach=parameters.cfl)
@@ -119,7 +114,7 @@ class SmokeSolver:
             if cut_off := self.grid.cut_off_faces():
                 raise ValueError(f'smoke "{self.name}": wind {parameters.cut_off_problem(cut_off)}')
             start_wind(self.air, parameters.wind, parameters.windward_faces)
-            self._project()
+            self._projections.append(self._projection.project())
             self._extrapolation.fill()
             self.begin_frame(0.0)
 
@@ -137,17 +132,14 @@ class SmokeSolver:
         """
         speed, acceleration = self._find_speed_and_acceleration()
         gusts = 0.0 if self._turbulence is None else self._turbulence.acceleration
-        without_sources = self._largest_step(speed, acceleration + gusts)
+        distance = self.parameters.cfl * self.grid.cell_size
+        without_sources = time_of_travel(distance, speed, acceleration + gusts)
         for source in self.sources:
             if source.parameters.emits_during(self.time_s, self.time_s + without_sources):
                 speed = max(speed, source.speed)
                 acceleration = max(acceleration, self._buoyancy_bound(source.target_excess, source.target_density))
         limits = [self.obstacles.stable_dt(), *(force.stable_dt() for force in self.air_forces)]
-        return min(self._largest_step(speed, acceleration + gusts), *limits)
-
-    def _largest_step(self, speed: float, acceleration: float) -> float:
-        distance = self.parameters.cfl * self.grid.cell_size
-        return time_of_travel(distance, speed, acceleration)
+        return min(time_of_travel(distance, speed, acceleration + gusts), *limits)
 
     def substep(self, dt: float) -> None:
         """Advance by dt [s]; the cells that obstacles fill at its end have been marked."""
@@ -158,7 +150,7 @@ class SmokeSolver:
         self._emit(dt)
         operator, step = self._projection.multigrid.coefficients.operator, dt / self.grid.cell_size
         brake_inflow(self.air, operator, self._open_sides, self.grid.cells, step)
-        self._project()
+        self._projections.append(self._projection.project())
         cool(self.air, self.parameters, dt)
         self._extrapolation.fill()
         self.time_s += dt
@@ -175,8 +167,7 @@ class SmokeSolver:
     def begin_frame(self, time_s: float) -> None:
         """A frame starts at simulated time `time_s` [s]."""
         self.time_s = time_s
-        self._iterations = self._not_converged = 0
-        self._residual = self._divergence = self._compression = 0.0
+        self._projections: list[ProjectionReport] = []
 
     def snapshots(self) -> dict[str, Snapshot]:
         """Density, temperature and velocity at cell centres; solid cells hold no smoke."""
@@ -240,15 +231,15 @@ class SmokeSolver:
             "emitted_mass": self._emitted_mass,
             "max_temperature": self.parameters.ambient_temperature + (float(excess.max()) if len(excess) else 0.0),
             "max_speed": speed,
-            "iterations": float(self._iterations),
-            "residual": self._residual,
-            "divergence": self._divergence,
-            "not_converged": float(self._not_converged),
+            "iterations": float(sum(report.iterations for report in self._projections)),
+            "residual": max((report.residual for report in self._projections), default=0.0),
+            "divergence": max((report.divergence for report in self._projections), default=0.0),
+            "not_converged": float(sum(not report.converged for report in self._projections)),
         }
         if self.obstacles.moving:
             numbers["covered_mass"] = self._covered_mass
             numbers["uncovered_mass"] = self._uncovered_mass
-            numbers["compression"] = self._compression
+            numbers["compression"] = max((report.compression for report in self._projections), default=0.0)
         return numbers
 
     def remedies(self) -> Remedies:
@@ -278,14 +269,6 @@ class SmokeSolver:
         for source in self.sources:
             if source.parameters.emits_during(self.time_s, self.time_s + dt):
                 self._emitted_mass += source.emit(self.time_s, dt) * self.grid.cell_size**3
-
-    def _project(self) -> None:
-        report = self._projection.project()
-        self._iterations += report.iterations
-        self._not_converged += not report.converged
-        self._residual = max(self._residual, report.residual)
-        self._divergence = max(self._divergence, report.divergence)
-        self._compression = max(self._compression, report.compression)
 
     def _follow_obstacles(self) -> None:
         self._projection.update()

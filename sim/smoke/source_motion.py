@@ -1,8 +1,9 @@
-"""Where sources that move are: along keyframes, or on a rigid body."""
+"""Where sources that move are, along keyframes or on a rigid body, and which cells and faces they pass over."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,25 +12,29 @@ from numpy.typing import NDArray
 
 from sim.core.motion import rotation
 from sim.core.motion.paths import KeyframePath, Motion, path_through
+from sim.shapes.level_set import LevelSet
+from sim.shapes.parameters import BunnyShape, DuckShape, MeshShape, Placement
+from sim.shapes.placement import PlacedSolid, build_solid
+from sim.smoke.grid import Index3, SmokeGrid
 
 if TYPE_CHECKING:
     from sim.smoke.parameters import SmokeSourceParameters
 
 Array = NDArray[np.float64]
 
+COSTLY_SHAPES = (DuckShape, BunnyShape, MeshShape)  # their distances take long, and so are looked up
+LOOKUPS_PER_CELL = 2.0  # nodes of such a table along the edge of a cell
+ROUND_OFF = 1.0e-9  # of ways and distances, in parts of them and in cells, at most
+CELLS = 3  # stands for cells where the axis of faces is asked for
+
 
 class SourceMotion(Protocol):
     """How a source moves."""
 
     def poses(self, begin_s: float, end_s: float, *, spacing: float) -> list[Motion]:
-        """Its motion at times so close that it leaves no gap.
+        """Its motion from a time to another [s] in a step of the smoke, so often that it leaves no gap; once at least.
 
-        Args:
-            begin_s, end_s: the span of time [s], which a step of the smoke contains.
-            spacing: largest way of any of its points from one of the poses to the next [m].
-
-        Returns:
-            From the beginning to the end, one at least.
+        None of its points goes farther than a spacing [m] from one pose to the next.
         """
 
     def speed(self) -> float:
@@ -53,16 +58,6 @@ class PathMotion:
         return self._speed
 
 
-@dataclass(frozen=True)
-class _Leg:
-    """A body's motion at the beginning and at the end of a step."""
-
-    begin_s: float
-    end_s: float
-    begin: Motion
-    end: Motion
-
-
 class BodyMotion:
     """Fixed to a rigid body, which someone else tells the motion of, step by step.
 
@@ -77,36 +72,36 @@ class BodyMotion:
 
     def stay(self, body: Motion) -> None:
         """The body is here: at the start, or where a run continues."""
-        self._leg = _Leg(0.0, 0.0, body, body)
+        self._times, self._begin, self._end = (0.0, 0.0), body, body
 
     def carry(self, body: Motion, begin_s: float, end_s: float) -> None:
         """In the coming step of the smoke, from one time to another [s], the body gets here."""
-        self._leg = _Leg(begin_s, end_s, self._leg.end, body)
+        self._times, self._begin, self._end = (begin_s, end_s), self._end, body
 
     def poses(self, begin_s: float, end_s: float, *, spacing: float) -> list[Motion]:
         """See `SourceMotion`."""
-        leg = self._leg
-        duration = leg.end_s - leg.begin_s
+        (leg_begin_s, leg_end_s), begin, end = self._times, self._begin, self._end
+        duration = leg_end_s - leg_begin_s
         if duration <= 0.0:
-            return [self._on(leg.end)]
-        turn = rotation.logarithm(rotation.product(leg.end.orientation, rotation.conjugate(leg.begin.orientation)))
-        step = leg.end.position - leg.begin.position
+            return [self._on(end)]
+        turn = rotation.logarithm(rotation.product(end.orientation, rotation.conjugate(begin.orientation)))
+        step = end.position - begin.position
         length = (float(np.linalg.norm(step)) + self._arm * float(np.linalg.norm(turn))) * (end_s - begin_s) / duration
         poses = []
         for time in _times(begin_s, end_s, length, spacing):
-            part = (time - leg.begin_s) / duration
+            part = (time - leg_begin_s) / duration
             body = Motion(
-                leg.begin.position + part * step,
-                rotation.product(rotation.exponential(part * turn), leg.begin.orientation),
-                leg.begin.velocity + part * (leg.end.velocity - leg.begin.velocity),
-                leg.begin.angular_velocity + part * (leg.end.angular_velocity - leg.begin.angular_velocity),
+                begin.position + part * step,
+                rotation.product(rotation.exponential(part * turn), begin.orientation),
+                begin.velocity + part * (end.velocity - begin.velocity),
+                begin.angular_velocity + part * (end.angular_velocity - begin.angular_velocity),
             )
             poses.append(self._on(body))
         return poses
 
     def speed(self) -> float:
         """At the end of the last step [m/s]."""
-        body = self._leg.end
+        body = self._end
         return float(np.linalg.norm(body.velocity)) + self._arm * float(np.linalg.norm(body.angular_velocity))
 
     def _on(self, body: Motion) -> Motion:
@@ -134,3 +129,88 @@ def _times(begin_s: float, end_s: float, length: float, spacing: float) -> list[
         return [end_s]
     count = max(1, math.ceil(length / spacing))
     return [begin_s + (end_s - begin_s) * number / count for number in range(count + 1)]
+
+
+@dataclass(frozen=True)
+class Swept:
+    """The places that a shape passed over."""
+
+    indices: NDArray[np.int32]  # of the places in flat arrays, ascending, (n,)
+    places: NDArray[np.float64]  # their positions [m], (n, 3)
+    poses: NDArray[np.int64]  # which of the poses was the last to cover each, (n,)
+
+
+class SweptShape:
+    """A shape that moves over a grid; a place is covered if it lies inside, as for shapes that stay.
+
+    Attributes:
+        reach: largest distance of its points from its origin [m].
+    """
+
+    def __init__(self, placement: Placement, grid: SmokeGrid) -> None:
+        """Build the shape; where it stands does not matter.
+
+        Raises:
+            ShapeError: it cannot be built.
+        """
+        placed = build_solid(placement)
+        self._grid = grid
+        self._solid = PlacedSolid(placed.shape, placed.scale, np.eye(3), np.zeros(3))
+        self.reach = float(np.linalg.norm(np.abs(self._solid.bounds).max(axis=0)))
+        self._distance = self._solid.signed_distance
+        self._is_exact = not isinstance(placement.shape, COSTLY_SHAPES)
+        if not self._is_exact:
+            spacing = grid.cell_size / LOOKUPS_PER_CELL
+            self._distance = LevelSet.sample(self._solid, spacing, exact_within=2.0 * spacing).signed_distance
+
+    def covered(self, poses: Sequence[Motion], axis: int) -> Swept:
+        """The faces across an axis, or the `CELLS`, that it covers in one of the poses at least."""
+        grid = self._grid
+        shape: Index3 = grid.cells if axis == CELLS else grid.face_shape(axis)
+        offset = np.array([0.0 if a == axis else 0.5 for a in range(3)])
+        windows = [self._window(pose, shape, offset) for pose in poses]
+        first = np.min([low for low, _ in windows], axis=0)
+        size = np.maximum(np.max([high for _, high in windows], axis=0) - first, 0)
+        last = np.full(size, -1, np.int64)
+        # Backwards, so that what a later pose covers need not be looked at again. No more need what is farther off
+        # than the shape has gone since it was looked at.
+        free_until = np.full(size, -np.inf)
+        ways = self._ways_to_the_last(poses)
+        for number in reversed(range(len(poses))):
+            pose, (low, high) = poses[number], windows[number]
+            window = tuple(map(slice, low - first, high - first))
+            asked = np.nonzero((last[window] < 0) & (free_until[window] <= ways[number]))
+            if len(asked[0]) == 0:
+                continue
+            places = self._positions(np.stack(asked, axis=-1) + low, offset)
+            own = rotation.rotated(rotation.conjugate(pose.orientation), places - pose.position)
+            distance = self._distance(own)
+            last[window][asked] = np.where(distance < 0.0, number, -1)
+            if self._is_exact:
+                free_until[window][asked] = ways[number] + distance
+        found = np.argwhere(last >= 0) + first
+        padded = grid.padded
+        indices = ((found[:, 0] + 1) * padded[1] + found[:, 1] + 1) * padded[2] + found[:, 2] + 1
+        return Swept(indices.astype(np.int32), self._positions(found, offset), last[last >= 0])
+
+    def _ways_to_the_last(self, poses: Sequence[Motion]) -> NDArray[np.float64]:
+        """Bound of how far points of the shape go from each pose to the last one [m], (n,)."""
+        origins = np.stack([pose.position for pose in poses])
+        turned = np.stack([rotation.matrices(pose.orientation) for pose in poses])
+        steps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
+        turns = np.linalg.norm(np.diff(turned, axis=0), axis=(1, 2))
+        ways = (1.0 + ROUND_OFF) * (steps + self.reach * turns) + ROUND_OFF * self._grid.cell_size
+        return np.append(np.cumsum(ways[::-1])[::-1], 0.0)
+
+    def _window(
+        self, pose: Motion, shape: Index3, offset: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The first place within the shape's box along each axis, from 0, and the first one after it."""
+        solid = PlacedSolid(self._solid.shape, self._solid.scale, rotation.matrices(pose.orientation), pose.position)
+        lower, upper = (solid.bounds - self._grid.origin) / self._grid.cell_size - offset
+        low = np.clip(np.ceil(lower), 0, shape).astype(np.int64)
+        return low, np.clip(np.floor(upper) + 1, low, shape).astype(np.int64)
+
+    def _positions(self, places: NDArray[np.int64], offset: NDArray[np.float64]) -> NDArray[np.float64]:
+        positions: NDArray[np.float64] = np.asarray(self._grid.origin) + (places + offset) * self._grid.cell_size
+        return positions

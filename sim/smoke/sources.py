@@ -18,15 +18,12 @@ from sim.smoke.grid import SmokeGrid
 from sim.smoke.lanes import Grid
 from sim.smoke.obstacles import Air, is_solid
 from sim.smoke.parameters import SmokeParameters, SmokeSourceParameters
-from sim.smoke.source_motion import SourceMotion, motion_of
-from sim.smoke.sweep import CELLS, SweptShape
+from sim.smoke.source_motion import CELLS, SourceMotion, SweptShape, motion_of
 
 BLOCK = 256  # cells whose emission one thread adds up
 FLUCTUATION_CELLS = 4  # edge of the blocks of cells that fluctuate together: smaller ones are averaged away by the flow
 FLUCTUATION_RATE_HZ = 20.0  # how often the fluctuation changes
-
-POSES_PER_CELL = 4.0
-"""A source that moves emits at poses of which none is farther than a quarter of a cell from the next."""
+POSES_PER_CELL = 4.0  # a source that moves emits at poses that are a quarter of a cell apart at most
 
 
 @bundle

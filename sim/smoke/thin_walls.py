@@ -17,23 +17,16 @@ from numpy.typing import NDArray
 
 from sim.core.domain import DomainParameters
 from sim.shapes.sampling import stratified_points
-from sim.shapes.solid import Solid
+from sim.shapes.solid import Solid, outward_normals
 from sim.smoke.parameters import WHOLE, SmokeParameters
 
 Points = NDArray[np.float64]
 
-PROBES = 1000
-"""Points of the surface within the box below which a body's thickness is looked at: shares are right to 0.03."""
-
-POINTS_DRAWN = 64 * PROBES
-"""Of the whole surface if the box cuts some off: of one of which less than a 64th lies in it fewer are looked at."""
-
+PROBES = 1000  # points of the surface within the box below which the thickness is looked at: shares right to 0.03
+POINTS_DRAWN = 64 * PROBES  # of the whole surface if the box cuts some off; fewer are looked at if a 64th is in it
 DEPTHS = 8  # along the ray inwards, up to the edge of a cell, where it is seen whether it is still in the body
 HALVINGS = 5  # of the interval in which a ray leaves the body
-
-OPPOSITE = np.cos(np.deg2rad(45.0))
-"""Cosine of the angle between a ray and the surface's normal where it leaves a wall, at least."""
-
+OPPOSITE = np.cos(np.deg2rad(45.0))  # least cosine between a ray and the surface's normal where it leaves a wall
 LUCK = (0.0, 1.0 / 3.0, 2.0 / 3.0)  # where in a cell a body that moves may be, for an average [cells]
 
 
@@ -109,17 +102,10 @@ def _thickness(solid: Solid, points: Points, inwards: Points, longest: float) ->
         low, high = np.where(outside, low, middle), np.where(outside, middle, high)
     left[thin] = high
     ends = points[thin] + high[:, None] * inwards[thin]
-    left[thin[np.sum(_normals(solid, ends, 0.01 * step) * inwards[thin], axis=1) < OPPOSITE]] = np.inf
+    left[thin[np.sum(outward_normals(solid.signed_distance, ends, 0.01 * step) * inwards[thin], axis=1) < OPPOSITE]] = (
+        np.inf
+    )
     return left
-
-
-def _normals(solid: Solid, points: Points, step: float) -> Points:
-    """Unit vectors out of the body at points of its surface, (n, 3), by central differences over a step [m]."""
-    offsets = step * np.concatenate([np.eye(3), -np.eye(3)])
-    values = solid.signed_distance((points[:, None] + offsets).reshape(-1, 3)).reshape(-1, 6)
-    gradient: Points = values[:, :3] - values[:, 3:]
-    length = np.linalg.norm(gradient, axis=1, keepdims=True)
-    return gradient / np.maximum(length, np.finfo(np.float64).tiny)
 
 
 def _has_solid_cell(
@@ -141,14 +127,7 @@ def _column(
     """Whether a body holds one of the two centres next to each point, along the axis of its largest |n_i|, (n,).
 
     The column stands on the point, not on the centre of its cell: the rim of a plate, of which cells cut off up to half
-    their width, is not missed.
-
-    Args:
-        solids: the body, and those that may lie beside it.
-        points: of its surface [m], (n, 3).
-        inwards: unit vectors into it there, (n, 3).
-        low: a corner of cells [m], (3,).
-        cell_size: their edge [m].
+    their width, is not missed. Bodies may lie beside each other; cells have a corner at `low` [m], (3,).
     """
     found = np.zeros(len(points), bool)
     axis, every = np.abs(inwards).argmax(axis=1), np.arange(len(points))

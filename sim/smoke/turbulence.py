@@ -18,14 +18,9 @@ from sim.smoke.obstacles import Air
 from sim.smoke.parameters import CELLS_PER_EDDY, TurbulenceParameters
 
 REACH = 4  # nodes of the lattice along an axis that a cell and its faces depend on
-
-PEAK = 3.0
-"""Largest acceleration that steps are cut for, over the root mean square: a bell curve exceeds it by chance only."""
-
+PEAK = 3.0  # largest acceleration that steps are cut for, over the root mean square: exceeded by chance only
 SUMS = 5  # numbers that a face along z needs of a row of the lattice
-
-FACE, CENTRE, SLOPE = range(3)
-"""Weights of the lattice's nodes: at a lower face, at a cell's centre, and their difference across the cell."""
+FACE, CENTRE, SLOPE = range(3)  # weights of nodes: at a lower face, at a cell's centre, the difference across the cell
 
 
 @bundle
@@ -113,10 +108,9 @@ class Turbulence:
                 weights[:, node, SLOPE] = (_spline(faces[1:] - at) - _spline(faces[:-1] - at)) / grid.cell_size
             first = int(nearest[0]) - 1
             origin.append(first)
-            all_firsts = self._lattice.firsts_x, self._lattice.firsts_y, self._lattice.firsts_z
-            all_weights = self._lattice.weights_x, self._lattice.weights_y, self._lattice.weights_z
-            all_firsts[axis].from_numpy((nearest[:-1] - 1 - first).astype(np.int32))
-            all_weights[axis].from_numpy(weights.reshape(-1, 3).astype(np.float32))
+            firsts_of, weights_of = (getattr(self._lattice, f"{name}_{'xyz'[axis]}") for name in ("firsts", "weights"))
+            firsts_of.from_numpy((nearest[:-1] - 1 - first).astype(np.int32))
+            weights_of.from_numpy(weights.reshape(-1, 3).astype(np.float32))
         return origin
 
 

@@ -1,4 +1,4 @@
-"""The fluid at one moment, sorted into cells: its potentials, and its flow at any points."""
+"""The fluid at one moment, sorted into cells: its normals, its potentials, and its flow at any points."""
 
 import math
 from typing import NamedTuple
@@ -14,15 +14,20 @@ from sim.core.launch import kernel
 from sim.whitewater.motion import FluidState
 
 SUPPORT_IN_SPACINGS = 2.0  # support radius h over the lattice spacing, as in the simulation
-
-FULL_NEIGHBORHOOD = 4.0 / 3.0 * math.pi * SUPPORT_IN_SPACINGS**3
-"""Particles within h of a point in the bulk: 33.5; beside a flat surface half as many."""
+FULL_NEIGHBORHOOD = 4.0 / 3.0 * math.pi * SUPPORT_IN_SPACINGS**3  # particles within h of a point in the bulk: 33.5
 
 # Integrals of W = 1 - r/h over a ball and over a disc: a quarter and a third of their sizes.
 _FULL_WEIGHT = FULL_NEIGHBORHOOD / 4.0
 _FULL_SURFACE_WEIGHT = math.pi * SUPPORT_IN_SPACINGS**2 / 3.0
 
 _ANYWHERE = (-3.0e38,) * 3, (3.0e38,) * 3
+
+TINY = 1.0e-6  # two particles closer than this share of h have no direction to each other
+SURFACE_ASYMMETRY = 0.25
+"""Length of the mean weighted direction away from the neighbours from which a particle counts as one of the surface:
+0 in the bulk, 0.53 on the flat face of a lattice, 0.2 in the layer below, up to 1 beyond."""
+
+CREST_DIRECTION = 0.6  # least cosine between velocity and normal on a crest (eq. 6): waves move against their surface
 
 
 class FluidField:
@@ -60,7 +65,7 @@ class FluidField:
     def potentials(self, min_speed: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Trapped air [m/s] and wave crest [-] of every particle, (n,) each, in the order of `update`.
 
-        Both are 0 for particles slower than `min_speed` [m/s]. See `sim.whitewater.kernels.compute_potentials`.
+        Both are 0 for particles slower than `min_speed` [m/s]. See `compute_potentials`.
         """
         count = len(self._order)
         trapped_air, wave_crest = np.zeros(count, np.float32), np.zeros(count, np.float32)
@@ -81,16 +86,6 @@ class FluidField:
         flow, neighbors = ti.Vector.ndarray(3, ti.f32, count), ti.ndarray(ti.i32, count)
         sample_flow(on_device(points), count, self._fluid, flow, neighbors)
         return flow.to_numpy(), neighbors.to_numpy()
-
-
-TINY = 1.0e-6  # two particles closer than this share of h have no direction to each other
-
-SURFACE_ASYMMETRY = 0.25
-"""Length of the mean weighted direction away from the neighbours from which a particle counts as one of the surface:
-0 in the bulk, 0.53 on the flat face of a lattice, 0.2 in the layer below, up to 1 beyond."""
-
-CREST_DIRECTION = 0.6
-"""Least cosine between velocity and normal on a crest (their eq. 6): the wave moves against its own surface."""
 
 
 @bundle

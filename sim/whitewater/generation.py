@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.core.philox import uniforms
+from sim.core.hashed_numbers import uniforms
 from sim.whitewater.cloud import WhitewaterCloud, WhitewaterKind
 from sim.whitewater.motion import FluidState
 from sim.whitewater.parameters import WhitewaterParameters
@@ -69,8 +69,9 @@ def generate(
         # Evenly thinned, so that no region goes without.
         chosen = np.arange(room) * wanted // max(room, 1)
         source, sample = source[chosen], sample[chosen]
-    across, angle, along, _ = _numbers(state.particle_id[source], sample, moment, (parameters.seed, _PLACES))
-    size, life, _, _ = _numbers(state.particle_id[source], sample, moment, (parameters.seed, _FATES))
+    ids = state.particle_id[source]
+    across, angle, along, _ = uniforms((ids, sample, *moment), (parameters.seed, _PLACES))
+    size, life, _, _ = uniforms((ids, sample, *moment), (parameters.seed, _FATES))
     velocity = state.velocity[source].astype(np.float64)
     speed = np.linalg.norm(velocity, axis=1)
     share = np.sqrt(across)
@@ -94,18 +95,11 @@ def _sources(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """For each new particle the row of its fluid particle, and its number among those of the same one."""
     active = np.flatnonzero(expected > 0.0)
-    chance, _, _, _ = _numbers(state.particle_id[active], np.zeros(len(active), np.intp), moment, (seed, _COUNTS))
+    chance, _, _, _ = uniforms((state.particle_id[active], np.zeros(len(active), np.intp), *moment), (seed, _COUNTS))
     counts = np.floor(expected[active] + chance).astype(np.intp)
     source = np.repeat(active, counts)
     first = np.repeat(np.cumsum(counts) - counts, counts)
     return source, np.arange(len(source)) - first
-
-
-def _numbers(
-    particle_id: NDArray[np.integer], sample: NDArray[np.integer], moment: Moment, key: tuple[int, int]
-) -> Float64Array:
-    """Four numbers in [0, 1) for each particle and sample, (4, n)."""
-    return uniforms((particle_id, sample, *moment), key)
 
 
 def _direction_across(velocity: Float64Array, angle: Float64Array) -> Float64Array:

@@ -17,11 +17,8 @@ from sim.shapes.placement import build_solid
 
 Float64Array = NDArray[np.float64]
 
-# Most cells of a body's distance grid along its longest edge, 2 million in all: it is sampled in every process.
-_FINEST_GRID = 128
-
-# Rounds of pushing points out of bodies and walls: corners between two need two, a third settles most of the rest.
-_PUSHES = 3
+_FINEST_GRID = 128  # most cells of a body along its longest edge, 2 million in all: sampled in every process
+_PUSHES = 3  # rounds of pushing points out of bodies and walls: corners between two need two, a third most of the rest
 
 
 @dataclass(frozen=True)

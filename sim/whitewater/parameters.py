@@ -11,9 +11,9 @@ from sim.core.parameters import NonNegative, Parameters, Positive
 LARGEST_CLOUD = 20_000_000
 
 _RANGES = (
-    ("min_speed", "max_speed", "m/s"),
-    ("min_trapped_air", "max_trapped_air", "m/s"),
-    ("min_wave_crest", "max_wave_crest", "-"),
+    ("min_speed", "max_speed", " m/s"),
+    ("min_trapped_air", "max_trapped_air", " m/s"),
+    ("min_wave_crest", "max_wave_crest", ""),
 )
 
 
@@ -71,16 +71,13 @@ class WhitewaterParameters(Parameters):
     @model_validator(mode="after")
     def _ranges_have_an_extent(self) -> Self:
         for low, high, unit in _RANGES:
-            if getattr(self, high) <= getattr(self, low):
-                shown = f" {unit}" if unit != "-" else ""
-                raise ValueError(
-                    f"{high} must be above {low} = {getattr(self, low):g}{shown}, got {getattr(self, high):g}{shown}"
-                )
+            least, most = getattr(self, low), getattr(self, high)
+            if most <= least:
+                raise ValueError(f"{high} must be above {low} = {least:g}{unit}, got {most:g}{unit}")
         for low, high in (("lifetime_min", "lifetime_max"), ("radius_min_in_radii", "radius_max_in_radii")):
-            if getattr(self, high) < getattr(self, low):
-                raise ValueError(
-                    f"{high} must not be below {low} = {getattr(self, low):g}, got {getattr(self, high):g}"
-                )
+            least, most = getattr(self, low), getattr(self, high)
+            if most < least:
+                raise ValueError(f"{high} must not be below {low} = {least:g}, got {most:g}")
         if self.bubble_neighbors < self.spray_neighbors:
             raise ValueError(
                 f"bubble_neighbors must not be below spray_neighbors = {self.spray_neighbors}, "

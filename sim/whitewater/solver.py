@@ -56,22 +56,17 @@ class WhitewaterSolver:
         bodies: Sequence[MovingObstacle] = (),
         sources: NDArray[np.int32] | None = None,
     ) -> tuple[WhitewaterCloud, WhitewaterReport]:
-        """The cloud of the next frame.
+        """The cloud of a frame, from that of the frame before.
 
-        Args:
-            cloud: of the frame before.
-            begin: all fluids of the tank at the frame before.
-            end: all fluids at this frame.
-            frame: number of this frame.
-            particle_radius: of the fluids [m].
-            bodies: rigid bodies between the two frames.
-            sources: ids of the fluid particles that make whitewater, those of one fluid, (n,); all if omitted. The
-                others are around it like its own: under another fluid there is neither a crest nor spray.
+        All fluids of the tank, of one particle radius [m], go from `begin` to `end`, and bodies with them. Particles of
+        the ids in `sources`, those of one fluid, (n,), make whitewater; all if omitted. The others are around them like
+        their own: under another fluid there is neither a crest nor spray.
         """
         motion = FluidMotion(begin, end, self._frame_dt)
         field = FluidField(motion.bounds(), particle_radius, len(end.position))
         obstacles = Obstacles(self._domain, bodies, self._frame_dt)
-        substeps = self._substep_count(motion.max_speed(), field.support_radius)
+        crossed = motion.max_speed() * self._frame_dt / field.support_radius
+        substeps = min(max(1, math.ceil(crossed)), MAX_SUBSTEPS)
         dt = self._frame_dt / substeps
         is_source = None if sources is None else np.isin(motion.particle_id, sources)
         generated = not_generated = 0
@@ -81,22 +76,15 @@ class WhitewaterSolver:
             field.update(fluid)
             cloud = self._move(cloud, field, obstacles, share, dt)
             room = max(0, self._parameters.max_particles - len(cloud))
-            rate = self._generation_rate(fluid, field, is_source)
+            rate = generation_rate(fluid.velocity, *field.potentials(self._parameters.min_speed), self._parameters)
+            rate = rate if is_source is None else np.where(is_source, rate, 0.0)
+            moment, parameters = (frame, substep), self._parameters
             born, missed = generate(
-                fluid,
-                rate,
-                dt,
-                particle_radius=particle_radius,
-                room=room,
-                moment=(frame, substep),
-                parameters=self._parameters,
+                fluid, rate, dt, particle_radius=particle_radius, room=room, moment=moment, parameters=parameters
             )
             cloud = cloud.joined(self._settled(born, field, obstacles, share))
             generated, not_generated = generated + len(born), not_generated + missed
         return cloud, WhitewaterReport(substeps, generated, not_generated)
-
-    def _substep_count(self, max_speed: float, support_radius: float) -> int:
-        return min(max(1, math.ceil(max_speed * self._frame_dt / support_radius)), MAX_SUBSTEPS)
 
     def _move(
         self, cloud: WhitewaterCloud, field: FluidField, obstacles: Obstacles, share: float, dt: float
@@ -165,13 +153,6 @@ class WhitewaterSolver:
         moved[bubble] = position[bubble] + dt * terminal + tau * (1.0 - decay) * lag
         changed[bubble] = terminal + decay * lag
         return moved, changed
-
-    def _generation_rate(
-        self, fluid: FluidState, field: FluidField, is_source: NDArray[np.bool_] | None
-    ) -> Float64Array:
-        trapped_air, wave_crest = field.potentials(self._parameters.min_speed)
-        rate = generation_rate(fluid.velocity, trapped_air, wave_crest, self._parameters)
-        return rate if is_source is None else np.where(is_source, rate, 0.0)
 
     def _settled(self, born: WhitewaterCloud, field: FluidField, obstacles: Obstacles, share: float) -> WhitewaterCloud:
         """New particles outside of solids, as what they are."""

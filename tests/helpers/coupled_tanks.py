@@ -9,9 +9,8 @@ from small_fluids import EARTH, lattice
 
 from sim.core.domain import DomainParameters
 from sim.core.world import World
-from sim.coupling.body_samples import samples_of_moving_bodies
 from sim.coupling.body_speed import expected_body_speed
-from sim.coupling.fluid_rigid import FluidRigidCoupling
+from sim.coupling.fluid_rigid import FluidRigidCoupling, samples_of_moving_bodies
 from sim.fluid.boundary_akinci2012 import BoundarySamples, domain_wall_samples
 from sim.fluid.parameters import FluidParameters
 from sim.fluid.solvers import SOLVERS

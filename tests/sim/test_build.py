@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from sim.build import build_world
 from sim.fluid.filling import fill_fluids
-from sim.rigid.static import StaticBody
+from sim.rigid.states import StaticBody
 from sim.scene import SceneParameters
 
 SPACING = 0.02

@@ -1,4 +1,4 @@
-"""Paths of kinematic bodies, with velocities that are their exact derivatives."""
+"""Paths of kinematic bodies, with velocities that are their exact derivatives, and poses of many bodies at one time."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from sim.core.launch import MOST_LAUNCHES, fast_launch
+from sim.core.launch import MOST_LAUNCHES, FastKernel, kernel
 
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 AnyNumbers = ti.types.ndarray(ndim=1)
@@ -10,8 +10,7 @@ Cells = ti.types.vector(3, ti.i32)
 Pair = ti.types.vector(2, ti.f32)
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def fill(
     numbers: Floats, count: ti.i32, factor: ti.f32, power: ti.template(), shift: ti.math.vec3, cell: Cells
 ) -> ti.i32:
@@ -24,21 +23,18 @@ def fill(
     return count + cell[2]
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def ends(numbers: Floats, count: ti.i32) -> Pair:
     return Pair(numbers[0], numbers[count - 1])
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def halve(numbers: AnyNumbers):
     for i in range(numbers.shape[0]):
         numbers[i] = numbers[i] / 2
 
 
-@fast_launch
-@ti.kernel
+@kernel
 def refuse_doubles(numbers: Floats):
     for i in range(numbers.shape[0]):
         numbers[i] = 0.0
@@ -103,8 +99,7 @@ def test_an_array_of_the_wrong_type_is_refused_after_a_right_one_too(taichi_cpu)
 
 
 def test_the_first_call_returns_what_later_ones_do(taichi_cpu):
-    @fast_launch
-    @ti.kernel
+    @kernel
     def both(numbers: Floats) -> Pair:
         return Pair(numbers[0], numbers[1])
 
@@ -129,4 +124,4 @@ def test_a_kernel_with_arguments_that_cannot_be_passed_is_refused(taichi_cpu):
         return matrix[0, 0]
 
     with pytest.raises(TypeError, match="cannot pass"):
-        fast_launch(of_matrix)
+        FastKernel(of_matrix)

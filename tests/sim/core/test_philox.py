@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.core.philox import philox, uniforms
+from sim.core.hashed_numbers import philox, uniforms
 
 ONES = 0xFFFFFFFF
 

@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from sim.core.reductions import MAX_QUANTITIES, LaneReduction
+from sim.core.launch import kernel
+from sim.core.reductions import MAX_QUANTITIES, LaneReduction, Results, Tree, reduced_tree
+
+
+@kernel
+def reduce_lanes(tree: Tree) -> Results:
+    return reduced_tree(tree)
 
 
 def test_results_are_the_maxima_then_the_sums_of_the_lanes(taichi_cpu):
@@ -11,13 +17,13 @@ def test_results_are_the_maxima_then_the_sums_of_the_lanes(taichi_cpu):
     values = np.random.default_rng(1).integers(-999, 1000, (MAX_QUANTITIES, lanes)).astype(np.float32)
     reduction.partial.from_numpy(values.ravel())
     expected = np.concatenate([values[:3].max(axis=1), values[3:].sum(axis=1)])
-    np.testing.assert_array_equal(reduction.result(), expected)
+    np.testing.assert_array_equal(reduction.unpack(reduce_lanes(reduction.tree)), expected)
 
 
 def test_fewer_quantities_leave_no_trace_of_others(taichi_cpu):
     reduction = LaneReduction(maxima=0, sums=1)
     reduction.partial.fill(1.0)
-    np.testing.assert_array_equal(reduction.result(), [reduction.lanes.count])
+    np.testing.assert_array_equal(reduction.unpack(reduce_lanes(reduction.tree)), [reduction.lanes.count])
 
 
 def test_a_reduction_refuses_more_quantities_than_it_can_return(taichi_cpu):

@@ -99,7 +99,8 @@ def test_velocities_and_error_are_those_of_the_explicit_matrix(taichi_cpu):
     def mean_square(change: np.ndarray) -> float:
         return float(change @ masses @ change) / 1000.0
 
-    change = np.concatenate([solver.change.to_numpy()[:n].ravel(), solver.bodies._change.ravel()]).astype(np.float64)
+    of_particles, of_bodies = solver._iterate.change.to_numpy()[:n], solver.bodies._change
+    change = np.concatenate([of_particles.ravel(), of_bodies.ravel()]).astype(np.float64)
     left = np.linalg.solve(masses, given - matrix @ change)
     starts = [*range(0, 3 * n, 3), 3 * n, 3 * n + 6, 3 * n + 12]
     asked = np.concatenate([np.linalg.solve(matrix[i:j, i:j], given[i:j]) for i, j in itertools.pairwise(starts)])

@@ -6,9 +6,9 @@ import pytest
 from sim.cloth.parameters import ClothParameters
 from sim.cloth.solver import ClothSolver
 from sim.core.domain import DomainParameters
-from sim.coupling.cloth_samples import ClothSamples
+from sim.coupling.cloth_fluid import ClothSamples
 from sim.fluid.kernels import evaluate, particle_volume
-from sim.fluid.sheet_samples import AMID_SAMPLES, kept_away, sheet_standoff
+from sim.fluid.sheets import AMID_SAMPLES, kept_away, sheet_standoff
 
 SPACING = 0.02
 

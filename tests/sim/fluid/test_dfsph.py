@@ -170,5 +170,5 @@ def test_the_neighbour_list_has_no_skin_and_is_made_anew_for_every_step(shaken_c
     assert fluid.diagnostics()["neighbor_searches"] == 3.0  # one before the second step, the third and this
     position = fluid.checkpoint()["position"].astype(np.float64)
     near = np.linalg.norm(position[:, None] - position[None], axis=-1) < SUPPORT
-    found = fluid.particles.near.fluid_count.to_numpy()[: fluid.particle_count]
+    found = fluid.particles.neighbors.lists.fluid_count.to_numpy()[: fluid.particle_count]
     np.testing.assert_array_equal(found, near.sum(axis=1) - 1)

@@ -8,8 +8,8 @@ from small_fluids import EVERY_FACE, lattice, make_fluid, run, steps
 
 from sim.core.domain import DomainParameters
 from sim.fluid.pressure import filled_diagonal, iterations_ahead, largest_eigenvalue
-from sim.fluid.solve_record import SolveRecord
 from sim.fluid.solvers import SOLVERS
+from sim.fluid.stepping import SolveRecord
 
 OPEN_SPACE = DomainParameters(min=(-1.0, -1.0, -1.0), max=(1.0, 1.0, 1.0), open_faces=EVERY_FACE)
 EVERY = pytest.mark.parametrize("solver", sorted(SOLVERS))

@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from sim.shapes.mass_properties import integrate_moments
-from sim.shapes.mesh_repair import boundary_edges, boundary_loops, cap_holes
-from sim.shapes.mesh_solid import solid_from_triangles
+from sim.shapes.mesh_solid import boundary_edges, boundary_loops, cap_holes, solid_from_triangles
 from sim.shapes.solid import ShapeError
 
 SPHERE = trimesh.creation.icosphere(subdivisions=4, radius=1.0)

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from sim.rigid.parameters import RigidBodyParameters
-from sim.rigid.static import StaticBody
+from sim.rigid.states import StaticBody
 from sim.shapes.mass_properties import mass_properties_of_mesh, mass_properties_of_solid
 from sim.shapes.parameters import Placement
 from sim.shapes.placement import build_solid

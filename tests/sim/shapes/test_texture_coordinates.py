@@ -10,7 +10,7 @@ import trimesh
 from trimesh.visual import TextureVisuals
 
 from sim.shapes.mesh_file import read_texture_coordinates, read_upright_triangles, texture_coordinates
-from sim.shapes.mesh_repair import boundary_loops, cap_holes, merge_vertices
+from sim.shapes.mesh_solid import boundary_loops, cap_holes, merge_vertices
 from sim.shapes.parameters import MeshShape, Placement
 from sim.shapes.placement import build_solid
 from sim.shapes.solid import TriangleMesh

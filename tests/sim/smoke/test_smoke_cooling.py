@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sim.core.domain import DomainParameters
-from sim.smoke.cooling import cool
+from sim.smoke.forces import cool
 from sim.smoke.parameters import SmokeParameters
 from sim.smoke.solver import SmokeSolver
 

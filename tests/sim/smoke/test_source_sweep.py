@@ -5,8 +5,7 @@ import pytest
 from sim.core.domain import DomainParameters
 from sim.smoke.grid import SmokeGrid
 from sim.smoke.parameters import SmokeParameters
-from sim.smoke.source_motion import motion_of
-from sim.smoke.sweep import CELLS, SweptShape
+from sim.smoke.source_motion import CELLS, SweptShape, motion_of
 
 DOMAIN = DomainParameters(min=(-0.5, -0.5, 0.0), max=(0.5, 0.5, 1.0))
 CELL = 1.0 / 48.0

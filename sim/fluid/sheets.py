@@ -1,10 +1,12 @@
 """Sheets in a fluid: what the fluid does to their samples, how these answer, and the fluid that moves along."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from sim.core.arrays import Floats, Vectors, on_device
 from sim.core.bundles import bundle
@@ -12,16 +14,100 @@ from sim.core.launch import kernel
 from sim.core.parameters import Vector3
 from sim.core.solver import Arrays
 from sim.fluid.boundary import Boundary, NearParticles, Samples, Sheets
-from sim.fluid.kernels import TINY_DISTANCE, Discretization, distance, spline, spline_slope
+from sim.fluid.boundary_akinci2012 import BoundarySamples
+from sim.fluid.kernels import (
+    SUPPORT_IN_SPACINGS,
+    TINY_DISTANCE,
+    Discretization,
+    distance,
+    evaluate,
+    lattice_offsets,
+    layer_field,
+    particle_volume,
+    spline,
+    spline_slope,
+    wall_calibration,
+)
 from sim.fluid.particles import Fluid
-from sim.fluid.sheet_samples import SheetSamples, one_sided_field, one_sided_tilt, resting_field
 from sim.fluid.stepping import Box
 
-# Solves of a step whose forces last apart from each other: of divergence, and of density with all other forces.
-DIVERGENCE, DENSITY = 0, 1
+DIVERGENCE, DENSITY = 0, 1  # solves of a step whose forces last apart: of divergence, of density with all other forces
+FULL_CONTACT = 0.5  # of the density that samples give to fluid at rest beside them: with it a particle touches in full
+AMID_SAMPLES = 2.5  # density in the middle of a sheet by its samples alone: so far above 1 that nothing gets through
 
-# Share of the density that samples give to fluid at rest beside them with which a particle touches them in full.
-FULL_CONTACT = 0.5
+
+@dataclass(frozen=True, eq=False)
+class SheetSamples:
+    """One layer of samples of each sheet."""
+
+    boundary: BoundarySamples  # samples of the sheets at rest, with volumes that let nothing through, (m, 3)
+    own_mass: NDArray[np.float64]  # of the sheet's part that each stands for [kg], (m,)
+    # of fluid that keeps its distance on both sides of that part without being displaced [m³], (m,)
+    missing_volume: NDArray[np.float64]
+
+
+def sheet_factor(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Factor on the volumes of a sheet's samples [-], relative to those of a wall."""
+    wall = wall_calibration(support_in_spacings)
+    amid = wall.volume_in_particles * layer_field(0.0, support_in_spacings)[0]
+    return AMID_SAMPLES / (amid * particle_volume(1.0, support_in_spacings))
+
+
+def resting_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Density that samples give to the first layer of a fluid at rest beside them [-]: what it lacks of 1."""
+    offsets = lattice_offsets(support_in_spacings)
+    beyond = np.linalg.norm(offsets[offsets[:, 2] > 0.0], axis=1)
+    return particle_volume(1.0, support_in_spacings) * float(evaluate(beyond, support_in_spacings).sum())
+
+
+def sheet_standoff(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Distance from a sheet at which a lattice of fluid is at rest [spacings]: 1.3 at the usual support."""
+    wall = wall_calibration(support_in_spacings)
+    volume = sheet_factor(support_in_spacings) * wall.volume_in_particles * particle_volume(1.0, support_in_spacings)
+    lacking = resting_field(support_in_spacings)
+    return float(
+        brentq(lambda gap: volume * layer_field(gap, support_in_spacings)[0] - lacking, 0.0, support_in_spacings)
+    )
+
+
+def kept_away(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Distance from a sheet within which there is no fluid [spacings]: particles fill half a spacing around them."""
+    return sheet_standoff(support_in_spacings) - 0.5
+
+
+def one_sided_field(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """V sum_i W_ib over the particles of a lattice at rest on one side of a sheet [-]."""
+    gaps = np.arange(sheet_standoff(support_in_spacings), support_in_spacings)
+    layers = sum(layer_field(float(gap), support_in_spacings)[0] for gap in gaps)
+    return particle_volume(1.0, support_in_spacings) * layers
+
+
+def one_sided_tilt(support_in_spacings: float = SUPPORT_IN_SPACINGS) -> float:
+    """Length of the mean unit vector from a sheet to the particles of a lattice at rest on one side, weighted by W."""
+    axis = np.arange(-np.ceil(support_in_spacings), np.ceil(support_in_spacings) + 1)
+    gaps = np.arange(sheet_standoff(support_in_spacings), support_in_spacings)
+    # As a sample lies anywhere between the particles, and no less often in the middle of four than on one.
+    offsets = np.stack(np.meshgrid(axis + 0.25, axis + 0.25, gaps, indexing="ij"), axis=-1).reshape(-1, 3)
+    distances = np.linalg.norm(offsets, axis=1)
+    weights = evaluate(distances, support_in_spacings)
+    return float((weights * offsets[:, 2] / distances).sum() / weights.sum())
+
+
+@bundle
+class Contacts(NamedTuple):
+    """Particles as they touched sheets at the start of the step, (capacity,) each."""
+
+    position: Vectors  # where they were [m]
+    mass: Floats  # m_i min(1, s_i/s_full) over s_i = sum_b V_b W_ib [kg]; 0 for those that touch none
+    count: ti.i32  # particles there were
+
+
+@bundle
+class OneSide(NamedTuple):
+    """Fluid at rest on one side of a sheet, as a sample sees it."""
+
+    field: ti.f32  # V sum_i W_ib [-]
+    tilt: ti.f32  # length of the mean unit vector to the particles, weighted by W [-]
 
 
 class SheetForces:
@@ -124,16 +210,8 @@ class SheetForces:
         weighs on the sheet instead: what is lifted is the volume that the sheet has.
         """
         d = self._discretization
-        add_missing_weight(
-            fluid,
-            near,
-            self._boundary.sheets,
-            self._missing_volume,
-            d.particle_volume * d.sigma,
-            self._one_side,
-            dt * self._gravity,
-            self.impulse,
-        )
+        sheets, factor, gravity_dt = self._boundary.sheets, d.particle_volume * d.sigma, dt * self._gravity
+        add_missing_weight(fluid, near, sheets, self._missing_volume, factor, self._one_side, gravity_dt, self.impulse)
 
     def take_motion(self, fluid: Fluid, change: ti.Ndarray, dt: float, box: Box) -> None:
         """Give the fluid that touched at the start of the step of dt [s] the changes of velocity of the samples [m/s].
@@ -152,31 +230,8 @@ class SheetForces:
             force.from_numpy(np.ascontiguousarray(arrays[f"sheet_force_{solve}"]))
 
     def _push(self, force: ti.Ndarray, skipped: int, factor: float) -> None:
-        push_sheet_samples(
-            force,
-            self._boundary.sheets._replace(skipped=skipped),
-            factor,
-            self._answering_mass,
-            self._boundary.samples,
-            self.push,
-        )
-
-
-@bundle
-class Contacts(NamedTuple):
-    """Particles as they touched sheets at the start of the step, (capacity,) each."""
-
-    position: Vectors  # where they were [m]
-    mass: Floats  # m_i min(1, s_i/s_full) over s_i = sum_b V_b W_ib [kg]; 0 for those that touch none
-    count: ti.i32  # particles there were
-
-
-@bundle
-class OneSide(NamedTuple):
-    """Fluid at rest on one side of a sheet, as a sample sees it."""
-
-    field: ti.f32  # V sum_i W_ib [-]
-    tilt: ti.f32  # length of the mean unit vector to the particles, weighted by W [-]
+        sheets, samples = self._boundary.sheets._replace(skipped=skipped), self._boundary.samples
+        push_sheet_samples(force, sheets, factor, self._answering_mass, samples, self.push)
 
 
 @kernel
