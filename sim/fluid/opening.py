@@ -124,7 +124,7 @@ class Opening:
 
         It keeps surrounding fluid from flowing into the gap that opens behind a layer before the next one fills it.
         The samples are as far outside of the nozzle as those of a wall that touches the fluid. They push, and exert no
-        friction (`sim.fluid.opening.is_felt_in_nozzles`).
+        friction (`is_felt_in_nozzles`).
         """
         depths = np.arange(0.0, self.nozzle_depth, spacing)
         outside = (_wall_standoff(self.support_in_spacings) - 0.5) * spacing

@@ -11,8 +11,7 @@ from pipeline.model.boxes import overlap
 from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path
-from sim.fluid.opening import opening_problem
-from sim.fluid.opening import Opening
+from sim.fluid.opening import Opening, opening_problem
 from sim.fluid.parameters import FluidParameters, shared_conflicts
 from sim.shapes.sampling import fill_with_particles
 

@@ -17,8 +17,7 @@ from pipeline.model.job import Job
 from pipeline.model.positions import KeyPath
 from pipeline.model.problems import Findings, format_path
 from sim.core.domain import DomainParameters
-from sim.fluid.opening import is_same_nozzle
-from sim.fluid.opening import Opening
+from sim.fluid.opening import Opening, is_same_nozzle
 from sim.shapes.solid import Solid
 
 Points = NDArray[np.float64]
