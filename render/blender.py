@@ -20,7 +20,6 @@ from render.temporary_folder import environment_of_child
 logger = logging.getLogger(__name__)
 
 MINIMUM_BLENDER_VERSION = (4, 5)
-TEMPORARY_PREFIX = "blender-"  # of the temporary folders of Blenders in processes of their own
 _STARTUP_VERSION_TIMEOUT_S = 120.0
 _TERMINATE_TIMEOUT_S = 10.0
 _LOG_TAIL_LINES = 30
@@ -152,7 +151,7 @@ class ChildRenderer:
         self._log_tail: deque[str] = deque(maxlen=_LOG_TAIL_LINES)
         self._argv = build_argv(blender, spec_path.resolve(), threads=threads, gpu=gpu)
         with contextlib.ExitStack() as on_failure:
-            environment = on_failure.enter_context(environment_of_child(TEMPORARY_PREFIX))
+            environment = on_failure.enter_context(environment_of_child("blender"))
             pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
             self._process: subprocess.Popen[str] = subprocess.Popen(self._argv, env=environment, **pipes, **_TEXT)
             self._leftovers = on_failure.pop_all()
@@ -295,7 +294,7 @@ def run_script(argv: Sequence[str], *, timeout_s: float, purpose: str) -> subpro
         BlenderUnavailableError: it cannot be started.
         OSError: there is no place for its temporary files.
     """
-    with environment_of_child(TEMPORARY_PREFIX) as environment:
+    with environment_of_child("blender") as environment:
         try:
             return subprocess.run(argv, capture_output=True, timeout=timeout_s, check=False, env=environment, **_TEXT)
         except OSError as error:

@@ -134,8 +134,8 @@ class FrameDrawing:
         """The camera's view without any body, (rows, columns, 4); drawn once for a still camera."""
         if _STILL_SET in _EMPTY_SETS:
             return _EMPTY_SETS[_STILL_SET]
-        with tempfile.TemporaryDirectory(prefix="set-") as folder:
-            picture = Path(folder) / "set.png"
+        with temporary_folder("set") as folder:
+            picture = folder / "set.png"
             self.renderer.render_set(self._frame, picture, resolution=(columns, rows))
             empty = over_black(read_picture(picture))
         if not self._context.job.placed_camera.moves:

@@ -226,7 +226,7 @@ def test_a_full_temporary_disk_is_not_told_as_a_blender_that_cannot_be_started(m
 
 def test_a_temporary_folder_that_cannot_be_removed_costs_no_picture(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with environment_of_child("blender-") as environment:
+    with environment_of_child("blender") as environment:
         refuse_removal(monkeypatch, tmp_path)
     assert environment["TMPDIR"].startswith(f"{tmp_path}/")
 
@@ -234,7 +234,7 @@ def test_a_temporary_folder_that_cannot_be_removed_costs_no_picture(tmp_path, mo
 def test_blender_up_to_4_5_asks_for_its_temporary_folder_by_another_name_first(tmp_path, monkeypatch):
     monkeypatch.setenv("TMP", "/elsewhere")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with environment_of_child("blender-") as environment:
+    with environment_of_child("blender") as environment:
         assert environment["TMP"] == environment["TMPDIR"] != "/elsewhere"
 
 

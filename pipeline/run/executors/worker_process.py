@@ -205,7 +205,7 @@ def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, ExitSta
         on_failure.enter_context(ours)
         # What somebody still writes goes with the worker's guardian.
         scratch = on_failure.enter_context(ExitStack())
-        environment = scratch.enter_context(environment_of_child("pipeline-worker-"))
+        environment = scratch.enter_context(environment_of_child("worker"))
         process = subprocess.Popen(
             python_argv("pipeline.run.executors.worker", str(theirs.fileno()), str(os.getpid()), environment["TMPDIR"]),
             stdin=subprocess.DEVNULL,

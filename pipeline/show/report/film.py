@@ -68,8 +68,8 @@ def _loop(layout: JobLayout, job: Job, pictures: Sequence[Path], remark: str) ->
     chosen = evenly_spread(pictures, LOOP_PICTURES)
     fps = (job.movie.playback_fps or job.fps) * len(chosen) / len(pictures)
     width = min(LOOP_WIDTH, job.render.resolution[0])
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "film.webp")
+    with temporary_folder("report") as folder:
+        path = folder / "film.webp"
         try:
             write_loop(chosen, path, fps=fps, width=width, loop_fps=min(fps, LOOP_FPS))
         except (InvalidFileError, ValueError) as error:
