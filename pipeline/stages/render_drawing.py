@@ -2,7 +2,7 @@
 
 import os
 import shutil
-import tempfile
+
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -100,6 +101,16 @@ def _signal_one(of: Callable[[Family], list[psutil.Process]], number: signal.Sig
         return True
 
     return inject
+
+
+def _kill_all(situation: Situation) -> bool:
+    """As the end of a container does: nobody is left to clear up."""
+    if situation.runner is None:
+        return False
+    for each in situation.family.living():
+        with contextlib.suppress(psutil.NoSuchProcess):
+            each.kill()
+    return True
 
 
 def _stop_runner(situation: Situation) -> bool:
@@ -259,6 +270,7 @@ def _turn_clock(situation: Situation) -> bool:
 KINDS = (
     Kind("disk full", _fill_disk, _give_room, own_disk=True),
     Kind("kill -9 of the runner", _signal_runner(signal.SIGKILL), role="runner"),
+    Kind("kill -9 of all processes at once", _kill_all),
     Kind("folder read-only for a while", _forbid_writing, _allow_writing, (0.2, 3.0)),
     Kind("file system refuses writes", _refuse_writes, _allow_writes, (0.2, 3.0)),
     Kind("kill -9 of a worker", _signal_one(Family.workers, signal.SIGKILL), role="worker"),

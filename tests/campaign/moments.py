@@ -22,7 +22,7 @@ STEPS = {
         ("before its lease is in place", r"^os.rename \S+ \S*/runner\.lease$"),
         ("before it opens the record", r"^sqlite3.connect \S*/manifest\.db"),
         ("before the job's file is in place", r"^os.rename \S+ \S*/job\.toml$"),
-        ("before it starts a worker", r"^subprocess.Popen .*pipeline\.worker"),
+        ("before it starts a worker", r"^subprocess.Popen .*pipeline\.run\.executors\.worker"),
         ("before it gives its lease back", r"^os.remove \S*/runner\.lease"),
     ),
     "worker": (

@@ -36,6 +36,8 @@ def broken_promises(studio: Studio, reference: Mapping[str, str], harmed: Set[st
     ]
     if left:
         yield f"unfinished files are left: {', '.join(left)}"
+    if temporary := sorted(path.name for path in studio.temporary.iterdir()):
+        yield f"temporary files are left: {', '.join(temporary)}"
     yield from _done_twice(studio, harmed)
     if "Traceback" in studio.printed():
         yield "a command ended in a traceback"
@@ -54,5 +56,6 @@ def _may_be_done_again(task: str, harmed: Set[str]) -> bool:
     """Whether an output of the task was damaged. Tasks are called after stages, outputs after folders."""
     stage, _, rest = task.partition("/")
     folders = {"simulate": "cache/", "render": "frames/", "bodies": "meshes/", "volume": "volumes/", "movie": "movie"}
+    folders |= {"surface": "surfaces/", "cloth": "cloths/"}
     stems = rest.removeprefix("segment-")
     return any(path.startswith(folders[stage]) and (stage in ("simulate", "movie") or stems in path) for path in harmed)

@@ -41,8 +41,24 @@ shape = { type = "sphere", radius = 0.1 }
 position = [-0.15, 0.1, 0.12]
 temperature = 420.0
 """
-SCENES = {"ball": BALL, "smoke": BALL + SMOKE}
-"""What is simulated: a ball starts in a second or two, smoke compiles its kernels for ten."""
+WATER = """
+[[fluid]]
+name = "water"
+particle_radius = 0.03
+[[fluid.block]]
+shape = { type = "box", size = [0.24, 0.24, 0.18] }
+position = [0.15, -0.15, 0.1]
+"""
+CLOTH = """
+[[cloth]]
+name = "sheet"
+shape = { type = "rectangle", size = [0.3, 0.3], counts = [9, 9] }
+position = [0.0, 0.0, 0.3]
+[[cloth.pin]]
+corner = "x-y-"
+"""
+SCENES = {"ball": BALL, "smoke": BALL + SMOKE, "all": BALL + SMOKE + WATER + CLOTH}
+"""What is simulated: a ball starts in a second or two, smoke compiles its kernels for ten, all kinds for longer."""
 
 JOB = """\
 name = "{name}"
@@ -63,10 +79,12 @@ device = "cpu"                  # a GPU may compile for minutes before its first
 {limits}"""
 LIMITS = """\
 [limits.{stage}]
-stall_s = 30
+stall_s = {stall_s}
 memory_gb = 2
 """
-STAGES = ("bodies", "simulate", "volume", "render", "movie")
+STALL_S = {"all": 120}
+"""Longest time without a sign of life, by scene, where it is not 30 s: kernels compile in silence."""
+STAGES = ("bodies", "simulate", "surface", "cloth", "volume", "render", "movie")
 
 BLENDER = """\
 #!{python}
@@ -100,11 +118,11 @@ class Studio:
     def open(cls, folder: Path, *, scene: str) -> Studio:
         """A studio where nothing was submitted yet."""
         studio = cls(folder)
-        for each in (studio.control, studio.renders):
+        for each in (studio.control, studio.renders, studio.temporary):
             each.mkdir(parents=True)
         studio.blender.write_text(BLENDER.format(python=sys.executable))
         studio.blender.chmod(0o755)
-        limits = "\n".join(LIMITS.format(stage=stage) for stage in STAGES)
+        limits = "\n".join(LIMITS.format(stage=stage, stall_s=STALL_S.get(scene, 30)) for stage in STAGES)
         text = JOB.format(name=NAME, frames=FRAMES, scene=SCENES[scene], limits=limits)
         (folder / f"{NAME}.toml").write_text(text)
         return studio
@@ -118,6 +136,11 @@ class Studio:
     def renders(self) -> Path:
         """Parent of the job's folder."""
         return self.folder / "renders"
+
+    @property
+    def temporary(self) -> Path:
+        """Where all processes have their temporary files."""
+        return self.folder / "temporary"
 
     @property
     def root(self) -> Path:
@@ -143,6 +166,7 @@ class Studio:
                     **os.environ,
                     "PYTHONPATH": os.pathsep.join([str(HOOKS), str(PROJECT)]),
                     "CAMPAIGN_CONTROL": str(self.control),
+                    "TMPDIR": str(self.temporary),
                 },
                 stdin=subprocess.DEVNULL,
                 stdout=out,

@@ -19,7 +19,7 @@ from .studio import PROJECT, SCENES, Studio
 from .table import Result, Row
 
 FAULTS = 8
-SEED = 57
+SEED = 135030
 """Its faults, of the first mixed round, are such that each of the main promises is put to the test."""
 PATIENCE_S = 1800.0
 """Each run has limits of its own; a busy machine may take its time for all of them."""
@@ -33,6 +33,7 @@ def campaign(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_the_faults_of_a_mixed_round_are_of_different_kinds() -> None:
     drawn = [kind.name for kind in draw_kinds(random.Random(SEED), KINDS, FAULTS)]
     assert {"kill -9 of the runner", "kill -9 of a worker", "kill -9 of Blender", "disk full"} <= {*drawn}
+    assert "kill -9 of all processes at once" in drawn
     assert {"output truncated", "bit of an output flipped, unseen", "clock jumps"} <= {*drawn}
     assert {*draw_kinds(random.Random(SEED), KINDS, 2 * len(KINDS))} == {*KINDS}
     assert len({*draw_kinds(random.Random(SEED), KINDS, len(KINDS))}) == len(KINDS)
