@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from pipeline.base.errors import PipelineError
 from pipeline.base.files import replacing
@@ -14,6 +13,7 @@ from pipeline.stages.render_scene import framed_points, render_spec, write_motio
 from render.blender import FrameRenderError
 from render.movie import encode_segment, validate_movie
 from render.parameters import MovieParameters
+from render.temporary_folder import temporary_folder
 from render.workbench import draw_frames
 
 QUALITY = MovieParameters(crf=20, preset="veryfast")
@@ -48,14 +48,14 @@ def make_animatic(
     """
     job = loaded.job
     found = survey(loaded, layout, range(frames))
-    with scratch_folder(loaded, found, layout) as scratch, TemporaryDirectory(prefix="animatic-") as folder:
+    with scratch_folder(loaded, found, layout) as scratch, temporary_folder("animatic") as folder:
         spec = scratch.root / "scene.json"
         render_spec(job, scratch, framed_points(job, scratch)).model_copy(update={"engine": "workbench"}).write(spec)
         for frame in range(frames):
             write_motion(job, scratch, frame, attempt=1)
         try:
             pictures = draw_frames(
-                spec, range(frames), Path(folder), threads=threads, blender=job.render.blender, drawn=drawn
+                spec, range(frames), folder, threads=threads, blender=job.render.blender, drawn=drawn
             )
         except FrameRenderError as error:
             raise PipelineError(str(error)) from error

@@ -10,7 +10,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from pipeline.base.errors import PipelineError
 from pipeline.base.files import replacing
@@ -21,6 +20,7 @@ from pipeline.run.executors.attempt import STAGES_REFERENCE, load_stages
 from pipeline.run.plan import made_from, plan_job
 from pipeline.run.single_stage import run_tasks
 from pipeline.store.receipts import Receipt, committed_receipt
+from render.temporary_folder import temporary_folder
 
 SIMULATION = "simulate"
 
@@ -106,8 +106,8 @@ def make_still(
 @contextmanager
 def scratch_folder(loaded: LoadedJob, found: Survey, layout: JobLayout) -> Iterator[JobLayout]:
     """A job's folder of its own, in which what is committed is there by link; gone at the end of the block."""
-    with TemporaryDirectory(prefix="still-") as folder:
-        scratch = JobLayout(Path(folder).resolve())
+    with temporary_folder("still") as folder:
+        scratch = JobLayout(folder.resolve())
         scratch.job_file.write_text(loaded.text, encoding="utf-8")
         for receipt in found.committed:
             path, copy = scratch.path(receipt.artifact), scratch.receipt(receipt.artifact)

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from render.blender import Renderer, open_renderer
 from render.camera_path import View
 from render.errors import InvalidFileError
 from render.pictures import PictureStatistics, check_pixels, over_black, read_picture, require_more_than_set
+from render.temporary_folder import temporary_folder
 
 SET_PIXELS = 96
 """Along the longer side of the empty set that pictures are held against: half a percent of it is 25 pixels."""

@@ -1,6 +1,5 @@
 """The film of a job as the report holds it: itself where it is small enough and browsers play it, else a small loop."""
 
-import tempfile
 from base64 import b64encode
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pipeline.show.picture_set import evenly_spread
 from pipeline.store.receipts import read_receipt
 from render.errors import InvalidFileError
 from render.loop import write_loop
+from render.temporary_folder import temporary_folder
 
 MOST_BYTES = 24 << 20  # of a film that is put into the page: a browser holds the page in memory, a third larger as text
 PLAYABLE = frozenset({"h264", "av1"})  # codecs that the usual browsers play; H.265 and ProRes are not among them

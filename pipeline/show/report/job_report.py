@@ -1,6 +1,5 @@
 """What a report tells of a job, gathered from its folder."""
 
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -23,6 +22,7 @@ from pipeline.store.provenance import origins_of
 from pipeline.store.receipts import read_receipt
 from render.errors import InvalidFileError
 from render.sheet import contact_sheet
+from render.temporary_folder import temporary_folder
 
 SHEET_PICTURES, SHEET_COLUMNS = 12, 4
 SHEET_WIDTH = 1200  # at most [pixels]; small pictures are not enlarged
@@ -179,8 +179,8 @@ def _sheet(layout: JobLayout, pictures: Sequence[Path], *, picture_width: int) -
         return None
     chosen = evenly_spread(pictures, SHEET_PICTURES)
     width = min(SHEET_WIDTH, SHEET_COLUMNS * (picture_width + 8))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "sheet.webp")
+    with temporary_folder("report") as folder:
+        path = folder / "sheet.webp"
         try:
             contact_sheet(chosen, path, columns=SHEET_COLUMNS, width=width)
         except (InvalidFileError, ValueError) as error:
