@@ -121,7 +121,7 @@ color = [0.1, 0.3, 0.8]
 
 
 def test_a_job_is_drawn_with_the_poses_of_its_cache(tmp_path, monkeypatch):
-    monkeypatch.setattr("render.blender.open_renderer", WarmRenderer)
+    monkeypatch.setattr("pipeline.stages.render_drawing.open_renderer", WarmRenderer)
     job, layout = job_of_the_ball(tmp_path, "flight", CAMERA_AND_ROCK)
     task = RenderStage().plan(job, layout)[2]
     assert task.inputs == ("meshes/ball.ply", "meshes/rock.ply", "cache/000002.h5")

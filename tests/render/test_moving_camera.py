@@ -109,7 +109,7 @@ follow = "ball"
 
 
 def test_a_body_that_the_camera_follows_stays_in_the_middle_and_sharp(tmp_path, monkeypatch):
-    monkeypatch.setattr("render.blender.open_renderer", WarmRenderer)
+    monkeypatch.setattr("pipeline.stages.render_drawing.open_renderer", WarmRenderer)
     job, layout = job_of_the_ball(tmp_path, "chase", FOLLOWING_CAMERA)
     task = RenderStage().plan(job, layout)[2]
     ball = Snapshot("rigid", pose(position=(0.4, 0.0, 0.5), velocity=(24.0, 0.0, 0.0))["ball"], {})

@@ -68,7 +68,7 @@ SIZE = (192, 108)
 
 @pytest.fixture
 def warm(monkeypatch):
-    monkeypatch.setattr("render.blender.open_renderer", WarmRenderer)
+    monkeypatch.setattr("pipeline.stages.render_drawing.open_renderer", WarmRenderer)
 
 
 def draw_the_ball(layout: JobLayout) -> TaskEvent:
@@ -93,7 +93,7 @@ def draw_with_faults(folder: Path, monkeypatch: pytest.MonkeyPatch, faults: int)
             run_python("import bpy; bpy.data.objects['ball'].hide_render = True")
         return renderer
 
-    monkeypatch.setattr("render.blender.open_renderer", open_dropping)
+    monkeypatch.setattr("pipeline.stages.render_drawing.open_renderer", open_dropping)
     _, layout = job_of_the_ball(folder, "pond", "")
     text = layout.job_file.read_text().replace("[64, 36]", f"{[*SIZE]}").replace("samples = 32", "samples = 16")
     layout.job_file.write_text(text.replace("denoise = false", "denoise = true"))

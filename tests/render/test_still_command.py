@@ -20,7 +20,7 @@ from render.pictures import validate_exr
 
 @pytest.fixture(autouse=True)
 def warm(monkeypatch):
-    monkeypatch.setattr("render.blender.open_renderer", WarmRenderer)
+    monkeypatch.setattr("pipeline.stages.render_drawing.open_renderer", WarmRenderer)
 
 
 @pytest.fixture

@@ -100,7 +100,7 @@ def test_frames_of_two_devices_are_not_mixed(layout: JobLayout, monkeypatch: pyt
     with monkeypatch.context() as other_machine:
         # Only the name is another machine's: what it would compute is not what this is about.
         other_machine.setattr(
-            "sim.core.runtime.initialize", lambda device, **options: start(device, **options) and "cuda"
+            "pipeline.stages.simulate.initialize", lambda device, **options: start(device, **options) and "cuda"
         )
         assert isinstance(simulate(layout, frames=2), Finished)
     former = read_frame(layout.path(layout.frame_cache(1)))

@@ -13,7 +13,7 @@ from playwright.sync_api import Page
 
 from pipeline.queue.job_queue import Desired, new_entry
 from pipeline.record.manifest import Manifest
-from pipeline.show.report.film import ReportFilm
+from pipeline.show.report.film import as_address
 
 pytestmark = needs_browser
 PATIENCE_MS = 1000 * PATIENCE_S
@@ -80,7 +80,7 @@ def test_the_film_in_a_report_is_let_through(farm: Farm) -> None:
         picture = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 90, np.uint8), format="rgb24")
         container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
-    address = ReportFilm(film.read_bytes(), "video/mp4", 64, 48).address
+    address = as_address(film.read_bytes(), "video/mp4")
     layout.report.write_text(f'<!doctype html><title>film</title><video preload="auto" src="{address}"></video>')
     with dashboard(farm) as (client, _), open_page() as page:
         page.goto(f"http://{client.place}/jobs/film/report")

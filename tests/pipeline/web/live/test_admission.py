@@ -34,7 +34,7 @@ def test_a_scene_that_is_too_large_is_told_what_fits(tmp_path):
 def told_of(monkeypatch, *arguments: str) -> str:
     """What the command says of a job on two cores, without running it."""
     monkeypatch.setattr("pipeline.web.live.running.show_live", lambda *_, **__: None)
-    monkeypatch.setattr("sim.core.runtime.resolve_device", lambda _: "cpu")
+    monkeypatch.setattr("pipeline.kinds.checks.memory_budget.resolve_device", lambda _: "cpu")
     return pipeline("live", *arguments, "--cores", 2).output
 
 
