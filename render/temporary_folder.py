@@ -1,4 +1,4 @@
-"""Temporary folders that go even where their process is killed: the next one to make such a folder removes them."""
+"""Temporary folders that go even where their process is killed: the next run or maker of one removes them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def temporary_folder(purpose: str) -> Iterator[Path]:
     Raises:
         OSError: there is no place for it.
     """
-    _remove_those_of_the_dead()
+    remove_folders_of_the_dead()
     folder, lock = _locked_folder(purpose)
     try:
         yield folder
@@ -49,6 +49,18 @@ def environment_of_child(purpose: str) -> Iterator[dict[str, str]]:
         yield {**os.environ, **dict.fromkeys(VARIABLES, str(folder))}
 
 
+def remove_folders_of_the_dead() -> None:
+    """Remove the temporary folders whose processes have ended without doing so."""
+    for folder in Path(gettempdir()).glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError):  # somebody else's, or gone meanwhile, or no locks on folders here
+            descriptor = _opened(folder)
+            try:
+                if _lock(descriptor):
+                    shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(descriptor)
+
+
 def _locked_folder(purpose: str) -> tuple[Path, int]:
     """A new folder, and the descriptor that locks it."""
     while True:
@@ -64,17 +76,6 @@ def _locked_folder(purpose: str) -> tuple[Path, int]:
         if is_locked:
             return folder, descriptor
         os.close(descriptor)
-
-
-def _remove_those_of_the_dead() -> None:
-    for folder in Path(gettempdir()).glob(f"{PREFIX}*"):
-        with contextlib.suppress(OSError):  # somebody else's, or gone meanwhile, or no locks on folders here
-            descriptor = _opened(folder)
-            try:
-                if _lock(descriptor):
-                    shutil.rmtree(folder, ignore_errors=True)
-            finally:
-                os.close(descriptor)
 
 
 def _opened(folder: Path) -> int:

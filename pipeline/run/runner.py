@@ -30,6 +30,7 @@ from pipeline.run.goal import write_goal
 from pipeline.run.plan import Assessment, Verdict, assess, frame_turns, plan_job, up_to_date
 from pipeline.run.scheduler import Scheduler
 from pipeline.store.artifacts import sweep_parts
+from render.temporary_folder import remove_folders_of_the_dead
 
 _TURN_S = 0.25
 """Longest time that the loop sleeps [s]; so soon it answers Ctrl-C."""
@@ -81,6 +82,7 @@ def run_job(
     control = control or RunControl()
     policy = policy or Policy()
     began = time.monotonic()
+    remove_folders_of_the_dead()
     layout.root.mkdir(parents=True, exist_ok=True)
     with Lease.acquire(layout.lease) as lease, Manifest(layout.manifest) as manifest, control.on_signals():
         if job_text is not None:

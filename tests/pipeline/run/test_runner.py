@@ -57,6 +57,15 @@ def test_a_finished_job_has_nothing_to_do(finished):
     assert contents(finished) == before
 
 
+def test_a_run_with_nothing_to_do_removes_the_temporary_folders_of_killed_workers(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    left = tmp_path / "pipeline-tmp-worker-of_a_killed_run"
+    left.mkdir()
+    (left / "half.png").write_bytes(b"half")
+    run_recorded(finished)
+    assert not left.exists()
+
+
 def test_a_later_stage_starts_while_the_simulation_runs(root):
     write_faults(root, {"steps": ["wait for reader@5"]})
     recorder = Recorder()
