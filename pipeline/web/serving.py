@@ -22,7 +22,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import h11
 import uvicorn
@@ -43,6 +43,8 @@ MOST_CONNECTIONS = 512
 REQUEST_S = 10.0  # in which a request must be in; ours are a few KB
 
 _OPENING = threading.Lock()
+
+Result = TypeVar("Result")
 
 
 # --- addresses and the end ---
@@ -210,10 +212,24 @@ def page_server(*, host: str = LOCAL, port: int = 0, label: str | None = None) -
             raise _taken(host, port)
         for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
             server._websock_server.unregister_handler(message)
+        server.get_event_loop().call_soon_threadsafe(_tell_in_a_line, server.get_event_loop())
         yield server
     finally:
         with _silence():
             server.stop()
+
+
+def in_its_loop(server: viser.ViserServer, act: Callable[..., Result], *arguments: object) -> Result:
+    """What `act` returns, done in the event loop of a viser server: nothing else may talk to its pages.
+
+    viser wakes what waits for messages by an `asyncio.Event`, which is for one thread: set in another while a page
+    comes or goes, it raises RuntimeError. Not to be called in that loop itself.
+    """
+
+    async def done() -> Result:
+        return act(*arguments)
+
+    return asyncio.run_coroutine_threadsafe(done(), server.get_event_loop()).result()
 
 
 def address(server: viser.ViserServer) -> str:
@@ -232,6 +248,38 @@ def refusal(headers: Headers, access: Access) -> str | None:
     if any(origin.lower().partition("://")[2] != named[0].lower() for origin in headers.get_all("Origin")):
         return "another site may not use this page"
     return None
+
+
+class _OneLine(logging.Filter):
+    """Errors of connections without their tracebacks."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Put what a message has raised in place of the traceback; every record is printed."""
+        if record.exc_info and record.exc_info[1] and record.getMessage() == "connection handler failed":
+            record.msg, record.args = _not_understood(record.exc_info[1]), ()
+            record.exc_info = record.exc_text = None
+        return True
+
+
+def _log_of_connections() -> logging.Logger:
+    log = logging.getLogger(f"{__name__}.connections")
+    if not log.filters:
+        log.addFilter(_OneLine())
+    return log
+
+
+def _tell_in_a_line(loop: asyncio.AbstractEventLoop) -> None:
+    """Have errors that messages of a page raise cost a line each: anybody here may send what viser cannot read."""
+
+    def tell(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        logging.getLogger(__name__).error(context["message"] if error is None else _not_understood(error))
+
+    loop.set_exception_handler(tell)
+
+
+def _not_understood(error: BaseException) -> str:
+    return f"a message of a page was not understood: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 @contextmanager
@@ -254,7 +302,7 @@ def _guarded(access: Access) -> Iterator[list[bool]]:
             return process_request(connection, request)
 
         guarded.append(True)
-        return plain(*arguments, process_request=process, **options)
+        return plain(*arguments, process_request=process, logger=_log_of_connections(), **options)
 
     module: Any = websockets.asyncio.server
     with _OPENING:

@@ -14,7 +14,7 @@ from pipeline.web.live.page import LivePage
 from pipeline.web.live.recording import Recorder
 from pipeline.web.live.session import Session
 from pipeline.web.live.soundness import LONGEST_FRAME_S
-from pipeline.web.serving import page_server
+from pipeline.web.serving import in_its_loop, page_server
 
 BALL_OVER_SHEET = """\
 name = "drape"
@@ -74,7 +74,8 @@ def recording(folder: Path, output: Path | None = None, text: str = BALL_OVER_SH
 
 def page_of(server: viser.ViserServer, read: LoadedJob, session: Session, folder: Path) -> LivePage:
     """The page of a session that saves jobs and records into a folder."""
-    return LivePage(server, session, Recorder(read, session, folder / "renders", device="cpu"), folder)
+    recorder = Recorder(read, session, folder / "renders", device="cpu")
+    return in_its_loop(server, LivePage, server, session, recorder, folder)
 
 
 @contextmanager

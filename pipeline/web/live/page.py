@@ -12,16 +12,17 @@ from pipeline.web.live.recording import Recorder
 from pipeline.web.live.saving import save_job
 from pipeline.web.live.scene import LiveScene
 from pipeline.web.live.session import Session
+from pipeline.web.serving import in_its_loop
 
 DECADE_STEP = 0.02
 """Of sliders over the powers of ten: 5 %."""
 
 
 class LivePage:
-    """The page of a session, which all browsers share; jobs are saved in the folder."""
+    """The page of a session, which all browsers share; jobs are saved in the folder. Made in the server's loop."""
 
     def __init__(self, server: viser.ViserServer, session: Session, recorder: Recorder, folder: Path) -> None:
-        self._session, self._recorder, self._folder = session, recorder, folder
+        self._server, self._session, self._recorder, self._folder = server, session, recorder, folder
         self._written = recorder.loaded.job
         self._sliders: dict[str, tuple[Parameter, Any]] = {}
         self._revision = session.revision
@@ -49,10 +50,13 @@ class LivePage:
 
     def show(self) -> None:
         """Show where the scene is."""
-        self._scene.show(self._session.bodies(), self._session.drags.pins)
+        in_its_loop(self._server, self._scene.show, self._session.bodies(), self._session.drags.pins)
 
     def tell(self) -> None:
         """Show how it goes, and parameters that something other than the page has changed; only news are sent."""
+        in_its_loop(self._server, self._tell)
+
+    def _tell(self) -> None:
         self._changes.content = _plain(told_changes(self._written, self._session.values))
         self._pause.label = "Go on" if self._session.is_paused else "Pause"
         self._record.label = "Stop recording" if self._recorder.is_recording else "Record"

@@ -15,7 +15,7 @@ from pipeline.run.executors.failures import describe, is_out_of_memory
 from pipeline.web.live.recording import Recorder
 from pipeline.web.live.requests import CannotGoOnError
 from pipeline.web.live.session import Session
-from pipeline.web.serving import address, page_server
+from pipeline.web.serving import address, in_its_loop, page_server
 
 if TYPE_CHECKING:
     from pipeline.web.live.page import LivePage
@@ -73,7 +73,7 @@ def show_live(
             raise PipelineError(f"{job.name}: {error}") from error
         session.is_paused = paused
         recorder = Recorder(loaded, session, output, device=device)
-        page = LivePage(server, session, recorder, folder)
+        page = in_its_loop(server, LivePage, server, session, recorder, folder)
         say(f"{address(server)} runs {job.name}; Ctrl-C ends it")
         try:
             with _memory_told(job):

@@ -69,6 +69,11 @@ class Controls:
         """Solver and name of the plotted number."""
         return self._choices.get(self.plotted.value)
 
+    def go_to(self, frame: int | None) -> None:
+        """Put the slider at a frame."""
+        if frame is not None:
+            self.slider.value = frame
+
     def offer_frames(self, frames: Sequence[int]) -> None:
         """Let the slider reach all frames."""
         self.slider.max = max(frames[-1] if frames else 1, 1)

@@ -22,6 +22,7 @@ from pipeline.store.cache import read_numbers
 from pipeline.web.bounded_cache import BoundedCache
 from pipeline.web.drawing.bodies import Extents, Look
 from pipeline.web.drawing.canvas import Canvas, begin_at, camera_orientation, vertical_fov
+from pipeline.web.serving import in_its_loop
 from pipeline.web.viewer.committed import CommittedFrames, Stamp, artifacts_of_frame
 from pipeline.web.viewer.controls import Controls
 from pipeline.web.viewer.frames import ShownFrame, read_shown_frame
@@ -57,18 +58,13 @@ class ViewPage:
         self._series, self._extents = SolverSeries(), Extents()
         self._spoilt: dict[int, tuple[str, str]] = {}  # by frame: the hash it should have, and what is wrong
         self._job_trouble = self._files_trouble = ""
-        self.canvas = Canvas(server)
         self.playback = Playback(rate=float(min(self._job.fps, 60)))
         self._drawn: tuple[object, ...] = ()
         self._panel: tuple[object, ...] = ()
         self._next_look = -np.inf
         self._shown: ShownFrame | None = None
-        self._look_from_aside()
         waits = not any(self._committed.folder.glob("*.h5.json"))
-        changed = self._when_used(lambda _: None)
-        self.controls = Controls(server.gui, self._job, rate=int(self.playback.rate), waits=waits, changed=changed)
-        self.controls.offer_layers(self._scene.layers)
-        self._wire()
+        self._in_its_loop(self._lay_out, waits)
 
     @property
     def frame(self) -> int | None:
@@ -101,11 +97,28 @@ class ViewPage:
             self._show(frame)
         except OSError as error:  # a right that was taken away, or a server of files that is gone: it may come back
             self._files_trouble = f"{self._layout.root} cannot be read now: {error}"
-            self._tell(self.playback.frame, self.controls.look())
+            self._in_its_loop(self._tell, self.playback.frame, self.controls.look())
             return LOOK_S
         due = self.playback.wait(now)
         waits = [self._next_look - now, *([] if due is None else [due]), *([0.0] if pending else [])]
         return max(0.0, min(waits))
+
+    def _in_its_loop(self, act: Callable[..., None], *arguments: object) -> None:
+        """Have the server's loop do what talks to the pages: canvas and controls."""
+        in_its_loop(self._server, act, *arguments)
+
+    def _lay_out(self, waits: bool) -> None:
+        self.canvas = Canvas(self._server)
+        self._look_from_aside()
+        self.controls = Controls(
+            self._server.gui,
+            self._job,
+            rate=int(self.playback.rate),
+            waits=waits,
+            changed=self._when_used(lambda _: None),
+        )
+        self.controls.offer_layers(self._scene.layers)
+        self._wire()
 
     # --- what there is ---
 
@@ -120,7 +133,7 @@ class ViewPage:
                 self._scene = JobScene(self._job, self._layout, self._committed)
                 self._loaded.clear()
                 self._drawn = ()
-                self.controls.offer_layers(self._scene.layers)
+                self._in_its_loop(self.controls.offer_layers, self._scene.layers)
             except (PipelineError, OSError) as error:
                 self._job_trouble = f"{self._layout.job_file}: {error}; shown as it was before"
         if self._committed.update():
@@ -128,9 +141,9 @@ class ViewPage:
             self.playback.offer(frames, follow=self.controls.follow.value)
             self._series.keep(frames)
             self._spoilt = {frame: told for frame, told in self._spoilt.items() if frame in frames}
-            self.controls.offer_frames(frames)
-            if self.playback.frame is not None and not self.playback.plays:
-                self.controls.slider.value = self.playback.frame
+            self._in_its_loop(self.controls.offer_frames, frames)
+            if not self.playback.plays:
+                self._in_its_loop(self.controls.go_to, self.playback.frame)
 
     def _read_numbers(self, until: float) -> bool:
         """Read numbers of frames that are new; returns whether there are more."""
@@ -148,7 +161,7 @@ class ViewPage:
             except InvalidArtifactError as error:
                 self._spoilt[frame] = (source, str(error))
         if changed:
-            self.controls.offer_numbers(self._series)
+            self._in_its_loop(self.controls.offer_numbers, self._series)
         return False
 
     def _is_spoilt(self, frame: int) -> bool:
@@ -185,13 +198,14 @@ class ViewPage:
         wanted = (frame, stamp, look, self._extents.top_speed)
         if wanted != self._drawn:
             shown = None if frame is None else self._load(frame, stamp, surfaces=SURFACES in look.layers)
-            self._scene.draw(self.canvas, shown, look, self._extents)
+            self._in_its_loop(self._scene.draw, self.canvas, shown, look, self._extents)
             self._shown, self._drawn = shown, wanted
-            if frame is not None and self.playback.plays:
-                self.controls.slider.value = frame
+            if self.playback.plays:
+                self._in_its_loop(self.controls.go_to, frame)
             if shown is not None:
-                self.controls.offer_values({name for cloud in shown.clouds.values() for name in cloud.values})
-        self._tell(frame, look)
+                values = {name for cloud in shown.clouds.values() for name in cloud.values}
+                self._in_its_loop(self.controls.offer_values, values)
+        self._in_its_loop(self._tell, frame, look)
 
     def _tell(self, frame: int | None, look: Look) -> None:
         """Text and plot; viser sends only what differs."""
@@ -263,8 +277,7 @@ class ViewPage:
     def _step(self, where: str) -> None:
         far = len(self.frames)
         self.playback.step({"first": -far, "back": -1, "next": 1, "last": far}[where])
-        if self.playback.frame is not None:
-            self.controls.slider.value = self.playback.frame
+        self._in_its_loop(self.controls.go_to, self.playback.frame)
 
     def _go_to_newest(self) -> None:
         if self.controls.follow.value:
@@ -284,7 +297,7 @@ class ViewPage:
         aside = np.array([cosine * x - sine * y, sine * x + cosine * y, z])
         begin_at(self._server, target + aside, target, fov=0.75)
 
-    def _look_through(self, event: Any) -> None:
+    async def _look_through(self, event: Any) -> None:  # a coroutine, as these are run in the server's loop
         """Put the camera of the page whose button it was where the film's is."""
         view = self._shown.view if self._shown is not None and self._shown.view is not None else self._first_view()
         width, height = self._job.render.resolution

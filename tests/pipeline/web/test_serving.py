@@ -6,6 +6,7 @@ import asyncio
 import http.client
 import socket
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,16 +15,17 @@ import msgspec
 import pytest
 import viser
 import websockets.asyncio.server
+from browser import until
 from click.testing import Result
 from command_line import pipeline
 from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 from viser import _messages
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from pipeline.base.errors import PipelineError
-from pipeline.web.serving import address, config_of, listen, page_server, remark_of
+from pipeline.web.serving import address, config_of, in_its_loop, listen, page_server, remark_of
 
 DROP = """
 name = "drop"
@@ -70,6 +72,42 @@ def test_its_own_page_and_programs_are_let_in(server, name):
     for origin in (f"http://{name}:{{port}}", None):
         with joined(server, origin=origin, name=name) as page:
             assert page.recv(timeout=20)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        pytest.param(b"", id="empty"),
+        pytest.param(b"\xff\x00", id="no message"),
+        pytest.param("hello", id="text"),
+        pytest.param(msgspec.msgpack.encode([1]), id="a list"),
+        pytest.param(msgspec.msgpack.encode({"type": "Bomb"}), id="unknown type"),
+        pytest.param(
+            msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": 1, "x": "y" * 5000}), id="other fields"
+        ),
+    ],
+)
+def test_a_message_that_cannot_be_read_costs_a_line(server, message, caplog, capfd):
+    with joined(server, origin=None) as page, pytest.raises(ConnectionClosed):
+        page.send(message)
+        while page.recv(timeout=20):
+            pass
+    until(lambda: caplog.records, "nothing is told")
+    (record,) = caplog.records
+    assert record.exc_info is None
+    assert "a message of a page was not understood" in record.getMessage()
+    assert len(record.getMessage()) < 300
+    assert "Traceback" not in capfd.readouterr().err
+    with joined(server, origin=None) as page:
+        assert page.recv(timeout=20)
+
+
+def test_what_is_done_in_its_loop_is_done_there_and_its_error_comes_back(server):
+    where = in_its_loop(server, threading.get_ident)
+    assert where != threading.get_ident()
+    assert where == in_its_loop(server, threading.get_ident)
+    with pytest.raises(ZeroDivisionError):
+        in_its_loop(server, lambda: 1 // 0)
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:1", "http://localhost:{port}", "null"])

@@ -1,12 +1,15 @@
 """The command puts a session and its page together."""
 
 import math
+import threading
 
 import pytest
-from live_jobs import live
+from live_jobs import BALL_OVER_SHEET, live, served
+from page_threads import threads_that_push
 
 from pipeline.web.live import running
 from pipeline.web.live.soundness import LONGEST_FRAME_S
+from pipeline.web.serving import in_its_loop
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -41,3 +44,14 @@ def test_errors_of_the_program_keep_their_traceback(tmp_path, monkeypatch):
     monkeypatch.setattr(running, "run", fails)
     with pytest.raises(RuntimeError, match="Event loop is closed"):
         live(tmp_path)
+
+
+def test_only_the_loop_of_the_server_talks_to_pages(tmp_path, monkeypatch):
+    threads = threads_that_push(monkeypatch)
+    with served(tmp_path, BALL_OVER_SHEET) as (session, page, server):
+        threads.clear()  # the server began by itself
+        for _ in range(3):
+            session.advance()
+            page.show()
+            page.tell()
+        assert threads == {in_its_loop(server, threading.get_ident)}

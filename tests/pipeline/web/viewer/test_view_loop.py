@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import viewed_job
 import viser
 from inline_tasks import run_task
+from page_threads import threads_that_push
 from scipy.spatial.transform import Rotation
 from websockets.sync.client import connect
 
@@ -24,7 +26,7 @@ from pipeline.store.receipts import read_receipt
 from pipeline.web.drawing.canvas import Canvas
 from pipeline.web.drawing.shapes import Smoke
 from pipeline.web.drawing.smoke_pictures import cut
-from pipeline.web.serving import page_server
+from pipeline.web.serving import in_its_loop, page_server
 from pipeline.web.viewer.page import ViewPage
 
 
@@ -62,6 +64,16 @@ def test_a_page_that_reads_nothing_holds_up_nobody_and_costs_no_memory(server, l
         assert page.frame == 5
         # Of each thing and property one message waits, however many frames were shown; six have been through all.
         assert max(sizes[12:]) <= 2 * max(sizes[:12])
+
+
+def test_only_the_loop_of_the_server_talks_to_pages(server, layout, monkeypatch):
+    threads = threads_that_push(monkeypatch)
+    page = page_of(server, layout)
+    for number in range(6):
+        page.playback.seek(number)
+        page.advance(float(number))
+    assert page.frame == 5
+    assert threads == {in_its_loop(server, threading.get_ident)}
 
 
 def test_a_job_file_that_cannot_be_used_is_a_line_and_frames_stay(server, layout):
