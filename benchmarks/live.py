@@ -28,8 +28,8 @@ from pipeline.web.live.admission import live_job
 from pipeline.web.live.page import LivePage
 from pipeline.web.live.recording import Recorder
 from pipeline.web.live.running import run as run_loop
-from pipeline.web.live.session import Session, Status
-from pipeline.web.serving import page_server
+from pipeline.web.live.session import Session
+from pipeline.web.serving import in_its_loop, page_server
 from sim.core.runtime import initialize
 
 JOB = """
@@ -77,8 +77,8 @@ class Counted:
         self.show_s += time.perf_counter() - began
         self.shown += 1
 
-    def tell(self, status: Status) -> None:
-        self._page.tell(status)
+    def tell(self) -> None:
+        self._page.tell()
 
 
 def measure(session: Session, page: Counted, seconds: float, *, drags: bool) -> dict[str, Any]:
@@ -94,9 +94,8 @@ def measure(session: Session, page: Counted, seconds: float, *, drags: bool) -> 
         nonlocal seen
         if session.world.frame != seen:
             seen = session.world.frame
-            status = session.status()
-            times.append(status.frame_ms)
-            substeps.append(status.substeps["cloth"])
+            times.append(session.frame_ms)
+            substeps.append(session.substeps["cloth"])
             if session.report is not None:
                 strains.append(session.report.diagnostics["cloth"]["max_strain"])
         passed = time.perf_counter() - began
@@ -152,7 +151,7 @@ def main() -> dict[str, Any]:
         session.reset()
         recorder = Recorder(loaded, session, Path(), device=device)
         with page_server() as server:
-            page = LivePage(server, session, recorder, Path())
+            page = in_its_loop(server, LivePage, server, session, recorder, Path())
             address = f"ws://127.0.0.1:{server.get_port()}"
             viewer = None
             if not arguments.without_viewer:

@@ -33,12 +33,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.base.fingerprint import task_fingerprint
-
 from benchmarks.compare import HERE, arguments_of, child, run, timed
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
-from pipeline.base.task import ArtifactPath, Resources, Task, TaskId, TaskState
+from pipeline.base.task import ArtifactPath, Resources, Task, TaskId, TaskState, task_fingerprint
 from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest
 from pipeline.run.control import Selection
@@ -233,8 +231,8 @@ def run_command(arguments: list[str]) -> None:
     import pipeline.stages
     from pipeline.cli.main import main as command_line
 
-    pipeline.stages.STAGES = STAGES  # type: ignore[assignment]
-    pipeline.queue.turns.STAGES_REFERENCE = STAGES_REFERENCE
+    pipeline.stages.STAGES = STAGES
+    pipeline.queue.turns.STAGES_REFERENCE = STAGES_REFERENCE  # type: ignore[attr-defined]
     command_line(arguments)
 
 

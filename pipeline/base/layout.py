@@ -56,6 +56,7 @@ class JobLayout:
     preview_movie = _Below("movie-so-far.mp4")  # of the pictures that are there, while there is no whole film
     preview_scratch = _Below(".so-far")  # what the preview movie is made of, while a run makes it
     stills = _Below("stills")  # single frames drawn with other settings than the film's; no artifacts
+    logs_folder = _Below("logs")  # of attempts
     inputs = _Below("inputs")  # copies of the user's own files, such as meshes
     checkpoints = _Below("cache/checkpoints")
 
@@ -76,13 +77,12 @@ class JobLayout:
 
     def log(self, task_id: TaskId, attempt: int) -> Path:
         """Log of one attempt."""
-        return self.root / "logs" / f"{task_id}.{attempt}.log"
+        return self.logs_folder / f"{task_id}.{attempt}.log"
 
     def logs(self) -> Iterator[tuple[TaskId, int, Path]]:
         """Every log: of which task and attempt, and where it is."""
-        folder = self.root / "logs"
-        for path in sorted(folder.rglob("*.log")):
-            task, _, number = path.relative_to(folder).as_posix().removesuffix(".log").rpartition(".")
+        for path in sorted(self.logs_folder.rglob("*.log")):
+            task, _, number = path.relative_to(self.logs_folder).as_posix().removesuffix(".log").rpartition(".")
             if number.isdigit():
                 yield TaskId(task), int(number), path
 

@@ -1,9 +1,14 @@
 """Times, sizes and common phrases, as people read them."""
 
+import unicodedata
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 
 import click
+
+LONGEST_LINE = 2000
+_UNSEEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Unicode categories of what steers a terminal or hides in a text: control, format, surrogate, separators."""
 
 
 def duration(seconds: float) -> str:
@@ -49,7 +54,15 @@ def mixed_devices(drawn_on: Mapping[str, int]) -> list[str]:
     ]
 
 
+def printable(text: str) -> str:
+    """A line for a terminal, of whatever somebody wrote: control characters as escapes, and not endless."""
+    shown = text if len(text) <= LONGEST_LINE else f"{text[:LONGEST_LINE]}..."
+    return "".join(
+        each.encode("unicode_escape").decode() if unicodedata.category(each) in _UNSEEN else each for each in shown
+    )
+
+
 def print_warnings(warnings: Sequence[str]) -> None:
     """Warnings go to the error stream, so that output stays fit for a pipe."""
     for warning in warnings:
-        click.secho(f"warning: {warning}", err=True, fg="yellow")
+        click.secho(f"warning: {printable(warning)}", err=True, fg="yellow")

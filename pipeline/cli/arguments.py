@@ -16,6 +16,7 @@ import click
 
 from pipeline.base.errors import JobFileError, PipelineError
 from pipeline.base.layout import JobLayout
+from pipeline.base.places import check_places
 from pipeline.queue.submitting import QueueOptions
 from pipeline.run.executors.choice import executor_options
 
@@ -191,13 +192,17 @@ def job_folder(job: str, output: Path) -> JobLayout:
 
 
 def find_job(job: str, output: Path) -> JobLayout:
-    """The folder of a job that was submitted, as by `job_folder`. Raises PipelineError if there is none, too."""
+    """The folder of a job that was submitted, as by `job_folder`.
+
+    Raises PipelineError: there is none, or something is in the place of a file or a folder of it.
+    """
     layout = job_folder(job, output)
     if not layout.job_file.exists():
         file = next((each for each in (Path(job), _with_ending(Path(job))) if each.is_file()), None)
         near = nearest(layout.root.name, [each.parent.name for each in layout.root.parent.glob("*/job.toml")])
         submit = f"pipeline submit {shlex.quote(str(file)) if file else f'JOB{SUFFIX}'}"
         raise PipelineError(f"no submitted job in {layout.root}{near}; submit one with: {submit}")
+    check_places(layout)
     return layout
 
 

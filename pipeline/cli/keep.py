@@ -82,7 +82,7 @@ def clean(
 ) -> None:
     """Remove files of a job by stage and age, useless ones, or all.
 
-    Without --yes it only says what would go.
+    Without --yes it only says what would go. Of single stages, files that somebody has edited stay.
 
     \b
     pipeline clean my-film --stage surface --stage volume
@@ -116,7 +116,8 @@ def clean(
             remove_contents(layout, is_meant)
         else:
             choice = Choice(frozenset(stages), checkpoints=checkpoints, superseded=superseded, age_s=age_s)
-            remove_chosen(layout, choice, is_meant)
+            for artifact, flaw in remove_chosen(layout, choice, is_meant).items():
+                click.echo(f"{artifact} stays: {flaw}")
     if everything and yes:
         remove_guard(layout.lease)
         with suppress(OSError):  # not empty: a job that was submitted in this moment has the folder now

@@ -8,6 +8,7 @@ import click
 
 from pipeline import __version__
 from pipeline.base.errors import PLACE_TROUBLES, DiskFullError, PipelineError
+from pipeline.base.wording import printable
 from pipeline.cli.control import cancel, pause, priority, resume, work
 from pipeline.cli.keep import clean, doctor, schema, verify
 from pipeline.cli.look import explain, status
@@ -48,8 +49,8 @@ class PipelineGroup(click.Group):
         try:
             return super().invoke(ctx)
         except PipelineError as error:
-            for line in str(error).splitlines():
-                click.secho(f"error: {line}", err=True, fg="red")
+            for line in str(error).split("\n"):
+                click.secho(f"error: {printable(line)}", err=True, fg="red")
             ctx.exit(error.exit_code)
         except OSError as error:
             if error.errno not in PLACE_TROUBLES:

@@ -262,6 +262,7 @@ def openjd(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
     """
     from pipeline.base.files import replace_durably
     from pipeline.base.lease import refuse_if_held
+    from pipeline.base.places import check_places
     from pipeline.job.inputs import keep_inputs
     from pipeline.run.checked_job import load_checked_job
     from pipeline.run.executors.choice import require_named_devices
@@ -276,6 +277,7 @@ def openjd(job_file: Path, overrides: tuple[str, ...], preview: bool, output: Pa
     layout = JobLayout((output / loaded.job.name).absolute())
     refuse_if_held(layout.lease)
     layout.root.mkdir(parents=True, exist_ok=True)
+    check_places(layout)
     job, text = keep_inputs(loaded, layout)
     replace_durably(layout.job_file, text)
     described = job_template(job.name, plan_job(job, layout, STAGES), python=python)

@@ -1,6 +1,8 @@
 """A job file becomes a Job: read, changed by options, validated; every problem at once."""
 
 import re
+import shlex
+import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from pipeline.base.errors import JobFileError
+from pipeline.base.layout import JobLayout
 from pipeline.job.input_files import InputFile, input_files
 from pipeline.job.messages import explain
 from pipeline.job.overrides import Override, OverrideError, apply_overrides, parse_override
@@ -19,12 +22,17 @@ from pipeline.model.job import Job
 from pipeline.model.meshes import with_value
 from pipeline.model.problems import JobSource
 
-MAX_BYTES = 16 * 2**20
+MAX_BYTES = 2**20
 """No person writes a larger job file; a film given by mistake is refused before it is read."""
 MAX_DEPTH = 32
 """Four times what any job needs; keeps recursive code far from Python's limit."""
 MOST_JOBS = 16
 
+_TEXT_OR_COMMENT = re.compile(
+    r'"""(?:[^\\]|\\.)*?"""|' + r"'''.*?'''" + r'|"(?:[^"\\\n]|\\.)*"' + r"|'[^'\n]*'|#[^\n]*", re.DOTALL
+)
+_BETWEEN_KEYS = re.compile(r"[=,{}\[\]\n]")
+_DIGEST = re.compile("[0-9a-f]{64}")
 _SYNTAX_POSITION = re.compile(
     r"(?P<what>.*) \(at (?:line (?P<line>\d+), column (?P<column>\d+)|end of document)\)", re.DOTALL
 )
@@ -86,21 +94,45 @@ def _read_text(path: Path) -> str:
         raise JobFileError([f"{path}: no such file; `pipeline new NAME` writes a starter"]) from None
     except UnicodeDecodeError as error:
         byte = f"byte {error.start} is 0x{error.object[error.start]:02x}"
-        raise JobFileError([f"{path}: not UTF-8 text ({byte})"]) from None
+        raise JobFileError([f"{path}: not UTF-8 text ({byte}){_remedy(path)}"]) from None
     except (OSError, ValueError) as error:
         raise JobFileError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from None
 
 
 def _parse(path: Path, text: str) -> dict[str, Any]:
     try:
+        if _longest_key(text) > MAX_DEPTH:  # reading it would take time by the square of its length
+            raise JobFileError([f"{path.name}: nested too deeply"])
         document = tomllib.loads(text)
         if _depth(document) > MAX_DEPTH:
             raise JobFileError([f"{path.name}: nested too deeply"])
     except tomllib.TOMLDecodeError as error:
-        raise JobFileError([_syntax_error(path, text, str(error))]) from None
+        raise JobFileError([f"{_syntax_error(path, text, str(error))}{_remedy(path)}"]) from None
     except RecursionError:
         raise JobFileError([f"{path.name}: nested too deeply"]) from None
+    except ValueError:  # of Python, which reads no whole number of that length
+        raise JobFileError(
+            [f"{path.name}: a whole number has more than {sys.get_int_max_str_digits()} digits"]
+        ) from None
     return document
+
+
+def _longest_key(text: str) -> int:
+    """Most parts of a dotted key, at least: texts and comments do not count."""
+    bare = _TEXT_OR_COMMENT.sub(lambda found: "" if found[0].startswith("#") else "_", text)
+    return max(piece.count(".") + 1 for piece in _BETWEEN_KEYS.split(bare))
+
+
+def _remedy(path: Path) -> str:
+    """How to get back the damaged job file of a job's folder, if texts of earlier runs are kept there."""
+    layout = JobLayout(path.parent)
+    if path.name != layout.job_file.name:
+        return ""
+    texts = [each for each in layout.job_text("").parent.glob("*.toml") if _DIGEST.fullmatch(each.stem)]
+    if not texts:
+        return ""
+    latest = max(texts, key=lambda each: each.stat().st_mtime)
+    return f"; that of its last run is kept: cp {shlex.quote(str(latest))} {shlex.quote(str(path))}"
 
 
 def _depth(document: Any) -> int:

@@ -30,7 +30,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import ConfigDict, Field, TypeAdapter
 
 from pipeline.base.errors import NO_LOCKS, PipelineError
-from pipeline.base.files import replace_durably, sync
+from pipeline.base.files import holds, replace_durably, sync
 from pipeline.base.layout import JobLayout
 
 MAX_ENTRY_BYTES = 40 * 2**20
@@ -267,7 +267,8 @@ class JobQueue:
                 old = None  # it is replaced by a good one
             if old is not None and new.text is None:
                 new = replace(new, text=old.text)  # a version that waits to be taken over stays the newest
-            if old is not None and old.text is None and new.text == self._text_in_folder(new.name):
+            is_known = new.text is not None and holds(self.layout(new.name).job_file, new.text)
+            if old is not None and old.text is None and is_known:
                 new = replace(new, text=None)
             if old is not None and old.desired is Desired.RUN:
                 new = replace(new, submitted=old.submitted, background=new.background or old.background)
@@ -293,11 +294,6 @@ class JobQueue:
         with self.locked():  # so nobody is writing
             for path in self._entries.glob(".*.part.*"):
                 path.unlink()
-
-    def _text_in_folder(self, name: str) -> str | None:
-        """The job file that the last run left in the job's folder; None if there is none."""
-        path = self.layout(name).job_file
-        return path.read_text(encoding="utf-8") if path.exists() else None
 
     @property
     def _entries(self) -> Path:

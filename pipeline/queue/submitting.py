@@ -10,7 +10,9 @@ import click
 
 from pipeline.base import wording
 from pipeline.base.errors import DiskFullError, MissingInputError, OutdatedManifestError, PipelineError
+from pipeline.base.files import holds
 from pipeline.base.layout import JobLayout
+from pipeline.base.places import check_places
 from pipeline.base.wording import print_warnings
 from pipeline.run.executors.choice import ExecutorChoice, require_named_devices, require_possible
 from pipeline.run.executors.failures import is_disk_full
@@ -75,7 +77,8 @@ def run(
         until: the stages after which it ends; empty: the film.
 
     Raises:
-        PipelineError: the folder cannot be written to, the record is damaged, or there is nothing such to run again.
+        PipelineError: the folder cannot be written to, something is in the place of a part of it, the record is
+            damaged, or there is nothing such to run again.
         StageUnavailableError: a stage that has to run cannot run on this machine.
         JobBusyError: the job is being run by another process, and something is to run again.
     """
@@ -93,6 +96,7 @@ def run(
             raise click.UsageError("--cores is for this machine; on a cluster the workers' tags say what they offer")
         require_named_devices(job, todo)
     _make_folder(layout)
+    check_places(layout)
     queue = JobQueue.of(layout)
     name = checked_name(layout.root.absolute().name)
     if job.recorded is not None and queue.find(name) is None:
@@ -160,7 +164,7 @@ def is_finished(state: JobAssessment | None, layout: JobLayout, text: str | None
     return (
         state is not None
         and state.at_rest
-        and (text is None or (layout.job_file.exists() and text == layout.job_file.read_text(encoding="utf-8")))
+        and (text is None or holds(layout.job_file, text))
         and read_goal(layout) == tuple(until)
         and JobQueue.of(layout).find(layout.root.absolute().name) is None
     )

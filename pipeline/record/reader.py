@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Self
 from pipeline.base.errors import ManifestError, OutdatedManifestError
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.paused_gc import many_objects
+from pipeline.base.places import is_inside
 from pipeline.base.task import ArtifactPath, TaskId, TaskState
 from pipeline.record.migrations import migrations, refuse_newer, schema_version
 
@@ -197,7 +198,11 @@ class ManifestReader:
     def artifacts(self) -> dict[ArtifactPath, ArtifactRow]:
         """Every artifact on record."""
         with many_objects():
-            return {row.artifact: row for row in map(ArtifactRow._make, self._rows("SELECT * FROM artifact"))}
+            rows = {row.artifact: row for row in map(ArtifactRow._make, self._rows("SELECT * FROM artifact"))}
+        for artifact in rows:
+            if not is_inside(artifact):
+                raise damaged(self._path, f"it speaks of a file outside the folder: {artifact!a:.200}")
+        return rows
 
     def is_at_rest(self, tasks: int) -> bool:
         """Whether the last run ended well and cleanly, with this number of tasks, and nothing was started since."""

@@ -11,6 +11,7 @@ from pipeline.base.errors import PipelineError
 from pipeline.base.files import replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import digest_of
+from pipeline.base.places import check_places
 from pipeline.base.task import ArtifactPath, FailureKind, TaskState
 from pipeline.base.wording import counted
 from pipeline.record.manifest import Manifest, artifact_row
@@ -210,24 +211,27 @@ def _move_aside(manifest: Path) -> Path | None:
 
 
 def flaws_of(layout: JobLayout, *, deep: bool) -> tuple[int, dict[str, str]]:
-    """How many files of a job were checked, and what is wrong with which; `deep` compares contents."""
+    """How many files of a job were checked, and what is wrong with which; `deep` compares contents.
+
+    Raises PipelineError: something is in the place of a file or a folder of the job.
+    """
     flaws: dict[str, str] = {}
-    seen = {}
-    for receipt in receipts(layout):
-        flaw = verify_artifact(layout, receipt, deep=deep)
-        if flaw is not None:
-            flaws[receipt.artifact] = flaw
-        seen[receipt.artifact] = artifact_row(receipt)
+    committed = {receipt.artifact: receipt for receipt in receipts(layout)}
+    rows: dict[ArtifactPath, ArtifactRow] = {}
     if layout.manifest.exists():
         with ManifestReader.open_readonly(layout.manifest) as manifest:
             rows = manifest.artifacts()
-        for artifact, row in rows.items():
-            if artifact not in seen:
-                flaws.setdefault(artifact, "its receipt is missing or damaged")
-            elif deep and seen[artifact]._replace(mtime_ns=row.mtime_ns) != row:
-                flaws.setdefault(artifact, "the record says something else than its receipt")
-        seen.update(rows)
-    return len(seen), flaws
+    check_places(layout, committed.keys() | rows.keys())
+    for artifact, receipt in committed.items():
+        flaw = verify_artifact(layout, receipt, deep=deep)
+        if flaw is not None:
+            flaws[artifact] = flaw
+    for artifact, row in rows.items():
+        if artifact not in committed:
+            flaws.setdefault(artifact, "its receipt is missing or damaged")
+        elif deep and artifact_row(committed[artifact])._replace(mtime_ns=row.mtime_ns) != row:
+            flaws.setdefault(artifact, "the record says something else than its receipt")
+    return len(committed.keys() | rows.keys()), flaws
 
 
 def restore_text(layout: JobLayout, path: Path) -> bool:
@@ -238,7 +242,7 @@ def restore_text(layout: JobLayout, path: Path) -> bool:
             parameters = manifest.parameters(path.stem)
         text = None if parameters is None else parameters.canonical
     elif layout.job_file.exists():
-        text = layout.job_file.read_text(encoding="utf-8")
+        text = layout.job_file.read_bytes().decode(errors="replace")  # that of a damaged one has another digest
     path.unlink()
     if text is None or digest_of(text) != path.stem:
         return False

@@ -8,10 +8,12 @@ from pathlib import Path
 
 from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
-from pipeline.base.task import TaskId
+from pipeline.base.places import check_places
+from pipeline.base.task import ArtifactPath, TaskId
 from pipeline.job.loading import load_job
 from pipeline.record.manifest import Manifest
 from pipeline.run.plan import plan_job
+from pipeline.store.receipts import FILE_IS_MISSING, read_receipt, verify_artifact
 
 
 def remove_contents(layout: JobLayout, is_meant: Callable[[list[Path]], bool]) -> None:
@@ -36,10 +38,14 @@ class Choice:
     age_s: float | None
 
 
-def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Path]], bool]) -> None:
+def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Path]], bool]) -> dict[ArtifactPath, str]:
     """Remove files of a job by choice, with their receipts and rows; see `remove_contents`.
 
-    Raises PipelineError: there is no such stage, or its files could never be made anew.
+    Returns:
+        Artifacts that stay, because their files are not what was committed, each with what is wrong.
+
+    Raises PipelineError: there is no such stage, its files could never be made anew, or something is in the place of a
+        file or a folder of the job.
     """
     from pipeline.stages import STAGES
 
@@ -56,9 +62,11 @@ def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Pa
     planned = {output for task in tasks for output in task.outputs}
     theirs = {task.id for task in tasks if task.stage in choice.stages}
     with Manifest(layout.manifest) as manifest:
+        rows = manifest.artifacts()
+        check_places(layout, rows)
         artifacts = [
             artifact
-            for artifact, row in manifest.artifacts().items()
+            for artifact, row in rows.items()
             if row.task in theirs
             or row.task.split("/")[0] in choice.stages
             or (choice.superseded and artifact not in planned and (job.recorded is None or row.task != "simulate"))
@@ -72,13 +80,17 @@ def remove_chosen(layout: JobLayout, choice: Choice, is_meant: Callable[[list[Pa
             before = time.time() - choice.age_s
             artifacts = [artifact for artifact in artifacts if _is_older(layout.path(artifact), before)]
             others = [path for path in others if _is_older(path, before)]
+        flaws = {each: verify_artifact(layout, read_receipt(layout, each) or rows[each]) for each in artifacts}
+        edited = {each: flaw for each, flaw in flaws.items() if flaw is not None and flaw != FILE_IS_MISSING}
+        artifacts = [artifact for artifact in artifacts if artifact not in edited]
         files = [*map(layout.path, artifacts), *others]
         if not is_meant(files):
-            return
+            return edited
         # Receipts go first: a file without one does not count, a receipt without its file would be a claim.
         for path in [*map(layout.receipt, artifacts), *files]:
             path.unlink(missing_ok=True)
         manifest.forget_artifacts(artifacts)
+        return edited
 
 
 def superseded_logs(layout: JobLayout) -> list[Path]:

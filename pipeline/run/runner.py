@@ -12,9 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.base.errors import DiskFullError, PlanError
-from pipeline.base.files import replace_durably
+from pipeline.base.files import holds, replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
+from pipeline.base.places import check_places
 from pipeline.base.resources import machine_capacity
 from pipeline.base.task import ArtifactPath, Policy, Resources, TaskId, TaskState
 from pipeline.model.job import Job
@@ -72,6 +73,7 @@ def run_job(
         JobBusyError: another live process runs this job.
         LeaseLostError: another process took the job over, because this one did not answer for long.
         ManifestError: the record is damaged; the text says what to do.
+        PipelineError: something is in the place of a file or a folder of the job.
         PlanError: the stages' tasks do not fit together, or `rerun` names what is not there.
     """
 
@@ -84,11 +86,13 @@ def run_job(
     began = time.monotonic()
     remove_folders_of_the_dead()
     layout.root.mkdir(parents=True, exist_ok=True)
+    check_places(layout)
     with Lease.acquire(layout.lease) as lease, Manifest(layout.manifest) as manifest, control.on_signals():
         if job_text is not None:
             _write_job_file(layout, job_text)
         # What is refused here was no run: the record goes on saying how the last one ended.
         tasks = plan_job(job, layout, load_stages(stages), until)
+        check_places(layout, (artifact for task in tasks for artifact in task.outputs))
         forced = frozenset[TaskId]() if rerun is None else rerun.of(tasks)
         write_goal(layout, until)
         clean = manifest.begin_run(job.name, run=lease.holder.token)
@@ -259,6 +263,5 @@ class _Run:
 
 def _write_job_file(layout: JobLayout, text: str) -> None:
     """Replace the job's own copy of its file, at once as a whole; left alone if nothing changed."""
-    if layout.job_file.exists() and layout.job_file.read_text(encoding="utf-8") == text:
-        return
-    replace_durably(layout.job_file, text)
+    if not holds(layout.job_file, text):
+        replace_durably(layout.job_file, text)

@@ -11,6 +11,7 @@ from itertools import count
 
 from pipeline.base.errors import PipelineError
 from pipeline.base.layout import JobLayout
+from pipeline.base.places import check_places
 from pipeline.base.resources import claim
 from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, task_fingerprint
 from pipeline.model.job import Job
@@ -67,8 +68,9 @@ def run_tasks(
     What else they read is in the job's folder. `tell` takes the share that is done, 0 to 1, and a sentence. Once
     `stop_requested` says so a task writes a checkpoint, and no other one follows.
 
-    Raises PipelineError: an input is not there.
+    Raises PipelineError: an input is not there, or something is in the place of a file or a folder of the job.
     """
+    check_places(layout, (artifact for task in todo for artifact in task.outputs))
     ran, up_to_date, failures = 0, 0, list[Failed]()
     for index, task in enumerate(todo):
         assignment = _assignment(task, layout, capacity=capacity, stages=stages)

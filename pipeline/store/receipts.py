@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from blake3 import blake3
 
@@ -89,7 +89,30 @@ def read_receipt(layout: JobLayout, artifact: ArtifactPath) -> Receipt | None:
     return receipt if receipt is not None and receipt.artifact == artifact else None
 
 
-def verify_artifact(layout: JobLayout, receipt: Receipt, *, deep: bool = False) -> str | None:
+class Described(Protocol):
+    """What says which bytes an artifact has: its receipt, or its row of the manifest."""
+
+    @property
+    def artifact(self) -> ArtifactPath:
+        """Its path relative to the job's folder."""
+
+    @property
+    def size(self) -> int:
+        """Of the file [bytes]."""
+
+    @property
+    def mtime_ns(self) -> int:
+        """Modification time [ns since the epoch]."""
+
+    @property
+    def hash(self) -> str:
+        """blake3 of the bytes, in hexadecimal."""
+
+
+FILE_IS_MISSING = "file is missing"
+
+
+def verify_artifact(layout: JobLayout, receipt: Described, *, deep: bool = False) -> str | None:
     """Fault of a file by its receipt, a sentence; None if it is as it was committed.
 
     `deep`: hash the bytes even if size and modification time are the recorded ones.
@@ -98,7 +121,7 @@ def verify_artifact(layout: JobLayout, receipt: Receipt, *, deep: bool = False) 
     try:
         status = path.stat()
     except (FileNotFoundError, NotADirectoryError):
-        return "file is missing"
+        return FILE_IS_MISSING
     if status.st_size != receipt.size:
         return f"file was edited or truncated: size {status.st_size}, receipt says {receipt.size}"
     if not deep and status.st_mtime_ns == receipt.mtime_ns:

@@ -141,6 +141,8 @@ def _read_kind(content: bytes, kind: str) -> tuple[Points, NDArray[np.int64]]:
         return read_obj(_obj_text(content))[:2]
     # Texture coordinates of a PLY would split its vertices.
     mesh = _load(content, kind, **({"fix_texture": False} if kind == "ply" else {})).to_mesh()
+    if kind == "ply" and len(mesh.faces) < (announced := _ply_header(content)[1].get("face", 0)):
+        raise ValueError(f"{announced} faces are announced, {len(mesh.faces)} are there")
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
 
 
@@ -152,7 +154,29 @@ def _load(content: bytes, kind: str, **options: Any) -> Any:
     """The scene in the bytes alone: given the path, trimesh would follow references to files beside it."""
     import trimesh
 
+    if kind == "ply":
+        header, counts = _ply_header(content)
+        body = content[len(header) :]
+        if sum(counts.values()) > len(body):
+            told = ", ".join(f"{count} of {name}" for name, count in counts.items())
+            raise ValueError(f"its header announces {told}, in {len(body)} bytes")
+        # A comment may name a picture, which is not read here.
+        comments = (b"comment", b"obj_info")
+        content = b"".join(line for line in header.splitlines(keepends=True) if not line.startswith(comments)) + body
     return trimesh.load_scene(BytesIO(content), file_type=kind, process=False, **options)
+
+
+def _ply_header(content: bytes) -> tuple[bytes, dict[str, int]]:
+    """The header of a PLY up to its last line, and how many of each element it announces.
+
+    Raises ValueError: it has no end, or a number that is none.
+    """
+    header = content[: content.index(b"end_header")]
+    words = (line.split() for line in header.splitlines())
+    counts = {each[1].decode(errors="replace"): int(each[2]) for each in words if each[:1] == [b"element"]}
+    if any(count < 0 for count in counts.values()):
+        raise ValueError("its header announces less than nothing")
+    return header, counts
 
 
 def read_obj(text: str) -> tuple[Points, NDArray[np.int64], NDArray[np.float64] | None]:

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from sim.core.domain import DomainParameters
 from validation.cases import Case, Found
-from validation.checks import CaseResult, Check
-from validation.figures import THEORY, TITLES, label_axes, make_panels, style_of
+from validation.checks import TITLES, CaseResult, Check
+from validation.figures import THEORY, label_axes, make_panels, style_of
 from validation.scenes import GRAVITY, lattice, make_fluid, recorded, state_of
 
 REFERENCE = Path(__file__).resolve().parents[2] / "tests" / "reference" / "dam_break_front.csv"

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from validation.cases import Case, Found
-from validation.checks import CaseResult, Check, fitted_order, order_of_differences
-from validation.figures import COLOURS, TITLES, draw_refinement, label_axes, make_panels, plot_each, style_of
+from validation.checks import TITLES, CaseResult, Check, fitted_order, order_of_differences
+from validation.figures import COLOURS, draw_refinement, label_axes, make_panels, plot_each, style_of
 from validation.smoke_boxes import (
     Advection,
     Array,

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from sim.fluid.wcsph import WCSPHSolver
 from validation.cases import Case, Found
 from validation.checks import CaseResult, Check
 from validation.figures import COLOURS, THEORY, label_axes, make_panels, style_of
@@ -114,7 +115,7 @@ def release_often(solver: str, radius: float, moments: int) -> Experiment:
         forces.append(impulse[0] / (INTERVAL * mass * GRAVITY))
     mean = np.mean(forces, axis=0)
     # Sound that is sent out by a sphere that starts dies down to a tenth in this time.
-    sound_delay = 2.0 * radius / held.fluid.sound_speed if solver == "wcsph" else 0.0
+    sound_delay = 2.0 * radius / held.fluid.sound_speed if isinstance(held.fluid, WCSPHSolver) else 0.0
     return Experiment(
         times=times,
         held=np.array(pushes),
