@@ -34,8 +34,8 @@ NOISE = 0.03
 TIMES = ("_s", "_ms", "_us", "_per_frame", "_bare", "[ms]", "plan", "nothing to do", "submit", "status", "command")
 """How the names of numbers end that are times."""
 
-OF_THE_SCENE = ("dt_s", "simulated_s", "building_s", "first_step_s")
-"""How the names of those end that are no times of the program, or are mostly those of compiling kernels."""
+OF_THE_SCENE = ("dt_s", "simulated_s", "building_s", "first_step_s", "_per_s", "_per_core_s")
+"""How the names of those end that are no times of the program, are rates, or mostly the compiling of kernels."""
 
 Numbers = dict[str, float]
 

@@ -32,11 +32,12 @@ def check_places(layout: JobLayout, artifacts: Iterable[ArtifactPath] = ()) -> N
     folders = [layout.receipts, layout.job_text("").parent, layout.parameters_text("").parent, layout.logs_folder]
     folders += [layout.preview_scratch, layout.stills, layout.inputs, layout.checkpoints]
     folders += [layout.rejected_picture(0).parent]
-    names: dict[Path, set[str]] = defaultdict(set)
+    by_folder: dict[str, set[str]] = defaultdict(set)
     for artifact in artifacts:
-        parent, _, name = artifact.rpartition("/")
-        names[layout.root / parent].add(name)
-        names[layout.receipts / parent].add(f"{name}.json")
+        folder, _, name = artifact.rpartition("/")
+        by_folder[folder].add(name)
+    names = {layout.root / folder: own for folder, own in by_folder.items()}
+    names |= {layout.receipts / folder: {f"{name}.json" for name in own} for folder, own in by_folder.items()}
     faults = list(_faults(layout.root, files, {*folders, *names} - {layout.root}, names))
     if faults:
         more = [f"and {len(faults) - _MOST_TOLD} more"] if len(faults) > _MOST_TOLD else []

@@ -4,13 +4,12 @@ import time
 
 import click
 
-from pipeline.base.errors import OutdatedManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import busy_error, live_holder
 from pipeline.base.task import TaskState
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob
 from pipeline.queue.states import ending_of
-from pipeline.record.reader import LastRun, ManifestReader, StageSummary, done_and_total
+from pipeline.record.reader import LastRun, StageSummary, done_and_total, record_of
 from pipeline.run.events import JobOutcome
 from pipeline.run.goal import what_is_made
 from pipeline.run.progress import Display, StageProgress, open_display
@@ -166,17 +165,6 @@ def _say_preview_movie(display: Display, layout: JobLayout) -> bool:
         return False
     display.say(f"the preview movie, made anew now and then: {layout.preview_movie}")
     return True
-
-
-def record_of(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:
-    """Counts by stage and the last run; nothing while the runner is still making its manifest, or renewing it."""
-    if not layout.manifest.exists():
-        return [], LastRun(None, None)
-    try:
-        with ManifestReader.open_readonly(layout.manifest) as manifest:
-            return manifest.summary(), manifest.last_run()
-    except OutdatedManifestError:
-        return [], LastRun(None, None)
 
 
 def _update(stages: dict[str, StageProgress], summary: list[StageSummary]) -> None:

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from pipeline.base.errors import ManifestError, OutdatedManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import live_holder
-from pipeline.queue.following import record_of
 from pipeline.queue.job_queue import JobQueue, QueuedJob
 from pipeline.queue.states import JobState, state_after, state_of
-from pipeline.record.reader import LastRun, ManifestReader, done_and_total
+from pipeline.record.reader import LastRun, ManifestReader, done_and_total, record_of
 from pipeline.store.artifacts import holds_frames
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from pipeline.base.errors import ManifestError, OutdatedManifestError
+from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.paused_gc import many_objects
 from pipeline.base.places import is_inside
@@ -397,6 +398,17 @@ class ManifestReader:
         """All rows of a query. Damage shows only at the page that it hit, so they are fetched here, under one roof."""
         with clear_errors(self._path, "read"):
             return self._connection.execute(query, parameters).fetchall()
+
+
+def record_of(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:
+    """Counts by stage and the last run; nothing while the runner is still making its manifest, or renewing it."""
+    if not layout.manifest.exists():
+        return [], LastRun(None, None)
+    try:
+        with ManifestReader.open_readonly(layout.manifest) as manifest:
+            return manifest.summary(), manifest.last_run()
+    except OutdatedManifestError:
+        return [], LastRun(None, None)
 
 
 def _has_log_format(path: Path) -> bool:

@@ -3,11 +3,13 @@
 The same arrays give the same bytes: HDF5 stores no times here, and groups and attributes are written in a fixed order.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import h5py
 import numpy as np
@@ -15,13 +17,14 @@ from blake3 import blake3
 from numpy.typing import NDArray
 
 from pipeline.base.errors import InvalidArtifactError
-from pipeline.kinds.base import Codec
 from pipeline.kinds.smoke_codec import read_density
 from pipeline.kinds.stored_arrays import read_array, write_array
-from pipeline.kinds.table import KINDS
 from sim.core.snapshots import Attribute, Snapshot
 from sim.core.solver import Diagnostics
 from sim.core.world import FrameReport
+
+if TYPE_CHECKING:
+    from pipeline.kinds.base import Codec
 
 FRAME_FORMAT = "physics-pipeline frame"
 CHECKPOINT_FORMAT = "physics-pipeline checkpoint"
@@ -267,6 +270,8 @@ def _read_body(group: h5py.Group) -> Snapshot:
 
 
 def _codec_of(kind: str) -> Codec | None:
+    from pipeline.kinds.table import KINDS  # a few numbers, as `status` reads them, are read without all models
+
     row = KINDS.get(kind)
     return None if row is None or row.codec is None else row.codec()
 

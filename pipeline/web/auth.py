@@ -13,6 +13,7 @@ import hmac
 import ipaddress
 import math
 import os
+import re
 import secrets
 import shlex
 import socket
@@ -61,6 +62,9 @@ HEADERS = {
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
     "cache-control": "no-store",
 }
+
+_HOST = re.compile(r"(?:\[(?P<address>[0-9a-f:.]+)\]|(?P<name>[a-z0-9._-]+))(?::[0-9]{1,5})?")
+"""RFC 9110, 7.2, without user names and escapes, which no address of ours has."""
 
 Refuse = Callable[[Request, int, str], Response]
 
@@ -157,11 +161,9 @@ def _bits(token: str) -> float:
 
 
 def host_of(header: str) -> str:
-    """The name in a Host header, without its port and without brackets, in lower case."""
-    name = header.strip().lower()
-    if name.startswith("["):
-        return name[1:].partition("]")[0]
-    return name.partition(":")[0] if name.count(":") == 1 else name
+    """The name in a Host header, without its port and without brackets, in lower case; "" if it is no such header."""
+    found = _HOST.fullmatch(header.strip().lower())
+    return (found["address"] or found["name"]) if found else ""
 
 
 def is_address(name: str) -> bool:
@@ -224,10 +226,8 @@ class Gate:
     async def _decide(self, request: Request) -> tuple[ASGIApp, str | None]:
         """Application that answers a request, and the cookie of a new session, if it begins one."""
         access = self._access
-        if not access.knows_host(request.headers.get("host", "")):
-            return self._refuse(request, 421, "this address is not the dashboard's; use the one that it printed"), None
-        if request.method == "POST" and not _is_own(request):
-            return self._refuse(request, 403, "this was not sent by a page of the dashboard"), None
+        if (refusal := _refusal(request, access)) is not None:
+            return self._refuse(request, *refusal), None
         path = request.scope["path"]  # as routed; that of `request.url` depends on the Host header, too
         if path.startswith("/static/"):  # the same for everybody
             return self._app, None
@@ -255,6 +255,17 @@ class Gate:
             session = access.session(cookie)
         request.scope["session"] = session
         return self._app, cookie
+
+
+def _refusal(request: Request, access: Access) -> tuple[int, str] | None:
+    """Status and sentence for a request that does not come from a page of ours; None for one that may."""
+    if "content-length" in request.headers and "transfer-encoding" in request.headers:
+        return 400, "a request has one length: of two, a proxy in between may read the other"
+    if not access.knows_host(request.headers.get("host", "")):
+        return 421, "this address is not the dashboard's; use the one that it printed"
+    if request.method == "POST" and not _is_own(request):
+        return 403, "this was not sent by a page of the dashboard"
+    return None
 
 
 async def form_of(request: Request) -> dict[str, str]:

@@ -19,8 +19,9 @@ import ipaddress
 import logging
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from operator import attrgetter
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 LOCAL = "127.0.0.1"
 GRACE_S = 2  # that an answer may still take once the end is asked for; a film that is played would take for ever
 MOST_CONNECTIONS = 512
+MOST_OF_ADDRESS = 64  # connections; browsers open six
 REQUEST_S = 10.0  # in which a request must be in; ours are a few KB
 
 _OPENING = threading.Lock()
@@ -132,14 +134,25 @@ def config_of(application: ASGIApp) -> uvicorn.Config:
 
 
 class Connection(H11Protocol):
-    """A connection that is closed when a request does not come to its end, so that none is held open for nothing."""
+    """A connection that is closed when a request does not come to its end, so that none is held open for nothing.
+
+    Nor do many that wait keep others out: where there are too many of an address, or of all, the oldest that waits for
+    a request is closed for the newest.
+    """
 
     _patience: asyncio.TimerHandle | None = None
+    _made_s = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first request."""
         super().connection_made(transport)
+        self._made_s = self.loop.time()
         self._wait_or_not()
+        there = [each for each in self.connections if isinstance(each, Connection) and not each.transport.is_closing()]
+        for crowd, most in ((self._of_same_address(there), MOST_OF_ADDRESS), (there, MOST_CONNECTIONS - 1)):
+            waiting = [each for each in crowd if each._waits]
+            if len(crowd) > most and waiting:
+                min(waiting, key=attrgetter("_made_s")).transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """Take a piece of a request; the time counts from its first piece, or from the connection's beginning."""
@@ -151,8 +164,17 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
         self._stop_waiting()
 
+    def _of_same_address(self, others: Sequence[Connection]) -> list[Connection]:
+        """Those of the same machine; of IPv6 those of its network."""
+        return [each for each in others if _network_of(each.client) == _network_of(self.client)]
+
+    @property
+    def _waits(self) -> bool:
+        """Whether no request has come yet, or not to its end."""
+        return self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
+
     def _wait_or_not(self) -> None:
-        if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
+        if not self._waits:
             self._stop_waiting()
         elif self._patience is None:
             self._patience = self.loop.call_later(REQUEST_S, self.transport.close)
@@ -161,6 +183,14 @@ class Connection(H11Protocol):
         if self._patience is not None:
             self._patience.cancel()
             self._patience = None
+
+
+def _network_of(client: tuple[str, int] | None) -> str:
+    """The IPv4 address of a client, or the /64 of its IPv6 address, of which any machine has all."""
+    if client is None or ":" not in client[0]:
+        return client[0] if client else ""
+    address = ipaddress.IPv6Address(client[0].partition("%")[0])
+    return str(address.ipv4_mapped or ipaddress.IPv6Network((address, 64), strict=False))
 
 
 class Server(uvicorn.Server):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from command_line import pipeline
+from farm_processes import Farm
 from synthetic_jobs import contents, run_synthetic
 
 from pipeline.base.layout import JobLayout
@@ -68,3 +69,46 @@ def test_clean_of_a_stage_removes_its_files_and_receipts(layout: JobLayout, monk
     assert not layout.receipt(ArtifactPath("double/000000.bin")).exists()
     verified = pipeline("verify", layout.root)
     assert (verified.exit_code, verified.stdout[:15]) == (0, "7 files checked")
+
+
+def test_files_that_were_edited_stay_when_their_stage_is_cleaned(
+    layout: JobLayout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import synthetic_stages
+
+    monkeypatch.setattr("pipeline.stages.STAGES", synthetic_stages.STAGES)
+    edited = ArtifactPath("double/000002.bin")
+    layout.path(edited).write_text("edited by hand")
+    cleaned = pipeline("clean", layout.root, "--stage", "double", "--yes")
+    assert "removing 5 files" in cleaned.output
+    assert f"{edited} stays: file was edited" in cleaned.output
+    assert layout.path(edited).read_text() == "edited by hand"
+    assert layout.receipt(edited).exists()
+
+
+def test_a_damaged_job_file_of_the_folder_is_replaced_by_the_one_that_is_submitted(tmp_path: Path) -> None:
+    farm = Farm(tmp_path)
+    farm.job("film", frames=2)
+    layout = farm.layout("film")
+    farm.run("submit", "film.toml", "--executor", "inline")
+    whole = layout.job_file.read_bytes()
+    layout.job_file.write_bytes(bytes([whole[0] ^ 0x80]) + whole[1:])
+    refused = farm.run("resume", "film", "--executor", "inline", code=2)
+    assert "not UTF-8 text (byte 0 is" in refused.err
+    remedy = shlex.split(refused.err.strip().partition("is kept: ")[2])
+    assert farm.run("verify", "film", "--deep").code == 0
+    farm.run("submit", "film.toml", "--executor", "inline")
+    assert layout.job_file.read_bytes() == Path(remedy[1]).read_bytes() == whole
+    farm.close()
+
+
+@pytest.mark.parametrize("content", [b"", b"garbled", b"SQLite format 3\0" + bytes(4080)])
+def test_a_garbled_manifest_is_told_with_the_remedy(layout: JobLayout, content: bytes) -> None:
+    for other in layout.root.glob("manifest.db-*"):
+        other.unlink()
+    layout.manifest.write_bytes(content)
+    refused = pipeline("submit", layout.job_file, "--output", layout.root.parent)
+    assert (refused.exit_code, "Traceback" in refused.output) == (1, False)
+    assert "manifest.db is damaged" in refused.stderr
+    remedy = shlex.split(refused.stderr.strip().rpartition("with: pipeline ")[2])
+    assert "made of 13 receipts" in pipeline(*remedy).output

@@ -1,6 +1,7 @@
 """Job files that are wrong, and the lines that say so; and that nothing but such lines ever comes out."""
 
 import random
+import shlex
 import tomllib
 from pathlib import Path
 from typing import get_args
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from places import PROJECT
 
 from pipeline.base.errors import JobFileError
+from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job, read_job
 from pipeline.job.starter import TEMPLATES, starter
 from pipeline.model.job import Job
@@ -101,10 +103,40 @@ def test_what_is_wrong_in_a_job_file_is_told_in_one_line(text, tmp_path):
         ('name = "dam"\nduration = 1e300', "duration of 1e+300 s at 60 fps is more than 1,000,000 frames"),
         ('name = "dam"\nframes = 3\nduration = 1', "give frames or duration, not both"),
         ("a = " + "[" * 3000 + "]" * 3000, "nested too deeply"),
+        pytest.param(".".join("a" * 100_000) + " = 1", "nested too deeply", id="dotted key"),
+        pytest.param(f"frames = {'9' * 6000}", "a whole number has more than 4300 digits", id="6000 digits"),
     ],
 )
 def test_what_is_wrong_with_the_whole_job_is_told_without_a_line(text, expected, tmp_path):
     assert problems_of(text, tmp_path) == [f"dam.toml: {expected}"]
+
+
+def test_dots_in_texts_and_comments_are_no_depth(tmp_path):
+    dots = "." * 100
+    comments = f"# {dots} don't\nname = \"dam\" # 'it's {dots}\n"
+    (problem,) = problems_of(f'{comments}[material]\nwall = \'{dots}\'\nb = """\n\\"{dots}"""\n', tmp_path)[:1]
+    assert "nested" not in problem
+
+
+def test_a_large_value_of_an_unknown_key_is_told_at_once(tmp_path):
+    (problem,) = problems_of(f'name = "dam"\nwhat = [{"1, " * 300_000}]', tmp_path)
+    assert problem.startswith('dam.toml:2 what: unknown key "what"')
+    (problem,) = problems_of(f'name = "dam"\nwhat = [{"1, " * 2_000_000}]', tmp_path)
+    assert problem.endswith("6 MB is not a job file; a few KB are usual")
+
+
+def test_the_job_file_of_a_folder_that_was_damaged_is_told_with_that_of_its_last_run(tmp_path):
+    layout = JobLayout(tmp_path)
+    layout.job_text("0" * 64).parent.mkdir(parents=True)
+    layout.job_text("0" * 64).write_text('name = "dam"')
+    (tmp_path / ".provenance" / "jobs" / "$(x).toml").write_text("somebody's")
+    for damage in (b'name = "d\xe1m"', b'name ? "dam"'):
+        layout.job_file.write_bytes(damage)
+        with pytest.raises(JobFileError) as error:
+            read_job(layout.job_file)
+        (problem,) = error.value.problems
+        remedy = shlex.split(problem.partition("is kept: ")[2])
+        assert remedy == ["cp", str(layout.job_text("0" * 64)), str(layout.job_file)]
 
 
 def test_a_name_that_is_no_file_name_is_told_with_the_rule(tmp_path):

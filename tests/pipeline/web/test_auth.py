@@ -15,7 +15,8 @@ from pipeline.web.auth import Access, access_of, host_of
 
 @pytest.mark.parametrize(
     ("header", "name"),
-    [("a.b:1", "a.b"), ("A.B", "a.b"), ("[::1]:80", "::1"), ("[::1]", "::1"), ("::1", "::1"), ("", "")],
+    [("a.b:1", "a.b"), ("A.B", "a.b"), ("[::1]:80", "::1"), ("[::1]", "::1"), ("", "")]
+    + [(odd, "") for odd in ("::1", "127.0.0.1:80@evil", "a@127.0.0.1", "127.0.0.1/", "[::1]evil", "a:b", "a:1:2")],
 )
 def test_hosts_are_read_from_headers(header: str, name: str) -> None:
     assert host_of(header) == name

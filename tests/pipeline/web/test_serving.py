@@ -203,6 +203,45 @@ def test_a_name_that_stands_for_the_loopback_is_remarked_on() -> None:
         assert remark_of(listening, "studio-3") == ""
 
 
+def test_many_connections_that_say_nothing_keep_nobody_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.web.serving.MOST_OF_ADDRESS", 8)
+    monkeypatch.setattr("pipeline.web.serving.MOST_CONNECTIONS", 20)
+
+    async def answer(_scope: Scope, _receive: Receive, send: Send) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"2")]})
+        await send({"type": "http.response.body", "body": b"ok"})
+
+    async def try_all() -> list[bytes]:
+        config = config_of(answer)
+        config.load()
+        protocol, state, loop = config.http_protocol_class, ServerState(), asyncio.get_running_loop()
+        server = await loop.create_server(
+            lambda: protocol(config=config, server_state=state, app_state={}), "127.0.0.1", 0
+        )
+        port = server.sockets[0].getsockname()[1]
+        silent = [
+            await asyncio.open_connection("127.0.0.1", port, local_addr=(f"127.0.0.{host}", 0))
+            for host in (1, 2, 3, 4)
+            for _ in range(12)
+        ]
+        assert len(state.connections) <= 20
+
+        async def asked(host: int) -> bytes:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(f"127.0.0.{host}", 0))
+            writer.write(b"GET / HTTP/1.1\r\nHost: a\r\nConnection: close\r\n\r\n")
+            said = await asyncio.wait_for(reader.read(), 4.0)
+            writer.close()
+            return said
+
+        said = [await asked(host) for host in (1, 9)]
+        for _, writer in silent:
+            writer.close()
+        server.close()
+        return said
+
+    assert all(each.startswith(b"HTTP/1.1 200") for each in asyncio.run(try_all()))
+
+
 def test_a_connection_without_a_whole_request_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.web.serving.REQUEST_S", 0.3, raising=False)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from sim.shapes.mesh_file import read_triangles
-from sim.shapes.parameters import Placement
+from sim.shapes.mesh_file import read_texture_coordinates, read_triangles
+from sim.shapes.parameters import MeshShape, Placement
 from sim.shapes.placement import build_solid
 from sim.shapes.solid import ShapeError
 
@@ -138,6 +138,29 @@ def test_texture_coordinates_of_corners_do_not_renumber_a_ply(tmp_path):
     vertices, faces = read_triangles(tmp_path / "seam.ply")
     np.testing.assert_array_equal(vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     np.testing.assert_array_equal(faces, [[1, 3, 2], [0, 1, 2]])
+
+
+PLY = (
+    "ply\nformat ascii 1.0\ncomment TextureFile somebody.png\nelement vertex 4\nproperty float x\nproperty float y\n"
+    "property float z\nelement face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+)
+
+
+def test_a_ply_whose_comment_names_a_picture_is_read_without_it(tmp_path, caplog, capfd):
+    (tmp_path / "corner.ply").write_text(PLY.format(faces=4))
+    shape = MeshShape(type="mesh", file=str(tmp_path / "corner.ply"))
+    assert len(read_triangles(tmp_path / "corner.ply")[1]) == 4
+    assert read_texture_coordinates(shape) is None
+    assert caplog.records == []
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("faces", [5, 4_000_000_000, -1])
+def test_a_ply_that_has_fewer_faces_than_it_announces_is_refused(tmp_path, faces):
+    (tmp_path / "cut.ply").write_text(PLY.format(faces=faces))
+    with pytest.raises(ShapeError, match=r"cut.ply\" is not a readable PLY file"):
+        read_triangles(tmp_path / "cut.ply")
 
 
 def test_y_up_turns_the_file_upright(tmp_path):

@@ -250,11 +250,26 @@ def test_looking_leaves_no_trace_and_locks_nobody_out(farm: Farm) -> None:
 def test_requests_that_name_another_host_are_refused(farm: Farm) -> None:
     with dashboard(farm) as (client, _):
         port = client.place.partition(":")[2]
-        strangers = ("evil.example", f"evil.example:{port}", "10.0.0.7", "127.0.0.1.evil.example", "", "localhost.evil")
+        strangers = (
+            "evil.example",
+            f"evil.example:{port}",
+            f"127.0.0.1:{port}@evil.example",
+            "user@127.0.0.1",
+            "10.0.0.7",
+            "127.0.0.1.evil.example",
+            "",
+            "localhost.evil",
+        )
         for host in strangers:
             assert client.ask("/", Host=host).status in (400, 421), host
         for host in (f"localhost:{port}", f"127.0.0.1:{port}", f"[::1]:{port}"):
             assert client.ask("/", Host=host).status == 200, host
+
+
+def test_a_request_with_two_lengths_is_refused(farm: Farm) -> None:
+    with dashboard(farm) as (client, _):
+        assert client.ask("/", Content_Length="5", Transfer_Encoding="chunked").status == 400
+        assert client.ask("/").status == 200
 
 
 def test_actions_need_their_own_page_and_a_post(farm: Farm) -> None:
