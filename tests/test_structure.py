@@ -12,8 +12,8 @@ HEAVY = {"taichi", "bpy", "trimesh", "igl", "scipy", "av", "pysplashsurf", "open
 
 
 def modules_after(statement: str) -> set[str]:
-    """Top-level modules that a fresh interpreter has loaded after a statement."""
-    code = f"import sys; {statement}; print(*{{name.partition('.')[0] for name in sys.modules}})"
+    """Modules, and top-level packages, that a fresh interpreter has loaded after a statement."""
+    code = f"import sys; {statement}; print(*sys.modules, *{{name.partition('.')[0] for name in sys.modules}})"
     child = subprocess.run([sys.executable, "-c", code], cwd=PROJECT, capture_output=True, text=True, check=True)
     return set(child.stdout.split())
 
@@ -37,6 +37,12 @@ def test_import_loads_neither_physics_nor_blender(statement):
 def test_help_needs_no_arrays_and_no_tables():
     """`pipeline --help` answers at once."""
     assert modules_after("import pipeline.cli.main") & {"numpy", "rich", "h5py"} == set()
+
+
+def test_the_state_of_a_job_needs_no_models_of_kinds_and_no_progress_bars():
+    """`pipeline status` answers soon."""
+    loaded = modules_after("import pipeline.cli.main, pipeline.queue.listing, pipeline.run.solver_numbers")
+    assert loaded & {"pipeline.kinds.table", "pipeline.model.job", "rich"} == set()
 
 
 def test_import_contracts_hold():

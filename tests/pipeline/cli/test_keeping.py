@@ -98,11 +98,11 @@ def test_a_damaged_job_file_of_the_folder_is_replaced_by_the_one_that_is_submitt
     remedy = shlex.split(refused.err.strip().partition("is kept: ")[2])
     assert farm.run("verify", "film", "--deep").code == 0
     farm.run("submit", "film.toml", "--executor", "inline")
-    assert layout.job_file.read_bytes() == Path(remedy[1]).read_bytes() == whole
+    assert layout.job_file.read_bytes() == (tmp_path / remedy[1]).read_bytes() == whole
     farm.close()
 
 
-@pytest.mark.parametrize("content", [b"", b"garbled", b"SQLite format 3\0" + bytes(4080)])
+@pytest.mark.parametrize("content", [b"garbled", b"SQLite format 3\0" + bytes(4080)])
 def test_a_garbled_manifest_is_told_with_the_remedy(layout: JobLayout, content: bytes) -> None:
     for other in layout.root.glob("manifest.db-*"):
         other.unlink()
