@@ -1,7 +1,13 @@
 """Commands that control jobs which run or wait: pause, resume, cancel, priority, work."""
 
+from __future__ import annotations
+
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -20,6 +26,11 @@ from pipeline.cli.arguments import (
 )
 from pipeline.queue.submitting import QueueOptions, is_finished, look_at, run, stages_to_run
 
+if TYPE_CHECKING:
+    from pipeline.base.lease import Lease
+    from pipeline.queue.job_queue import JobQueue
+
+LOOK_INTERVAL_S = 0.5
 STOPPED_EXIT_CODE = 143  # as shells report a program that SIGTERM ended
 FAILED_EXIT_CODE = 5
 
@@ -130,7 +141,8 @@ def work(
 ) -> None:
     """Run the queue in this terminal until nothing waits in it.
 
-    `submit --detach` does this in the background. Ctrl-C, or a signal TERM, lets the running job finish what it is at
+    `submit --detach` does this in the background. Where somebody runs the queue already, this one waits, and takes
+    over if that one ends or is killed. Ctrl-C, or a signal TERM, lets the running job finish what it is at
     and leaves the rest in the queue.
 
     With a job and --stage, run just that stage, or some frames of it, without the queue: for farm managers, see
@@ -154,7 +166,6 @@ def work(
 
 
 def _run_queue(output: Path) -> None:
-    from pipeline.base.lease import Lease
     from pipeline.queue.farm import FarmRunner
     from pipeline.queue.job_queue import JobQueue
     from pipeline.queue.turns import Turns, say
@@ -162,13 +173,41 @@ def _run_queue(output: Path) -> None:
     queue = JobQueue(output.absolute())
     if not queue.folder.exists():
         raise PipelineError(f"{output} has no queue: nothing was ever submitted there")
-    with Lease.acquire(queue.lease) as lease:
+    with _lease_of(queue) as lease:
+        if lease is None:
+            click.echo("the queue is empty", err=True)
+            return
         if lease.takeover is not None:
             say(f"{lease.takeover}; its queue goes on")
         turns = Turns(queue, None)
         FarmRunner(queue, lease, turns.run, say, turns.ended, pause_on_signal=False).work()
     left = len(queue.waiting())
     click.echo(f"{left} jobs are left in the queue" if left else "the queue is empty", err=True)
+
+
+@contextmanager
+def _lease_of(queue: JobQueue) -> Iterator[Lease | None]:
+    """The lease of a queue, once nobody else runs it; None if nothing is left in it by then."""
+    from pipeline.base.errors import JobBusyError
+    from pipeline.base.lease import Lease
+    from pipeline.queue.turns import say
+
+    is_told = False
+    while True:
+        try:
+            lease = Lease.acquire(queue.lease)
+        except JobBusyError as busy:
+            if not is_told:
+                say(f"{busy}; this one takes over if that ends before the queue")
+            is_told = True
+            if not queue.waiting():
+                yield None
+                return
+            time.sleep(LOOK_INTERVAL_S)
+            continue
+        with lease:
+            yield lease
+        return
 
 
 def _run_stage(layout: JobLayout, stage: str, frames: str | None, *, cores: int | None, openjd: bool) -> None:

@@ -30,7 +30,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import ConfigDict, Field, TypeAdapter
 
 from pipeline.base.errors import NO_LOCKS, PipelineError
-from pipeline.base.files import holds, replace_durably, sync
+from pipeline.base.files import holds, open_regular, replace_durably, sync
 from pipeline.base.layout import JobLayout
 
 MAX_ENTRY_BYTES = 40 * 2**20
@@ -211,7 +211,7 @@ class JobQueue:
             known = self._read.get(name)
             if known is not None and known[0] == _version(path.stat()):
                 return known[1]
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 status = os.fstat(file.fileno())
                 content = file.read(MAX_ENTRY_BYTES + 1)
             if len(content) > MAX_ENTRY_BYTES:

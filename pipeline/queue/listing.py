@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 
-from pipeline.base.errors import ManifestError, OutdatedManifestError
+from pipeline.base.errors import OutdatedManifestError, PipelineError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import live_holder
+from pipeline.base.places import check_places
 from pipeline.queue.job_queue import JobQueue, QueuedJob
 from pipeline.queue.states import JobState, state_after, state_of
 from pipeline.record.reader import LastRun, ManifestReader, done_and_total, record_of
@@ -73,11 +74,12 @@ def _listed(layout: JobLayout, entry: QueuedJob | None, flaws: list[str]) -> Lis
     priority = None if entry is None else entry.priority
     changed = _last_change(layout) if entry is None else entry.submitted
     try:
+        check_places(layout)
         state = state_of_job(layout, entry)
         done, tasks = done_and_total(record_of(layout)[0])
     except OutdatedManifestError:  # the next run brings it up to date
         return ListedJob(name, JobState.INTERRUPTED, priority, changed, note=note)
-    except (ManifestError, OSError) as error:
+    except (PipelineError, OSError) as error:
         flaws.append(f"{name}: {error}")
         state = JobState.UNKNOWN if entry is None else state_of(entry, runs=False)
         return ListedJob(name, state, priority, changed, note=note)

@@ -13,6 +13,7 @@ from pipeline.base.lease import Lease
 from pipeline.base.resources import machine_capacity
 from pipeline.base.wording import print_warnings
 from pipeline.job.loading import job_of_text, load_job
+from pipeline.model.gpus import render_trouble, usable_gpus
 from pipeline.model.job import Job
 from pipeline.queue.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background
 from pipeline.queue.following import CTRL_C, STOPPED_FROM_ELSEWHERE, Follower
@@ -29,7 +30,6 @@ from pipeline.run.goal import read_goal, what_is_made
 from pipeline.run.progress import ProgressObserver, open_display
 from pipeline.run.runner import run_job
 from pipeline.run.solver_numbers import SolverWatch, simulation_numbers
-from pipeline.stages.gpus import render_trouble, usable_gpus
 
 GPU_TASKS = 1
 """At least one task at a time on a GPU. Whether there is one, a stage says that has to run."""

@@ -14,13 +14,13 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.places import check_places
 from pipeline.base.resources import claim
 from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, task_fingerprint
+from pipeline.model.gpus import first_gpu
 from pipeline.model.job import Job
 from pipeline.run.control import Selection
 from pipeline.run.events import Failed, Progress, TaskEvent
 from pipeline.run.executors.attempt import STAGES_REFERENCE, load_stages, run_attempt
 from pipeline.run.executors.base import Assignment
 from pipeline.run.plan import plan_job
-from pipeline.stages.gpus import first_gpu
 from pipeline.store.receipts import Receipt, is_committed, read_receipt, verify_artifact
 
 _STOPS = frozenset({FailureKind.DISK_FULL, FailureKind.CANCELLED})

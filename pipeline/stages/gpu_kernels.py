@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.base.parameter_set import digest_of
-from pipeline.stages.gpus import driver_version
+from pipeline.model.gpus import driver_version
 from sim.core.runtime import cache_folder
 
 

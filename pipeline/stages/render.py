@@ -13,11 +13,11 @@ from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
 from pipeline.job.input_files import split_blend
 from pipeline.kinds.table import material_of, products_of
+from pipeline.model.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
 from pipeline.model.job import Job
 from pipeline.model.looks import BODY, parts_of
 from pipeline.model.problems import suggestion
 from pipeline.stages.base import Stage, TaskContext
-from pipeline.stages.gpus import OWN_GPUS, known_gpus, own_gpus, render_gpus, usable_gpus
 from pipeline.stages.inputs import blender_version
 from pipeline.stages.render_drawing import CPU, FrameDrawing, close_renderers, may_be_empty
 from pipeline.stages.render_scene import render_spec, write_motion

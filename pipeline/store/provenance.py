@@ -19,7 +19,7 @@ from blake3 import blake3
 
 from pipeline import __version__
 from pipeline.base import wording
-from pipeline.base.files import replace_durably, sync
+from pipeline.base.files import open_regular, replace_durably, sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet, digest_of
 from pipeline.store.receipts import Receipt
@@ -52,7 +52,7 @@ def keep_texts(layout: JobLayout, parameters: ParameterSet) -> str:
 def read_text(path: Path) -> str | None:
     """A kept text; None if it is not there, or not what its name says."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             content = file.read(MAX_TEXT_BYTES + 1)
     except (FileNotFoundError, NotADirectoryError):
         return None

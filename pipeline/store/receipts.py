@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from blake3 import blake3
 
 from pipeline.base.errors import InvalidArtifactError
+from pipeline.base.files import open_regular
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import digest_of
 from pipeline.base.task import ArtifactPath, TaskId
@@ -80,7 +81,7 @@ def hash_file(path: Path) -> str:
 def read_receipt(layout: JobLayout, artifact: ArtifactPath) -> Receipt | None:
     """The artifact's receipt, or None if there is none or it is not readable as one (then it does not count)."""
     try:
-        with layout.receipt(artifact).open("rb") as file:
+        with open_regular(layout.receipt(artifact)) as file:
             content = file.read(_MAX_RECEIPT_BYTES + 1)
         receipt = Receipt.from_json(content.decode()) if len(content) <= _MAX_RECEIPT_BYTES else None
     except (FileNotFoundError, InvalidArtifactError, UnicodeDecodeError):

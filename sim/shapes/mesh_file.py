@@ -120,7 +120,8 @@ def read_triangles(path: Path) -> tuple[Points, NDArray[np.int64]]:
         ShapeError: the file is missing, of an unknown kind, or unreadable.
     """
     if not path.is_file():
-        raise ShapeError(f'shape.file: must be a mesh file, "{path}" does not exist; check the path')
+        found = "is no file" if path.exists() else "does not exist; check the path"
+        raise ShapeError(f'shape.file: must be a mesh file, "{path}" {found}')
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise ShapeError(f'shape.file: must be an OBJ, PLY, STL or GLB file, got "{path.name}"; export it as GLB')

@@ -12,7 +12,7 @@ from command_line import pipeline
 from needed_blender import needs_bpy
 
 from pipeline.base.layout import JobLayout
-from pipeline.stages import gpus
+from pipeline.model import gpus
 from pipeline.stages.gpu_kernels import kernels_marker
 from pipeline.store.receipts import read_receipt
 

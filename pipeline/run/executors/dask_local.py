@@ -10,8 +10,8 @@ from distributed import Nanny, Scheduler
 from distributed.deploy.spec import SpecCluster
 
 from pipeline.base.task import Resources
+from pipeline.model.gpus import OWN_GPUS, own_gpus
 from pipeline.run.executors.dask_slots import CPU_TAG, GPU_TAG, MEMORY_TAG
-from pipeline.stages.gpus import OWN_GPUS, own_gpus
 
 SCHEDULER_SETTINGS = {
     "distributed.scheduler.allowed-failures": 0,  # further attempts are the runner's business

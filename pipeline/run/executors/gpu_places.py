@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from functools import cache
 from itertools import count
 
-from pipeline.stages.gpus import own_gpus, require_some
+from pipeline.model.gpus import own_gpus, require_some
 
 
 class GpuPlaces:

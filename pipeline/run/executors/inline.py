@@ -6,10 +6,10 @@ from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from dataclasses import replace
 
 from pipeline.base.task import FailureKind, TaskId
+from pipeline.model.gpus import first_gpu
 from pipeline.run.events import Failed
 from pipeline.run.executors.attempt import run_attempt
 from pipeline.run.executors.base import Assignment, Executor
-from pipeline.stages.gpus import first_gpu
 
 
 class InlineExecutor(Executor):

@@ -9,11 +9,11 @@ from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Resources, Task, TaskId
 from pipeline.job.loading import job_of_text
+from pipeline.model.gpus import OWN_GPUS, first_gpu, own_gpus
 from pipeline.run.executors.dask_local import gpu_places
 from pipeline.run.executors.gpu_places import GpuPlaces
 from pipeline.run.plan import plan_job
 from pipeline.stages import STAGES
-from pipeline.stages.gpus import OWN_GPUS, first_gpu, own_gpus
 
 
 def task(stage: str) -> Task:

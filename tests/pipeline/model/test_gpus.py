@@ -12,10 +12,10 @@ from needed_blender import needs_bpy
 from pipeline.base import wording
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import job_of_text
+from pipeline.model.gpus import known_gpus, render_trouble, usable_gpus
 from pipeline.model.job import Job
 from pipeline.run.plan import plan_job
 from pipeline.stages import STAGES, gpus
-from pipeline.stages.gpus import known_gpus, render_trouble, usable_gpus
 from pipeline.stages.render import RenderStage
 from render.gpus import Gpu, Probe, find_gpus, read_answer
 
@@ -54,7 +54,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     machine = Machine()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv(gpus.OWN_GPUS, raising=False)
-    monkeypatch.setattr("pipeline.stages.gpus.find_gpus", machine.find_gpus)
+    monkeypatch.setattr("pipeline.model.gpus.find_gpus", machine.find_gpus)
     monkeypatch.setattr(gpus, "_device_files", lambda: ["/dev/nvidia0", "/dev/nvidia1"])
     monkeypatch.setattr(gpus, "driver_version", lambda: "570.1")
     start_anew()
