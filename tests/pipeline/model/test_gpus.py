@@ -12,10 +12,11 @@ from needed_blender import needs_bpy
 from pipeline.base import wording
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import job_of_text
+from pipeline.model import gpus
 from pipeline.model.gpus import known_gpus, render_trouble, usable_gpus
 from pipeline.model.job import Job
 from pipeline.run.plan import plan_job
-from pipeline.stages import STAGES, gpus
+from pipeline.stages import STAGES
 from pipeline.stages.render import RenderStage
 from render.gpus import Gpu, Probe, find_gpus, read_answer
 
