@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from pathlib import Path
 
@@ -100,6 +101,21 @@ def test_a_damaged_job_file_of_the_folder_is_replaced_by_the_one_that_is_submitt
     farm.run("submit", "film.toml", "--executor", "inline")
     assert layout.job_file.read_bytes() == (tmp_path / remedy[1]).read_bytes() == whole
     farm.close()
+
+
+def test_pipes_in_the_place_of_files_hold_up_no_status(layout: JobLayout) -> None:
+    for receipt in layout.receipts.rglob("*.json"):
+        receipt.unlink()
+        os.mkfifo(receipt)
+    assert pipeline("status", layout.root).exit_code == 0
+    assert pipeline("status", "--output", layout.root.parent).exit_code == 0
+    for path in (layout.manifest, layout.goal, layout.lease):
+        path.unlink(missing_ok=True)
+        os.mkfifo(path)
+        told = pipeline("status", layout.root)
+        assert (told.exit_code, f"{path} is no file" in told.stderr) == (1, True)
+        listed = pipeline("status", "--output", layout.root.parent)
+        assert f"{path} is no file" in listed.output
 
 
 @pytest.mark.parametrize("content", [b"garbled", b"SQLite format 3\0" + bytes(4080)])

@@ -195,6 +195,28 @@ def test_when_a_runner_is_killed_whoever_waits_takes_the_queue_over(farm, undist
 
 
 @pytest.mark.slow
+def test_a_second_runner_of_the_queue_waits_and_takes_over_from_one_that_is_killed(farm, undisturbed):
+    runner, second = start_long(farm, "a"), farm.start("work")
+    assert second.stderr is not None
+    assert "is being run already" in second.stderr.readline()
+    os.kill(runner.pid, signal.SIGKILL)
+    runner.wait()
+    farm.faults("a", {})
+    assert f"taking over from process {runner.pid}" in farm.finish(second).err
+    assert_long_done_once(farm, "a", begins=undisturbed)
+
+
+@pytest.mark.slow
+def test_a_second_runner_ends_with_the_queue(farm):
+    runner, second = start_long(farm, "a"), farm.start("work")
+    assert second.stderr is not None
+    assert "is being run already" in second.stderr.readline()
+    farm.faults("a", {})
+    assert farm.finish(runner).code == 0
+    assert "the queue is empty" in farm.finish(second).err
+
+
+@pytest.mark.slow
 def test_another_version_submitted_meanwhile_follows_and_both_commands_end_well(farm):
     first = start_long(farm, "a")
     second = farm.start("submit", farm.job("a", frames=60, pause_s=1.0, focal_length_mm=70.0).name)
