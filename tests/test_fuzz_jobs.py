@@ -1,4 +1,4 @@
-"""Spoiled job files are refused by a sentence: a short run of `python -m tests.fuzz_jobs`."""
+"""Spoiled job files are refused by a sentence: a short run of `python tests/helpers/fuzz_jobs.py`."""
 
 from __future__ import annotations
 

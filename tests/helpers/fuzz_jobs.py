@@ -1,7 +1,7 @@
-"""Spoils the sample jobs in thousands of ways, and lists what becomes of them: `python -m tests.fuzz_jobs --seed 0`.
+"""Spoils the sample jobs in thousands of ways, and lists what becomes of them.
 
-    python -m tests.fuzz_jobs --seed 1 --count 10000
-    python -m tests.fuzz_jobs --seed 1 --first 4711 --count 1
+    python tests/helpers/fuzz_jobs.py --seed 1 --count 10000
+    python tests/helpers/fuzz_jobs.py --seed 1 --first 4711 --count 1
 
 Each mutation is read; if it still is a valid job file, it is planned, and a share of these (`--scenes`) goes through
 all of `pipeline check`, which builds the scene and takes a second or so. Promised are: never a traceback, never a hang,
@@ -33,7 +33,21 @@ from places import PROJECT
 HANG_S = 60.0
 """A check of a sample job takes a second or so."""
 HOSTILE = (
-    *("-1", "0", "1", "1e400", "-1e308", "nan", "inf", "9" * 40, "1e-320", "0x7fffffffffffffff", "true", "1979-05-27"),
+    *(
+        "-1",
+        "0",
+        "1",
+        "1e400",
+        "-1e308",
+        "nan",
+        "inf",
+        "9" * 40,
+        "9" * 6000,
+        "1e-320",
+        "0x7fffffffffffffff",
+        "true",
+        "1979-05-27",
+    ),
     *('""', "[]", "{}", "[[]]", "[" * 200 + "]" * 200, "[0.0, 0.0, 0.0, 0.0]", "[1, 'a']", '{ type = "box" }', "None"),
     *(
         '"../../../etc/passwd"',
@@ -60,6 +74,7 @@ HOSTILE = (
 INSERTED = (
     *("[render]\nblender = 'touch'\n", "include = '/etc/passwd'\n", "[a.b.c.d]\n"),
     *("[[", "=", "\x00", "\ufeff", "# \x1b[2J\n"),
+    *(".".join("a" * 3000) + " = 1\n", "what = [" + "1, " * 3000 + "]\n", '"\\u001b[2J" = 1\n'),
 )
 """Pieces of text, anywhere."""
 
