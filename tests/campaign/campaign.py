@@ -120,7 +120,7 @@ class Campaign:
         for name in ("undisturbed",) if self._in_haste else ("warm-up", "undisturbed"):
             studio = Studio.open(self._folder / name, scene=self._scene)
             before, began = self._family.processor_s, time.monotonic()
-            runner = studio.submit()
+            runner = self._family.adopt(studio.submit())
             runner.returncode = self._family.wait(runner.pid, PATIENCE_S)
             if runner.returncode != 0 or self._family.left_over(PROCESSES_END_WITHIN_S):
                 raise SystemExit(f"the undisturbed run failed:\n{studio.printed()}")
@@ -215,7 +215,7 @@ class _Round:
     def afterwards(self) -> list[str]:
         """What a finished job still has to show: that there is nothing to do."""
         broken = []
-        again = self._studio.submit()
+        again = self._family.adopt(self._studio.submit())
         again.returncode = self._family.wait(again.pid, PATIENCE_S)
         if again.returncode != 0 or "up to date" not in self._studio.printed().splitlines()[-1]:
             broken.append(f"a finished job has something to do; submitted again it ends with {again.returncode}")
@@ -226,7 +226,7 @@ class _Round:
     def _run_once(self) -> int:
         """One submit, from its start to its end."""
         self._arm(starting=True)
-        runner = self._studio.submit()
+        runner = self._family.adopt(self._studio.submit())
         self._situation.runner = runner.pid
         until = time.monotonic() + PATIENCE_S
         while (code := self._family.exit_code(runner.pid)) is None:

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -33,6 +34,11 @@ class Family:
         self.processor_s = 0.0
         """Processor time of all that have ended so far [s]."""
         self._codes: dict[int, int] = {}
+
+    def adopt(self, child: subprocess.Popen[bytes]) -> subprocess.Popen[bytes]:
+        """Watch a child that was started just now: how an earlier process of the same number ended is forgotten."""
+        self._codes.pop(child.pid, None)
+        return child
 
     def reap(self) -> None:
         """Take note of all that have ended."""

@@ -185,7 +185,7 @@ def _change(path: Path, change: Callable[[Path, random.Random], None], chance: r
 
 def _look_deeply(situation: Situation) -> None:
     """What changed without a trace in the file's times is found by a deep look; the next submit heals it."""
-    verified = situation.studio.start("verify", "tiny", "--deep")
+    verified = situation.family.adopt(situation.studio.start("verify", "tiny", "--deep"))
     verified.returncode = situation.family.wait(verified.pid, 300.0)
 
 

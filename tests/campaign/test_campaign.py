@@ -25,6 +25,21 @@ PATIENCE_S = 1800.0
 """Each run has limits of its own; a busy machine may take its time for all of them."""
 
 
+TWO_OF_A_NUMBER = """
+import subprocess, sys
+from tests.campaign.family import Family
+
+family = Family()
+child = subprocess.Popen([sys.executable, "-c", "input(); raise SystemExit(3)"], stdin=subprocess.PIPE)
+family._codes[child.pid] = 7  # of a process that had this number before
+family.adopt(child)
+print(family.exit_code(child.pid), flush=True)
+child.stdin.write(b"\\n")
+child.stdin.close()
+print(family.wait(child.pid, 30.0))
+"""
+
+
 def campaign(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "tests.campaign", *arguments]
     return subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
@@ -63,6 +78,14 @@ def test_a_job_under_eight_faults_keeps_every_promise(tmp_path: Path) -> None:
     assert (row["injected"], row["survived"], told["broken"]) == (FAULTS, FAULTS, [])
     assert row["runs"] > 1
     assert f"| **all** | {FAULTS} | {FAULTS} |" in ended.stdout
+
+
+def test_a_process_with_the_number_of_an_earlier_one_is_told_apart() -> None:
+    """Numbers of processes come again within an hour of faults; the family is that of a process of its own."""
+    ended = subprocess.run(
+        [sys.executable, "-c", TWO_OF_A_NUMBER], cwd=PROJECT, capture_output=True, text=True, check=False, timeout=60.0
+    )
+    assert ended.stdout.split() == ["None", "3"], ended.stderr
 
 
 def test_help_has_examples_and_unknown_faults_are_refused() -> None:
