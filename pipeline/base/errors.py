@@ -81,6 +81,10 @@ class ManifestError(PipelineError):
     """The job's manifest cannot be used; says how to get a good one from the receipts."""
 
 
+class DamagedManifestError(ManifestError):
+    """The manifest's file is damaged; the next run of the job makes it anew of the receipts."""
+
+
 class OutdatedManifestError(ManifestError):
     """The manifest is of an older program, or was never finished; the next run of the job brings it up to date."""
 

@@ -4,6 +4,7 @@ import time
 
 import click
 
+from pipeline.base.errors import DamagedManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import busy_error, live_holder
 from pipeline.base.task import TaskState
@@ -53,6 +54,14 @@ def watch(layout: JobLayout) -> int:
         display.close()
 
 
+def _record_to_be(layout: JobLayout) -> tuple[list[StageSummary], LastRun]:
+    """As `record_of`; nothing of a damaged record, which the run that is waited for makes anew."""
+    try:
+        return record_of(layout)
+    except DamagedManifestError:
+        return [], LastRun(None, None)
+
+
 class Follower:
     """Sees one submission through that waits in the queue or runs in another process."""
 
@@ -60,7 +69,7 @@ class Follower:
         self._queue = queue
         self._layout = layout
         self._name = layout.root.absolute().name
-        self._before = record_of(layout)[1].run
+        self._before = _record_to_be(layout)[1].run
         self._seen_running = live_holder(layout.lease) is not None
         self._said = ""
         self._preview_said = False
@@ -92,7 +101,7 @@ class Follower:
             while True:
                 entry = self._queue.find(self._name)
                 runs = live_holder(self._layout.lease) is not None
-                summary, last_run = record_of(self._layout)
+                summary, last_run = _record_to_be(self._layout)
                 _update(stages, summary)
                 if runs:
                     self._seen_running = True

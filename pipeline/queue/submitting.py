@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING
 import click
 
 from pipeline.base import wording
-from pipeline.base.errors import DiskFullError, MissingInputError, OutdatedManifestError, PipelineError
+from pipeline.base.errors import (
+    DamagedManifestError,
+    DiskFullError,
+    MissingInputError,
+    OutdatedManifestError,
+    PipelineError,
+)
 from pipeline.base.files import holds
 from pipeline.base.layout import JobLayout
 from pipeline.base.places import check_places
@@ -138,8 +144,8 @@ def look_at(job: Job, layout: JobLayout, until: Sequence[str] = ()) -> JobAssess
 
     try:
         return assess_job(job, layout, until)
-    except (OutdatedManifestError, MissingInputError):
-        # Only the runner may bring the record up to date; and what is missing is for the check of the job to say.
+    except (DamagedManifestError, OutdatedManifestError, MissingInputError):
+        # Only the runner may put the record in order; and what is missing is for the check of the job to say.
         return None
 
 

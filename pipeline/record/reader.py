@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from pipeline.base.errors import ManifestError, OutdatedManifestError
+from pipeline.base.errors import DamagedManifestError, ManifestError, OutdatedManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.paused_gc import many_objects
@@ -417,11 +417,11 @@ def _has_log_format(path: Path) -> bool:
         return file.read(19)[18:] == b"\2"
 
 
-def damaged(path: Path, finding: str) -> ManifestError:
+def damaged(path: Path, finding: str) -> DamagedManifestError:
     """The error for a manifest that SQLite cannot trust."""
-    return ManifestError(
-        f"{path} is damaged ({finding}). No finished work is lost: every artifact has its receipt. "
-        f"Make a new manifest of the receipts with: pipeline verify {shlex.quote(str(path.parent))} --rebuild"
+    return DamagedManifestError(
+        f"{path} is damaged ({finding}). No finished work is lost: every artifact has its receipt, and the next run of "
+        f"the job makes the manifest anew of these, as does: pipeline verify {shlex.quote(str(path.parent))} --rebuild"
     )
 
 

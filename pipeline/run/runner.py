@@ -10,17 +10,19 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
-from pipeline.base.errors import DiskFullError, PlanError
+from pipeline.base.errors import DamagedManifestError, DiskFullError, PlanError
 from pipeline.base.files import holds, replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
 from pipeline.base.places import check_places
 from pipeline.base.resources import machine_capacity
-from pipeline.base.task import ArtifactPath, Policy, Resources, TaskId, TaskState
+from pipeline.base.task import ArtifactPath, Policy, Resources, Task, TaskId, TaskState
+from pipeline.base.wording import counted
 from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest
-from pipeline.record.reconcile import reconcile
+from pipeline.record.reconcile import Reconciliation, rebuild_manifest, reconcile
 from pipeline.run import events
 from pipeline.run.bookkeeping import RunRecord
 from pipeline.run.control import RunControl, Selection
@@ -72,7 +74,7 @@ def run_job(
     Raises:
         JobBusyError: another live process runs this job.
         LeaseLostError: another process took the job over, because this one did not answer for long.
-        ManifestError: the record is damaged; the text says what to do.
+        ManifestError: the record cannot be used; the text says what to do. One that is damaged is made anew.
         PipelineError: something is in the place of a file or a folder of the job.
         PlanError: the stages' tasks do not fit together, or `rerun` names what is not there.
     """
@@ -87,7 +89,58 @@ def run_job(
     remove_folders_of_the_dead()
     layout.root.mkdir(parents=True, exist_ok=True)
     check_places(layout)
-    with Lease.acquire(layout.lease) as lease, Manifest(layout.manifest) as manifest, control.on_signals():
+    with Lease.acquire(layout.lease) as lease, control.on_signals():
+        begin = partial(_begin, job, layout, lease, job_text=job_text, stages=stages, rerun=rerun, until=until)
+        try:
+            manifest, tasks, forced, reconciliation = begin()
+        except DamagedManifestError:
+            notify(events.Notice(_made_anew(layout)))
+            manifest, tasks, forced, reconciliation = begin()
+        with manifest:
+            for sentence in (lease.takeover, *reconciliation.sentences):
+                if sentence is not None:
+                    notify(events.Notice(sentence))
+            assessments = assess(
+                tasks, reconciliation.rows, reconciliation.problems, parameters=manifest.parameters, forced=forced
+            )
+            notify(events.RunStarted(assessments))
+            lease.check()
+            record = RunRecord(manifest, job, layout, stages, reconciliation.valid_rows, notify)
+            record.invalidate(task for task in tasks if task.id in forced)
+            try:
+                scheduler = Scheduler(
+                    tasks,
+                    up_to_date={each.task.id for each in assessments if each.verdict is Verdict.UP_TO_DATE},
+                    committed=_kept(assessments),
+                    capacity=capacity or machine_capacity(gpus=max((task.resources.gpus for task in tasks), default=0)),
+                    machine=machine,
+                    policy=policy,
+                    policies={stage: limits.policy(policy) for stage, limits in job.limits.items()},
+                    turns=frame_turns(job),
+                )
+            except ValueError as error:  # a GPU that is nowhere, for instance
+                raise PlanError(str(error)) from error
+            scheduler.drain_changes()  # the initial states are recorded as a whole
+            manifest.record_plan(tasks, {task.id: scheduler.state(task.id) for task in tasks})
+            run = _Run(layout, lease, manifest, executor, notify, control, forced, record, scheduler)
+            outcome = run.outcome(run.loop(), time.monotonic() - began)
+    notify(events.RunEnded(outcome))
+    return outcome
+
+
+def _begin(
+    job: Job,
+    layout: JobLayout,
+    lease: Lease,
+    *,
+    job_text: str | None,
+    stages: str,
+    rerun: Selection | None,
+    until: Sequence[str],
+) -> tuple[Manifest, list[Task], frozenset[TaskId], Reconciliation]:
+    """The record, marked as being run; the tasks, those of them that are forced, and how record and files agree."""
+    manifest = Manifest(layout.manifest)
+    try:
         if job_text is not None:
             _write_job_file(layout, job_text)
         # What is refused here was no run: the record goes on saying how the last one ended.
@@ -98,36 +151,16 @@ def run_job(
         clean = manifest.begin_run(job.name, run=lease.holder.token)
         if lease.takeover is not None:
             manifest.log_event("takeover", lease.takeover)
-            notify(events.Notice(lease.takeover))
-        reconciliation = reconcile(manifest, layout, clean=clean)
-        for sentence in reconciliation.sentences:
-            notify(events.Notice(sentence))
-        assessments = assess(
-            tasks, reconciliation.rows, reconciliation.problems, parameters=manifest.parameters, forced=forced
-        )
-        notify(events.RunStarted(assessments))
-        lease.check()
-        record = RunRecord(manifest, job, layout, stages, reconciliation.valid_rows, notify)
-        record.invalidate(task for task in tasks if task.id in forced)
-        try:
-            scheduler = Scheduler(
-                tasks,
-                up_to_date={each.task.id for each in assessments if each.verdict is Verdict.UP_TO_DATE},
-                committed=_kept(assessments),
-                capacity=capacity or machine_capacity(gpus=max((task.resources.gpus for task in tasks), default=0)),
-                machine=machine,
-                policy=policy,
-                policies={stage: limits.policy(policy) for stage, limits in job.limits.items()},
-                turns=frame_turns(job),
-            )
-        except ValueError as error:  # a GPU that is nowhere, for instance
-            raise PlanError(str(error)) from error
-        scheduler.drain_changes()  # the initial states are recorded as a whole
-        manifest.record_plan(tasks, {task.id: scheduler.state(task.id) for task in tasks})
-        run = _Run(layout, lease, manifest, executor, notify, control, forced, record, scheduler)
-        outcome = run.outcome(run.loop(), time.monotonic() - began)
-    notify(events.RunEnded(outcome))
-    return outcome
+        return manifest, tasks, forced, reconcile(manifest, layout, clean=clean)
+    except BaseException:
+        manifest.close()
+        raise
+
+
+def _made_anew(layout: JobLayout) -> str:
+    """Make a new record of the receipts in place of a damaged one; returns what to tell of it."""
+    aside, count = rebuild_manifest(layout)
+    return f"{layout.manifest} was damaged and is made anew of {counted(count, 'receipt')}; the old one is {aside}"
 
 
 def _kept(assessments: Sequence[Assessment]) -> set[ArtifactPath]:

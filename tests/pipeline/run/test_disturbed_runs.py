@@ -19,7 +19,7 @@ from pipeline.base.lease import Lease
 from pipeline.base.task import ArtifactPath, FailureKind, TaskId
 from pipeline.record.manifest import Manifest
 from pipeline.run.control import RunControl
-from pipeline.run.events import Committed, Failed, Finished, JobOutcome, RunEvent, RunStarted, TaskEvent
+from pipeline.run.events import Committed, Failed, Finished, JobOutcome, Notice, RunEvent, RunStarted, TaskEvent
 from pipeline.run.executors.base import Assignment
 from pipeline.run.executors.inline import InlineExecutor
 from pipeline.run.executors.processes import ProcessExecutor
@@ -171,3 +171,36 @@ def test_a_file_that_vanishes_while_its_task_ends_fails_the_task(root):
     assert outcome.kind is JobOutcome.FAILED
     assert "steps/000003.bin was there when its task ended" in outcome.failures[0].message
     assert run_recorded(root)[0].kind is JobOutcome.SUCCEEDED
+
+
+def shred(manifest: Path) -> None:
+    content = bytearray(manifest.read_bytes())
+    content[4096:] = b"\xa5" * (len(content) - 4096)
+    manifest.write_bytes(content)
+
+
+def garble(manifest: Path) -> None:
+    manifest.write_bytes(b"garbled")
+
+
+def flip_a_bit_of_a_path(manifest: Path) -> None:
+    """Found by reading alone: the file is sound to SQLite."""
+    text = b"steps/000002.bin"
+    content = manifest.read_bytes()
+    assert text in content
+    manifest.write_bytes(content.replace(text, bytes([text[0] | 0x80]) + text[1:]))
+
+
+@pytest.mark.parametrize("damage", [shred, garble, flip_a_bit_of_a_path])
+def test_a_damaged_record_is_made_anew_and_no_work_is_done_again(root, damage):
+    run_recorded(root)
+    for name in ("-wal", "-shm"):
+        assert not Path(f"{JobLayout(root).manifest}{name}").exists()
+    damage(JobLayout(root).manifest)
+    outcome, recorder = run_recorded(root)
+    assert (outcome.kind, recorder.ran()) == (JobOutcome.SUCCEEDED, [])
+    told = recorder.of(Notice)[0].message
+    assert "was damaged and is made anew of 13 receipts; the old one is" in told
+    assert Path(told.rpartition(" ")[2]).exists()
+    outcome, recorder = run_recorded(root)
+    assert (recorder.of(Notice), recorder.ran()) == ([], [])
