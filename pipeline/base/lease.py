@@ -2,9 +2,11 @@
 
 The holder is named in a small file: machine, boot, process and the process's start time, so that a number that was
 given to another process later is not mistaken for it. The file's modification time is the heartbeat. Whoever changes
-the file holds a `flock` on a guard file beside it meanwhile, so of two that race one finds the other's name. Nothing
-here has to be deleted by a person: the kernel drops the guard with its process, and a dead holder is taken over. A
-thread of the holder's keeps the heartbeat going, whatever the holder is busy with.
+the file holds a `flock` on a guard file beside it meanwhile, so of two that race one finds the other's name. Locks of
+a network file system may end at the machine, so machines race for a name instead: a free lease is had by the first
+hard link of that name, and a dead holder is succeeded by whoever first makes the name that only its successor may
+have. Nothing here has to be deleted by a person: the kernel drops the guard with its process, and a dead holder is
+taken over. A thread of the holder's keeps the heartbeat going, whatever the holder is busy with.
 
 On the same machine the process itself is looked for, so a holder that is stopped or slow keeps its lease and a dead
 one loses it at once. On another machine (or in another container) only the heartbeat can be seen. Its age is taken
@@ -14,6 +16,7 @@ do not agree do not matter.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -21,6 +24,7 @@ import platform
 import threading
 import time
 import uuid
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -36,6 +40,15 @@ HEARTBEAT_INTERVAL_S = 5.0  # how often a holder says that it is alive
 
 EXPIRY_S = 60.0
 """Age of the heartbeat at which a holder on another machine counts as dead: a dozen heartbeats missed in a row."""
+
+_RACE_RETRY_S = 0.05
+"""How soon a lease is looked at again that another machine is about to change."""
+
+_LEGIBLE_S = 1.0
+"""How long a lease is read again whose holder is not legible: it may be changing just now."""
+
+_NO_HARD_LINKS = NO_LOCKS | {errno.EPERM, errno.EMLINK}
+"""Codes of an OSError of `link` where a file system has no hard links."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +89,7 @@ class Lease:
     def __init__(self, path: Path, holder: LeaseHolder, takeover: str | None) -> None:
         self._path = path
         self._loss: LeaseLostError | None = None
+        self._renewed = time.monotonic()  # when the heartbeat was last known to be written
         self._given_back = threading.Event()
         self._beating: threading.Thread | None = None
         self.holder = holder
@@ -107,36 +121,42 @@ class Lease:
                     f"{self._path.parent} was taken over by {_describe(read_holder(self._path))} "
                     "while this process did not answer"
                 )
+            began = time.monotonic()
             os.utime(self._path)
+        self._renewed = began
 
     def check(self) -> None:
-        """Make sure that the lease was still ours at the last heartbeat; costs nothing.
+        """Make sure that the lease was still ours at the last heartbeat; costs nothing while the heart beats.
 
         Raises LeaseLostError: see `heartbeat`.
         """
+        if self._loss is None and self._is_overdue():  # this process was stopped, or its file system did not answer
+            self._renew()
         if self._loss is not None:
             raise self._loss
 
+    def _is_overdue(self) -> bool:
+        return time.monotonic() - self._renewed > EXPIRY_S
+
+    def _renew(self) -> None:
+        try:
+            self.heartbeat()
+        except LeaseLostError as loss:
+            self._loss = loss
+        except OSError as error:
+            # A file system that does not answer may do so the next time; until then others may count us alive.
+            if self._is_overdue():
+                self._loss = LeaseLostError(f"{self._path} could not be renewed for {EXPIRY_S:.0f} s: {error}")
+
     def _beat(self) -> None:
         """Keep the heartbeat going until the lease is given back or lost."""
-        heard = time.monotonic()
-        while not self._given_back.wait(HEARTBEAT_INTERVAL_S):
-            try:
-                self.heartbeat()
-                heard = time.monotonic()
-            except LeaseLostError as loss:
-                self._loss = loss
-                return
-            except OSError as error:
-                # A file system that does not answer may do so the next time; until then others may count us alive.
-                if time.monotonic() - heard > EXPIRY_S:
-                    self._loss = LeaseLostError(f"{self._path} could not be renewed for {EXPIRY_S:.0f} s: {error}")
-                    return
+        while self._loss is None and not self._given_back.wait(HEARTBEAT_INTERVAL_S):
+            self._renew()
 
     def release(self) -> None:
-        """Give the lease back; one that somebody else has taken over is left alone."""
+        """Give the lease back; one that somebody else has taken over, or may be about to, is left alone."""
         with _guard(self._path):
-            if self._is_mine():
+            if self._is_mine() and not self._is_overdue():
                 self._path.unlink()
 
     def _is_mine(self) -> bool:
@@ -158,20 +178,61 @@ class Lease:
 
 def _take(path: Path) -> tuple[LeaseHolder, str | None]:
     """Write this process's name into a lease's file, unless a live one's is there; see `Lease.acquire`."""
+    mine = LeaseHolder.this_process()
+    part = path.with_name(f".{path.name}.part.{int(mine.token, 16)}")
+    until = time.monotonic() + _LEGIBLE_S
     with _guard(path) as now_s:
-        takeover = None
-        if path.exists():
-            holder = read_holder(path)
-            evidence = _evidence_of_death(holder, age_s=now_s - path.stat().st_mtime)
-            if evidence is None:
-                assert holder is not None
-                raise busy_error(path, holder)
-            takeover = f"taking over from {_describe(holder)}: {evidence}"
-        mine = LeaseHolder.this_process()
-        part = path.with_name(f".{path.name}.part.{mine.pid}")
-        part.write_text(json.dumps(asdict(mine), indent=1) + "\n")
-        part.replace(path)
-    return mine, takeover
+        try:
+            while True:
+                # Written anew in each turn, as a run that begins elsewhere sweeps what others have begun to write.
+                part.write_text(json.dumps(asdict(mine), indent=1) + "\n")
+                try:
+                    age_s = now_s - path.stat().st_mtime
+                except FileNotFoundError:
+                    if _gets_name(part, path):
+                        return mine, None
+                else:
+                    holder = read_holder(path)
+                    evidence = _evidence_of_death(holder, age_s=age_s)
+                    if evidence is None and (holder is not None or time.monotonic() > until):
+                        raise busy_error(path, holder)
+                    if evidence is not None and _succeeds(part, path, holder, now_s=now_s):
+                        return mine, f"taking over from {_describe(holder)}: {evidence}"
+                time.sleep(_RACE_RETRY_S)  # another machine was quicker, or is about to be; the next look shows it
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def _succeeds(part: Path, path: Path, dead: LeaseHolder | None, *, now_s: float) -> bool:
+    """Put `part` in the place of a dead holder's lease, unless another machine does so, or has done it."""
+    claim = path.with_name(f".{path.name}.successor.part.{zlib.crc32(repr(dead).encode())}")
+    if not _gets_name(part, claim):
+        with suppress(FileNotFoundError):
+            if _evidence_of_death(read_holder(claim), age_s=now_s - claim.stat().st_mtime) is not None:
+                claim.unlink()
+        return False
+    if read_holder(path) != dead:  # it was succeeded just before
+        claim.unlink()
+        return False
+    claim.replace(path)
+    return True
+
+
+def _gets_name(part: Path, name: Path) -> bool:
+    """Give a file a further name; False if that is in use, by the file system itself and not by what is cached."""
+    try:
+        os.link(part, name)
+    except (FileExistsError, FileNotFoundError):
+        return False
+    except OSError as error:
+        if error.errno not in _NO_HARD_LINKS:
+            raise
+        try:
+            with name.open("x") as file:
+                file.write(part.read_text())
+        except FileExistsError:
+            return False
+    return True
 
 
 def read_holder(path: Path) -> LeaseHolder | None:
@@ -183,13 +244,19 @@ def read_holder(path: Path) -> LeaseHolder | None:
 
 
 def live_holder(path: Path) -> LeaseHolder | None:
-    """The live process that holds a lease, or None: for `status`, which changes nothing.
+    """The live process that holds a lease, or None: for `status`, which changes nothing but the guard's times.
 
-    The heartbeat's age is taken by this machine's clock here.
+    Where it may not even do that, the heartbeat's age is taken by this machine's clock.
     """
     holder = read_holder(path)
+    if holder is None:
+        return None
+    guard, now_s = _guard_file(path), time.time()
+    with suppress(OSError):
+        os.utime(guard, follow_symlinks=False)
+        now_s = guard.lstat().st_mtime
     try:
-        age_s = time.time() - path.stat().st_mtime
+        age_s = now_s - path.stat().st_mtime
     except FileNotFoundError:
         return None
     return holder if _evidence_of_death(holder, age_s=age_s) is None else None
@@ -202,10 +269,10 @@ def refuse_if_held(path: Path) -> None:
         raise busy_error(path, holder)
 
 
-def busy_error(path: Path, holder: LeaseHolder) -> JobBusyError:
+def busy_error(path: Path, holder: LeaseHolder | None) -> JobBusyError:
     """The error that says who runs what this lease is about."""
-    since = wording.moment(holder.acquired)
-    return JobBusyError(f"{path.parent} is being run already, by {_describe(holder)} since {since}")
+    since = "" if holder is None else f" since {wording.moment(holder.acquired)}"
+    return JobBusyError(f"{path.parent} is being run already, by {_describe(holder)}{since}")
 
 
 def remove_guard(path: Path) -> None:
@@ -217,9 +284,9 @@ def remove_guard(path: Path) -> None:
 
 def _evidence_of_death(holder: LeaseHolder | None, *, age_s: float) -> str | None:
     """Why the holder counts as dead, or None if it may be alive."""
-    if holder is None:
-        return "its name is not legible"
-    uptime_s = time.time() - float(psutil.boot_time())
+    if holder is None:  # a machine of another kind wrote it, or the power was cut
+        return f"its name is not legible, and is {age_s:.0f} s old" if age_s > EXPIRY_S else None
+    uptime_s = time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
     if holder.host == platform.node() and holder.boot_id != _boot_id() and age_s > uptime_s:
         # Its last heartbeat is older than this boot. (A live one of another machine that has the same name is not.)
         return "the machine was restarted since"

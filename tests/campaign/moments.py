@@ -19,7 +19,7 @@ STATES = ("running", "succeeded")
 
 STEPS = {
     "runner": (
-        ("before its lease is in place", r"^os.rename \S+ \S*/runner\.lease$"),
+        ("before its lease is in place", r"^os.(link|rename) \S+ \S*/runner\.lease$"),
         ("before it opens the record", r"^sqlite3.connect \S*/manifest\.db"),
         ("before the job's file is in place", r"^os.rename \S+ \S*/job\.toml$"),
         ("before it starts a worker", r"^subprocess.Popen .*pipeline\.run\.executors\.worker"),

@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 
 CONTROL = os.environ.get("CAMPAIGN_CONTROL", "")
-WATCHED = {"open", "os.rename", "os.remove", "os.mkdir", "subprocess.Popen", "sqlite3.connect"}
+WATCHED = {"open", "os.rename", "os.link", "os.remove", "os.mkdir", "subprocess.Popen", "sqlite3.connect"}
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _HELD_S = 10.0
 _busy = threading.local()
