@@ -86,7 +86,7 @@ class DamagedManifestError(ManifestError):
 
 
 class OutdatedManifestError(ManifestError):
-    """The manifest is of an older program, or was never finished; the next run of the job brings it up to date."""
+    """The manifest is of an older program, or was not finished; the next run of the job brings it up to date."""
 
 
 class PlanError(PipelineError):

@@ -117,10 +117,9 @@ class Lease:
         """
         with _guard(self._path):
             if not self._is_mine():
-                raise LeaseLostError(
-                    f"{self._path.parent} was taken over by {_describe(read_holder(self._path))} "
-                    "while this process did not answer"
-                )
+                successor = read_holder(self._path)
+                who = "another process, which has ended" if successor is None else _describe(successor)
+                raise LeaseLostError(f"{self._path.parent} was taken over by {who} while this process did not answer")
             began = time.monotonic()
             os.utime(self._path)
         self._renewed = began

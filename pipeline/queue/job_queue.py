@@ -39,6 +39,8 @@ MAX_NAME_BYTES = 200
 """A folder's name becomes a file's, with an ending."""
 LATEST_S = 1e11
 """No wall time of a submission is later [s since the epoch]."""
+ABANDONED_S = 60.0
+"""A file that is being written and older than this is nobody's any more."""
 SETTLED_S = 2.0
 """A file that was changed longer ago than this would show another change by its time of modification."""
 
@@ -64,7 +66,7 @@ class QueuedJob:
     submission: str  # names this submission; a new one is drawn when the job is to run (again)
     desired: Desired = Desired.RUN
     priority: int = 0  # higher ones go first, and interrupt lower ones
-    # wall time of the submission [s since the epoch]; the older of equals goes first
+    # when it was submitted, by the clock of the queue's file system [s since the epoch]; the older of equals goes first
     submitted: Annotated[float, Field(ge=0.0, lt=LATEST_S, allow_inf_nan=False)] = 0.0
     note: str = ""  # why it pauses or failed, or empty
     text: str | None = None  # its job file, until a run has taken it over into the folder; None: what is in the folder
@@ -121,6 +123,7 @@ class JobQueue:
         self.folder = farm / ".farm"
         self._mutex = threading.RLock()
         self._is_locked = False
+        self._now_s = 0.0  # when the lock was taken, by the file system's clock: machines' clocks need not agree
         self._read: dict[str, tuple[tuple[int, int, int], QueuedJob]] = {}
 
     @property
@@ -185,6 +188,8 @@ class JobQueue:
             ) from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
+            os.utime(descriptor)
+            self._now_s = os.fstat(descriptor).st_mtime
         except BaseException as error:
             os.close(descriptor)
             if isinstance(error, OSError) and error.errno in NO_LOCKS:
@@ -261,6 +266,7 @@ class JobQueue:
         Returns the entry as it is now; with the older one's submission if that asks for the very same run already.
         """
         with self.locked():
+            new = replace(new, submitted=self._now_s)
             try:
                 old = self.find(new.name)
             except QueueError:
@@ -291,9 +297,11 @@ class JobQueue:
 
     def sweep(self) -> None:
         """Remove what killed writers left beside the entries."""
-        with self.locked():  # so nobody is writing
+        with self.locked():  # so nobody on this machine is writing
             for path in self._entries.glob(".*.part.*"):
-                path.unlink()
+                with suppress(FileNotFoundError):
+                    if self._now_s - path.stat().st_mtime > ABANDONED_S:
+                        path.unlink()
 
     @property
     def _entries(self) -> Path:

@@ -11,16 +11,19 @@ import errno
 import json
 import os
 import platform
+import shutil
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Self
+from uuid import uuid4
 
 import psutil
 
-from pipeline.base.errors import ManifestError
+from pipeline.base.errors import LeaseLostError, ManifestError
+from pipeline.base.files import sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, FailureKind, Task, TaskId, TaskState
 from pipeline.record.migrations import migrate
@@ -31,6 +34,7 @@ from pipeline.record.reader import (
     ManifestReader,
     clear_errors,
     damaged,
+    is_busy,
     is_damage,
     result_code,
 )
@@ -41,6 +45,13 @@ _NETWORK_FILE_SYSTEMS = {
     *("ceph", "glusterfs", "lustre", "beegfs", "gpfs", "ocfs2", "gfs2"),
     *("9p", "virtiofs"),  # a host's folder in a virtual machine: the host may write it as well
 }
+
+NETWORK_TIMEOUT_S = 180.0
+"""How long to wait for the lock of another process on a network file system: its server drops those of a machine that
+died only after a while, which is 90 s for NFS."""
+
+
+_MOVED = 1032  # SQLITE_READONLY_DBMOVED: another file has the name of the one that is open
 
 
 class Manifest(ManifestReader):
@@ -53,14 +64,19 @@ class Manifest(ManifestReader):
             ManifestError: it is damaged (the text names the remedy), of a newer program, or may not be written.
             OSError: ENOSPC, the disk is full.
         """
+        on_network = is_on_network(path)
+        timeout_s = NETWORK_TIMEOUT_S if on_network else BUSY_TIMEOUT_S
         try:
-            connection = sqlite3.connect(path, isolation_level=None, timeout=BUSY_TIMEOUT_S)
+            connection = sqlite3.connect(path, isolation_level=None, timeout=timeout_s)
         except sqlite3.Error as error:
             raise _opening_error(path, error) from error
         super().__init__(connection, path)
+        self._run = ""  # the run that writes, once it has begun
         try:
             # The write-ahead log lives in memory that processes share, which a network file system does not have.
-            self._journal_mode = "DELETE" if is_on_network(path) else "WAL"
+            # What is left is a journal that is emptied, not removed: a process that was cut off and then goes on must
+            # do nothing by name, see `move_out_of_reach`.
+            self._journal_mode = "TRUNCATE" if on_network else "WAL"
             connection.execute(f"PRAGMA journal_mode = {self._journal_mode}")
             connection.execute("PRAGMA synchronous = FULL")
             connection.execute("PRAGMA foreign_keys = ON")
@@ -91,6 +107,7 @@ class Manifest(ManifestReader):
                 " name = excluded.name, clean_shutdown = 0, run = excluded.run, outcome = NULL",
                 (job_name, time.time(), run),
             )
+        self._run = run
         return row is not None and bool(row[0])
 
     def end_run(self, outcome: str = SUCCEEDED, *, clean: bool = True) -> None:
@@ -107,6 +124,7 @@ class Manifest(ManifestReader):
         Raises:
             OSError: ENOSPC, the disk is full.
             ManifestError: the file is damaged, or cannot be written any more.
+            LeaseLostError: another run has begun meanwhile.
         """
         if self._connection.in_transaction:
             yield
@@ -117,15 +135,26 @@ class Manifest(ManifestReader):
             try:
                 self._connection.execute(f"PRAGMA synchronous = {synchronous}")
                 self._connection.execute("BEGIN IMMEDIATE")
+                self._refuse_another_run()
                 yield
                 self._connection.execute("COMMIT")
             except sqlite3.OperationalError as error:
                 if _is_full(error):
                     raise _disk_full(self._path) from error
+                if result_code(error) == _MOVED:
+                    raise self._taken_over() from error
                 raise
             finally:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
+
+    def _refuse_another_run(self) -> None:
+        """Raise LeaseLostError if the record is another run's: this process slept, or its file system did."""
+        if self._run and self._connection.execute("SELECT run FROM job").fetchone() != (self._run,):
+            raise self._taken_over()
+
+    def _taken_over(self) -> LeaseLostError:
+        return LeaseLostError(f"{self._path.parent} was taken over by another run while this one did not answer")
 
     # --- the plan ---
     def record_plan(self, tasks: Sequence[Task], states: Mapping[TaskId, TaskState] | None = None) -> None:
@@ -276,6 +305,35 @@ def artifact_row(receipt: Receipt) -> ArtifactRow:
     return ArtifactRow(**same, inputs=inputs)
 
 
+def move_out_of_reach(path: Path) -> None:
+    """Put a copy in the place of a manifest on a network file system, whose last writer did not answer.
+
+    If that was cut off in the middle of a commit and goes on, it writes to a file that has no name any more. Locks
+    cannot see to that, as they may end at the machine, or be dropped by the server.
+    """
+    if not is_on_network(path) or not path.exists():
+        return
+    copy, journal = path.with_name(f".{path.name}.part.{uuid4().int}"), _journal(path)
+    try:
+        if journal.exists():
+            shutil.copyfile(journal, _journal(copy))
+        shutil.copyfile(path, copy)
+        with clear_errors(path, "read"), closing(sqlite3.connect(copy)) as connection:
+            connection.execute("PRAGMA journal_mode = DELETE")  # rolls back what was not committed
+            connection.execute("SELECT * FROM sqlite_master").fetchall()
+        sync(copy)
+        copy.replace(path)
+        journal.unlink(missing_ok=True)  # a journal that is left behind here would change nothing
+        sync(path.parent)
+    finally:
+        copy.unlink(missing_ok=True)
+        _journal(copy).unlink(missing_ok=True)
+
+
+def _journal(path: Path) -> Path:
+    return path.with_name(f"{path.name}-journal")
+
+
 def is_on_network(path: Path, mounts: Iterable[tuple[str, str]] | None = None) -> bool:
     """Whether a path, which need not exist, lies on a file system that several machines may write.
 
@@ -296,6 +354,8 @@ def _opening_error(path: Path, error: sqlite3.Error) -> Exception:
         return _disk_full(path)
     if is_damage(error):
         return damaged(path, str(error))
+    if is_busy(error):
+        return ManifestError(f"{path} cannot be opened: another process, perhaps on another machine, has locked it")
     return ManifestError(f"{path} cannot be opened ({error}); the job's folder must exist and be writable")
 
 

@@ -437,7 +437,11 @@ def clear_errors(path: Path, what: str) -> Iterator[None]:
         if is_damage(error):
             raise damaged(path, str(error)) from error
         if isinstance(error, sqlite3.OperationalError):
-            raise ManifestError(f"{path} cannot be {what} ({error})") from error
+            if what == "read" and result_code(error) & 0xFF == sqlite3.SQLITE_READONLY:  # what began has to be undone
+                why = "its writer is in the middle of a change, or was cut off there"
+                raise OutdatedManifestError(f"{path}: {why}; look again, or submit the job once") from error
+            why = "another process, perhaps on another machine, has locked it" if is_busy(error) else str(error)
+            raise ManifestError(f"{path} cannot be {what} ({why})") from error
         raise
 
 
@@ -447,6 +451,11 @@ def is_damage(error: sqlite3.Error) -> bool:
         return True
     # Flipped bits in a text; an error of the Python module, which has no result code.
     return isinstance(error, sqlite3.OperationalError) and str(error).startswith("Could not decode to UTF-8")
+
+
+def is_busy(error: sqlite3.Error) -> bool:
+    """Whether another process held a lock for longer than we waited."""
+    return result_code(error) & 0xFF == sqlite3.SQLITE_BUSY
 
 
 def result_code(error: sqlite3.Error) -> int:

@@ -21,7 +21,7 @@ from pipeline.base.resources import machine_capacity
 from pipeline.base.task import ArtifactPath, Policy, Resources, Task, TaskId, TaskState
 from pipeline.base.wording import counted
 from pipeline.model.job import Job
-from pipeline.record.manifest import Manifest
+from pipeline.record.manifest import Manifest, move_out_of_reach
 from pipeline.record.reconcile import Reconciliation, rebuild_manifest, reconcile
 from pipeline.run import events
 from pipeline.run.bookkeeping import RunRecord
@@ -139,6 +139,8 @@ def _begin(
     until: Sequence[str],
 ) -> tuple[Manifest, list[Task], frozenset[TaskId], Reconciliation]:
     """The record, marked as being run; the tasks, those of them that are forced, and how record and files agree."""
+    if lease.takeover is not None:
+        move_out_of_reach(layout.manifest)
     manifest = Manifest(layout.manifest)
     try:
         if job_text is not None:

@@ -40,7 +40,7 @@ from pipeline.base.task import ArtifactPath, Task
 from pipeline.store.provenance import keep_texts, maker
 from pipeline.store.receipts import Receipt, hash_file, read_receipt, verify_artifact
 
-_PART_NAME = re.compile(r"^\..+\.part\.\d+$")
+_PART_NAME = re.compile(r"^\..+\.part\.\d+(-journal)?$")
 _LOCK_NAME = ".lock"
 
 

@@ -26,6 +26,8 @@ _STACK_DUMP_S = 1.0
 """Time a stalled worker gets to write its stacks before it is killed [s]."""
 _RETIRE_GRACE_S = 20.0
 """Time a worker gets to leave by itself, writing its kernel cache for instance, before it is killed [s]."""
+_DEATH_S = 10.0
+"""Time a killed worker gets to be gone [s]; one in a call to a file system that does not answer may outlive it."""
 FURTHER_WORKERS = 6
 """Idle workers beyond one a core: as many as there are stages, as a Blender for every frame would be slow."""
 _MEMORY_WATCH_S = 0.5
@@ -111,14 +113,17 @@ class ProcessExecutor(Executor):
                 worker.end_by(time.monotonic() + grace_s, FailureKind.CANCELLED, sentence)
 
     def shutdown(self) -> None:
-        """Let idle workers go, kill busy ones, and wait until every process is gone."""
+        """Let idle workers go, kill busy ones, and wait until every process is gone that can go."""
         for worker in self._workers:
             if worker.assignment is None:
                 self._retire(worker)
             else:
                 worker.end_by(time.monotonic(), FailureKind.CANCELLED, "the executor was shut down")
-        while self._workers:
+        until = time.monotonic() + _RETIRE_GRACE_S + _DEATH_S
+        while self._workers and time.monotonic() < until:
             self._turn(_POLL_S)
+        for worker in [*self._workers]:  # they were killed, and end as soon as their file system answers
+            self._bury(worker)
 
     # --- places on GPUs ---
 

@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import platform
 import re
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -14,10 +15,10 @@ import pytest
 from places import HELPERS
 from record_samples import film, make_film
 
-from pipeline.base.errors import ManifestError
+from pipeline.base.errors import LeaseLostError, ManifestError, OutdatedManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import FailureKind, TaskId, TaskState
-from pipeline.record.manifest import Manifest, artifact_row, is_on_network
+from pipeline.record.manifest import Manifest, artifact_row, is_on_network, move_out_of_reach
 from pipeline.record.migrations import migrations, schema_version
 from pipeline.record.reader import SUCCEEDED, LastRun, ManifestReader, StageSummary
 from pipeline.store.receipts import Receipt
@@ -186,6 +187,29 @@ def test_a_run_is_clean_only_if_the_last_one_ended_and_how_is_known_only_then(la
         assert not manifest.begin_run("film")
 
 
+def test_a_run_that_was_taken_over_writes_nothing_any_more(layout: JobLayout) -> None:
+    with Manifest(layout.manifest) as slept, Manifest(layout.manifest) as newer:
+        slept.record_plan(film(1))
+        slept.begin_run("film", run="first")
+        slept.log_event("pause", "it sleeps")
+        newer.begin_run("film", run="second")
+        with pytest.raises(LeaseLostError, match="was taken over"):
+            slept.start_attempt(RENDER)
+        assert newer.history(RENDER) == []
+        newer.start_attempt(RENDER)
+
+
+def test_a_record_that_another_process_has_locked_is_told(layout: JobLayout, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.record.manifest.BUSY_TIMEOUT_S", 0.0)
+    with Manifest(layout.manifest) as manifest, manifest.transaction():
+        manifest.log_event("pause", "it is written")
+        with (
+            Manifest(layout.manifest) as other,
+            pytest.raises(ManifestError, match=r"another process, .* has locked it"),
+        ):
+            other.log_event("pause", "it waits")
+
+
 KILLED_WRITER = """
 import os, sys
 from pathlib import Path
@@ -291,7 +315,7 @@ def test_a_manifest_that_is_only_busy_is_not_called_damaged(layout: JobLayout, m
     with Manifest(layout.manifest) as manifest:
         manifest.record_plan(film(1))
         manifest._connection.execute("BEGIN EXCLUSIVE")
-        with pytest.raises(ManifestError, match=r"manifest\.db cannot be read \(database is locked\)"):
+        with pytest.raises(ManifestError, match=r"manifest\.db cannot be read \(another process, .* has locked it\)"):
             Manifest.open_readonly(layout.manifest, timeout_s=0.0)
 
 
@@ -347,8 +371,47 @@ def test_a_network_file_system_gets_a_rollback_journal(monkeypatch: pytest.Monke
     with Manifest(layout.manifest) as manifest:
         manifest.record_plan(film(1))
         manifest.set_states({RENDER: TaskState.FAILED})
-        assert manifest._connection.execute("PRAGMA journal_mode").fetchone() == ("delete",)
+        assert manifest._connection.execute("PRAGMA journal_mode").fetchone() == ("truncate",)
         assert manifest._connection.execute("PRAGMA synchronous").fetchone() == (2,)
+
+
+def test_who_was_cut_off_in_the_middle_of_a_commit_reaches_the_record_no_more(
+    monkeypatch: pytest.MonkeyPatch, layout: JobLayout
+) -> None:
+    monkeypatch.setattr("pipeline.record.manifest.is_on_network", lambda _: True)
+    with Manifest(layout.manifest) as cut_off:
+        cut_off.record_plan(film(1))
+        cut_off.begin_run("film", run="first")
+        with cut_off.transaction():
+            cut_off.start_attempt(RENDER)
+            move_out_of_reach(layout.manifest)
+            with Manifest(layout.manifest) as newer:
+                newer.begin_run("film", run="second")
+        with pytest.raises(LeaseLostError, match="was taken over"):
+            cut_off.log_event("pause", "it goes on")
+    with Manifest.open_readonly(layout.manifest) as reader:
+        assert (reader.last_run().run, reader.history(RENDER)) == ("second", [])
+    assert not [*layout.root.rglob("*.part.*")]
+
+
+def test_a_commit_that_was_cut_off_for_good_is_undone_by_the_next_run(
+    monkeypatch: pytest.MonkeyPatch, layout: JobLayout, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("pipeline.record.manifest.is_on_network", lambda _: True)
+    left = tmp_path / "left"
+    left.mkdir()
+    with Manifest(layout.manifest) as manifest:
+        manifest.record_plan(film(1))
+        manifest._connection.execute("PRAGMA cache_size = 1")  # pages are written before the commit
+        with manifest.transaction():
+            manifest.record_plan(film(500))
+            for file in layout.root.glob("manifest.db*"):
+                shutil.copy(file, left)
+    with pytest.raises(OutdatedManifestError, match="in the middle of a change"):
+        Manifest.open_readonly(left / "manifest.db")
+    move_out_of_reach(left / "manifest.db")
+    with Manifest.open_readonly(left / "manifest.db") as reader:
+        assert len(reader.states()) == len(film(1))
 
 
 def test_network_file_systems_are_told_by_the_deepest_mount(tmp_path: Path) -> None:

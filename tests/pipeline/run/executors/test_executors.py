@@ -64,6 +64,23 @@ class TestProcesses(ProcessesContract):
         assert executor.worker_pids == []
         assert not any(psutil.pid_exists(pid) for pid in pids)
 
+    def test_shutdown_does_not_wait_for_a_process_that_cannot_end(self, executor, layout, monkeypatch):
+        # As one in a call to a network file system that does not answer: signals reach it only afterwards.
+        monkeypatch.setattr("pipeline.run.executors.processes._RETIRE_GRACE_S", 0.1)
+        monkeypatch.setattr("pipeline.run.executors.processes._DEATH_S", 0.1)
+        write_faults(layout.root, {"steps": ["hang"]})
+        executor.submit(assign(layout, "steps"))
+        while not any(isinstance(event, Started) for event in executor.wait(PATIENCE_S)):
+            pass
+        (pid,) = executor.worker_pids
+        with monkeypatch.context() as patch:
+            patch.setattr("os.killpg", lambda *_: None)
+            executor.shutdown()
+        assert failure(executor.wait(0.0)).kind is FailureKind.CANCELLED
+        assert not executor.worker_pids
+        os.killpg(pid, signal.SIGKILL)
+        assert_gone(pid)
+
     @pytest.mark.parametrize(
         ("fault", "sentence"),
         [
