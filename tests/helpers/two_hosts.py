@@ -94,8 +94,12 @@ class Host(Farm):
         subprocess.run(self.command(*words), check=True, timeout=PATIENCE_S)
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
+        return self.start_program(str(HERE / "synthetic_command.py"), *arguments)
+
+    def start_program(self, *words: str) -> subprocess.Popen[str]:
+        """Start a Python program."""
         process = subprocess.Popen(
-            self.command(sys.executable, str(HERE / "synthetic_command.py"), *arguments),
+            self.command(sys.executable, *words),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -9,6 +9,8 @@ from pipeline.base.errors import PipelineError
 from pipeline.base.task import FailureKind
 
 _DISK_FULL_CODES = {errno.ENOSPC, errno.EDQUOT}
+_NO_ANSWER_CODES = {errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN}
+"""How a network file system says that its server does not answer, or has started anew."""
 _DISK_FULL_TEXT = os.strerror(errno.ENOSPC)
 _OUT_OF_MEMORY_TEXTS = ("out of memory", "out of gpu")
 """How libraries that raise RuntimeError say it, in small letters: CUDA and Vulkan by Taichi, and Cycles."""
@@ -26,7 +28,7 @@ def classify(error: BaseException) -> FailureKind:
             return FailureKind.DISK_FULL
         if _is_called(_DIVERGED, link):
             return FailureKind.DIVERGED
-        if any(_is_called(name, link) for name in _BLENDER_LOST):
+        if any(_is_called(name, link) for name in _BLENDER_LOST) or _means_no_answer(link):
             return FailureKind.WORKER_LOST
     return FailureKind.FAILED
 
@@ -68,6 +70,10 @@ def _means_disk_full(error: BaseException) -> bool:
         return True
     # Some libraries, HDF5 among them, pass the text on and lose the code.
     return isinstance(error, OSError | RuntimeError) and _DISK_FULL_TEXT in str(error)
+
+
+def _means_no_answer(error: BaseException) -> bool:
+    return isinstance(error, OSError) and error.errno in _NO_ANSWER_CODES
 
 
 def _means_out_of_memory(error: BaseException) -> bool:

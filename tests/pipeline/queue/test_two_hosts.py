@@ -5,13 +5,17 @@ The whole, with partitions of the real length: `pytest -m "slow or nightly" test
 
 from __future__ import annotations
 
+import os
 import random
+import subprocess
+import sys
 import time
 from collections import Counter
 from pathlib import Path
 
 import pytest
 from farm_processes import Ended, wait_until
+from places import PROJECT
 from synthetic_jobs import contents, job_text, run_recorded
 from two_hosts import Host, two_hosts, what_is_missing
 
@@ -19,6 +23,7 @@ from pipeline.base.errors import JobBusyError
 from pipeline.base.lease import EXPIRY_S
 from pipeline.base.task import TaskState
 from pipeline.record.reader import ManifestReader
+from tests.campaign.studio import JOB, SCENES, is_artifact
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(what_is_missing()), reason=what_is_missing())]
 
@@ -60,7 +65,9 @@ def test_of_two_hosts_that_submit_one_job_at_once_one_runs_it(tmp_path: Path, un
         ended = [host.finish(process) for host, process in [(host, host.start("submit", job)) for host in (ash, birch)]]
         assert_made_once(ash, "film", undisturbed)
         (runner,) = hosts_of(ash, "film")
-        assert sum(f" on {runner} since " in each.err for each in ended) == 1
+        # Who runs it is told where it ran already when the other one came.
+        assert [f" on {runner} since " in each.err for each in ended] != [True, True]
+        assert sum("report: " in each.err for each in ended) == 1
         assert len(ash.attempts("film")) == len(succeeded(ash, "film"))
 
 
@@ -99,6 +106,29 @@ def test_when_the_holders_host_loses_power_the_other_one_goes_on(tmp_path: Path,
         assert "taking over from process" in ended.err
         assert_made_once(birch, "film", undisturbed)
         assert sorted(done + birch.commits()) == sorted(f"{artifact}.json" for artifact in undisturbed)
+
+
+@pytest.mark.nightly
+def test_a_film_of_every_kind_is_the_same_whichever_host_loses_power(tmp_path: Path) -> None:
+    job = JOB.format(name="film", frames=FRAMES, scene=SCENES["all"], limits="")
+    (tmp_path / "film.toml").write_text(job)
+    command = ("-m", "pipeline", "submit", "film.toml")
+    subprocess.run([sys.executable, *command], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(PROJECT)}, check=True)
+    with two_hosts(tmp_path) as (_, ash, birch):
+        (ash.folder / "film.toml").write_text(job)
+        root = ash.layout("film").root
+        ash.start_program(*command)
+        wait_until(lambda: len([*root.glob("frames/*.png")]) >= 2, "some frames are drawn")
+        waiting = birch.start_program(*command)
+        ash.lose_power()
+        ended = birch.finish(waiting)
+        assert "taking over from process" in ended.err
+
+        def made(folder: Path) -> dict[str, bytes]:
+            return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if is_artifact(path)}
+
+        assert made(root) == made(tmp_path / "renders" / "film")
+        assert len(ash.commits() + birch.commits()) == len(set(ash.commits() + birch.commits()))
 
 
 def cut_off_and_back(
