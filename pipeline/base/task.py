@@ -57,7 +57,7 @@ class Task:
     frame: int | None = None  # None: the whole job
     resources: Resources = field(default=Resources())
     checkpointed: bool = False  # it commits its outputs one by one and continues where it stopped
-    on_first_gpu: bool = False  # if it needs a GPU, it takes the machine's first one and cannot be given another
+    lowest_gpu: bool = False  # of several GPUs it is given the lowest that is free, others the highest
 
 
 def task_fingerprint(task: Task, hashes: Mapping[ArtifactPath, str]) -> str:
@@ -91,6 +91,7 @@ class FailureKind(StrEnum):
     STALLED = "stalled"
     OUT_OF_MEMORY = "out of memory"
     WORKER_LOST = "worker lost"
+    GPU_ERROR = "GPU error"
     DISK_FULL = "disk full"
     CANCELLED = "cancelled"
     DIVERGED = "diverged"

@@ -65,7 +65,7 @@ def own_gpus() -> tuple[int, ...] | None:
 def first_gpu(task: Task) -> int:
     """The place of the GPU that a task gets where tasks run one after another; see `require_some`."""
     own = own_gpus()
-    return 0 if own is None or task.on_first_gpu else require_some(own)[0]
+    return 0 if own is None or (task.lowest_gpu and not own) else require_some(own)[0]
 
 
 def require_some(places: Sequence[int]) -> Sequence[int]:

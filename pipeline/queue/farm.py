@@ -251,6 +251,8 @@ class FarmRunner:
             case JobOutcome.DISK_FULL:
                 place = f" ({outcome.full_place})" if outcome.full_place else ""
                 self._settle(job, Desired.PAUSE, f"the disk is full{place}")
+            case JobOutcome.NO_GPU:
+                self._settle(job, Desired.PAUSE, "every GPU has failed")
             case _ if control.signals and self.pause_on_signal and job.submission == self.submission:
                 self._settle(job, Desired.PAUSE, "stopped by hand")
             case _:  # its entry says what is wanted: it pauses, or waits for its next turn

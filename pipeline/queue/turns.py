@@ -13,7 +13,7 @@ from pipeline.base.lease import Lease
 from pipeline.base.resources import machine_capacity
 from pipeline.base.wording import print_warnings
 from pipeline.job.loading import job_of_text, load_job
-from pipeline.model.gpus import render_trouble, usable_gpus
+from pipeline.model.gpus import own_gpus, render_trouble, usable_gpus
 from pipeline.model.job import Job
 from pipeline.queue.farm import Ended, FarmControl, FarmRunner, StopReason, TakeOver, start_in_background
 from pipeline.queue.following import CTRL_C, STOPPED_FROM_ELSEWHERE, Follower
@@ -30,9 +30,16 @@ from pipeline.run.goal import read_goal, what_is_made
 from pipeline.run.progress import ProgressObserver, open_display
 from pipeline.run.runner import run_job
 from pipeline.run.solver_numbers import SolverWatch, simulation_numbers
+from sim.core.runtime import cuda_gpus
 
 GPU_TASKS = 1
 """At least one task at a time on a GPU. Whether there is one, a stage says that has to run."""
+
+
+def gpu_count(job: Job, *, draws: bool) -> int:
+    """How many of this machine's GPUs tasks of a job may have: those that draw, else those that simulate."""
+    drawing = len(usable_gpus(job)) if draws else 0
+    return max(GPU_TASKS, drawing or len(own_gpus() or cuda_gpus()))
 
 
 def stand_in_queue(queue: JobQueue, layout: JobLayout, entry: QueuedJob, *, detach: bool) -> int:
@@ -164,7 +171,7 @@ def _run_once(
 ) -> Outcome:
     choice = ExecutorChoice.from_settings(entry.settings)
     draws_here = choice.scheduler is None and needs_pictures(entry.until)
-    capacity = machine_capacity(gpus=max(GPU_TASKS, len(usable_gpus(job))) if draws_here else GPU_TASKS)
+    capacity = machine_capacity(gpus=gpu_count(job, draws=draws_here))
     if entry.cores is not None:
         capacity = replace(capacity, cores=min(entry.cores, capacity.cores))
     rerun = None

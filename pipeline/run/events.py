@@ -95,7 +95,15 @@ class CapacityChanged:
     capacity: Resources
 
 
-ExecutorEvent = TaskEvent | CapacityChanged
+@dataclass(frozen=True, slots=True)
+class GpuWithdrawn:
+    """A GPU of this machine failed a task, and no other task gets it in this run; comes before the task's failure."""
+
+    left: int  # how many GPUs remain
+    message: str  # one line for the user
+
+
+ExecutorEvent = TaskEvent | CapacityChanged | GpuWithdrawn
 
 # --- added by the runner, for the scheduler ---
 
@@ -124,7 +132,9 @@ class Tick:
     now: float
 
 
-SchedulerEvent = Committed | Finished | Skipped | Failed | CapacityChanged | DrainRequested | CancelRequested | Tick
+SchedulerEvent = (
+    Committed | Finished | Skipped | Failed | CapacityChanged | GpuWithdrawn | DrainRequested | CancelRequested | Tick
+)
 
 # --- instructions of the scheduler ---
 
@@ -136,6 +146,7 @@ class JobOutcome(StrEnum):
     FAILED = "failed"
     TOO_MANY_FAILURES = "too many failures"
     DISK_FULL = "disk full"
+    NO_GPU = "no GPU left"
     DRAINED = "drained"
     CANCELLED = "cancelled"
 
@@ -220,6 +231,7 @@ _EXIT_CODES = {
     JobOutcome.FAILED: 5,
     JobOutcome.TOO_MANY_FAILURES: 6,
     JobOutcome.DISK_FULL: 7,
+    JobOutcome.NO_GPU: 9,
     JobOutcome.DRAINED: 130,  # as shells report a program that Ctrl-C ended
     JobOutcome.CANCELLED: 130,
 }

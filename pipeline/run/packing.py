@@ -5,6 +5,7 @@ Part of the scheduler, and as pure: it does no input or output and has no clock.
 
 import heapq
 from collections import defaultdict
+from dataclasses import replace
 
 from pipeline.base.task import Resources, TaskId
 
@@ -37,6 +38,11 @@ class Packing:
         capacity = offered.at_least(self.machine)
         self.free = self.free + capacity - self._capacity
         self._capacity = capacity
+
+    def keep_gpus(self, left: int) -> None:
+        """Of the machine's GPUs so many are left."""
+        self.machine = replace(self.machine, gpus=left)
+        self.resize(replace(self._capacity, gpus=left))
 
     def add(self, task_id: TaskId, *, need: Resources, priority: Priority) -> None:
         """A task is ready."""

@@ -282,7 +282,10 @@ class _Run:
             self.executor.cancel(task_id, grace_s=grace_s)
 
     def _take(self, event: events.ExecutorEvent) -> list[events.Instruction]:
-        if isinstance(event, events.CapacityChanged):
+        if isinstance(event, events.CapacityChanged | events.GpuWithdrawn):
+            if isinstance(event, events.GpuWithdrawn):
+                self.manifest.log_event("gpu", event.message)
+                self.notify(events.Notice(event.message))
             return self.scheduler.handle(event)
         self.notify(event)
         settled = self.record.take(event, lacking=self.scheduler.lacking)

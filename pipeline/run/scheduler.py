@@ -190,8 +190,8 @@ class Scheduler:
                 self._end(entry, TaskState.UP_TO_DATE)
             case events.Failed(task_id, _, kind):
                 instructions += self._fail(self._running_entry(task_id, kind), kind)
-            case events.CapacityChanged(offered):
-                self._packing.resize(offered)
+            case events.CapacityChanged() | events.GpuWithdrawn():
+                instructions += self._resize(event)
             case events.DrainRequested():
                 instructions += self._drain(events.JobOutcome.DRAINED)
             case events.CancelRequested():
@@ -203,6 +203,13 @@ class Scheduler:
                     _, task_id = heapq.heappop(self._waiting)
                     self._enqueue(self._entries[task_id])
         return instructions + self._next_instructions()
+
+    def _resize(self, event: events.CapacityChanged | events.GpuWithdrawn) -> list[events.Instruction]:
+        if isinstance(event, events.CapacityChanged):
+            self._packing.resize(event.capacity)
+            return []
+        self._packing.keep_gpus(event.left)
+        return [] if event.left else self._drain(events.JobOutcome.NO_GPU)
 
     # --- transitions ---
 

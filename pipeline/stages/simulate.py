@@ -68,7 +68,7 @@ class SimulateStage(Stage):
                 parameters=self._parameters(job),
                 resources=_resources(job),
                 checkpointed=True,
-                on_first_gpu=True,  # Taichi's own choice
+                lowest_gpu=True,
             )
         ]
 
@@ -136,7 +136,7 @@ class _Simulation:
         self._context = context
         self._folder = context.layout.checkpoints
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._device = initialize(context.job.device, threads=context.threads)
+        self._device = initialize(context.job.device, threads=context.threads, gpu=context.gpu)
         more = (kind.solvers for kind in KINDS.values() if kind.solvers is not None)
         solvers = [solver for make in more for solver in make(context.job, context.job.fps)]
         self._world: World = build_world(context.job, frames_per_second=context.job.fps, solvers=solvers)

@@ -61,11 +61,12 @@ class DeviceUnavailableError(RuntimeError):
         return f'device "{self.device}" is not available: {self.reason}{remedy}'
 
 
-def initialize(device: Device = "auto", *, threads: int | None = None) -> str:
+def initialize(device: Device = "auto", *, threads: int | None = None, gpu: int | None = None) -> str:
     """Start Taichi on a device and return its back end, such as "cpu"; the only `ti.init` of the project.
 
     A second call that asks for what runs already (or for "auto") changes nothing. "auto" takes the first of
     `PREFERENCE` that works; threads are all that the process may use if omitted, and results do not depend on them.
+    `gpu` is the place of the GPU that CUDA computes on, among those of `cuda_gpus`; other back ends choose themselves.
 
     Raises:
         DeviceUnavailableError: that device does not work here, or Taichi itself does not load.
@@ -81,6 +82,10 @@ def initialize(device: Device = "auto", *, threads: int | None = None) -> str:
         return str(running)
     backend = resolve_device(device)
     thread_count = threads if threads is not None else _usable_cores()
+    if backend == "cuda" and gpu and (visible := cuda_gpus()):
+        if gpu >= len(visible):
+            raise DeviceUnavailableError(backend, f"there is no GPU {gpu}, counted from 0, among {len(visible)}")
+        os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu]  # read when the driver starts, which it does now
     _start_taichi(backend, thread_count)
     _in_use.update(device=backend, threads=thread_count)
     return backend
@@ -100,6 +105,14 @@ def resolve_device(device: Device) -> str:
         if reason != OK:
             raise DeviceUnavailableError(device, reason)
     return device
+
+
+def cuda_gpus() -> list[str]:
+    """The CUDA GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them; empty where that is unknown."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None:
+        return [name.strip() for name in named.split(",") if name.strip()]
+    return [str(place) for place, _ in enumerate(Path("/dev").glob("nvidia[0-9]*"))]
 
 
 def available_devices() -> dict[str, str]:

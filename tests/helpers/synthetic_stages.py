@@ -274,6 +274,21 @@ def _lose_blender(context: TaskContext) -> None:
     raise BlenderDiedError(3, -9, "(it wrote nothing)")
 
 
+GPU_WORDS = (
+    "[cuda_driver.h:operator()@92] CUDA Error CUDA_ERROR_ILLEGAL_ADDRESS: an illegal memory access was encountered"
+)
+
+
+def _lose_gpu(context: TaskContext) -> None:
+    raise RuntimeError(GPU_WORDS)
+
+
+def _lose_gpu_and_abort(context: TaskContext) -> None:
+    """As a driver that ends the process."""
+    print(GPU_WORDS, flush=True)
+    os.abort()
+
+
 def _start_child_and_hang(context: TaskContext) -> None:
     _leave_child(context)
     time.sleep(600)
@@ -323,4 +338,6 @@ FAULTS = {
     "temporary files and hang": _write_temporary_files_and_hang,
     "large child": _start_large_child,
     "lose Blender": _lose_blender,
+    "lose GPU": _lose_gpu,
+    "lose GPU and abort": _lose_gpu_and_abort,
 }

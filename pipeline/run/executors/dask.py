@@ -187,6 +187,10 @@ class DaskExecutor(Executor):
         if attempt is None or attempt.assignment.attempt != event.attempt:
             return  # of an attempt that was given up
         attempt.started = True
+        if isinstance(event, Failed) and event.kind is FailureKind.GPU_ERROR and attempt.need.gpus:
+            self._slots.withdraw_gpu(attempt.offer)
+            self._say(f"a GPU of {attempt.offer.host} failed in {event.task_id} and gets no task any more in this run")
+            self._note_capacity()
         self._events.append(event)
         if isinstance(event, Finished | Failed):
             self._forget(event.task_id)
@@ -208,6 +212,9 @@ class DaskExecutor(Executor):
             self._alone_since = time.monotonic()
         elif not workers.present:
             self._say_once(f"the Dask scheduler {self._scheduler} has no workers yet; waiting for some")
+        self._note_capacity()
+
+    def _note_capacity(self) -> None:
         if self._slots.total != self.capacity and self._slots.offers:
             self.capacity = self._slots.total
             self._events.append(CapacityChanged(self.capacity))

@@ -23,8 +23,9 @@ from distributed.diagnostics.plugin import WorkerPlugin
 
 from pipeline.base.content import tool_version
 from pipeline.base.task import FailureKind, TaskId
-from pipeline.run.events import CapacityChanged, ExecutorEvent, Failed, Finished, Progress, TaskEvent
+from pipeline.run.events import CapacityChanged, ExecutorEvent, Failed, Finished, GpuWithdrawn, Progress, TaskEvent
 from pipeline.run.executors.base import Assignment
+from pipeline.run.executors.dask_slots import GPU_TAG
 from pipeline.run.executors.processes import ProcessExecutor
 
 _TURN_S = 0.1
@@ -92,8 +93,9 @@ class _Leave:
 class _JobSupervisor(threading.Thread):
     """Owns the worker processes of one job; they die with this thread, and it dies with the Dask worker."""
 
-    def __init__(self) -> None:
+    def __init__(self, gpus: int | None) -> None:
         super().__init__(name="job supervisor", daemon=True)
+        self._gpus = gpus
         self._commands: SimpleQueue[Assignment | _Cancel | _Leave] = SimpleQueue()
         self._inboxes: dict[tuple[TaskId, int], SimpleQueue[TaskEvent]] = {}
         self._lock = threading.Lock()
@@ -119,7 +121,7 @@ class _JobSupervisor(threading.Thread):
 
     def run(self) -> None:
         """The thread."""
-        executor = ProcessExecutor()
+        executor = ProcessExecutor(gpus=self._gpus)
         try:
             self._serve(executor)
         finally:
@@ -169,7 +171,8 @@ class _JobSupervisor(threading.Thread):
 
     def _deliver(self, events: Iterable[ExecutorEvent]) -> None:
         for event in events:
-            assert not isinstance(event, CapacityChanged)  # it is one machine
+            if isinstance(event, CapacityChanged | GpuWithdrawn):  # the runner hears it from the failure
+                continue
             key = event.task_id, event.attempt
             inbox = self._inboxes.pop(key, None) if isinstance(event, Finished | Failed) else self._inboxes.get(key)
             if inbox is not None:
@@ -184,13 +187,15 @@ class _Supervisors:
         self._threads: dict[Path, _JobSupervisor] = {}
         self._leaving = False
 
-    def run_attempt(self, assignment: Assignment) -> tuple[_JobSupervisor, SimpleQueue[TaskEvent]] | None:
-        """Begin an attempt; None when this Dask worker is leaving."""
+    def run_attempt(
+        self, assignment: Assignment, gpus: int | None
+    ) -> tuple[_JobSupervisor, SimpleQueue[TaskEvent]] | None:
+        """Begin an attempt on this Dask worker, which offers so many GPUs; None when it is leaving."""
         with self._lock:
             while not self._leaving:
                 supervisor = self._threads.get(assignment.root)
                 if supervisor is None:
-                    supervisor = self._threads[assignment.root] = _JobSupervisor()
+                    supervisor = self._threads[assignment.root] = _JobSupervisor(gpus)
                     supervisor.start()
                 inbox = supervisor.run_attempt(assignment)
                 if inbox is not None:
@@ -278,7 +283,7 @@ def drive(assignment: Assignment, order: DriverOrder) -> bytes:
         obstacle = "its Dask worker was replaced"
     elif not _is_wanted(worker, order.key):
         obstacle = "nobody waits for it any more"
-    elif (begun := _supervisors.run_attempt(assignment)) is None:
+    elif (begun := _supervisors.run_attempt(assignment, _gpus_of(worker))) is None:
         obstacle = "its Dask worker is leaving"
     if obstacle or begun is None:
         return pickle.dumps(Failed(assignment.task.id, assignment.attempt, FailureKind.WORKER_LOST, obstacle))
@@ -301,6 +306,12 @@ def drive(assignment: Assignment, order: DriverOrder) -> bytes:
             worker.log_event(order.topic, pickle.dumps((order.run, event)))
             if isinstance(event, Finished | Failed):
                 return pickle.dumps(event)
+
+
+def _gpus_of(worker: Worker) -> int | None:
+    """How many GPUs a Dask worker offers; None where it says nothing."""
+    offered = worker.state.total_resources.get(GPU_TAG)
+    return None if offered is None else int(offered)
 
 
 def _is_wanted(worker: Worker, key: str) -> bool:

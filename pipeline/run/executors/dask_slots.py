@@ -5,7 +5,7 @@ put tasks with tags into the queues of workers that are busy, so the worker is c
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from operator import add
 from typing import Any
@@ -100,6 +100,14 @@ class Slots:
         """Give the worker at this address nothing more, until an update lists it again; it keeps what it has."""
         if address in self._workers:
             self._workers[address].trusted = False
+
+    def withdraw_gpu(self, offer: Offer) -> None:
+        """Count a GPU of this worker no more, until it comes back as another incarnation."""
+        worker = self._workers.get(offer.address)
+        if worker is not None and worker.offer.identity == offer.identity and worker.offer.resources.gpus:
+            gone = Resources(0, 0, 1)
+            worker.offer = replace(worker.offer, resources=worker.offer.resources - gone)
+            worker.free = worker.free - gone
 
     def clamp(self, need: Resources) -> Resources:
         """A need that a single worker can meet, where the given one is put together from several.

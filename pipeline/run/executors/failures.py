@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +15,15 @@ _NO_ANSWER_CODES = {errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN}
 _DISK_FULL_TEXT = os.strerror(errno.ENOSPC)
 _OUT_OF_MEMORY_TEXTS = ("out of memory", "out of gpu")
 """How libraries that raise RuntimeError say it, in small letters: CUDA and Vulkan by Taichi, and Cycles."""
+_GPU_ERROR = re.compile(
+    r"cuda[_ ]error|optix_error|vk_error_device_lost|device (was )?lost|illegal address|fallen off the bus|\bxid\b"
+    r"|in (cuda|hip|oneapi|metal) queue|failed to create \w+ context|no cuda-capable device"
+    r"|(?-i:\bin cu[A-Z]\w+\()",
+    re.IGNORECASE,
+)
+"""How Taichi, Cycles and drivers say that a GPU does not go on; their words for its memory are out_of_memory's."""
 _DIVERGED = "SimulationDivergedError"
+_NO_DEVICE = "DeviceUnavailableError"
 _BLENDER_LOST = ("BlenderDiedError", "BlenderKilledError")
 """By name: asking isinstance would import the simulation and the renderer into every process."""
 
@@ -28,6 +37,9 @@ def classify(error: BaseException) -> FailureKind:
             return FailureKind.DISK_FULL
         if _is_called(_DIVERGED, link):
             return FailureKind.DIVERGED
+        lost_device = _is_called(_NO_DEVICE, link) and getattr(link, "device", "cpu") != "cpu"
+        if lost_device or (isinstance(link, RuntimeError) and means_gpu_error(str(link))):
+            return FailureKind.GPU_ERROR
         if any(_is_called(name, link) for name in _BLENDER_LOST) or _means_no_answer(link):
             return FailureKind.WORKER_LOST
     return FailureKind.FAILED
@@ -56,6 +68,11 @@ def full_place(error: BaseException) -> str:
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether an exception comes of too little memory, of the machine or of a GPU."""
     return classify(error) is FailureKind.OUT_OF_MEMORY
+
+
+def means_gpu_error(text: str) -> bool:
+    """Whether a library's words, or the last ones of a log, tell that a GPU failed."""
+    return _GPU_ERROR.search(text) is not None
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:

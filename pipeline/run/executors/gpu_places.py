@@ -1,15 +1,20 @@
 """Which of the machine's GPUs a task is given: the scheduler counts them, here each of them has its place.
 
-A simulation computes on the first one, as Taichi chooses that itself; so pictures take the highest that is free.
+A simulation takes the lowest that is free, which any back end of Taichi finds by itself; pictures take the highest.
 """
 
 import threading
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import cache
 from itertools import count
 
+from pipeline.base.errors import PipelineError
 from pipeline.model.gpus import own_gpus, require_some
+
+
+class NoGpuLeftError(PipelineError):
+    """Every GPU that tasks may be given has failed."""
 
 
 class GpuPlaces:
@@ -23,29 +28,44 @@ class GpuPlaces:
         self._tasks: Counter[int] = Counter()
         self._lock = threading.Lock()
 
-    def take(self, warm: Iterable[int] = (), *, first: bool = False, there: int | None = None) -> int:
+    def take(
+        self,
+        warm: Iterable[int] = (),
+        *,
+        lowest: bool = False,
+        there: int | None = None,
+        failed: Collection[int] = (),
+    ) -> int:
         """A place for one more task.
 
         Args:
             warm: places where Blender waits with the scene; one of these, if one is free.
-            first: it computes on the first GPU whatever it is given, even one that is taken or not among the own.
+            lowest: the lowest that is free instead of the highest; any, where the own are none.
             there: how many GPUs there are, where all may be given; None: unknown, and the lowest that is free is given.
+            failed: places that are given no more.
 
-        Raises PipelineError: there is none to give.
+        Raises:
+            NoGpuLeftError: all have failed.
+            PipelineError: there is none to give.
         """
         with self._lock:
-            place = 0 if first else next((each for each in sorted(warm) if not self._tasks[each]), None)
+            free = (each for each in sorted(warm) if not self._tasks[each] and each not in failed)
+            place = next(free, None)
             if place is None:
-                place = self._best(there)
+                place = self._best(lowest, there, failed)
             self._tasks[place] += 1
             return place
 
-    def _best(self, there: int | None) -> int:
-        choice = range(there) if self._own is None and there is not None else self._own
+    def _best(self, lowest: bool, there: int | None, failed: Collection[int]) -> int:
+        own = self._own or None if lowest else self._own
+        choice = range(there) if own is None and there is not None else own
         if choice is None:
-            return next(each for each in count() if not self._tasks[each])
-        # Beside another task only if a simulation came to a picture, or another runner knows nothing of this one.
-        return min(require_some(choice), key=lambda each: (self._tasks[each], -each))
+            return next(each for each in count() if not self._tasks[each] and each not in failed)
+        # Beside another task only if another runner knows nothing of this one.
+        left = [each for each in require_some(choice) if each not in failed]
+        if not left:
+            raise NoGpuLeftError("no GPU is left: all have failed in this run")
+        return min(left, key=lambda each: (self._tasks[each], each if lowest else -each))
 
     def give_back(self, place: int) -> None:
         """A task on it has ended."""

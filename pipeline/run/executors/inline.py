@@ -25,7 +25,10 @@ class InlineExecutor(Executor):
 
     def submit(self, assignment: Assignment) -> None:
         """Put the attempt into the queue."""
-        self._queue.append(replace(assignment, gpu=first_gpu(assignment.task)) if assignment.need.gpus else assignment)
+        # A simulation would leave this very process its own GPU alone, and the frames may have another.
+        if assignment.need.gpus and not assignment.task.lowest_gpu:
+            assignment = replace(assignment, gpu=first_gpu(assignment.task))
+        self._queue.append(assignment)
 
     def _turn(self, timeout_s: float) -> None:
         """Run the next assignment to its end, however long that takes."""

@@ -14,11 +14,11 @@ from math import inf
 from pipeline.base.memory import machine_memory_bytes, resident_memory_bytes
 from pipeline.base.resources import MEMORY_SHARE
 from pipeline.base.task import FailureKind, TaskId
-from pipeline.run.events import Failed, Finished, Progress
+from pipeline.run.events import Failed, Finished, GpuWithdrawn, Progress
 from pipeline.run.executors.base import Assignment, Executor
 from pipeline.run.executors.channel import Channel
 from pipeline.run.executors.failures import full_place, is_disk_full
-from pipeline.run.executors.gpu_places import places_of_process
+from pipeline.run.executors.gpu_places import NoGpuLeftError, places_of_process
 from pipeline.run.executors.worker import StopAttempt
 from pipeline.run.executors.worker_process import WorkerProcess, log_tail
 
@@ -65,6 +65,7 @@ class ProcessExecutor(Executor):
         self._memory_watched_at = 0.0
         self._worker_limit = self._limits.workers or (os.cpu_count() or 1) + FURTHER_WORKERS
         self._places = places_of_process()
+        self._failed_gpus: set[int] = set()
         self._workers: list[WorkerProcess] = []
         self._selector = selectors.DefaultSelector()
 
@@ -81,8 +82,14 @@ class ProcessExecutor(Executor):
     def submit(self, assignment: Assignment) -> None:
         """Give the attempt to a warm worker of its stage, or to a new one."""
         if assignment.need.gpus:
-            first, warm = assignment.task.on_first_gpu, self._warm_places(assignment)
-            assignment = replace(assignment, gpu=self._places.take(warm, first=first, there=self._gpus))
+            lowest, warm, failed = assignment.task.lowest_gpu, self._warm_places(assignment), self._failed_gpus
+            try:
+                place = self._places.take(warm, lowest=lowest, there=self._gpus, failed=failed)
+            except NoGpuLeftError as error:  # of a cluster's worker, whose offer another runner believes
+                task_id, attempt = assignment.task.id, assignment.attempt
+                self._events.append(Failed(task_id, attempt, FailureKind.GPU_ERROR, str(error)))
+                return
+            assignment = replace(assignment, gpu=place)
         key = (assignment.task.stage, assignment.threads, assignment.gpu)
         worker = next((worker for worker in self._workers if worker.idle and worker.key == key), None)
         if worker is None:
@@ -137,6 +144,20 @@ class ProcessExecutor(Executor):
         if assignment.gpu is not None:
             self._places.give_back(assignment.gpu)
 
+    def _withdraw_gpu(self, assignment: Assignment, failed: Failed) -> None:
+        """Give the GPU that failed an attempt to no other; idle workers that hold on to it go."""
+        if failed.kind is not FailureKind.GPU_ERROR or assignment.gpu is None or assignment.gpu in self._failed_gpus:
+            return
+        self._failed_gpus.add(assignment.gpu)
+        for worker in self._workers:
+            if worker.idle and worker.key[2] == assignment.gpu:
+                self._retire(worker)
+        if self._gpus is not None:
+            left = self._gpus - len(self._failed_gpus)
+            sentence = f"GPU {assignment.gpu} failed in {failed.task_id} and gets no task any more in this run"
+            rest = f"{left} left" if left else "none is left: the job pauses; submit it again when the GPU works"
+            self._events.append(GpuWithdrawn(left, f"{sentence}; {rest} ({failed.message.splitlines()[0]})"))
+
     # --- the life of a worker ---
 
     def _make_room(self) -> None:
@@ -166,7 +187,9 @@ class ProcessExecutor(Executor):
             kind, sentence = worker.explain_exit()
             seconds, details = time.monotonic() - worker.began, log_tail(assignment.log)
             peak = worker.peak_memory_bytes
-            self._events.append(Failed(assignment.task.id, assignment.attempt, kind, sentence, details, seconds, peak))
+            failed = Failed(assignment.task.id, assignment.attempt, kind, sentence, details, seconds, peak)
+            self._withdraw_gpu(assignment, failed)
+            self._events.append(failed)
             self._give_place_back(assignment)
         self._workers.remove(worker)
         self._close_channel(worker)
@@ -204,7 +227,11 @@ class ProcessExecutor(Executor):
             return
         for message in worker.channel.receive():
             worker.last_sign = time.monotonic()
-            self._events.append(worker.explain_failure(message) if isinstance(message, Failed) else message)
+            if isinstance(message, Failed):
+                assert worker.assignment is not None
+                message = worker.explain_failure(message)  # noqa: PLW2901
+                self._withdraw_gpu(worker.assignment, message)
+            self._events.append(message)
             if isinstance(message, Progress):
                 worker.note_progress(message)
             if isinstance(message, Finished | Failed):

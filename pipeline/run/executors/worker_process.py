@@ -19,6 +19,7 @@ from pipeline.base.task import FailureKind
 from pipeline.run.events import Failed, Progress
 from pipeline.run.executors.base import Assignment
 from pipeline.run.executors.channel import Channel
+from pipeline.run.executors.failures import means_gpu_error
 from pipeline.run.executors.worker import STACK_DUMP_SIGNAL
 from render.temporary_folder import environment_of_child
 
@@ -26,6 +27,8 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 PREPARATION_S = 4 * 3600.0
 """How long a worker may be silent while it prepares what is done once on a machine, such as Cycles' kernels [s]."""
 _LOG_TAIL_LINES = 20
+_DRIVER_LINES = 200
+"""Within so many of a log's last lines a driver's complaint is looked for: the stacks of all threads follow it."""
 WorkerKey = tuple[str, int, int | None]
 """Stage, thread count and GPU."""
 _LOG_TAIL_BYTES = 16_384
@@ -147,6 +150,10 @@ class WorkerProcess:
                 FailureKind.OUT_OF_MEMORY,
                 f"the kernel killed worker {self._process.pid}: the machine is out of memory",
             )
+        if self.key[2] is not None and self.assignment is not None:  # some drivers end the process
+            lines = log_tail(self.assignment.log, _DRIVER_LINES).splitlines()
+            if words := next(filter(means_gpu_error, reversed(lines)), ""):
+                return FailureKind.GPU_ERROR, f"worker {self._process.pid} ended after a GPU error: {words.strip()}"
         how = f"died of {_signal_name(-code)}" if code < 0 else f"exited with code {code}"
         return FailureKind.WORKER_LOST, f"worker {self._process.pid} {how} in the middle of its task"
 
@@ -162,7 +169,7 @@ class WorkerProcess:
         self._scratch.close()
 
 
-def log_tail(log: Path) -> str:
+def log_tail(log: Path, lines: int = _LOG_TAIL_LINES) -> str:
     """The last lines of a log; empty if there is none, or none that can be read."""
     try:
         with log.open("rb") as file:
@@ -171,7 +178,7 @@ def log_tail(log: Path) -> str:
             text = file.read().decode(errors="replace")
     except OSError:  # on a shared disk anything can be; the failure that it was to explain matters more
         return ""
-    return "\n".join(text.splitlines()[-_LOG_TAIL_LINES:])
+    return "\n".join(text.splitlines()[-lines:])
 
 
 def python_argv(module: str, *words: str) -> list[str]:

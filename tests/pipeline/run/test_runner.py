@@ -238,6 +238,24 @@ def test_the_record_says_how_each_run_ended(root):
     assert failed.run != succeeded.run
 
 
+def test_without_a_gpu_that_works_the_job_pauses_and_continues(tmp_path, monkeypatch):
+    """The film's first two GPUs fail; the third draws it in the next run."""
+    plan = FilmStage.plan
+    on_gpu = Resources(gpus=1)
+    monkeypatch.setattr(FilmStage, "plan", lambda *args: [replace(task, resources=on_gpu) for task in plan(*args)])
+    root, recorder = tmp_path / "job", Recorder()
+    write_faults(root, {"film": ["lose GPU", "lose GPU and abort"]})
+    outcomes = []
+    for _ in range(2):
+        with ProcessExecutor(gpus=2) as executor:
+            options = {"observers": [recorder.notify], "capacity": Resources(cores=2, gpus=2)}
+            outcomes.append(run_synthetic(root, executor, **options).kind)
+    assert outcomes == [JobOutcome.NO_GPU, JobOutcome.SUCCEEDED]
+    assert [notice.message.partition(";")[0] for notice in recorder.of(Notice)] == [
+        f"GPU {gpu} failed in film and gets no task any more in this run" for gpu in (1, 0)
+    ]
+
+
 def test_what_no_machine_has_is_a_clear_line(tmp_path, monkeypatch):
     plan = FilmStage.plan
     on_gpu = Resources(gpus=1)

@@ -148,3 +148,23 @@ def test_processes_that_fill_a_new_kernel_cache_at_the_same_time_do_no_harm(tmp_
 def test_device_error_survives_pickling():
     error = DeviceUnavailableError("cuda", "no driver")
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+@pytest.mark.parametrize(
+    ("named", "gpu", "seen"), [(None, 1, "1"), ("GPU-a, GPU-b", 1, "GPU-b"), ("5", 0, "5"), (None, None, None)]
+)
+def test_a_simulation_sees_its_own_gpu_alone_when_taichi_starts(monkeypatch, named, gpu, seen):
+    started = []
+    monkeypatch.setattr(runtime, "_in_use", {})
+    monkeypatch.setattr(runtime, "resolve_device", lambda device: device)
+    monkeypatch.setattr(runtime, "_start_taichi", lambda *_: started.append(os.environ.get("CUDA_VISIBLE_DEVICES")))
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if named is None:
+        monkeypatch.setattr(Path, "glob", lambda *_: [Path("/dev/nvidia0"), Path("/dev/nvidia1")])
+    else:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", named)
+    assert initialize("cuda", gpu=gpu) == "cuda"
+    assert started == [seen]
+    monkeypatch.setattr(runtime, "_in_use", {})
+    with pytest.raises(DeviceUnavailableError, match="there is no GPU 7"):
+        initialize("cuda", gpu=7)

@@ -173,6 +173,28 @@ def test_a_task_for_a_gpu_runs_where_there_is_one(port, layout):
         assert parent.pid == gifted.pid
 
 
+def test_a_worker_that_loses_its_gpu_hands_its_task_back_and_gets_no_other_one(port, layout):
+    told: list[str] = []
+    on_gpu = Resources(cores=1, gpus=1)
+    with (
+        running(start_worker(port, "CPU=1 GPU=1")),
+        running(start_worker(port, "CPU=1 GPU=1")),
+        DaskExecutor(f"tcp://{HOST}:{port}", layout.root, patience_s=START_PATIENCE_S, say=told.append) as executor,
+    ):
+        _wait_for_cores(executor, 2)
+        write_faults(layout.root, {"steps": ["lose GPU"]})
+        parents = set()
+        for attempt in (1, 2):
+            executor.submit(replace(assign(layout, "steps", attempt=attempt), need=on_gpu))
+            started = _wait_for_start(executor)
+            end = events_until_end(executor)[-1]
+            parents.add(started.pid)
+            assert isinstance(end, Failed if attempt == 1 else Finished)
+            assert executor.capacity.gpus == 1
+        assert isinstance(run(executor, replace(assign(layout, "double/000000"), need=on_gpu))[-1], Finished)
+    assert any("failed in steps and gets no task any more in this run" in sentence for sentence in told)
+
+
 def test_what_fits_on_no_worker_is_a_failure_in_the_end(cluster, layout):
     told: list[str] = []
     with DaskExecutor(cluster, layout.root, of_runner=True, say=told.append) as executor:

@@ -59,6 +59,22 @@ def test_what_fits_nowhere_yet_reserves_the_worker_that_will_have_room_first():
     assert workers.emptiest(Resources(cores=5)) is None
 
 
+def test_a_gpu_that_failed_counts_no_more_until_its_worker_is_another():
+    on_gpu = Resources(cores=1, gpus=1)
+    workers = slots(offer("a", 4, gpus=2), offer("b", 4))
+    first = workers.take(on_gpu, stage="simulate")
+    assert first is not None
+    workers.withdraw_gpu(first)
+    workers.give_back(first, on_gpu)
+    assert (workers.total.gpus, take(workers, on_gpu), take(workers, on_gpu)) == (1, "a", None)
+    workers.update({each.address: each for each in (offer("a", 4, gpus=2), offer("b", 4))})
+    assert workers.total.gpus == 1
+    workers.update({"a": offer("a", 4, gpus=2, identity="second")})
+    assert workers.total.gpus == 2
+    workers.withdraw_gpu(first)  # of the former one
+    assert workers.total.gpus == 2
+
+
 def test_gpus_memory_and_threads_count():
     workers = slots(offer("cpu", 16, threads=2), offer("gpu", 1, gpus=1, threads=2))
     assert take(workers, Resources(cores=1, gpus=1)) == "gpu"

@@ -6,6 +6,7 @@ import errno
 import os
 import signal
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -31,12 +32,13 @@ from synthetic_stages import write_faults
 from pipeline.base.errors import InvalidArtifactError, StageUnavailableError
 from pipeline.base.memory import read_oom_kills
 from pipeline.base.task import FailureKind, Resources, TaskId
-from pipeline.run.events import Committed, Failed, Finished, Progress, Started, TaskEvent
+from pipeline.run.events import Committed, ExecutorEvent, Failed, Finished, GpuWithdrawn, Progress, Started, TaskEvent
 from pipeline.run.executors.base import Assignment, Executor
 from pipeline.run.executors.failures import classify
 from pipeline.run.executors.inline import InlineExecutor
 from pipeline.run.executors.processes import ProcessExecutor, WorkerLimits
 from render.blender import BlenderDiedError, FrameRenderError
+from sim.core.runtime import DeviceUnavailableError
 
 __all__ = ["layout"]
 
@@ -244,6 +246,31 @@ class TestProcesses(ProcessesContract):
             assert workers(run(executor, on_gpu("double/000002"))) == [first]
             assert workers(run(executor, assign(layout, "double/000003"))) not in ([first], [second])
 
+    @pytest.mark.parametrize("fault", ["lose GPU", "lose GPU and abort"])
+    def test_a_gpu_that_fails_a_task_gets_no_other(self, layout, fault):
+        def on_gpu(name: str, attempt: int = 1) -> Assignment:
+            return replace(assign(layout, name, attempt=attempt), need=Resources(gpus=1))
+
+        with ProcessExecutor(gpus=2) as executor:
+            run(executor, assign(layout, "steps"))
+            run(executor, on_gpu("double/000001"))
+            (idle,) = executor.worker_gpus.items()
+            assert idle[1] == 1
+            write_faults(layout.root, {"double/000000": [fault, fault]})
+            withdrawn, failed = _end_of(executor, on_gpu("double/000000"))
+            assert isinstance(withdrawn, GpuWithdrawn) and withdrawn.left == 1
+            assert failure([failed]).kind is FailureKind.GPU_ERROR
+            assert set(executor.worker_gpus.values()) <= {1}  # one that is on its way out
+            (finished,) = _end_of(executor, on_gpu("double/000001", 2))
+            assert isinstance(finished, Finished)
+            assert 0 in executor.worker_gpus.values()
+            withdrawn, failed = _end_of(executor, on_gpu("double/000000", 2))
+            assert isinstance(withdrawn, GpuWithdrawn) and withdrawn.left == 0
+            assert failure([failed]).kind is FailureKind.GPU_ERROR
+            assert failure(run(executor, on_gpu("double/000002"))).kind is FailureKind.GPU_ERROR
+        with ProcessExecutor(gpus=1) as another_run:
+            assert isinstance(run(another_run, on_gpu("double/000000", 3))[-1], Finished)
+
     @pytest.mark.slow
     def test_sigterm_from_outside_lets_the_task_stop_and_the_worker_leave(self, executor, layout):
         write_faults(layout.root, {"steps": ["wait for stop@1"]})
@@ -266,6 +293,17 @@ class TestProcesses(ProcessesContract):
         assert isinstance(run(executor, large)[-1], Finished)
 
 
+def _end_of(executor: Executor, assignment: Assignment) -> list[ExecutorEvent]:
+    """How an attempt ended, and what was told of the machine."""
+    executor.submit(assignment)
+    told: list[ExecutorEvent] = []
+    until = time.monotonic() + PATIENCE_S
+    while not any(isinstance(event, Finished | Failed) for event in told):
+        assert time.monotonic() < until
+        told += executor.wait(0.5)
+    return [event for event in told if isinstance(event, Finished | Failed | GpuWithdrawn)]
+
+
 def test_kills_for_want_of_memory_are_counted(tmp_path):
     events = tmp_path / "memory.events"
     events.write_text("low 0\nhigh 3\nmax 12\noom 2\noom_kill 1\noom_group_kill 0\n")
@@ -285,6 +323,14 @@ def test_kills_for_want_of_memory_are_counted(tmp_path):
         (StageUnavailableError("no Blender"), FailureKind.FAILED),
         (FrameRenderError(3, "the mesh is broken"), FailureKind.FAILED),
         (BlenderDiedError(3, -9, "(it wrote nothing)"), FailureKind.WORKER_LOST),
+        (BlenderDiedError(3, -6, "Illegal address in CUDA queue copy_from_device"), FailureKind.GPU_ERROR),
+        (FrameRenderError(3, "Error: OPTIX_ERROR_UNKNOWN in optixLaunch (...)"), FailureKind.GPU_ERROR),
+        (FrameRenderError(3, "Launch failed in cuCtxSynchronize()"), FailureKind.GPU_ERROR),
+        (RuntimeError("[...] CUDA Error CUDA_ERROR_ECC_UNCORRECTABLE: ..."), FailureKind.GPU_ERROR),
+        (RuntimeError("[...] CUDA Error CUDA_ERROR_OUT_OF_MEMORY: out of memory"), FailureKind.OUT_OF_MEMORY),
+        (DeviceUnavailableError("cuda", "its driver ends the process"), FailureKind.GPU_ERROR),
+        (DeviceUnavailableError("cpu", "Taichi does not load"), FailureKind.FAILED),
+        (RuntimeError("a value in cube(3)"), FailureKind.FAILED),
     ],
 )
 def test_exceptions_are_classified_with_what_is_behind_them(error, kind):

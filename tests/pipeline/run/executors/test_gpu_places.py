@@ -11,15 +11,15 @@ from pipeline.base.task import Resources, Task, TaskId
 from pipeline.job.loading import job_of_text
 from pipeline.model.gpus import OWN_GPUS, first_gpu, own_gpus
 from pipeline.run.executors.dask_local import gpu_places
-from pipeline.run.executors.gpu_places import GpuPlaces
+from pipeline.run.executors.gpu_places import GpuPlaces, NoGpuLeftError
 from pipeline.run.plan import plan_job
 from pipeline.stages import STAGES
 
 
 def task(stage: str) -> Task:
-    """A task that needs a GPU; a simulation is bound to the first one."""
+    """A task that needs a GPU; a simulation takes the lowest."""
     parameters = ParameterSet.of(stage=stage, version=1, tools={})
-    return Task(TaskId(stage), stage, (), (), parameters, on_first_gpu=stage == "simulate")
+    return Task(TaskId(stage), stage, (), (), parameters, lowest_gpu=stage == "simulate")
 
 
 def test_each_picture_gets_the_highest_gpu_that_is_free():
@@ -37,20 +37,29 @@ def test_where_it_is_not_known_how_many_there_are_the_lowest_that_is_free_is_giv
     assert places.take() == 3
 
 
-def test_a_simulation_is_on_the_first_gpu_whatever_is_free():
+def test_simulations_take_the_lowest_gpus_and_pictures_the_others():
     places = GpuPlaces(None)
-    assert [places.take(first=True, there=3), places.take([0], there=3), places.take(there=3)] == [0, 2, 1]
-    places.give_back(0)
-    assert [places.take([0], there=3), places.take(first=True, there=3)] == [0, 0]  # shared until the picture is drawn
+    taken = [places.take(lowest=True, there=4), places.take(there=4), places.take(lowest=True, there=4)]
+    assert taken == [0, 3, 1]
     places = GpuPlaces([1, 3])
-    assert [places.take(first=True), places.take(), places.take()] == [0, 3, 1]
-    assert GpuPlaces([]).take(first=True) == 0
+    assert [places.take(lowest=True), places.take(), places.take(lowest=True)] == [1, 3, 1]
+    assert [GpuPlaces([]).take(lowest=True, there=2), GpuPlaces([]).take(lowest=True)] == [0, 0]
 
 
-def test_a_simulation_asks_for_the_first_gpu():
+def test_a_gpu_that_failed_is_given_no_more():
+    places = GpuPlaces(None)
+    assert [places.take([1], there=3, failed={1}), places.take(lowest=True, there=3, failed={0, 1})] == [2, 2]
+    assert places.take(failed={0}) == 1  # where it is not known how many there are
+    with pytest.raises(NoGpuLeftError):
+        places.take(there=3, failed={0, 1, 2})
+    with pytest.raises(NoGpuLeftError):
+        GpuPlaces([1]).take(lowest=True, failed={1})
+
+
+def test_a_simulation_asks_for_the_lowest_gpu():
     text = 'name = "ball"\ndevice = "cuda"\n[[rigid]]\nname = "ball"\nshape = { type = "sphere", radius = 0.1 }\n'
     planned = plan_job(job_of_text(text, Path("job.toml")), JobLayout(Path("renders/ball")), STAGES)
-    assert {task.stage for task in planned if task.on_first_gpu} == {"simulate"}
+    assert {task.stage for task in planned if task.lowest_gpu} == {"simulate"}
 
 
 def test_a_gpu_where_blender_waits_goes_before_another_unless_a_task_is_on_it():
