@@ -60,6 +60,8 @@ def machine_memory_bytes() -> int:
     for folder in _control_groups():
         with suppress(OSError, ValueError):  # "max" is no number, and no limit
             total = min(total, int((folder / "memory.max").read_text()))
+        with suppress(OSError, ValueError):  # version 1; without a limit it is larger than any machine
+            total = min(total, int((folder / "memory.limit_in_bytes").read_text()))
     return total
 
 
@@ -68,7 +70,7 @@ def out_of_memory_kills() -> int:
 
     A rise of this number is the evidence that a SIGKILL came from the kernel and not from a person.
     """
-    groups = [folder / "memory.events" for folder in _control_groups()[:1]]
+    groups = [folder / name for folder in _control_groups() for name in ("memory.events", "memory.oom_control")]
     for path in (*groups, Path("/proc/vmstat")):
         count = read_oom_kills(path)
         if count is not None:
@@ -87,15 +89,16 @@ def read_oom_kills(path: Path) -> int | None:
 
 
 def _control_groups() -> list[Path]:
-    """Folders of this process's control group (version 2) and of those around it, the innermost first."""
+    """Folders of this process's control group of memory and of those around it, the innermost first."""
+    folders: list[Path] = []
     with suppress(OSError):
         for line in Path("/proc/self/cgroup").read_text().splitlines():
-            hierarchy, _, group = line.split(":", 2)
-            if hierarchy == "0":
-                base = Path("/sys/fs/cgroup")
+            hierarchy, controllers, group = line.split(":", 2)
+            if hierarchy == "0" or "memory" in controllers.split(","):  # version 2, and version 1
+                base = Path("/sys/fs/cgroup") if hierarchy == "0" else Path("/sys/fs/cgroup/memory")
                 inner = base / group.lstrip("/")
-                return [folder for folder in (inner, *inner.parents) if folder.is_relative_to(base)]
-    return []
+                folders += [folder for folder in (inner, *inner.parents) if folder.is_relative_to(base)]
+    return folders
 
 
 def _children(pid: int) -> Iterator[int]:
