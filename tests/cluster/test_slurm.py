@@ -149,7 +149,6 @@ class DaskWorkers(Way):
     def finish(self) -> None:
         assert self.runner is not None
         finish(self.runner).assert_code(0)
-        self.film.assert_nothing_done_twice()
 
     def middle_of(self, stage: str) -> psutil.Process:
         assert self.runner is not None
@@ -211,7 +210,6 @@ def is_warned(way: Way, worker: psutil.Process) -> None:
             pytest.param(way, stage, happens, ends, marks=pytest.mark.nightly)
             for way, stage, happens, ends in [
                 (StageArrays, "render", is_killed, True),
-                (StageArrays, "render", is_cancelled, True),
                 (StageArrays, "simulate", loses_its_node, False),
                 (StageArrays, "simulate", has_its_node_drained, False),
                 (StageArrays, "simulate", is_out_of_time, False),
@@ -254,6 +252,8 @@ def test_a_film_on_slurm_is_the_same_whatever_happens(
     if happens is has_its_node_drained:
         assert again == []
         assert cluster.begun_on(node) == before
+    elif way is DaskWorkers:  # the runner may give another task to a worker that is about to leave
+        making.film.assert_nothing_done_twice()
     else:  # what stood still between two frames has none to draw again
         assert again == [stage] or (again == [] and stage == "render")
     if happens in (is_warned, is_out_of_time) and stage == "simulate":

@@ -164,12 +164,15 @@ class SlurmCluster:
         """Cancel all jobs, and have every node back."""
         self.run("scancel", "--user=root")
         self.wait(lambda: not self.active(), "jobs do not end")
-        for node in NODES:
-            if self.run("sinfo", f"--nodes={node}", "--noheader", "--format=%t") in ("drain", "drng", "down"):
-                self.set_node(node, "resume")
-        self.wait(self.is_idle, "nodes do not come back")
+        self.wait(self._are_nodes_back, "nodes do not come back")
         for path in self.folder.glob("job-*.out"):
             path.unlink()
+
+    def _are_nodes_back(self) -> bool:
+        for node in NODES:
+            if self.run("sinfo", f"--nodes={node}", "--noheader", "--format=%t") in ("drain", "down"):
+                self.set_node(node, "resume")
+        return self.is_idle()
 
     def is_idle(self) -> bool:
         """Whether all nodes are there and have nothing to do."""
