@@ -121,11 +121,14 @@ def test_damaged_files_are_made_again_and_kept_aside(finished: Studio, reference
 
 @pytest.mark.slow
 def test_a_damaged_manifest_is_made_anew_of_the_receipts(finished: Studio, reference: Studio) -> None:
-    finished.layout.manifest.write_bytes(b"this is no database" * 100)
-    refused = finished.run("submit", "tiny.toml").assert_code(1)
-    *_, remedy = refused.err.strip().partition("pipeline verify ")
+    garbled = b"this is no database" * 100
+    finished.layout.manifest.write_bytes(garbled)
+    *_, remedy = finished.run("plan", "tiny").assert_code(1).err.strip().partition("pipeline verify ")
     finished.run("verify", *remedy.split()).assert_code(0)
-    assert finished.submit().out.startswith("up to date")
+    finished.layout.manifest.write_bytes(garbled)
+    submitted = finished.submit()
+    assert submitted.out.startswith("up to date")
+    assert "was damaged and is made anew of" in submitted.err
     finished.assert_whole(like=reference)
 
 

@@ -33,7 +33,7 @@ from pipeline.base.task import FailureKind
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
+@pytest.mark.timeout(3000)
 def test_worker_and_runner_killed_in_every_stage_and_the_film_is_the_same(reference: Studio, tmp_path: Path) -> None:
     film = Studio.open(tmp_path)
     victims = {stage: ["worker", "runner"] for stage in STAGE_NAMES}

@@ -24,7 +24,7 @@ frames = 6
 name = "plume"
 source = [{ shape = { type = "sphere", radius = 0.1 }, position = [0.0, 0.0, 0.2] }]
 """
-PATIENCE_S = 30.0  # far above the second that anything here takes, so that only a hang gets there
+PATIENCE_S = 120.0  # far above the second that anything here takes, so that only a hang gets there
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from pipeline.queue.job_queue import JobQueue
 from pipeline.record.reader import AttemptRow, ManifestReader
 
 HERE = Path(__file__).resolve().parent
-PATIENCE_S = 120.0
+PATIENCE_S = 900.0
 """Only a hang, or a very busy machine, gets here."""
 
 

@@ -26,8 +26,9 @@ from pipeline.base.task import TaskId
 from pipeline.record.reader import SUCCEEDED, AttemptRow, ManifestReader
 from pipeline.stages import STAGES
 
-PATIENCE_S = 240.0
-"""A film takes some 20 s on two idle cores; only a hang, or a very busy machine, gets here."""
+PATIENCE_S = 900.0
+"""A film takes some 20 s on two idle cores, and minutes where others are busy and kernels are compiled anew after each
+kill; only a hang gets here."""
 
 FRAMES = 6
 STAGE_NAMES = [stage.name for stage in STAGES if stage.name != "bounds"]

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import drawing_stages
 import pytest
 from command_line import pipeline
-from synthetic_jobs import run_synthetic
+from synthetic_jobs import job_text
 
 from pipeline.base.layout import JobLayout
 from pipeline.cli.main import SECTIONS
-from pipeline.run.executors.inline import InlineExecutor
 from pipeline.store.receipts import hash_file
 
 READERS = {"new", "check", "plan", "status", "explain", "view", "live", "doctor", "schema", "dashboard"}
@@ -51,13 +51,22 @@ LINKS = (
 )
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(autouse=True)
+def drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Films take a moment: most commands that are called make what is spoilt anew."""
+    monkeypatch.setattr("pipeline.stages.STAGES", drawing_stages.STAGES)
+    monkeypatch.setattr("pipeline.queue.turns.STAGES_REFERENCE", drawing_stages.REFERENCE)
+
+
+@pytest.fixture
+def finished(tmp_path: Path, drawing: None) -> Path:
     """The folder of a finished job."""
-    root = tmp_path_factory.mktemp("finished") / "synthetic"
-    with InlineExecutor() as executor:
-        run_synthetic(root, executor)
-    return root
+    file = tmp_path / "finished" / "synthetic.toml"
+    file.parent.mkdir()
+    file.write_text(job_text(frames=2))
+    ended = pipeline("submit", file, "--output", file.parent, "--executor", "inline")
+    assert ended.exit_code == 0, ended.output
+    return file.with_suffix("")
 
 
 @pytest.fixture
@@ -92,9 +101,9 @@ def calls(root: Path) -> list[list[str]]:
     ]
 
 
-def sweep(finished: Path, outside: Path, spoil: Callable[[JobLayout], None]) -> list[int]:
-    """Call every command on a spoilt copy of the folder; returns the exit codes of those that do not just read it."""
-    before, codes = state(outside), []
+def sweep(finished: Path, outside: Path, spoil: Callable[[JobLayout], None]) -> set[str]:
+    """Call every command on a spoilt copy of the folder; returns those that were refused in one way or another."""
+    before, refused = state(outside), set()
     for number in range(sum(map(len, WRITERS.values()))):
         root = outside.parent / f"farm-{number}" / finished.name
         command = calls(root)[number]
@@ -104,8 +113,9 @@ def sweep(finished: Path, outside: Path, spoil: Callable[[JobLayout], None]) -> 
         ended = pipeline(*command)
         assert state(outside) == before, command
         assert ended.exception is None or isinstance(ended.exception, SystemExit), (command, ended.exception)
-        codes.append(ended.exit_code)
-    return codes
+        if ended.exit_code:
+            refused.add(command[0])
+    return refused
 
 
 def test_every_command_is_swept() -> None:
@@ -116,8 +126,8 @@ def record(layout: JobLayout, path: str, file: Path) -> None:
     """Put a file on record as a rendered picture."""
     with closing(sqlite3.connect(layout.manifest)) as manifest, manifest:
         manifest.execute(
-            "INSERT INTO artifact SELECT ?, task, attempt, fingerprint, parameters, ?, ?, ?, inputs, device"
-            " FROM artifact WHERE task = 'double/000000'",
+            "INSERT OR REPLACE INTO artifact SELECT ?, task, attempt, fingerprint, parameters, ?, ?, ?, inputs, device"
+            " FROM artifact WHERE task = 'render/000001'",
             (path, file.stat().st_size, file.stat().st_mtime_ns, hash_file(file)),
         )
         manifest.execute("UPDATE artifact SET task = 'render/000000' WHERE path = ?", (path,))
@@ -128,7 +138,7 @@ def test_recorded_paths_do_not_lead_outside(finished: Path, outside: Path, recor
     def spoil(layout: JobLayout) -> None:
         record(layout, recorded.format(outside=outside), outside / PICTURE)
 
-    assert sweep(finished, outside, spoil).count(0) <= 4
+    assert sweep(finished, outside, spoil) >= {"report", "verify", "clean"}  # a run makes the record anew
 
 
 @pytest.mark.parametrize("link", LINKS)

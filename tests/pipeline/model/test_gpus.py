@@ -54,7 +54,8 @@ class Machine:
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
     machine = Machine()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv(gpus.OWN_GPUS, raising=False)
+    for name in (gpus.OWN_GPUS, *gpus._VISIBILITY):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("pipeline.model.gpus.find_gpus", machine.find_gpus)
     monkeypatch.setattr(gpus, "_device_files", lambda: ["/dev/nvidia0", "/dev/nvidia1"])
     monkeypatch.setattr(gpus, "driver_version", lambda: "570.1")

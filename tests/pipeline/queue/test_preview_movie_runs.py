@@ -225,7 +225,7 @@ def test_a_film_that_may_hold_frames_of_an_earlier_version_goes_when_a_run_begin
 
 
 def test_a_film_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
-    monkeypatch.setattr("pipeline.queue.preview_movie.SHARE", 0.05)
+    monkeypatch.setattr("pipeline.queue.preview_movie.SHARE", 1.0e-4)
     observer, said, assessments = watched(tmp_path, frames=400, drawn=200)
     layout = JobLayout(tmp_path)
     with observer:
@@ -237,7 +237,7 @@ def test_a_film_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
             time.sleep(0.05)
             receipt = Receipt(each.task.outputs[0], each.task.id, each.task.stage, 1, "f", "p", 1, 1, "h")
             observer.notify(Committed(each.task.id, 1, receipt))
-    # It takes a quarter of a second at least for its imports alone: the next one would be due after five.
+    # It takes a quarter of a second at least for its imports alone: the next one is due after 40 minutes.
     assert layout.preview_movie.stat().st_mtime_ns == first, said
 
 

@@ -158,7 +158,8 @@ def test_a_simulation_sees_its_own_gpu_alone_when_taichi_starts(monkeypatch, nam
     monkeypatch.setattr(runtime, "_in_use", {})
     monkeypatch.setattr(runtime, "resolve_device", lambda device: device)
     monkeypatch.setattr(runtime, "_start_taichi", lambda *_: started.append(os.environ.get("CUDA_VISIBLE_DEVICES")))
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # so that what `initialize` puts there does not stay
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     if named is None:
         monkeypatch.setattr(Path, "glob", lambda *_: [Path("/dev/nvidia0"), Path("/dev/nvidia1")])
     else:
