@@ -77,6 +77,15 @@ class LeaseLostError(PipelineError):
     exit_code = 4
 
 
+class FolderGoneError(PipelineError):
+    """The job's folder is not where it was any more; nothing is made in its place."""
+
+    @classmethod
+    def of(cls, folder: Path) -> Self:
+        """This folder was there when the command began."""
+        return cls(f"{folder} is not there any more; if it was renamed, resume the job by its new name")
+
+
 class ManifestError(PipelineError):
     """The job's manifest cannot be used; says how to get a good one from the receipts."""
 

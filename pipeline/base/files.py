@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import BinaryIO
 from uuid import uuid4
 
+from pipeline.base.errors import FolderGoneError
+
 
 def replace_durably(path: Path, content: str | bytes, *, mark: str = "part") -> None:
     """Write a file aside, force it to the disk and rename it: others see the old one or the new one, never a part.
@@ -37,6 +39,20 @@ def replacing(path: Path) -> Iterator[Path]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def make_folder(path: Path, *, within: Path) -> None:
+    """Make a folder, and those between it and `within`; each new name is forced to the disk.
+
+    Raises FolderGoneError: `within` itself is not there, which somebody has renamed or removed who wants no new one.
+    """
+    if path.is_dir():
+        return
+    if path == within:
+        raise FolderGoneError.of(within)
+    make_folder(path.parent, within=within)
+    path.mkdir(exist_ok=True)
+    sync(path.parent)
 
 
 def open_regular(path: Path) -> BinaryIO:

@@ -34,7 +34,7 @@ from typing import Self
 import psutil
 
 from pipeline.base import wording
-from pipeline.base.errors import NO_LOCKS, JobBusyError, LeaseLostError, PipelineError
+from pipeline.base.errors import NO_LOCKS, FolderGoneError, JobBusyError, LeaseLostError, PipelineError
 
 HEARTBEAT_INTERVAL_S = 5.0  # how often a holder says that it is alive
 
@@ -88,7 +88,8 @@ class Lease:
 
     def __init__(self, path: Path, holder: LeaseHolder, takeover: str | None) -> None:
         self._path = path
-        self._loss: LeaseLostError | None = None
+        self._folder = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)  # the way to the file where it is renamed
+        self._loss: FolderGoneError | LeaseLostError | None = None
         self._renewed = time.monotonic()  # when the heartbeat was last known to be written
         self._given_back = threading.Event()
         self._beating: threading.Thread | None = None
@@ -113,8 +114,11 @@ class Lease:
     def heartbeat(self) -> None:
         """Say that the holder is alive; inside the context a thread does, every HEARTBEAT_INTERVAL_S.
 
-        Raises LeaseLostError: somebody has taken the job over. Stop at once, and write no record any more.
+        Raises:
+            FolderGoneError: the folder is not there any more; see `look`.
+            LeaseLostError: somebody has taken the job over. Stop at once, and write no record any more.
         """
+        self.look()
         with _guard(self._path):
             if not self._is_mine():
                 successor = read_holder(self._path)
@@ -127,12 +131,17 @@ class Lease:
     def check(self) -> None:
         """Make sure that the lease was still ours at the last heartbeat; costs nothing while the heart beats.
 
-        Raises LeaseLostError: see `heartbeat`.
+        Raises FolderGoneError, LeaseLostError: see `heartbeat`.
         """
         if self._loss is None and self._is_overdue():  # this process was stopped, or its file system did not answer
             self._renew()
         if self._loss is not None:
             raise self._loss
+
+    def look(self) -> None:
+        """Make sure that the folder is still there. Raises FolderGoneError: stop, and make no new one."""
+        if not self._path.parent.is_dir():
+            raise FolderGoneError.of(self._path.parent)
 
     def _is_overdue(self) -> bool:
         return time.monotonic() - self._renewed > EXPIRY_S
@@ -140,7 +149,7 @@ class Lease:
     def _renew(self) -> None:
         try:
             self.heartbeat()
-        except LeaseLostError as loss:
+        except (FolderGoneError, LeaseLostError) as loss:
             self._loss = loss
         except OSError as error:
             # A file system that does not answer may do so the next time; until then others may count us alive.
@@ -154,6 +163,12 @@ class Lease:
 
     def release(self) -> None:
         """Give the lease back; one that somebody else has taken over, or may be about to, is left alone."""
+        try:
+            self.look()
+        except FolderGoneError:
+            if not self._is_overdue():
+                os.unlink(self._path.name, dir_fd=self._folder)
+            return
         with _guard(self._path):
             if self._is_mine() and not self._is_overdue():
                 self._path.unlink()
@@ -173,6 +188,7 @@ class Lease:
             self._beating.join()
         with suppress(OSError):  # a folder that refuses; once this process has ended, the lease counts for nothing
             self.release()
+        os.close(self._folder)
 
 
 def _take(path: Path) -> tuple[LeaseHolder, str | None]:

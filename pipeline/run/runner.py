@@ -72,6 +72,7 @@ def run_job(
         policy: when failed tasks are tried again, and when the job gives up; a stage's own limits come first.
 
     Raises:
+        FolderGoneError: the job's folder was renamed or removed meanwhile.
         JobBusyError: another live process runs this job.
         LeaseLostError: another process took the job over, because this one did not answer for long.
         ManifestError: the record cannot be used; the text says what to do. One that is damaged is made anew.
@@ -198,6 +199,8 @@ class _Run:
             while self.ending is None:
                 news = self.executor.wait(self._sleep_s())
                 self.lease.check()
+                if any(isinstance(event, events.Failed) for event in news):
+                    self.lease.look()
                 self._turn(news, self._obey_control() + self.scheduler.handle(events.Tick(time.monotonic())))
             if self.record.parts_left:
                 sweep_parts(self.layout)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import count
 
 from pipeline.base.errors import PipelineError
+from pipeline.base.files import make_folder
 from pipeline.base.layout import JobLayout
 from pipeline.base.places import check_places
 from pipeline.base.resources import claim
@@ -128,7 +129,7 @@ def _open_attempt(task: Task, layout: JobLayout) -> int:
     """A number that no other attempt has, on any machine: the log of that name is made, and was not there before."""
     committed = [read_receipt(layout, artifact) for artifact in task.outputs]
     first = 1 + max((receipt.attempt for receipt in committed if receipt and receipt.task == task.id), default=0)
-    layout.log(task.id, first).parent.mkdir(parents=True, exist_ok=True)
+    make_folder(layout.log(task.id, first).parent, within=layout.root)
     for number in count(first):
         try:
             descriptor = os.open(layout.log(task.id, number), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)

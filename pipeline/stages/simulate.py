@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.base.content import tool_version
 from pipeline.base.errors import InvalidArtifactError, StageUnavailableError
-from pipeline.base.files import sync
+from pipeline.base.files import make_folder, sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
@@ -135,7 +135,7 @@ class _Simulation:
 
         self._context = context
         self._folder = context.layout.checkpoints
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self._folder, within=context.layout.root)
         self._device = initialize(context.job.device, threads=context.threads, gpu=context.gpu)
         more = (kind.solvers for kind in KINDS.values() if kind.solvers is not None)
         solvers = [solver for make in more for solver in make(context.job, context.job.fps)]

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.base.errors import InvalidArtifactError, StaleAttemptError
-from pipeline.base.files import sync
+from pipeline.base.files import make_folder, sync
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, Task
 from pipeline.store.provenance import keep_texts, maker
@@ -102,13 +102,14 @@ def committing(
         device: what computes it, if that decides its last bits.
 
     Raises:
+        FolderGoneError: the job's folder is not there any more.
         InvalidArtifactError: on leaving, if nothing was written or `validate` refused it.
         StaleAttemptError: on leaving, if a newer attempt of the same task has committed this artifact.
     """
     target, receipt_path = layout.path(artifact), layout.receipt(artifact)
     commit, receipt_part = Commit(_part_path(target, attempt)), _part_path(receipt_path, attempt)
     started = _now_s()
-    _make_folder(target.parent)
+    make_folder(target.parent, within=layout.root)
     commit.path.unlink(missing_ok=True)
     try:
         yield commit
@@ -137,7 +138,7 @@ def committing(
             started=started,
             finished=_now_s(),
         )
-        _make_folder(receipt_path.parent)
+        make_folder(receipt_path.parent, within=layout.root)
         receipt_part.write_text(receipt.to_json())
         sync(receipt_part)
         with _lock(receipt_path.with_name(_LOCK_NAME)):
@@ -214,12 +215,3 @@ def _lock(path: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-def _make_folder(path: Path) -> None:
-    """Make a folder and its parents; each new name is forced to the disk."""
-    if path.is_dir():
-        return
-    _make_folder(path.parent)
-    path.mkdir(exist_ok=True)
-    sync(path.parent)

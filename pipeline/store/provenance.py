@@ -19,7 +19,7 @@ from blake3 import blake3
 
 from pipeline import __version__
 from pipeline.base import wording
-from pipeline.base.files import open_regular, replace_durably, sync
+from pipeline.base.files import make_folder, open_regular, replace_durably
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet, digest_of
 from pipeline.store.receipts import Receipt
@@ -39,13 +39,13 @@ def keep_texts(layout: JobLayout, parameters: ParameterSet) -> str:
 
     Raises OSError: they cannot be written, as on a full disk.
     """
-    _keep(layout.parameters_text(parameters.digest), parameters.canonical)
+    _keep(layout, layout.parameters_text(parameters.digest), parameters.canonical)
     try:
         text = layout.job_file.read_text(encoding="utf-8")
     except FileNotFoundError:
         return ""
     digest = digest_of(text)
-    _keep(layout.job_text(digest), text)
+    _keep(layout, layout.job_text(digest), text)
     return digest
 
 
@@ -68,14 +68,10 @@ def damaged_texts(layout: JobLayout) -> Iterator[Path]:
             yield path
 
 
-def _keep(path: Path, text: str) -> None:
-    if path.exists():
-        return
-    if not path.parent.is_dir():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        sync(path.parent.parent)
-        sync(path.parent.parent.parent)
-    replace_durably(path, text)
+def _keep(layout: JobLayout, path: Path, text: str) -> None:
+    if not path.exists():
+        make_folder(path.parent, within=layout.root)
+        replace_durably(path, text)
 
 
 # --- in words ---

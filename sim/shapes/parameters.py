@@ -115,7 +115,7 @@ class BallastParameters(Parameters):
 class WeightedPlacement(Placement):
     """A shape in the world that may have a mass."""
 
-    density: Positive | None = Field(
+    density: Annotated[float, Field(ge=1e-3, le=1e6)] | None = Field(
         default=None,
         description="Mass per volume [kg/m³]; dynamic bodies need one. Within some 10 % of a fluid's, a body that "
         "starts deep below its surface rises or sinks slowly.",

@@ -5,6 +5,7 @@ from collections import deque
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from dataclasses import replace
 
+from pipeline.base.files import make_folder
 from pipeline.base.task import FailureKind, TaskId
 from pipeline.model.gpus import first_gpu
 from pipeline.run.events import Failed
@@ -52,7 +53,7 @@ class InlineExecutor(Executor):
         with ExitStack() as output:
 
             def open_log() -> None:
-                assignment.log.parent.mkdir(parents=True, exist_ok=True)
+                make_folder(assignment.log.parent, within=assignment.root)
                 log = output.enter_context(assignment.log.open("a", encoding="utf-8"))
                 output.enter_context(redirect_stdout(log))
                 output.enter_context(redirect_stderr(log))

@@ -23,6 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from types import FrameType
 
+from pipeline.base.files import make_folder
 from pipeline.base.task import TaskId
 from pipeline.run.events import Failed, Finished, TaskEvent
 from pipeline.run.executors.attempt import run_attempt
@@ -74,7 +75,7 @@ class _Worker:
                 assignment,
                 self._emit,
                 stop_requested=self._stop.is_set,
-                prepare=partial(redirect_output, assignment.log),
+                prepare=partial(redirect_output, assignment.log, within=assignment.root),
             )
 
     def _emit(self, event: TaskEvent) -> None:
@@ -108,9 +109,9 @@ class _Worker:
         self._assignments.put(None)
 
 
-def redirect_output(log: Path) -> None:
+def redirect_output(log: Path, *, within: Path) -> None:
     """Send descriptors 1 and 2 to the end of a log file, so that what C libraries print gets there as well."""
-    log.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(log.parent, within=within)
     sys.stdout.flush()
     sys.stderr.flush()
     ctypes.CDLL(None).fflush(None)

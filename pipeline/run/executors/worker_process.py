@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 
+from pipeline.base.files import make_folder
 from pipeline.base.memory import out_of_memory_kills, process_tree, tree_memory_bytes
 from pipeline.base.task import FailureKind
 from pipeline.run.events import Failed, Progress
@@ -206,7 +207,7 @@ def _spawn(first: Assignment) -> tuple[subprocess.Popen[bytes], Channel, ExitSta
     Its temporary folder is its own, as Blender and Taichi leave theirs behind where they are killed. The last of what
     is returned removes it.
     """
-    first.log.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(first.log.parent, within=first.root)
     ours, theirs = socket.socketpair()
     with ExitStack() as on_failure, theirs, first.log.open("ab") as log:
         on_failure.enter_context(ours)

@@ -38,7 +38,11 @@ def placed_at_first_keyframe(data: Any, what: str) -> Any:
         return data  # the keyframe's own validation says what is wrong with it
     start = {key: first[key] for key in ("position", "rotation_deg") if key in first}
     for key in ("position", "rotation_deg"):
-        if key in data and tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
+        if key not in data:
+            continue
+        if not isinstance(data[key], list | tuple):
+            return data  # its own validation, too
+        if tuple(data[key]) != tuple(start.get(key, (0.0, 0.0, 0.0))):
             raise ValueError(f"{key} differs from that of the first keyframe, which places the {what}; remove {key}")
     return {**data, **start}
 

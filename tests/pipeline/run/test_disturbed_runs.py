@@ -13,7 +13,7 @@ import pytest
 from synthetic_jobs import Recorder, contents, job_text, run_recorded, run_synthetic
 from synthetic_stages import write_faults
 
-from pipeline.base.errors import JobBusyError, LeaseLostError
+from pipeline.base.errors import FolderGoneError, JobBusyError, LeaseLostError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
 from pipeline.base.task import ArtifactPath, FailureKind, TaskId
@@ -106,6 +106,42 @@ def test_a_run_whose_lease_was_taken_over_stops(root, monkeypatch):
     with InlineExecutor() as executor, pytest.raises(LeaseLostError, match=r"taken over by process \d+ on elsewhere"):
         run_synthetic(root, executor, observers=[Reacting(Committed, take_over_from_elsewhere).notify])
     assert lease.exists()
+
+
+@pytest.mark.parametrize("executor", [InlineExecutor, ProcessExecutor])
+def test_a_run_whose_folder_is_renamed_stops_and_makes_no_new_one(root, executor):
+    write_faults(root, {}, pause_s=0.02)
+    renamed = root.with_name("renamed")
+
+    def rename(commit: Committed) -> None:
+        if commit.receipt.artifact == "steps/000002.bin":
+            root.rename(renamed)
+
+    observer = Reacting(Committed, rename)
+    with executor() as running, pytest.raises(FolderGoneError, match="job is not there any more; if it was renamed"):
+        run_synthetic(root, running, observers=[observer.notify])
+    assert not root.exists()
+    done = {event.receipt.artifact for event in observer.of(Committed)}
+    write_faults(renamed, {})
+    outcome, recorder = run_recorded(renamed)
+    assert outcome.kind is JobOutcome.SUCCEEDED
+    assert not done & {event.receipt.artifact for event in recorder.of(Committed)}
+    run_recorded(root.with_name("undisturbed"))
+    assert contents(renamed) == contents(root.with_name("undisturbed"))
+
+
+def test_a_folder_that_is_gone_is_missed_at_the_next_heartbeat(root, monkeypatch):
+    monkeypatch.setattr("pipeline.base.lease.HEARTBEAT_INTERVAL_S", 0.01)
+    root.mkdir()
+    with Lease.acquire(JobLayout(root).lease) as lease:
+        lease.check()
+        root.rename(root.with_name("renamed"))
+        until = time.monotonic() + 30.0
+        with pytest.raises(FolderGoneError):
+            while time.monotonic() < until:
+                lease.check()
+                time.sleep(0.01)
+    assert not root.exists()
 
 
 class LosingExecutor(InlineExecutor):

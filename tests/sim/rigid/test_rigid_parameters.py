@@ -38,6 +38,11 @@ SENSELESS = {
         {"kind": "kinematic", "keyframe": KEYFRAMES, "position": (3, 0, 0)},
         "position differs from that of the first keyframe",
     ),
+    "a number for a starting place": (
+        {"kind": "kinematic", "keyframe": KEYFRAMES, "position": 3},
+        "Input should be a valid tuple",
+    ),
+    "lighter than any body": ({"kind": "dynamic", "density": 1e-320}, "greater than or equal to 0.001"),
     "ballast without mass": (
         {"kind": "kinematic", "ballast": ({"mass": 1, "position": (0, 0, 0)},)},
         'a kinematic body has no mass for ballast to add to; .* use kind = "dynamic"',
