@@ -105,6 +105,7 @@ class Kind:
     # changes that make the bodies coarser by a factor, for a preview; the last argument builds the solids of the job,
     # or is None where its numbers cannot be computed with
     coarser: Callable[[Job, float, SolidBuilder | None], Sequence[Change]] = lambda _job, _factor, _solids: ()
+    lighter: str = ""  # what of it takes less memory, for people: "a larger fluid.particle_radius"
     # its solvers in a scene, at so many frames a second; None for the kinds that `sim.build` couples
     solvers: Callable[[SceneParameters, float], Sequence[Solver]] | None = None
     # whether a body is one of those that have one solver, which is called by the name of the kind; None for kinds whose

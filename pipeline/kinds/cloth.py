@@ -142,6 +142,7 @@ CLOTH = Kind(
     material=lambda cloth: {BODY: LOOKS[cloth.material]},
     check=_check,
     coarser=_coarser,
+    lighter="fewer nodes of a cloth.shape",
     shares_solver=lambda _cloth: True,
     is_closed=False,
     product=MESH,

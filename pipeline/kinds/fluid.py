@@ -172,6 +172,7 @@ FLUID = Kind(
     placements=_placements,
     check=_check,
     coarser=_coarser,
+    lighter="a larger fluid.particle_radius",
     product=SURFACE,
     objects=_objects,
     reach=_reach,

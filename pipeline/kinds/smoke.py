@@ -139,6 +139,7 @@ SMOKE = Kind(
     placements=_placements,
     check=_check,
     coarser=_coarser,
+    lighter="a larger smoke.cell_size",
     codec=_codec,
     product=VOLUME,
     objects=_objects,

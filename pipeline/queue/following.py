@@ -1,12 +1,14 @@
 """Followers of a job that another process runs, or that waits in the queue."""
 
 import time
+from collections.abc import Callable
+from functools import partial
 
 import click
 
 from pipeline.base.errors import DamagedManifestError
 from pipeline.base.layout import JobLayout
-from pipeline.base.lease import busy_error, live_holder
+from pipeline.base.lease import LeaseHolder, busy_error, live_holder
 from pipeline.base.task import TaskState
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob
 from pipeline.queue.states import ending_of
@@ -71,6 +73,7 @@ class Follower:
         self._name = layout.root.absolute().name
         self._before = _record_to_be(layout)[1].run
         self._seen_running = live_holder(layout.lease) is not None
+        self._holder_named = bool(submission)  # who asks to follow knows that it runs
         self._said = ""
         self._preview_said = False
         self.submission = submission
@@ -81,10 +84,7 @@ class Follower:
         self.submission = queued.submission
         holder = live_holder(self._layout.lease)
         if holder is not None:
-            click.echo(
-                f"{busy_error(self._layout.lease, holder)}; watching it instead (Ctrl-C ends the watching only)",
-                err=True,
-            )
+            self._name_holder(holder, partial(click.echo, err=True))
             if queued.submission == entry.submission:
                 click.echo("it runs an earlier version of the job; this one follows", err=True)
         return queued
@@ -100,11 +100,13 @@ class Follower:
         try:
             while True:
                 entry = self._queue.find(self._name)
-                runs = live_holder(self._layout.lease) is not None
+                holder = live_holder(self._layout.lease)
+                runs = holder is not None
                 summary, last_run = _record_to_be(self._layout)
                 _update(stages, summary)
-                if runs:
+                if holder is not None:
                     self._seen_running = True
+                    self._name_holder(holder, display.say)
                     display.show(stages.values())
                     self._preview_said = self._preview_said or _say_preview_movie(display, self._layout)
                 if entry is None:
@@ -130,6 +132,11 @@ class Follower:
             return CTRL_C
         finally:
             display.close()
+
+    def _name_holder(self, holder: LeaseHolder, tell: Callable[[str], None]) -> None:
+        if not self._holder_named:
+            self._holder_named = True
+            tell(f"{busy_error(self._layout.lease, holder)}; watching it instead (Ctrl-C ends the watching only)")
 
     def _say_place(self, display: Display) -> None:
         names = [job.name for job in self._queue.waiting()]

@@ -1,7 +1,7 @@
 """What a run puts on record: its attempts, each numbered before it starts, what they commit, and how they end."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath, FailureKind, Resources, Task, TaskId, task_fingerprint
@@ -9,6 +9,7 @@ from pipeline.model.job import Job
 from pipeline.record.manifest import Manifest, artifact_row
 from pipeline.record.reader import ArtifactRow
 from pipeline.run.events import Committed, Failed, Finished, Notice, Observer, TaskEvent, Warned
+from pipeline.run.executors.attempt import load_stages
 from pipeline.run.executors.base import Assignment
 from pipeline.run.plan import input_hashes
 from pipeline.run.scheduler import OWN_FAILURES
@@ -106,6 +107,8 @@ class RunRecord:
         return [*adopted, end]
 
     def _take_failure(self, failed: Failed, untold: Sequence[ArtifactPath]) -> list[Settled]:
+        if failed.kind is FailureKind.OUT_OF_MEMORY and (lighter := self._lighter(failed.task_id)):
+            failed = replace(failed, message=f"{failed.message}; less is needed with {lighter}")
         # A process that was killed could not remove what it was writing, nor tell of its last commit.
         self.parts_left = True
         self.ended_by_force |= failed.kind in _FORCED_ENDS
@@ -127,6 +130,10 @@ class RunRecord:
             sentence = f"the disk is full ({place}): the job pauses; free some space and submit it again"
             self.notify(Notice(sentence))
         return [*adopted, failed]
+
+    def _lighter(self, task_id: TaskId) -> str:
+        stage = self._assignments[task_id].task.stage
+        return next(each.lighter(self.job) for each in load_stages(self.stages) if each.name == stage)
 
     def _adopt(self, task_id: TaskId, untold: Sequence[ArtifactPath]) -> tuple[list[Settled], list[ArtifactPath]]:
         """Take in outputs that are committed without the record knowing it: commits, and outputs that are not there.

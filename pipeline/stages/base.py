@@ -61,6 +61,10 @@ class Stage(Protocol):
         """Why this machine cannot run this stage of this job, a sentence each with a remedy; empty if it can."""
         return []
 
+    def lighter(self, job: Job) -> str:  # noqa: ARG002
+        """What of a job its tasks need less memory with, for people; empty if nobody can say."""
+        return ""
+
     @abstractmethod
     def run(self, context: TaskContext) -> None:
         """Commit the task's outputs. Idempotent; shares no state with other tasks but warm caches."""

@@ -46,6 +46,10 @@ class ProductStage(Stage):
         """What this machine lacks to make the files, if there are any to make."""
         return self._product.preflight() if self._kind.bodies(job) else []
 
+    def lighter(self, job: Job) -> str:  # noqa: ARG002
+        """What the kind says."""
+        return self._kind.lighter
+
     def run(self, context: TaskContext) -> None:
         """Make the file of one body and frame."""
         task = context.task

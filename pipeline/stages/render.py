@@ -102,6 +102,10 @@ class RenderStage(Stage):
         except BlenderUnavailableError as error:
             return [str(error)]
 
+    def lighter(self, job: Job) -> str:  # noqa: ARG002
+        """Fewer pixels; what is drawn is the bodies' matter."""
+        return "a smaller render.resolution"
+
     def run(self, context: TaskContext) -> None:
         """Draw one frame."""
         task, job, layout = context.task, context.job, context.layout

@@ -91,6 +91,10 @@ class SimulateStage(Stage):
             return [str(error)]
         return []
 
+    def lighter(self, job: Job) -> str:
+        """What every kind of body in the job says."""
+        return " or ".join(kind.lighter for kind in KINDS.values() if kind.lighter and kind.bodies(job))
+
     def run(self, context: TaskContext) -> None:
         """Compute the frames that are not committed yet.
 

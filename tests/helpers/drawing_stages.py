@@ -4,8 +4,6 @@
 wait until there is a preview movie, of which it keeps a copy, `seen.mp4`, fails frame 5, and lets each take so long.
 """
 
-# ruff: noqa: ARG002 - the signatures are the protocol's
-
 from __future__ import annotations
 
 import json
@@ -17,6 +15,7 @@ from PIL import Image
 
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Task, TaskId
+from pipeline.stages.base import Stage
 from pipeline.stages.movie import MovieStage
 from render.pictures import read_picture
 
@@ -30,7 +29,7 @@ SIZE = (96, 64)
 PATIENCE_S = 60.0
 
 
-class DrawStage:
+class DrawStage(Stage):
     """Plain pictures, brighter by eight levels a frame; their green is gravity's."""
 
     name = "render"
@@ -49,9 +48,6 @@ class DrawStage:
             )
             for frame in range(job.frame_count)
         ]
-
-    def preflight(self, job: Job) -> list[str]:
-        return []
 
     def run(self, context: TaskContext) -> None:
         frame, layout = context.task.frame, context.layout

@@ -28,6 +28,7 @@ from blake3 import blake3
 from pipeline.base.errors import InvalidArtifactError
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
+from pipeline.stages.base import Stage
 from render.blender import BlenderDiedError
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def double_artifact(frame: int) -> ArtifactPath:
 FILM = ArtifactPath("film.bin")
 
 
-class StepsStage:
+class StepsStage(Stage):
     name = "steps"
     version = 1
 
@@ -102,7 +103,7 @@ class StepsStage:
                 part.replace(checkpoint)
 
 
-class DoubleStage:
+class DoubleStage(Stage):
     name = "double"
     version = 1
 
@@ -120,6 +121,9 @@ class DoubleStage:
             for frame in range(job.frame_count)
         ]
 
+    def lighter(self, job: Job) -> str:
+        return "fewer frames"
+
     def run(self, context: TaskContext) -> None:
         time.sleep(pause_s(context))
         source = context.layout.path(context.task.inputs[0]).read_bytes()
@@ -129,7 +133,7 @@ class DoubleStage:
         context.progress(1, 1)
 
 
-class FilmStage:
+class FilmStage(Stage):
     name = "film"
     version = 1
 
@@ -270,6 +274,10 @@ def _start_large_child(context: TaskContext) -> None:
     time.sleep(600)
 
 
+def _take_memory_at_once(_context: TaskContext) -> None:
+    bytearray(os.urandom(2**20) * 2_000)
+
+
 def _lose_blender(context: TaskContext) -> None:
     raise BlenderDiedError(3, -9, "(it wrote nothing)")
 
@@ -337,6 +345,7 @@ FAULTS = {
     "temporary files and kill": _write_temporary_files_and_die,
     "temporary files and hang": _write_temporary_files_and_hang,
     "large child": _start_large_child,
+    "take memory at once": _take_memory_at_once,
     "lose Blender": _lose_blender,
     "lose GPU": _lose_gpu,
     "lose GPU and abort": _lose_gpu_and_abort,

@@ -93,7 +93,7 @@ class ProcessExecutor(Executor):
         key = (assignment.task.stage, assignment.threads, assignment.gpu)
         worker = next((worker for worker in self._workers if worker.idle and worker.key == key), None)
         if worker is None:
-            self._make_room()
+            self._make_room(assignment)
             try:
                 worker = WorkerProcess(key, assignment)
             except OSError as error:  # too many processes or files, no memory, a full disk: the task may try again
@@ -160,8 +160,17 @@ class ProcessExecutor(Executor):
 
     # --- the life of a worker ---
 
-    def _make_room(self) -> None:
-        """Let the longest idle worker go when a new one would be one too many."""
+    def _make_room(self, assignment: Assignment) -> None:
+        """Let the longest idle worker go when a new one would be one too many.
+
+        All of them go, with the memory that they hold, before a task that is to have all of it.
+        """
+        if assignment.need.memory_bytes >= self._task_memory_limit:
+            for worker in [worker for worker in self._workers if worker.idle]:
+                self._retire(worker)
+            until = time.monotonic() + _RETIRE_GRACE_S + _DEATH_S
+            while any(worker.assignment is None for worker in self._workers) and time.monotonic() < until:
+                self._turn(_POLL_S)
         staying = [worker for worker in self._workers if worker.idle or worker.assignment is not None]
         idle = [worker for worker in staying if worker.idle]
         if idle and len(staying) >= self._worker_limit:

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 
 from pipeline.base.files import make_folder
-from pipeline.base.memory import out_of_memory_kills, process_tree, tree_memory_bytes
+from pipeline.base.memory import machine_memory_bytes, out_of_memory_kills, process_tree, tree_memory_bytes
 from pipeline.base.task import FailureKind
 from pipeline.run.events import Failed, Progress
 from pipeline.run.executors.base import Assignment
@@ -120,9 +120,10 @@ class WorkerProcess:
 
     def explain_failure(self, failed: Failed) -> Failed:
         """What it says of its task; but a Blender that the kernel killed looks like one that was lost."""
-        failed = replace(failed, peak_memory_bytes=max(failed.peak_memory_bytes, self.peak_memory_bytes))
+        self.peak_memory_bytes = max(failed.peak_memory_bytes, self.peak_memory_bytes)
+        failed = replace(failed, peak_memory_bytes=self.peak_memory_bytes)
         if failed.kind is FailureKind.WORKER_LOST and self._memory_ran_out():
-            sentence = f"{failed.message}; the kernel killed it: the machine is out of memory"
+            sentence = f"{failed.message}; the kernel killed it: {self._memory_held()}"
             return replace(failed, kind=FailureKind.OUT_OF_MEMORY, message=sentence)
         return failed
 
@@ -147,10 +148,8 @@ class WorkerProcess:
             return self.verdict
         code = self._process.returncode
         if code == -signal.SIGKILL and self._memory_ran_out():
-            return (
-                FailureKind.OUT_OF_MEMORY,
-                f"the kernel killed worker {self._process.pid}: the machine is out of memory",
-            )
+            sentence = f"the kernel killed worker {self._process.pid}: {self._memory_held()}"
+            return FailureKind.OUT_OF_MEMORY, sentence
         if self.key[2] is not None and self.assignment is not None:  # some drivers end the process
             lines = log_tail(self.assignment.log, _DRIVER_LINES).splitlines()
             if words := next(filter(means_gpu_error, reversed(lines)), ""):
@@ -161,6 +160,10 @@ class WorkerProcess:
     def _memory_ran_out(self) -> bool:
         """Whether the kernel has killed a process for want of memory since the assignment was given."""
         return out_of_memory_kills() > self._out_of_memory_kills
+
+    def _memory_held(self) -> str:
+        held, machine = self.peak_memory_bytes / 1e9, machine_memory_bytes() / 1e9
+        return f"the machine is out of memory, of {machine:.3g} GB its processes held {held:.3g}"
 
     def close(self) -> None:
         """Give its descriptors back, and remove its temporary folder."""

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
 from executor_contract import PATIENCE_S, assert_gone, assign, events_until_end, failure, layout, run
+from places import HELPERS
 from synthetic_jobs import Recorder, job_text, run_synthetic
 from synthetic_stages import write_faults
 
@@ -21,6 +24,7 @@ from pipeline.base.errors import JobFileError
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import FailureKind, Resources, TaskId, TaskState
 from pipeline.job.loading import load_job
+from pipeline.record.reader import ManifestReader
 from pipeline.run.checked_job import load_checked_job
 from pipeline.run.events import Failed, JobOutcome
 from pipeline.run.executors import worker_process
@@ -69,6 +73,55 @@ def test_a_blender_that_the_kernel_killed_for_want_of_memory_is_no_lost_worker(e
     assert failed.kind is FailureKind.OUT_OF_MEMORY
     assert "Blender is gone" in failed.message
     assert "the machine is out of memory" in failed.message
+
+
+def test_idle_workers_leave_before_a_task_that_has_all_memory(executor, layout):
+    run(executor, assign(layout, "steps"))
+    run(executor, assign(layout, "double/000000"))
+    idle = executor.worker_pids
+    assert idle
+    run(executor, replace(assign(layout, "film"), need=Resources(memory_bytes=memory.machine_memory_bytes())))
+    assert not {*idle} & {*executor.worker_pids}
+
+
+@pytest.fixture
+def group(tmp_path: Path) -> Iterator[Path]:
+    """A control group of memory whose processes may hold 600 MB together."""
+    around = next(iter(memory._control_groups()), tmp_path)
+    group = around / f"test-{os.getpid()}"
+    limit = group / ("memory.limit_in_bytes" if (around / "memory.limit_in_bytes").exists() else "memory.max")
+    try:
+        group.mkdir()
+        limit.write_text("600000000\n")
+    except OSError as error:
+        pytest.skip(f"no control group of memory can be made here: {error}")
+    yield group
+    group.rmdir()
+
+
+@pytest.mark.slow
+def test_a_worker_that_the_kernel_kills_in_a_small_group_is_tried_once_more_and_refused(group, layout):
+    write_faults(layout.root, {"double/000002": 2 * ["take memory at once"]})
+    program = (
+        "import runpy, sys, pipeline.run.executors.processes as processes\n"
+        "processes._MEMORY_WATCH_S = 1.0e9  # the runner itself may see it first, and end it\n"
+        "runpy.run_path(sys.argv.pop(1), run_name='__main__')"
+    )
+    command = [sys.executable, "-c", program, str(HELPERS / "run_synthetic.py"), str(layout.root), "6"]
+    ended = subprocess.run(
+        ["sh", "-c", 'echo $$ > "$0/cgroup.procs" && exec "$@"', str(group), *command],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 5, ended.stderr
+    with ManifestReader.open_readonly(layout.manifest) as manifest:
+        attempts = manifest.history(TaskId("double/000002"))
+    assert [attempt.outcome for attempt in attempts] == ["out of memory", "out of memory"]
+    for attempt in attempts:
+        assert re.search(r"the kernel killed worker \d+: the machine is out of memory, of 0.6 GB", attempt.message)
+        assert attempt.message.endswith("; less is needed with fewer frames")
 
 
 def test_a_log_that_cannot_be_read_ends_nothing(tmp_path):
