@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import threading
 import time
@@ -13,6 +14,7 @@ import pytest
 import viser
 from browser import PATIENCE_S, needs_browser, open_page, until
 from live_jobs import BALL_OVER_SHEET, served
+from many_pages import crowd
 from playwright.sync_api import Page
 from websockets.sync.client import connect
 
@@ -86,6 +88,20 @@ def test_two_browsers_share_knobs_and_outlive_a_blow_up_and_each_other(tmp_path)
         playing = browser.submit(two_play, f"http://127.0.0.1:{server.get_port()}", session)
         run(session, page, ends=playing.done)
         playing.result()
+
+
+def test_many_pages_that_come_and_go_end_no_session(tmp_path, caplog):
+    with served(tmp_path, BALL_OVER_SHEET) as (session, page, server), ThreadPoolExecutor(1) as pages:
+        session.is_paused = False
+        address = f"ws://127.0.0.1:{server.get_port()}"
+        crowded = pages.submit(lambda: asyncio.run(crowd(address, pages=20, seconds=6.0, seed=1)))
+        run(session, page, ends=crowded.done)
+        seen = crowded.result()
+    assert seen["visits"] >= 20
+    assert seen["malformed"]
+    assert seen["messages"]
+    assert not seen["refused"]
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 def test_a_browser_that_never_reads_holds_up_neither_the_scene_nor_another_browser(tmp_path):
