@@ -49,6 +49,7 @@ def commit(
     hashes: Mapping[ArtifactPath, str] | None = None,
 ) -> Receipt:
     inputs = {path: (hashes or {})[path] for path in task.inputs}
+    layout.root.mkdir(parents=True, exist_ok=True)
     with committing(
         layout,
         artifact,

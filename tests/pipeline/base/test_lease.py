@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
@@ -177,12 +177,14 @@ def test_a_holder_that_was_taken_over_is_told_so_when_it_asks(path: Path, monkey
 def test_a_lease_that_could_not_be_renewed_for_long_counts_as_lost(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.base.lease.HEARTBEAT_INTERVAL_S", 0.01)
     monkeypatch.setattr("pipeline.base.lease.EXPIRY_S", 0.05)
-    folder = path.parent / "mounted"
-    folder.mkdir()
-    with Lease.acquire(folder / "lease") as lease:
-        folder.rename(path.parent / "gone")  # as when a network file system goes away
-        wait_until(lambda: lease._loss is not None)
-        (path.parent / "gone").rename(folder)
+
+    def no_answer(_: Path) -> NoReturn:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))  # as when a network file system goes away
+
+    with Lease.acquire(path) as lease:
+        with monkeypatch.context() as away:
+            away.setattr("pipeline.base.lease._guard", no_answer)
+            wait_until(lambda: lease._loss is not None)
         with pytest.raises(LeaseLostError, match="could not be renewed"):
             lease.check()
 

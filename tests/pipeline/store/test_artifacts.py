@@ -29,7 +29,9 @@ CHANGED = film(1, viscosity=2.0)[0]
 
 @pytest.fixture
 def layout(tmp_path: Path) -> JobLayout:
-    return JobLayout(tmp_path / "job")
+    layout = JobLayout(tmp_path / "job")
+    layout.root.mkdir()
+    return layout
 
 
 def commit_of(layout: JobLayout, *, attempt: int) -> AbstractContextManager[Commit]:
@@ -211,6 +213,7 @@ def test_kill_in_the_midst_of_commits_leaves_what_was_reported_or_something_newe
         reported = 0
         while reported < 20:
             line = writer.stdout.readline().strip()
+            assert line, "it ended"
             reported = int(line) if line.isdigit() else 0
         writer.send_signal(signal.SIGKILL)
         reported = max([reported, *(int(line) for line in writer.stdout.read().split())])
