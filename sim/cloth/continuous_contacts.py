@@ -70,6 +70,9 @@ class NearCloth(Protocol):
     def look(self, state: ClothState) -> float:
         """Note how cloth moves in this substep; returns a bound [m], which is not finite or huge after a blow-up."""
 
+    def warm_up(self) -> None:
+        """Compile what lists need only later on; before anything is listed."""
+
     def prepare(self, state: ClothState) -> None:
         """After `look`: have all pairs listed that may meet in this substep."""
 
@@ -132,7 +135,7 @@ class ContinuousContacts:
         self._missing, self._ends = LaneReduction(maxima=1, sums=0), LaneReduction(maxima=6, sums=0)
         self._state = state
         self._impulse_unit = 0.0
-        self._meets_cloth = False
+        self._meets_cloth, self._is_warm = False, False
         self._near: NearCloth = self._lone
         self.begin_frame()
 
@@ -191,6 +194,9 @@ class ContinuousContacts:
         self.rigid.begin_substep(dt)
         self._impulse_unit = IMPULSE_UNIT * self._mean_mass * dt**2
         self._nodes_as_one.fill(0.0)
+        if not self._is_warm:
+            self._warm_up(state)
+            self._is_warm = True
         while True:
             self._near.prepare(state)
             found = self._find(state, dt)
@@ -212,6 +218,16 @@ class ContinuousContacts:
         self._found += found
         self._left += left
 
+    def _warm_up(self, state: ClothState) -> None:
+        """Compile what the first contacts need: seconds, which no frame in the middle of a film should take."""
+        for short in sorted({self._is_short(0), self._is_short(self._contacts.capacity)}):
+            self._begin_push(state, 0, is_first=True, short=short)
+            self._push_on(0, 0, 0, short=short)
+            if self._meets_cloth:
+                self._crossings(state, 0, short=short)
+        self._near.measure_changes(state, self._sums.predicted)
+        self._near.warm_up()
+
     def _find(self, state: ClothState, dt: float) -> int:
         recovery = min(1.0, dt / RECOVERY_TIME_S)
         while True:
@@ -222,8 +238,20 @@ class ContinuousContacts:
                 return found
 
     def _push(self, state: ClothState, count: int, *, is_first: bool) -> None:
-        contacts, short = self._contacts, self._is_short(count)
-        pushing, touched, missing = begin_push(
+        short = self._is_short(count)
+        pushing, touched, missing = self._begin_push(state, count, is_first=is_first, short=short)
+        if not pushing:
+            return
+        self._iterations += STEPS
+        if not np.int32(missing).view(np.float32) <= TOLERANCE:
+            for first in range(0, MORE_ITERATIONS, STEPS):
+                self._push_on(pushing, touched, first, short=short)
+            self._iterations += MORE_ITERATIONS
+
+    def _begin_push(self, state: ClothState, count: int, *, is_first: bool, short: bool) -> list[int]:
+        """A round of the first `STEPS` steps; what `begin_push` returns."""
+        contacts = self._contacts
+        found: list[int] = begin_push(
             _momenta_from(0),
             count,
             contacts.found,
@@ -234,16 +262,10 @@ class ContinuousContacts:
             state.thickness,
             self.rigid.bodies.pushed,
             self._missing.tree,
-            is_first,
+            int(is_first),
             short,
         )
-        if not pushing:
-            return
-        self._iterations += STEPS
-        if not np.int32(missing).view(np.float32) <= TOLERANCE:
-            for first in range(0, MORE_ITERATIONS, STEPS):
-                self._push_on(int(pushing), int(touched), first, short=short)
-            self._iterations += MORE_ITERATIONS
+        return found
 
     def _push_on(self, count: int, touched: int, first: int, *, short: bool) -> None:
         """More steps of the contact iteration, from step `first` of `MORE_ITERATIONS` on."""
@@ -251,7 +273,7 @@ class ContinuousContacts:
         push_on(
             _momenta_from(first),
             int(first == 0),
-            first + STEPS >= MORE_ITERATIONS,
+            int(first + STEPS >= MORE_ITERATIONS),
             count,
             touched,
             contacts.found,
@@ -282,7 +304,7 @@ class ContinuousContacts:
             np.maximum(self._nodes_as_one, of_cloths, out=self._nodes_as_one)
         return failed
 
-    def _crossings(self, state: ClothState, count: int) -> int:
+    def _crossings(self, state: ClothState, count: int, *, short: bool | None = None) -> int:
         contacts = self._contacts
         if self._crossing.shape[0] < contacts.capacity:
             self._crossing = ti.ndarray(ti.i32, contacts.capacity)
@@ -298,7 +320,7 @@ class ContinuousContacts:
                 LEAST_GAP,
                 self._crossing,
                 self._crossing_count,
-                self._is_short(count),
+                self._is_short(count) if short is None else short,
             )
         )
 

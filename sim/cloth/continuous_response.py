@@ -72,7 +72,7 @@ def weigh_contacts(
     nodes: PushedNodes,
     sums: NodeSums,
     bodies: PushedBodies,
-    is_first: ti.template(),
+    is_first: ti.i32,
     is_short: ti.template(),
 ):
     """List the contacts that push, and compute their diagonal D; before the first round, forget their impulses, and
@@ -100,7 +100,7 @@ def weigh_contacts(
         ti.loop_config(serialize=True)
     for i in range(vertices_end):
         sums.shares[i], nodes.uses[2 * i], nodes.uses[2 * i + 1] = 0, 0, 0
-        if ti.static(is_first):
+        if is_first == 1:
             sums.predicted[i] = nodes.displacement[i]
     if ti.static(is_short):
         ti.loop_config(serialize=True)
@@ -155,7 +155,7 @@ def weigh_contacts(
         ti.loop_config(serialize=True)
     for place in range(sums.counter[0]):
         c = impulses.pushing[place]
-        if ti.static(is_first):
+        if is_first == 1:
             impulses.impulse[c] = ti.math.vec3(0.0)
         if bodies.may_move == 1 and (contacts.kind[c] >= 0 or contacts.kind[c] == WALL):
             contacts.normal[c] = turned_to_support(c, contacts, nodes.support)
@@ -380,6 +380,7 @@ def push_apart(
 
 @func
 def finish_push(
+    finishes: ti.i32,
     count: ti.i32,
     touched_count: ti.i32,
     contacts: Contacts,
@@ -388,9 +389,12 @@ def finish_push(
     bodies: PushedBodies,
     is_short: ti.template(),
 ):
-    """The displacements that the impulses alone make, from where the iteration started; so both sides get the same."""
+    """The displacements that the impulses alone make, from where the iteration started; so both sides get the same.
+
+    Nothing where it does not finish yet: a kernel with it and one without would be compiled, for seconds each.
+    """
     # Bounds before the first loop: each that is found between two loops would be a launch of its own on a GPU.
-    contacts_end, touched_end, bodies_end = count, touched_count, bodies.count
+    contacts_end, touched_end, bodies_end = finishes * count, finishes * touched_count, finishes * bodies.count
     if ti.static(is_short):
         ti.loop_config(serialize=True)
     for place in range(contacts_end):
@@ -461,7 +465,7 @@ def begin_push(
     thickness: Floats,
     bodies: PushedBodies,
     tree: Tree,
-    is_first: ti.template(),
+    is_first: ti.i32,
     is_short: ti.template(),
 ) -> ti.math.ivec3:
     """A round of contacts in one launch: which of them push, some steps of the iteration, and where these lead.
@@ -471,7 +475,7 @@ def begin_push(
     weigh_contacts(count, contacts, impulses, vertex_count, nodes, sums, bodies, is_first, is_short)
     pushing_count, touched_count = sums.counter[0], sums.counter[1]
     push_apart(momenta, 1, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
-    finish_push(pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
+    finish_push(1, pushing_count, touched_count, contacts, impulses, nodes, bodies, is_short)
     missing = most_missing(
         pushing_count, contacts, impulses.pushing, nodes.displacement, thickness, bodies.motion, tree, is_short
     )
@@ -482,7 +486,7 @@ def begin_push(
 def push_on(
     momenta: Momenta,
     starts: ti.i32,
-    finishes: ti.template(),
+    finishes: ti.i32,
     count: ti.i32,
     touched_count: ti.i32,
     contacts: Contacts,
@@ -493,8 +497,7 @@ def push_on(
 ):
     """More steps of the iteration, and where they lead if it `finishes`."""
     push_apart(momenta, starts, count, touched_count, contacts, impulses, nodes, bodies, is_short)
-    if ti.static(finishes):
-        finish_push(count, touched_count, contacts, impulses, nodes, bodies, is_short)
+    finish_push(finishes, count, touched_count, contacts, impulses, nodes, bodies, is_short)
 
 
 @kernel

@@ -99,6 +99,10 @@ class SelfCollision:
         self._is_outrun |= not holds
         return float(0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
+    def warm_up(self) -> None:
+        """Compile what carries lists over."""
+        self.with_triangles.carry(0, self._met.carried, self._met.capacity)
+
     def prepare(self, state: ClothState) -> None:
         """Have all pairs listed that vertices can bring within their thickness, or together, in this substep.
 
