@@ -77,7 +77,7 @@ def _live(folder: Path, printed: Path) -> tuple[subprocess.Popen[bytes], str]:
     command = [sys.executable, "-P", "-m", "pipeline", "live", str(job), "--port", "0", "--output", str(folder)]
     with printed.open("wb") as log:
         process = subprocess.Popen(command, cwd=PROJECT, stdout=log, stderr=log)
-    while (found := re.search(r"http://(127\.0\.0\.1:\d+)", printed.read_text())) is None:
+    while (found := re.search(r"http://(\S+:\d+)/ runs", printed.read_text())) is None:
         if process.poll() is not None:
             raise SystemExit(printed.read_text())
         time.sleep(0.1)
