@@ -12,7 +12,7 @@ from pipeline.base.content import tool_version
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import ArtifactPath, Resources, Task, TaskId
-from pipeline.kinds.fluid import most_particles
+from pipeline.kinds.fluid import FLUID, most_particles
 from pipeline.model.job import Job
 from pipeline.stages.base import Stage, TaskContext
 from pipeline.stages.inputs import by_content
@@ -62,6 +62,10 @@ class WhitewaterStage(Stage):
             for parameters, resources in ((self._parameters(job, fluid), _resources(job, fluid)),)
             for frame in range(job.frame_count)
         ]
+
+    def lighter(self, job: Job) -> str:  # noqa: ARG002
+        """What fluids say."""
+        return FLUID.lighter
 
     def run(self, context: TaskContext) -> None:
         """Make one frame of one fluid's whitewater."""

@@ -70,9 +70,6 @@ class NearCloth(Protocol):
     def look(self, state: ClothState) -> float:
         """Note how cloth moves in this substep; returns a bound [m], which is not finite or huge after a blow-up."""
 
-    def warm_up(self) -> None:
-        """Compile what lists need only later on; before anything is listed."""
-
     def prepare(self, state: ClothState) -> None:
         """After `look`: have all pairs listed that may meet in this substep."""
 
@@ -226,7 +223,8 @@ class ContinuousContacts:
             if self._meets_cloth:
                 self._crossings(state, 0, short=short)
         self._near.measure_changes(state, self._sums.predicted)
-        self._near.warm_up()
+        if self._meets_cloth:
+            self._pairs.warm_up()
 
     def _find(self, state: ClothState, dt: float) -> int:
         recovery = min(1.0, dt / RECOVERY_TIME_S)
@@ -287,24 +285,25 @@ class ContinuousContacts:
         """Push, and at last tie together, until no pair can have crossed; how many pairs still may have."""
         if not self._meets_cloth:
             return 0
+        short = self._is_short(count)
         for _ in range(REPAIRS):
-            failed = self._crossings(state, count)
+            failed = self._crossings(state, count, short=short)
             if not failed:
                 return 0
             self._repaired += failed
             self._push(state, count, is_first=False)
-        failed = self._crossings(state, count)
+        failed = self._crossings(state, count, short=short)
         if failed:
             zones = ImpactZones(state.mass.to_numpy(), state.inverse_mass.to_numpy() == 0.0)
             while failed and zones.join(self._contacts.vertices.to_numpy()[:count][self._crossing_rows(count)]):
                 state.displacement.from_numpy(zones.apply(state.displacement.to_numpy()))
-                failed = self._crossings(state, count)
+                failed = self._crossings(state, count, short=short)
             self._zone_vertices += len(zones.members)
             of_cloths = np.bincount(state.host.body[zones.members], minlength=len(self._nodes_as_one))
             np.maximum(self._nodes_as_one, of_cloths, out=self._nodes_as_one)
         return failed
 
-    def _crossings(self, state: ClothState, count: int, *, short: bool | None = None) -> int:
+    def _crossings(self, state: ClothState, count: int, *, short: bool) -> int:
         contacts = self._contacts
         if self._crossing.shape[0] < contacts.capacity:
             self._crossing = ti.ndarray(ti.i32, contacts.capacity)
@@ -320,7 +319,7 @@ class ContinuousContacts:
                 LEAST_GAP,
                 self._crossing,
                 self._crossing_count,
-                self._is_short(count) if short is None else short,
+                short,
             )
         )
 

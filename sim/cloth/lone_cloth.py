@@ -68,9 +68,6 @@ class LoneCloth:
             )
         )
 
-    def warm_up(self) -> None:
-        """There are no lists."""
-
     def prepare(self, state: ClothState) -> None:
         """There is nothing to list."""
 

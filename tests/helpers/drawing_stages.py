@@ -9,10 +9,12 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PIL import Image
 
+from pipeline.base.files import make_folder
 from pipeline.base.parameter_set import ParameterSet
 from pipeline.base.task import Task, TaskId
 from pipeline.stages.base import Stage
@@ -25,8 +27,29 @@ if TYPE_CHECKING:
     from pipeline.stages.base import TaskContext
 
 REFERENCE = "drawing_stages:STAGES"
+WITH_CACHE = "drawing_stages:STAGES_WITH_CACHE"
 SIZE = (96, 64)
 PATIENCE_S = 60.0
+
+
+class ComputeStage(Stage):
+    """What pictures may be drawn of: a file a frame, that gravity decides, and a checkpoint."""
+
+    name = "simulate"
+    version = 1
+
+    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
+        outputs = tuple(layout.frame_cache(frame) for frame in range(job.frame_count))
+        parameters = ParameterSet.of(stage=self.name, version=self.version, tools={}, gravity=job.gravity)
+        return [Task(TaskId("simulate"), self.name, (), outputs, parameters, checkpointed=True)]
+
+    def run(self, context: TaskContext) -> None:
+        make_folder(context.layout.checkpoints, within=context.layout.root)
+        (context.layout.checkpoints / "000000.h5").write_text("a state")
+        for output in context.task.outputs:
+            if not context.is_committed(output):
+                with context.committing(output, Path.read_bytes) as path:
+                    path.write_text(f"gravity {context.job.gravity}")
 
 
 class DrawStage(Stage):
@@ -68,3 +91,4 @@ class DrawStage(Stage):
 
 
 STAGES = (DrawStage(), MovieStage())
+STAGES_WITH_CACHE = (ComputeStage(), *STAGES)

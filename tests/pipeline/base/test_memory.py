@@ -3,12 +3,8 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
-import pytest
-
-from pipeline.base.memory import _control_groups
+from memory_group import memory_group
 
 LIMIT_BYTES = 200_000_000
 CODE = """
@@ -22,27 +18,10 @@ print(machine_memory_bytes(), killed, out_of_memory_kills() - before)
 """
 
 
-@pytest.fixture
-def group() -> Iterator[Path]:
-    for parent in _control_groups():
-        folder = parent / f"test-{os.getpid()}"
-        try:
-            folder.mkdir()
-        except OSError:
-            continue
-        for name in ("memory.max", "memory.limit_in_bytes"):
-            if (folder / name).exists():
-                (folder / name).write_text(str(LIMIT_BYTES))
-                yield folder
-                folder.rmdir()
-                return
-        folder.rmdir()
-    pytest.skip("no control group of memory can be made here")
-
-
-def test_a_control_groups_limit_is_the_machines_and_its_kills_are_counted(group):
+def test_a_control_groups_limit_is_the_machines_and_its_kills_are_counted():
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", CODE, str(group)]
-    told = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout.split()
+    with memory_group(LIMIT_BYTES) as group:
+        command = [sys.executable, "-c", CODE, str(group)]
+        told = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout.split()
     assert abs(int(told[0]) - LIMIT_BYTES) < 10_000  # whole pages
     assert told[1:] == ["-9", "1"]

@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 from executor_contract import PATIENCE_S, assert_gone, assign, events_until_end, failure, layout, run
+from memory_group import memory_group
 from places import HELPERS
 from synthetic_jobs import Recorder, job_text, run_synthetic
 from synthetic_stages import write_faults
@@ -84,23 +85,8 @@ def test_idle_workers_leave_before_a_task_that_has_all_memory(executor, layout):
     assert not {*idle} & {*executor.worker_pids}
 
 
-@pytest.fixture
-def group(tmp_path: Path) -> Iterator[Path]:
-    """A control group of memory whose processes may hold 600 MB together."""
-    around = next(iter(memory._control_groups()), tmp_path)
-    group = around / f"test-{os.getpid()}"
-    limit = group / ("memory.limit_in_bytes" if (around / "memory.limit_in_bytes").exists() else "memory.max")
-    try:
-        group.mkdir()
-        limit.write_text("600000000\n")
-    except OSError as error:
-        pytest.skip(f"no control group of memory can be made here: {error}")
-    yield group
-    group.rmdir()
-
-
 @pytest.mark.slow
-def test_a_worker_that_the_kernel_kills_in_a_small_group_is_tried_once_more_and_refused(group, layout):
+def test_a_worker_that_the_kernel_kills_in_a_small_group_is_tried_once_more_and_refused(layout):
     write_faults(layout.root, {"double/000002": 2 * ["take memory at once"]})
     program = (
         "import runpy, sys, pipeline.run.executors.processes as processes\n"
@@ -108,13 +94,14 @@ def test_a_worker_that_the_kernel_kills_in_a_small_group_is_tried_once_more_and_
         "runpy.run_path(sys.argv.pop(1), run_name='__main__')"
     )
     command = [sys.executable, "-c", program, str(HELPERS / "run_synthetic.py"), str(layout.root), "6"]
-    ended = subprocess.run(
-        ["sh", "-c", 'echo $$ > "$0/cgroup.procs" && exec "$@"', str(group), *command],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    with memory_group(600_000_000) as group:
+        ended = subprocess.run(
+            ["sh", "-c", 'echo $$ > "$0/cgroup.procs" && exec "$@"', str(group), *command],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     assert ended.returncode == 5, ended.stderr
     with ManifestReader.open_readonly(layout.manifest) as manifest:
         attempts = manifest.history(TaskId("double/000002"))

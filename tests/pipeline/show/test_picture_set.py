@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from drawing_stages import DrawStage
+from drawing_stages import ComputeStage, DrawStage
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.parameter_set import ParameterSet
@@ -19,24 +19,6 @@ from pipeline.store.artifacts import committing
 from pipeline.store.receipts import read_receipt
 
 FRAMES = 6
-
-
-class ComputeStage(DrawStage):
-    """What the pictures are drawn of: a file a frame, that gravity decides."""
-
-    name = "simulate"
-
-    def plan(self, job: Job, layout: JobLayout) -> list[Task]:
-        parameters = ParameterSet.of(stage=self.name, version=self.version, tools={}, gravity=job.gravity)
-        return [
-            Task(
-                TaskId("simulate"),
-                self.name,
-                (),
-                tuple(layout.frame_cache(frame) for frame in range(FRAMES)),
-                parameters,
-            )
-        ]
 
 
 class PictureStage(DrawStage):

@@ -91,9 +91,10 @@ def test_a_drop_oscillates_with_the_period_of_its_surface_tension(taichi_cpu):
         elongations.append(elongation())
     shortest = int(np.argmin(elongations))
     longest = shortest + int(np.argmax(elongations[shortest:]))
-    # Past the ball, and most of the way back: how far beyond it depends on the last digits, which processors differ in.
+    # Past the ball, and three quarters of the way back at least: whether beyond depends on the last digits, which
+    # processors differ in.
     assert elongations[shortest] < -0.05 * elongations[0]
-    assert elongations[longest] > 0.5 * elongations[shortest]
+    assert elongations[longest] > 0.25 * elongations[shortest]
     # Half a period lies between. Five particles to the radius, heavily damped, and each extreme is flat: 25 %.
     assert 2.0 * (longest - shortest) / 40.0 == pytest.approx(1.0, rel=0.25)
 
