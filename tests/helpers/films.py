@@ -200,7 +200,8 @@ class Studio:
     ) -> tuple[AttemptRow, int] | None:
         """An attempt of one of these stages in the middle of its work, with its process; None if the runner ends first.
 
-        The simulation is in the middle when it has committed two frames.
+        The simulation is in the middle when it has committed two frames. Attempts of a killed runner stay listed until
+        the next one has looked at them; their processes are gone.
         """
         wanted = set(stages)
         until = time.monotonic() + PATIENCE_S
@@ -208,7 +209,9 @@ class Studio:
             assert time.monotonic() < until, f"{wanted} never ran"
             for attempt in self.running():
                 worker = self.worker_of(attempt) if stage_of(attempt.task) in wanted else None
-                if worker is not None and (attempt.task != "simulate" or self._frames_simulated() >= 2):
+                if worker is None or not psutil.pid_exists(worker):
+                    continue
+                if attempt.task != "simulate" or self._frames_simulated() >= 2:
                     return attempt, worker
             time.sleep(0.01)
         return None
