@@ -173,14 +173,19 @@ def _run_queue(output: Path) -> None:
     queue = JobQueue(output.absolute())
     if not queue.folder.exists():
         raise PipelineError(f"{output} has no queue: nothing was ever submitted there")
-    with _lease_of(queue) as lease:
-        if lease is None:
-            click.echo("the queue is empty", err=True)
-            return
-        if lease.takeover is not None:
-            say(f"{lease.takeover}; its queue goes on")
-        turns = Turns(queue, None)
-        FarmRunner(queue, lease, turns.run, say, turns.ended, pause_on_signal=False).work()
+    turns = Turns(queue, None)
+    while True:
+        with _lease_of(queue) as lease:
+            if lease is None:
+                break
+            if lease.takeover is not None:
+                say(f"{lease.takeover}; its queue goes on")
+            try:
+                FarmRunner(queue, lease, turns.run, say, turns.ended).work()
+            except KeyboardInterrupt:
+                break
+        if not queue.left():
+            break
     left = len(queue.waiting())
     click.echo(f"{left} jobs are left in the queue" if left else "the queue is empty", err=True)
 

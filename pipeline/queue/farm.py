@@ -155,14 +155,13 @@ class FarmRunner:
     after_turn: Callable[[str, Path, Ended], None]
     # the submission that it runs for; it stops once that is settled. None: it runs until nothing waits
     submission: str | None = None
-    # whether the own job pauses if a signal stopped it, as a person meant it who pressed Ctrl-C; else, and if it is
-    # another one, it stays in the queue for the next runner
-    pause_on_signal: bool = True
     _busy: dict[str, float] = field(default_factory=dict)
     _told_busy: set[str] = field(default_factory=set)
 
     def work(self) -> Ended | None:
         """Run jobs; returns how the last turn of the own job ended, or None if it was settled without one.
+
+        More may have been queued meanwhile: once the lease is given back, `JobQueue.left` tells.
 
         Raises:
             LeaseLostError: another process runs the queue now.
@@ -173,13 +172,9 @@ class FarmRunner:
         own: Ended | None = None
         while True:
             self.lease.check()
-            with self.queue.locked():
-                waiting = self.queue.waiting()
-                if self.submission is not None and all(job.submission != self.submission for job in waiting):
-                    return own
-                if not waiting:
-                    self.lease.release()  # under the lock: who queues a job after this finds no runner, and becomes one
-                    return own
+            waiting = self.queue.waiting()
+            if all(self.submission not in (None, job.submission) for job in waiting):
+                return own
             job = next((job for job in waiting if self._busy.get(job.name, 0.0) <= time.monotonic()), None)
             if job is None:
                 time.sleep(LOOK_INTERVAL_S)
@@ -191,7 +186,7 @@ class FarmRunner:
                 # One that let another job go first has not ended: if it is settled meanwhile, that was somebody else.
                 own = None if ended.is_put_off else ended
             if stopped:
-                if self.submission is not None and job.submission != self.submission:
+                if job.submission != self.submission:
                     raise KeyboardInterrupt
                 return own
 
@@ -253,7 +248,7 @@ class FarmRunner:
                 self._settle(job, Desired.PAUSE, f"the disk is full{place}")
             case JobOutcome.NO_GPU:
                 self._settle(job, Desired.PAUSE, "every GPU has failed")
-            case _ if control.signals and self.pause_on_signal and job.submission == self.submission:
+            case _ if control.signals and job.submission == self.submission:
                 self._settle(job, Desired.PAUSE, "stopped by hand")
             case _:  # its entry says what is wanted: it pauses, or waits for its next turn
                 pass
@@ -292,7 +287,10 @@ def _disk_of(queue: JobQueue, job: QueuedJob) -> Path:
 
 
 def start_in_background(queue: JobQueue) -> int | None:
-    """Start a runner that no terminal holds, unless the queue has one; returns its process id, or None."""
+    """Start a runner that no terminal holds, unless the queue has one; returns its process id, or None.
+
+    One that is just ending sees what was queued before this call; see `JobQueue.left`.
+    """
     with queue.locked():
         if live_holder(queue.lease) is not None:
             return None

@@ -10,6 +10,7 @@ from pipeline.base.errors import DamagedManifestError
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import LeaseHolder, busy_error, live_holder
 from pipeline.base.task import TaskState
+from pipeline.queue.farm import start_in_background
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob
 from pipeline.queue.states import ending_of
 from pipeline.record.reader import LastRun, StageSummary, done_and_total, record_of
@@ -128,6 +129,7 @@ class Follower:
             entry = self._queue.find(self._name)
             if entry is not None and entry.submission == self.submission and entry.desired is Desired.RUN:
                 self._queue.change(self._name, background=True)  # nobody waits for it here any more
+                start_in_background(self._queue)
             display.say("not watching any more; the job runs on, or waits in the queue")
             return CTRL_C
         finally:

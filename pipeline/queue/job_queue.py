@@ -41,6 +41,8 @@ LATEST_S = 1e11
 """No wall time of a submission is later [s since the epoch]."""
 ABANDONED_S = 60.0
 """A file that is being written and older than this is nobody's any more."""
+UNSEEN_RETRY_S = 0.1
+"""How soon a file is looked for again that another host has made and this one cannot see yet."""
 SETTLED_S = 2.0
 """A file that was changed longer ago than this would show another change by its time of modification."""
 
@@ -201,7 +203,7 @@ class JobQueue:
     def listing(self) -> Listing:
         """Every entry, first to run first; what cannot be read as one is reported, and left alone."""
         jobs, flaws = [], []
-        for path in sorted(self._entries.glob("[!.]*.json")) if self._entries.is_dir() else ():
+        for path in self._paths():
             try:
                 jobs.append(self.find(path.name.removesuffix(".json")))
             except QueueError as error:
@@ -214,7 +216,8 @@ class JobQueue:
         path = self._path(name)
         try:
             known = self._read.get(name)
-            if known is not None and known[0] == _version(path.stat()):
+            # Under the lock what is read counts: hosts that share the folder remember attributes for seconds.
+            if known is not None and not self._is_locked and known[0] == _version(path.stat()):
                 return known[1]
             with open_regular(path) as file:
                 status = os.fstat(file.fileno())
@@ -243,6 +246,20 @@ class JobQueue:
     def waiting(self) -> tuple[QueuedJob, ...]:
         """The jobs that are to run, first to run first; a running one is among them."""
         return tuple(job for job in self.listing().jobs if job.desired is Desired.RUN)
+
+    def left(self) -> tuple[QueuedJob, ...]:
+        """The jobs that wait, whatever this host remembers of the folder.
+
+        Whoever stops running the queue looks here once the lease is given back, and whoever queues a job looks at the
+        lease after that: one of the two sees the other, on whatever hosts they are.
+        """
+        if not self.is_there():
+            return ()
+        with self.locked():
+            os.utime(self._entries)  # a client reads the names in a folder anew that it has changed
+            while not all(os.path.lexists(path) for path in self._paths()):
+                time.sleep(UNSEEN_RETRY_S)  # this host still remembers that there was no such file
+            return self.waiting()
 
     # --- changing ---
     def put(self, job: QueuedJob) -> None:
@@ -306,6 +323,9 @@ class JobQueue:
     @property
     def _entries(self) -> Path:
         return self.folder / "queue"
+
+    def _paths(self) -> list[Path]:
+        return sorted(self._entries.glob("[!.]*.json")) if self._entries.is_dir() else []
 
     def _path(self, name: str) -> Path:
         return self._entries / f"{checked_name(name)}.json"

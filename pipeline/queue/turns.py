@@ -247,7 +247,7 @@ def _write_report(layout: JobLayout) -> None:
 
 def _hand_over(queue: JobQueue) -> None:
     """Leave jobs that no terminal waits for to a runner in the background."""
-    if any(job.background for job in queue.waiting()):
+    if any(job.background for job in queue.left()):
         pid = start_in_background(queue)
         if pid is not None:
             say(f"jobs that wait go on in the background, process {pid}")

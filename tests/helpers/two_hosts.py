@@ -111,6 +111,14 @@ class Host(Farm):
     def set_clock(self, error_s: float) -> None:
         (self._own / "clock").write_text(str(error_s))
 
+    def stop_at(self, pattern: str) -> None:
+        """Let the next process that is about to do what matches stop (SIGSTOP); see the campaign's hooks."""
+        (self._own / "failpoint").write_text(f"other {int(signal.SIGSTOP)} {pattern}")
+
+    def stands(self) -> bool:
+        """Whether one has stopped so."""
+        return (self._own / "failpoint.hit").exists()
+
     def commits(self) -> list[str]:
         """Receipts that its processes have put in place, or were about to, by path below their folder."""
         path = self._own / "commits"

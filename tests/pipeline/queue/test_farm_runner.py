@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from command_line import pipeline
 from synthetic_jobs import job_text
 
 from pipeline.base.errors import DiskFullError, JobBusyError, LeaseLostError, PipelineError
@@ -18,7 +19,7 @@ from pipeline.queue.farm import Ended, FarmControl, FarmRunner, StopReason, Take
 from pipeline.queue.job_queue import Desired, JobQueue, QueuedJob, new_entry
 from pipeline.queue.submitting import QueueOptions
 from pipeline.queue.submitting import run as run_command
-from pipeline.queue.turns import exit_code_of
+from pipeline.queue.turns import Turns, exit_code_of
 from pipeline.run.events import JobOutcome, Outcome, RunEnded, RunStarted
 
 Run = Callable[[QueuedJob, FarmControl], JobOutcome]
@@ -220,6 +221,30 @@ def test_resumed_a_job_keeps_the_cores_and_the_reserve_that_it_was_given(queue, 
         job = job_of_text(job_text(), layout.job_file)
         assert run_command(job, layout, frozenset({"any"}), options=options, paused=paused) == 0
     assert [(entry.cores, entry.reserve_bytes) for entry in resumed] == [(1, 0), (2, 0)]
+
+
+def test_what_another_host_queues_while_the_runner_gives_its_lease_back_is_run(queue, monkeypatch):
+    elsewhere = JobQueue(queue.farm)
+    turns: list[str] = []
+    release = Lease.release
+
+    def run(_turns: Turns, job: QueuedJob, _control: FarmControl, _observer: TakeOver) -> Outcome:
+        turns.append(job.name)
+        return Outcome(DONE)
+
+    def release_late(lease: Lease) -> None:
+        if turns == ["a"] and not elsewhere.find("b"):
+            elsewhere.enqueue(new_entry("b", text="x", background=True))
+            assert start_in_background(elsewhere) is None  # it sees a runner that lives
+        release(lease)
+
+    monkeypatch.setattr("fcntl.flock", lambda *_: None)  # locks end at each host
+    monkeypatch.setattr(Turns, "run", run)
+    monkeypatch.setattr(Lease, "release", release_late)
+    queue.put(new_entry("a", text="x"))
+    told = pipeline("work", "--output", queue.farm)
+    assert (told.exit_code, turns) == (0, ["a", "b"])
+    assert "the queue is empty" in told.stderr
 
 
 @pytest.mark.slow

@@ -124,6 +124,17 @@ def test_entries_that_nobody_changes_are_read_once(queue, monkeypatch):
     assert len(read) == 1
 
 
+def test_a_change_counts_that_another_host_made_though_attributes_are_those_of_before(queue, monkeypatch):
+    monkeypatch.setattr("pipeline.queue.job_queue._version", lambda _status: (0, 0, 0))
+    old = queue.enqueue(new_entry("a"))
+    os.utime(queue.folder / "queue" / "a.json", (1.0, 1.0))
+    assert queue.find("a") == old
+    JobQueue(queue.farm).change("a", desired=Desired.PAUSE)
+    assert queue.find("a") == old
+    with queue.locked():
+        assert queue.find("a") == replace(old, desired=Desired.PAUSE)
+
+
 def test_what_killed_writers_left_is_swept_and_entries_stay(queue):
     queue.put(new_entry("a"))
     left = queue.folder / "queue" / ".a.json.part.77"

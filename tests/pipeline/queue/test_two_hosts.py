@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -22,6 +23,7 @@ from two_hosts import Host, two_hosts, what_is_missing
 from pipeline.base.errors import JobBusyError
 from pipeline.base.lease import EXPIRY_S
 from pipeline.base.task import TaskState
+from pipeline.queue.job_queue import new_entry
 from pipeline.record.reader import ManifestReader
 from tests.campaign.studio import JOB, SCENES, is_artifact
 
@@ -90,6 +92,26 @@ def test_each_job_of_a_queue_that_two_hosts_work_runs_once_in_the_order_of_submi
             assert_made_once(ash, name, undisturbed)
         began = [min(path.stat().st_mtime for path in ash.layout(name).root.glob("steps/*.bin")) for name in names]
         assert began == sorted(began)
+
+
+def test_a_job_that_is_detached_while_the_runner_of_the_other_host_ends_is_run(
+    tmp_path: Path, undisturbed: dict[str, bytes]
+) -> None:
+    with two_hosts(tmp_path) as (_, ash, birch):
+        for name in ("first", "last"):
+            ash.job(name, frames=FRAMES)
+        ash.queue.put(new_entry("first", text=(ash.folder / "first.toml").read_text()))
+        ash.stop_at(r"os\.remove .*/\.farm/runner\.lease$")
+        birch.stop_at(r"os\.rename .*/\.farm/queue/last\.json$")
+        ending, detaching = ash.start("work"), birch.start("submit", "last.toml", "--detach")
+        wait_until(lambda: ash.stands() and birch.stands(), "one ends, and the other queues its job")
+        ash.do("test", "!", "-e", "renders/.farm/queue/last.json")  # which its host remembers for a while
+        os.killpg(detaching.pid, signal.SIGCONT)
+        assert birch.finish(detaching).out.startswith("last is queued; the queue runs in the background\n")
+        os.killpg(ending.pid, signal.SIGCONT)
+        assert "the queue is empty" in ash.finish(ending).err
+        for name in ("first", "last"):
+            assert_made_once(ash, name, undisturbed)
 
 
 @pytest.mark.nightly

@@ -14,7 +14,7 @@ from record_samples import film
 from pipeline.base.layout import JobLayout
 from pipeline.base.lease import Lease
 from pipeline.base.task import TaskState
-from pipeline.queue.following import Follower, watch
+from pipeline.queue.following import CTRL_C, Follower, watch
 from pipeline.queue.job_queue import JobQueue, new_entry
 from pipeline.record.manifest import Manifest
 from pipeline.run.events import JobOutcome
@@ -73,6 +73,21 @@ def test_a_runner_that_ends_between_two_looks_leaves_a_film_and_not_a_job_that_w
 
     monkeypatch.setattr("pipeline.queue.following.live_holder", look)
     assert follower.follow() == 0
+
+
+def test_a_job_that_is_watched_no_more_when_its_runner_ends_goes_on_in_the_background(layout, monkeypatch):
+    queue = JobQueue.of(layout)
+    follower = Follower(queue, layout, submission=queue.enqueue(new_entry(layout.root.name)).submission)
+    runner = Lease.acquire(queue.lease)
+    started: list[JobQueue] = []
+
+    def interrupt(_seconds: float) -> None:
+        runner.release()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", interrupt)
+    monkeypatch.setattr("pipeline.queue.following.start_in_background", started.append)
+    assert (follower.follow(), started) == (CTRL_C, [queue])
 
 
 def succeed(layout: JobLayout, lease: Lease) -> None:
