@@ -28,7 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -186,12 +186,12 @@ def measure(folder: Path, tasks: int, dispatched: int, repeats: int) -> dict[str
     idle = [nothing_to_do_s(layout.root, tasks)]
     again = partial(run_noops, layout.root, tasks, InlineExecutor(), CommitClock())
     idle += [timed(again) for _ in range(repeats - 1)]
-    figures["nothing to do"] = [round(min(column), 3) for column in zip(*idle, strict=True)]
+    figures["nothing to do"] = least(idle)
     figures["status"] = fastest(5 * repeats, lambda: status(layout))
     (folder / "dispatch.toml").write_text(JOB.format(frames=tasks))
     layout.job_file.write_text(JOB.format(frames=tasks))
     for name, arguments in (("submit", ("submit", "dispatch.toml")), ("status command", ("status", job.name))):
-        figures[name] = [round(seconds, 3) for seconds in _command(folder, arguments)]
+        figures[name] = least(_command(folder, arguments) for _ in range(repeats))
     clock = CommitClock()
     with ProcessExecutor(WorkerLimits(tasks_per_worker=dispatched + 1)) as executor:
         chosen = Selection(frames=frozenset(range(dispatched)))
@@ -205,7 +205,12 @@ def measure(folder: Path, tasks: int, dispatched: int, repeats: int) -> dict[str
 def fastest(repeats: int, work: Callable[[], object]) -> list[float]:
     """Least wall time and least processor time of several calls [s]."""
     gc.collect()
-    return [round(min(column), 6) for column in zip(*(timed(work) for _ in range(repeats)), strict=True)]
+    return least(timed(work) for _ in range(repeats))
+
+
+def least(times: Iterable[tuple[float, float]]) -> list[float]:
+    """Of wall and processor times the least of each [s]."""
+    return [round(min(column), 6) for column in zip(*times, strict=True)]
 
 
 def status(layout: JobLayout) -> None:
@@ -226,13 +231,11 @@ def _command(folder: Path, arguments: tuple[str, ...]) -> tuple[float, float]:
 
 
 def run_command(arguments: list[str]) -> None:
-    """The command line over the no-op stage; does not return."""
-    import pipeline.queue.turns
+    """The command line over the no-op stage, of which nothing has to run; does not return."""
     import pipeline.stages
     from pipeline.cli.main import main as command_line
 
     pipeline.stages.STAGES = STAGES
-    pipeline.queue.turns.STAGES_REFERENCE = STAGES_REFERENCE  # type: ignore[attr-defined]
     command_line(arguments)
 
 

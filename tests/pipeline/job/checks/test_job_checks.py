@@ -1,14 +1,17 @@
 """Jobs that are valid TOML and valid models, and still cannot be meant."""
 
 import re
+from pathlib import Path
 
 import pytest
 import trimesh
 from checked_jobs import BALL, PLUME, WATER, checked, says
 
 from pipeline.base.errors import JobFileError
-from pipeline.job.loading import read_job
+from pipeline.job.loading import job_of_text, read_job
+from pipeline.job.magnitudes import check_magnitudes
 from pipeline.job.starter import TEMPLATES, starter
+from pipeline.model.problems import Findings
 from pipeline.run.checked_job import check_job, load_checked_job
 
 HEAD = 'name = "dam"\nframes = 10\n'
@@ -61,6 +64,17 @@ def test_job_that_cannot_be_meant_is_refused_at_its_place(text, expected, tmp_pa
     with pytest.raises(JobFileError) as refused:
         load_checked_job(tmp_path / "dam.toml")
     assert refused.value.problems == errors
+
+
+def test_of_numbers_of_usual_size_no_unit_is_asked_for(monkeypatch):
+    """The schema of all jobs says the units: to build it takes a tenth of the time of a submit with nothing to do."""
+    job = job_of_text(HEAD + WATER + BALL, Path("dam.toml"))
+
+    def refuse() -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("pipeline.job.schema.job_schema", refuse)
+    assert check_magnitudes(job, Findings())
 
 
 def test_a_job_without_a_body_is_refused(tmp_path):
