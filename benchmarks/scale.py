@@ -165,6 +165,7 @@ def nothing_to_do_s(root: Path, tasks: int) -> tuple[float, float]:
 def bare_commit_ms(root: Path, count: int) -> float:
     """Wall time of one commit in a loop without anything else [ms]."""
     layout = JobLayout(root)
+    root.mkdir()
     began = time.perf_counter()
     for frame in range(count):
         task = _task("bare", frame)
