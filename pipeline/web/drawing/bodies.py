@@ -19,9 +19,13 @@ from pipeline.web.drawing.colors import CLOTH, SURFACE, Colors, ramp, srgb
 from pipeline.web.drawing.shapes import Body, Particles, Pose, Sheet, Smoke
 from pipeline.web.drawing.smoke_pictures import cut, points
 from sim.core.snapshots import Snapshot
+from sim.rigid.parameters import RigidBodyParameters
+from sim.shapes.placement import build_solid
 
-MeshOf = Callable[[str, str], tuple[NDArray[Any], NDArray[Any]] | None]
-"""Vertices [m] and faces of a part of a body, by their names; None before they are made."""
+Mesh = tuple[NDArray[Any], NDArray[Any]]
+"""Vertices [m] and faces."""
+MeshOf = Callable[[str, str], Mesh | None]
+"""The mesh of a part of a body, by their names; None where there is none."""
 
 PLAIN, SPEED, PRESSURE = "plain", "speed", "pressure"
 """Colourings of particles; the speed is computed from velocities, every other value is an array of the snapshot."""
@@ -76,6 +80,19 @@ class Look:
     smoke_as: str = POINTS  # `POINTS` or `SLICE`
     slice_axis: str = "y"  # "x", "y" or "z"
     slice_share: float = 0.5  # place in the smoke's box, 0 to 1
+
+
+def meshes_at_rest(body: RigidBodyParameters) -> dict[tuple[str, str], Mesh]:
+    """Meshes of the parts of a rigid body, built as its stage builds them, by the names of body and part.
+
+    Raises ValueError, OSError: the file of its shape is damaged or gone.
+    """
+    mesh = build_solid(body).rest_mesh()
+    pieces = {part: mesh.piece(part) for part in parts_of(body.shape.type)}
+    return {
+        (body.name, part): (piece.vertices.astype(np.float32), piece.faces.astype(np.uint32))
+        for part, piece in pieces.items()
+    }
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 
 from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
-from pipeline.model.looks import parts_of
-from pipeline.web.drawing.bodies import Look, Setting, body_of, draw_bodies
+from pipeline.web.drawing.bodies import Look, Mesh, Setting, body_of, draw_bodies, meshes_at_rest
 from pipeline.web.drawing.canvas import Canvas, Rgb, begin_at
 from pipeline.web.drawing.colors import PIN
 from pipeline.web.live.drags import is_draggable
 from render.parameters import CameraParameters
 from sim.core.snapshots import Snapshot
-from sim.shapes.placement import build_solid
 
 OnDrag = Callable[[str, str, Any], None]
 """Called with the kind of the thing, its name and viser's event."""
@@ -55,12 +53,9 @@ class LiveScene:
             target = middle if of_film.look_at is None else np.asarray(of_film.look_at)
         begin_at(server, position, target, fov=float(np.radians(45.0)))
         self._ball = icosphere(subdivisions=2, radius=PIN_SHARE * size)
-        meshes: dict[tuple[str, str], tuple[NDArray[Any], NDArray[Any]]] = {}
+        meshes: dict[tuple[str, str], Mesh] = {}
         for body in job.rigid:
-            mesh = build_solid(body).rest_mesh()
-            for part in parts_of(body.shape.type):
-                piece = mesh.piece(part)
-                meshes[body.name, part] = piece.vertices.astype(np.float32), piece.faces.astype(np.uint32)
+            meshes |= meshes_at_rest(body)
         look = Look(frozenset(kind.display.layer for kind in KINDS.values()))
         self._setting = Setting(job, lambda body, part: meshes[body, part], look)
 

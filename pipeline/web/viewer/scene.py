@@ -1,16 +1,13 @@
 """A job's cached frames on the canvas: bodies, and around them surfaces, whitewater, pins, the domain, the camera."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.base.layout import JobLayout
 from pipeline.base.task import ArtifactPath
 from pipeline.kinds.table import KINDS
 from pipeline.model.job import Job
-from pipeline.model.looks import BODY
-from pipeline.web.drawing.bodies import Extents, Look, Setting, color_of, draw_bodies
+from pipeline.model.looks import BODY, parts_of
+from pipeline.web.drawing.bodies import Extents, Look, Mesh, Setting, color_of, draw_bodies, meshes_at_rest
 from pipeline.web.drawing.canvas import Canvas, box_edges
 from pipeline.web.drawing.colors import PIN, SURFACE, WHITEWATER
 from pipeline.web.drawing.shapes import Pose
@@ -31,7 +28,8 @@ class JobScene:
 
     def __init__(self, job: Job, layout: JobLayout, committed: CommittedFrames) -> None:
         self._job, self._layout, self._committed = job, layout, committed
-        self._meshes: dict[ArtifactPath, tuple[Stamp, tuple[NDArray[Any], NDArray[Any]]]] = {}
+        self._meshes: dict[ArtifactPath, tuple[Stamp, Mesh]] = {}
+        self._built, self._unbuilt = self._build()
         self._standing = {
             body.name: Pose("rigid", np.array(body.position), from_degrees(body.rotation_deg))
             for body in job.rigid
@@ -59,7 +57,7 @@ class JobScene:
 
     def draw(self, canvas: Canvas, frame: ShownFrame | None, look: Look, extents: Extents) -> None:
         """Draw a frame; None: only what stays the same."""
-        self.troubles = []
+        self.troubles = [*self._unbuilt]
         job, layers = self._job, look.layers
         bodies = {**({} if frame is None else frame.bodies), **self._standing}
         with canvas.picture():
@@ -81,8 +79,20 @@ class JobScene:
             if CAMERA in layers and frame.view is not None:
                 canvas.camera("/camera", frame.view, aspect=self._aspect, size=self._size / 10.0, color=CAMERA_COLOR)
 
-    def _mesh(self, body: str, part: str) -> tuple[NDArray[Any], NDArray[Any]] | None:
-        """The mesh of a part of a body; None before it is made."""
+    def _build(self) -> tuple[dict[tuple[str, str], Mesh], list[str]]:
+        """Meshes of bodies of which there are no files (yet), as after `--until surface`; and what failed of that."""
+        built: dict[tuple[str, str], Mesh] = {}
+        failed: list[str] = []
+        for body in self._job.rigid:
+            files = [self._layout.body_mesh(body.name, part) for part in parts_of(body.shape.type)]
+            try:
+                built |= {} if all(map(self._committed.is_there, files)) else meshes_at_rest(body)
+            except (ValueError, OSError) as error:
+                failed.append(f"{body.name} is not shown: {error}")
+        return built, failed
+
+    def _mesh(self, body: str, part: str) -> Mesh | None:
+        """The mesh of a part of a body; None if it cannot be made or read."""
         artifact = self._layout.body_mesh(body, part)
         stamp = self._committed.stamp([artifact])
         kept = self._meshes.get(artifact)
@@ -90,7 +100,7 @@ class JobScene:
             return kept[1]
         self._meshes.pop(artifact, None)
         if not self._committed.is_there(artifact):
-            return None
+            return self._built.get((body, part))
         try:
             mesh = read_ply(self._layout.path(artifact))
         except (InvalidFileError, OSError) as error:

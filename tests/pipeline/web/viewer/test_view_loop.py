@@ -21,6 +21,8 @@ from websockets.sync.client import connect
 
 from pipeline.base.layout import JobLayout
 from pipeline.job.loading import load_job
+from pipeline.run.plan import plan_job
+from pipeline.stages import STAGES
 from pipeline.stages.bodies import BodiesStage
 from pipeline.store.receipts import read_receipt
 from pipeline.web.drawing.canvas import Canvas
@@ -28,6 +30,7 @@ from pipeline.web.drawing.shapes import Smoke
 from pipeline.web.drawing.smoke_pictures import cut
 from pipeline.web.serving import in_its_loop, page_server
 from pipeline.web.viewer.page import ViewPage
+from render.meshes import read_ply
 
 
 @pytest.fixture
@@ -153,6 +156,27 @@ def test_a_body_that_is_made_anew_is_drawn_anew(server, layout):
         run_task(task, layout)
     page.advance(20.0)
     assert radius() == pytest.approx(0.25, rel=0.01)
+
+
+def test_bodies_whose_stage_the_goal_of_the_job_leaves_out_are_drawn_as_the_scene_has_them(server, layout):
+    job = load_job(layout.job_file)
+    assert "bodies" not in {task.stage for task in plan_job(job, layout, STAGES, ("surface",))}
+    mesh = layout.body_mesh("ball", "body")
+    made = read_ply(layout.path(mesh))
+    layout.receipt(mesh).unlink()
+    layout.path(mesh).unlink()
+    page = page_of(server, layout)
+    drawn = server.scene.get_handle_by_name("/rigid/ball/body")
+    assert np.array_equal(drawn.vertices, made.vertices)
+    assert np.array_equal(drawn.faces, made.faces)
+    assert "not shown" not in page.controls.notice.content
+    layout.job_file.write_text(
+        layout.job_file.read_text().replace(
+            '"sphere", radius = 0.1 }\nposition = [0.7, 0.3', '"mesh", file = "gone.ply" }\nposition = [0.7, 0.3'
+        )
+    )
+    page.advance(10.0)
+    assert "ball is not shown: " in page.controls.notice.content
 
 
 def test_pins_of_a_finer_cloth_than_the_frame_has_are_a_line(server, layout):
