@@ -256,10 +256,13 @@ class JobQueue:
         if not self.is_there():
             return ()
         with self.locked():
-            os.utime(self._entries)  # a client reads the names in a folder anew that it has changed
-            while not all(os.path.lexists(path) for path in self._paths()):
+            while True:
+                os.utime(self._entries)  # a client reads the names in a folder anew that it has changed
+                with suppress(FileNotFoundError):
+                    for path in self._paths():
+                        path.lstat()
+                    return self.waiting()
                 time.sleep(UNSEEN_RETRY_S)  # this host still remembers that there was no such file
-            return self.waiting()
 
     # --- changing ---
     def put(self, job: QueuedJob) -> None:
