@@ -24,6 +24,8 @@ from pipeline.run.control import RunControl
 from pipeline.run.events import JobOutcome, Notice, Outcome, RunEvent, RunStarted
 from pipeline.run.executors.failures import is_disk_full
 
+START_POLL_S = 0.05
+"""How often a runner that starts in the background is looked for."""
 LOOK_INTERVAL_S = 0.4
 """How often a running job's entry, the queue and the disk are looked at."""
 BUSY_RETRY_S = 1.0
@@ -287,7 +289,7 @@ def _disk_of(queue: JobQueue, job: QueuedJob) -> Path:
 
 
 def start_in_background(queue: JobQueue) -> int | None:
-    """Start a runner that no terminal holds, unless the queue has one; returns its process id, or None.
+    """Start a runner that no terminal holds, unless the queue has one; returns its process id once it runs, or None.
 
     One that is just ending sees what was queued before this call; see `JobQueue.left`.
     """
@@ -306,4 +308,6 @@ def start_in_background(queue: JobQueue) -> int | None:
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": search_path},
             )
-        return child.pid
+    while child.poll() is None and live_holder(queue.lease) is None:
+        time.sleep(START_POLL_S)
+    return child.pid
