@@ -20,8 +20,9 @@ from .studio import Studio
 from .table import Result, Row
 
 MIXED = "all of these, mixed"
-PATIENCE_S = 600.0
-"""A run takes seconds, minutes on a machine that is busy with other things; only a hang gets here."""
+PATIENCE_S = 1500.0
+"""A run takes seconds, minutes on a machine that is busy with other things, and two more for each worker of six that
+stop for ever one after the other; only a hang gets here."""
 PROCESSES_END_WITHIN_S = 30.0
 _POLL_S = 0.02
 _RUNNER_IS_BUSY = 4

@@ -1,0 +1,936 @@
+"""Trial of the next cloth solver on a square sheet of springs: small steps, exact threads, contacts that cannot cross.
+
+What `benchmarks.cloth_gates` measures, before the solver of `sim.cloth` is written anew; it goes when that one stands.
+
+A substep moves node i by u_i. Threads of warp and weft are solved exactly (tridiagonal, XPBD after Macklin et al. 2016
+with one step a substep, Macklin et al. 2019), bends and shears by relaxation; contacts and springs beyond a limit push
+in Jacobi iterations. Then every pair that might meet is tested: with n the normal between the closest points at the
+start, both sides stay apart if min n.(x_a + u_a) - max n.(x_b + u_b) is positive at the end, as both are linear in
+time. What fails is pushed again, and after some rounds moved as one, in zones that only grow (Bridson et al. 2002), so
+that it ends: nodes with one displacement do not meet.
+
+Pairs are listed for some substeps: those that get within the thickness if nodes go on as they do now, each at most a
+margin from there. A list holds as long as all nodes are that near to where they were foreseen, which is tested at the
+end of every substep; whatever is common to a pair's motion costs nothing.
+"""
+
+import math
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+SIDE, DENSITY, GRAVITY = 1.0, 0.3, 9.81
+"""Length of the sheet's sides [m], mass per area [kg/m²], acceleration [m/s²]."""
+
+STRETCH, SHEAR, BEND = 4.0e3, 50.0, 8.0e-6
+"""Stiffness of cotton [N/m], [N/m], [N m]."""
+
+SOFT_IN_COMPRESSION = 10.0
+"""Threads give way so many times as easily when pressed: they buckle below the length of an edge."""
+
+FRICTION, DRAG = 0.5, 0.1
+"""Coulomb's coefficient [-]; part of the speed lost in a second [1/s]."""
+
+RECOVERY_TIME_S = 0.01
+"""Layers that are too near go apart within about this time."""
+
+THICKNESS, MARGIN, LEAST_GAP = 0.5, 0.1, 0.01
+"""Distance that layers keep, how far nodes may get from where they were foreseen, and what contacts never go below, in
+edges."""
+
+STRAIN_LIMIT = 0.02
+"""Springs beyond this pull along with the contacts."""
+
+SQUEEZED = 0.8
+"""Cells with a shorter side or diagonal, in edges, count as bent."""
+
+BALL_RADIUS, BALL_FLOOR = 0.25, -0.4
+FUNNEL_RADIUS, FUNNEL_FLOOR = 0.12, -0.35
+"""The ball is about the origin; the funnel is a tube below a cone of 45 degrees. All [m]."""
+
+COLUMN_GAP, TURNS_PER_S, SHORTENING_SPEED, SHORTENING = 0.03, 0.5, 0.12, 0.3
+"""Of the column: gap of its seam, in its girth; turns of each end [1/s], in opposite directions; how fast [m/s] and how
+far [m] each end moves inwards."""
+
+PATCH_PAIRS = 48
+"""Patches with more neighbours than this are looked at as a whole."""
+
+FINER = 2.0**-22
+"""Unit of summed corrections, in edges: integers, so that their order does not matter."""
+
+SCENES = ("ball", "funnel", "twist")
+
+TALLY = ("searches", "rounds", "zoned_substeps", "largest_zone", "unresolved", "contacts")
+"""What is counted in a frame: the largest zone in nodes, `unresolved` are pairs that held nodes are led through."""
+
+vec3, vec4, ivec4 = ti.math.vec3, ti.math.vec4, ti.math.ivec4
+
+
+def start_of(scene: str, n: int) -> NDArray[np.float32]:
+    """Positions of the n x n nodes [m], (n * n, 3)."""
+    along = np.linspace(-0.5 * SIDE, 0.5 * SIDE, n)
+    y, x = (each.ravel() for each in np.meshgrid(along, along, indexing="ij"))
+    if scene == "ball":
+        return np.stack([x, y, np.full(n * n, 0.3)], axis=1).astype(np.float32)
+    if scene == "funnel":  # a little uneven, so that it crumples instead of folding as one
+        return np.stack([x, y, 0.75 + 0.02 * np.sin(9 * x + 4 * y) * np.cos(7 * y)], axis=1).astype(np.float32)
+    radius = SIDE / (2.0 * np.pi * (1.0 - COLUMN_GAP))
+    return np.stack([x, radius * np.cos(y / radius), radius * np.sin(y / radius)], axis=1).astype(np.float32)
+
+
+@ti.data_oriented
+class TrialSheet:
+    """The sheet.
+
+    Attributes:
+        count: of listed pairs.
+        tally: what happened since `begin_frame`, by name.
+
+    Args:
+        scene: one of `SCENES`.
+        n: nodes along a side, a power of two on a GPU.
+        substeps: in a frame of 1/60 s.
+        on_gpu: threads are solved by parallel cyclic reduction there, and one after the other by elimination elsewhere.
+        sweeps: solutions of all threads at a time.
+        rounds: of pushing before zones are joined.
+        every: substeps that a list is meant for.
+        room: of the list, in pairs a node.
+    """
+
+    def __init__(
+        self, scene: str, n: int, *, substeps: int, on_gpu: bool, sweeps: int, rounds: int, every: int, room: int
+    ) -> None:
+        self.scene, self.n, self.on_gpu, self.sweeps, self.rounds, self.every = scene, n, on_gpu, sweeps, rounds, every
+        self.h = SIDE / (n - 1)
+        self.dt = 1.0 / 60.0 / substeps
+        self.thickness, self.margin, self.least_gap = THICKNESS * self.h, MARGIN * self.h, LEAST_GAP * self.h
+        self.quantum, self.inverse_mass = FINER * self.h, 1.0 / (DENSITY * self.h**2)
+        self.cell = 3.0 * self.h
+        nodes = n * n
+        self.nodes, self.capacity = nodes, max(1 << 18, room * nodes)
+        self.buckets = 1 << math.ceil(math.log2(4 * nodes))
+        self.patch = 4 if n <= 160 else 8
+        self.patches_a_side = -(-n // self.patch)
+        self.patches = self.patches_a_side**2
+        self.lanes = 64 if on_gpu else 1
+        # Nodes: where they are, displacement of the substep, velocity; scratch; where and how the last search saw them.
+        self.x, self.u, self.v, self.scratch, self.seen, self.foreseen, self.start = (
+            ti.Vector.field(3, ti.f32, nodes) for _ in range(7)
+        )
+        self.w = ti.field(ti.f32, nodes)
+        self.sums, self.pushes = ti.Vector.field(3, ti.i32, nodes), ti.field(ti.i32, nodes)
+        self.multiplier = ti.field(ti.f32, (2, nodes))
+        self.direction = ti.Vector.field(3, ti.f32, nodes)
+        self.upper, self.right = ti.field(ti.f32, nodes), ti.field(ti.f32, nodes)
+        # Cells, each by its first node: box, box of its way, normal, motion and how far corners differ from it.
+        self.low, self.high, self.way_low, self.way_high, self.normal, self.motion = (
+            ti.Vector.field(3, ti.f32, nodes) for _ in range(6)
+        )
+        self.spread = ti.field(ti.f32, nodes)
+        self.is_bent, self.is_active, self.slot, self.entry = (ti.field(ti.i32, nodes) for _ in range(4))
+        self.bucket_count, self.bucket_start = ti.field(ti.i32, self.buckets), ti.field(ti.i32, self.buckets)
+        self.patch_low, self.patch_high, self.axis = (ti.Vector.field(3, ti.f32, self.patches) for _ in range(3))
+        self.half_angle = ti.field(ti.f32, self.patches)
+        self.near_count, self.is_flat = ti.field(ti.i32, self.patches), ti.field(ti.i32, self.patches)
+        self.near = ti.field(ti.i32, (self.patches, PATCH_PAIRS))
+        # Pairs: a node and a triangle, or the ends of two edges; weights of the closest points; normal and distance.
+        self.pair, self.is_edges = ti.Vector.field(4, ti.i32, self.capacity), ti.field(ti.i32, self.capacity)
+        self.weights, self.plane = (ti.Vector.field(4, ti.f32, self.capacity) for _ in range(2))
+        # Zones: the least node of each, its momentum over the mass of a node, how many nodes, and one that is held.
+        self.zone, self.zone_count, self.zone_held = (ti.field(ti.i32, nodes) for _ in range(3))
+        self.zone_sum = ti.Vector.field(3, ti.i64, nodes)
+        # Counters: listed pairs, hashed cells, what failed, what was pushed, what changed, half of the widest way.
+        self.counter = ti.field(ti.i32, 6)
+        self.strayed = ti.field(ti.i32, 64)
+        self.mean_sums, self.mean = ti.Vector.field(3, ti.i64, 64), ti.Vector.field(3, ti.f32, 1)
+        self.count, self._age, self._strayed, self._time = 0, every, 0.0, 0.0
+        self.tally: dict[str, int] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to the start."""
+        start, inverse_mass = start_of(self.scene, self.n), np.full(self.nodes, self.inverse_mass, dtype=np.float32)
+        if self.scene == "twist":
+            inverse_mass.reshape(self.n, self.n)[:, [0, -1]] = 0.0
+        self.x.from_numpy(start)
+        self.start.from_numpy(start)
+        self.w.from_numpy(inverse_mass)
+        for field in (self.u, self.v, self.sums, self.pushes, self.multiplier):
+            field.fill(0)
+        self._age, self._strayed, self._time = self.every, 0.0, 0.0
+        self.begin_frame()
+
+    def begin_frame(self) -> None:
+        """Count anew."""
+        self.tally = dict.fromkeys(TALLY, 0)
+
+    def positions(self) -> NDArray[np.float32]:
+        """Where nodes are [m], (n * n, 3)."""
+        return self.x.to_numpy() + self.u.to_numpy()
+
+    # --- the substep ------------------------------------------------------------------------------------------------
+
+    def substep(self) -> None:
+        """Advance by `dt`."""
+        self.predict(self._time)
+        self._time += self.dt
+        self.solve_threads()
+        if self._age >= self.every or self._strayed > self.margin:
+            self._look(float(self.every))
+        self.touch(self.count)
+        found = self._push()
+        self.solve_threads()
+        self._push()
+        for _ in range(3):  # pushed beyond what was foreseen: look at what is near these ways
+            if self._strayed <= self.margin:
+                break
+            self._look(1.0)
+            self.touch(self.count)
+            found = self._push()
+        self.tally["contacts"] = max(self.tally["contacts"], found)
+        self._keep_apart()
+        self._age += 1
+
+    def _push(self) -> int:
+        found, strayed = self.push(self.count, self._age)
+        self._strayed = strayed * self.quantum
+        return int(found)
+
+    def _look(self, steps: float) -> None:
+        self.count, self._age = int(self.search(steps)), 0
+        self.tally["searches"] += 1
+        if self.count > self.capacity:
+            raise SystemExit(f"{self.count} pairs, room for {self.capacity}: give more --room")
+
+    def _keep_apart(self) -> None:
+        """Push, and at last move as one, until every pair is known not to cross."""
+        for number in range(self.rounds + 1):
+            failed, strayed = self.test(self.count, self._age, int(number < self.rounds))
+            self._strayed = strayed * self.quantum
+            if not failed and self._strayed <= self.margin:
+                return
+            if number < self.rounds:
+                self.tally["rounds"] += 1
+                if not failed:
+                    self._look(1.0)
+                    self.touch(self.count)
+                else:
+                    self.push_again(self.count)
+        self.begin_zones()
+        self.tally["zoned_substeps"] += 1
+        while True:
+            grew = False
+            while self.join(self.count):
+                grew = True
+            self.move_zones()
+            failed, strayed = self.test(self.count, self._age, 0)
+            self._strayed = strayed * self.quantum
+            if not failed:
+                if self._strayed <= self.margin:
+                    break
+                self._look(1.0)
+                self.touch(self.count)
+            elif not grew:  # held nodes are led through each other
+                self.tally["unresolved"] += failed
+                break
+        self.tally["largest_zone"] = max(self.tally["largest_zone"], int(np.bincount(self.zone.to_numpy()).max()))
+
+    # --- springs ----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def keep_out(self, i):
+        """Lead a node out of the ball, the funnel or the floor, with friction."""
+        if self.w[i] > 0:
+            p = self.x[i] + self.u[i]
+            depth, n = 1.0, vec3(0, 0, 1)
+            if ti.static(self.scene == "ball"):
+                depth, n = p.norm() - BALL_RADIUS - self.thickness, p.normalized()
+                above = p.z - BALL_FLOOR - self.thickness
+                if above < depth:
+                    depth, n = above, vec3(0, 0, 1)
+            elif ti.static(self.scene == "funnel"):
+                r = ti.max(p.xy.norm(), 1e-9)
+                depth, n = FUNNEL_RADIUS - r, vec3(-p.x / r, -p.y / r, 0)
+                if p.z > 0:
+                    depth, n = (FUNNEL_RADIUS + p.z - r) * ti.sqrt(0.5), vec3(-p.x / r, -p.y / r, 1) * ti.sqrt(0.5)
+                depth -= self.thickness
+                above = p.z - FUNNEL_FLOOR - self.thickness
+                if above < depth:
+                    depth, n = above, vec3(0, 0, 1)
+            if depth < 0:
+                self.u[i] -= depth * n
+                slip = self.u[i] - self.u[i].dot(n) * n
+                length = slip.norm()
+                if length > 0:
+                    self.u[i] -= slip * ti.min(1.0, -FRICTION * depth / length)
+
+    @ti.func
+    def held(self, i, time):
+        """Displacement of an end of the column."""
+        side = ti.select(i % self.n == 0, 1.0, -1.0)
+        angle = side * 2.0 * math.pi * TURNS_PER_S * time
+        p = self.start[i]
+        c, s = ti.cos(angle), ti.sin(angle)
+        inwards = side * ti.min(SHORTENING_SPEED * time, SHORTENING)
+        return vec3(p.x + inwards, p.y * c - p.z * s, p.y * s + p.z * c) - self.x[i]
+
+    @ti.func
+    def bend(self, i, stride):
+        """Second difference of where nodes are led."""
+        of_start = self.x[i - stride] + self.x[i + stride] - 2 * self.x[i]
+        return of_start + (self.u[i - stride] + self.u[i + stride] - 2 * self.u[i])
+
+    @ti.func
+    def shear(self, i, j):
+        """Solve a diagonal."""
+        d = self.x[j] + self.u[j] - self.x[i] - self.u[i]
+        length, weight = d.norm(), self.w[i] + self.w[j]
+        if weight > 0 and length > 1e-9:
+            s = (length - ti.sqrt(2.0) * self.h) / (weight + 1.0 / (SHEAR * self.dt**2)) / length
+            self.u[i] += self.w[i] * s * d
+            self.u[j] -= self.w[j] * s * d
+
+    @ti.kernel
+    def predict(self, time: ti.f32):
+        """Where inertia, gravity, bends and shears lead."""
+        n, dt = ti.static(self.n), ti.static(self.dt)
+        stiffness = ti.static(BEND / self.h**2)
+        for i in range(self.nodes):
+            self.x[i] += self.u[i]
+            self.v[i] = self.u[i] / dt
+            if self.w[i] > 0:
+                self.u[i] = dt * self.v[i] * (1.0 - DRAG * dt) - vec3(0, 0, GRAVITY * dt**2)
+            self.sums[i], self.pushes[i] = 0, 0
+            self.multiplier[0, i], self.multiplier[1, i] = 0.0, 0.0
+            self.keep_out(i)
+            if self.w[i] == 0:
+                self.u[i] = self.held(i, time + dt)
+        for i in range(self.nodes):
+            force, curl = vec3(0), vec3(0)
+            if self.w[i] > 0:
+                for stride in ti.static((1, self.n)):
+                    q = i % n if ti.static(stride == 1) else i // n
+                    if q > 0 and q < n - 1:
+                        force -= 2 * self.bend(i, stride)
+                        curl -= 2 * (self.u[i - stride] + self.u[i + stride] - 2 * self.u[i])
+                    if q > 1:
+                        force += self.bend(i - stride, stride)
+                        curl += self.u[i - 2 * stride] + self.u[i] - 2 * self.u[i - stride]
+                    if q < n - 2:
+                        force += self.bend(i + stride, stride)
+                        curl += self.u[i] + self.u[i + 2 * stride] - 2 * self.u[i + stride]
+            share = self.inverse_mass / (6.0 * self.inverse_mass + 1.0 / (stiffness * dt**2))
+            self.scratch[i] = self.u[i] - 0.25 * share * force - 0.02 * curl
+        for i in range(self.nodes):
+            self.u[i] = self.scratch[i]
+        for k in ti.static(range(4)):  # both diagonals, every second row of cells
+            for q in range(((n - k % 2) // 2) * n):
+                r, c = 2 * (q // n) + k % 2, q % n
+                if c < n - 1 and r < n - 1:
+                    i = r * n + c
+                    if ti.static(k < 2):
+                        self.shear(i, i + n + 1)
+                    else:
+                        self.shear(i + 1, i + n)
+
+    @ti.kernel
+    def solve_threads(self):
+        """All threads of the warp, then of the weft."""
+        for _ in ti.static(range(self.sweeps)):
+            for along in ti.static((1, 0)):
+                if ti.static(self.on_gpu):
+                    self.reduce_threads(along)
+                else:
+                    self.eliminate_threads(along)
+
+    @ti.func
+    def node_of(self, thread, j, along: ti.template()):
+        return thread * self.n + j if ti.static(along == 0) else j * self.n + thread
+
+    @ti.func
+    def compliance(self, thread, length):
+        """Of a spring over dt²; threads on the edge have half as much cloth."""
+        of_edge = ti.select((thread == 0) | (thread == self.n - 1), 2.0, 1.0)
+        return of_edge * ti.select(length < self.h, SOFT_IN_COMPRESSION, 1.0) / (STRETCH * self.dt**2)
+
+    @ti.func
+    def eliminate_threads(self, along: ti.template()):
+        """(w_j + w_j+1 + a) l_j - w_j n_j-1.n_j l_j-1 - w_j+1 n_j.n_j+1 l_j+1 = C_j - a L_j, by elimination."""
+        n = ti.static(self.n)
+        for thread in range(n):
+            i = self.node_of(thread, 0, along)
+            p, before, wi, diagonal, right = self.x[i] + self.u[i], vec3(0), self.w[i], 1.0, 0.0
+            for j in range(n - 1):
+                other = self.node_of(thread, j + 1, along)
+                p_other, w_other = self.x[other] + self.u[other], self.w[other]
+                d = p_other - p
+                length = ti.max(d.norm(), 1e-9)
+                direction, a = d / length, self.compliance(thread, length)
+                off = -wi * direction.dot(before)
+                k = thread * n + j
+                self.upper[k] = off / diagonal if j > 0 else 0.0
+                diagonal = wi + w_other + a - off * self.upper[k]
+                if diagonal == 0.0:  # between two held nodes
+                    diagonal = 1.0
+                right = (length - self.h - a * self.multiplier[along, i] - off * right) / diagonal
+                self.right[k], self.direction[k] = right, direction
+                p, wi, before, i = p_other, w_other, direction, other
+            after, n_after, factor = 0.0, vec3(0), 0.0
+            for reverse in range(n):
+                j = n - 1 - reverse
+                i, k = self.node_of(thread, j, along), thread * n + j
+                own, direction = 0.0, vec3(0)
+                if j < n - 1:
+                    own, direction = self.right[k] - factor * after, self.direction[k]
+                    factor = self.upper[k]
+                    other = self.node_of(thread, j + 1, along)
+                    self.u[other] += self.w[other] * (after * n_after - own * direction)
+                    self.multiplier[along, i] += own
+                if j == 0:
+                    self.u[i] += self.w[i] * own * direction
+                after, n_after = own, direction
+
+    @ti.func
+    def reduce_threads(self, along: ti.template()):
+        """The same by parallel cyclic reduction, a block a thread."""
+        n = ti.static(self.n)
+        ti.loop_config(block_dim=self.n)
+        for g in range(self.nodes):
+            thread, j = g // n, g % n
+            i = self.node_of(thread, j, along)
+            sx, sy = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
+            sz, sa = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
+            sb, sc = ti.simt.block.SharedArray((self.n,), ti.f32), ti.simt.block.SharedArray((self.n,), ti.f32)
+            sr = ti.simt.block.SharedArray((self.n,), ti.f32)
+            p, wi = self.x[i] + self.u[i], self.w[i]
+            sx[j], sy[j], sz[j], sc[j] = p.x, p.y, p.z, wi
+            ti.simt.block.sync()
+            d, w_other = vec3(0), 0.0
+            if j < n - 1:
+                d, w_other = vec3(sx[j + 1], sy[j + 1], sz[j + 1]) - p, sc[j + 1]
+            length = ti.max(d.norm(), 1e-9)
+            direction = d / length
+            ti.simt.block.sync()
+            sx[j], sy[j], sz[j] = direction.x, direction.y, direction.z
+            ti.simt.block.sync()
+            a, b, c, r = 0.0, 1.0, 0.0, 0.0
+            if j < n - 1 and wi + w_other > 0:
+                compliance = self.compliance(thread, length)
+                b, r = wi + w_other + compliance, length - self.h - compliance * self.multiplier[along, i]
+                if j > 0:
+                    a = -wi * direction.dot(vec3(sx[j - 1], sy[j - 1], sz[j - 1]))
+                if j < n - 2:
+                    c = -w_other * direction.dot(vec3(sx[j + 1], sy[j + 1], sz[j + 1]))
+            s = 1
+            while s < n:
+                sa[j], sb[j], sc[j], sr[j] = a, b, c, r
+                ti.simt.block.sync()
+                if j - s >= 0:
+                    f = -a / sb[j - s]
+                    b, r, a = b + f * sc[j - s], r + f * sr[j - s], f * sa[j - s]
+                else:
+                    a = 0.0
+                if j + s < n:
+                    f = -c / sb[j + s]
+                    b, r, c = b + f * sa[j + s], r + f * sr[j + s], f * sc[j + s]
+                else:
+                    c = 0.0
+                ti.simt.block.sync()
+                s *= 2
+            own = r / b if j < n - 1 else 0.0
+            self.multiplier[along, i] += own
+            sr[j] = own
+            ti.simt.block.sync()
+            change = own * direction
+            if j > 0:
+                change -= sr[j - 1] * vec3(sx[j - 1], sy[j - 1], sz[j - 1])
+            self.u[i] += wi * change
+
+    # --- the search -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def cell_of(self, p):
+        return ti.cast(ti.floor(p / self.cell), ti.i32)
+
+    @ti.func
+    def bucket_of(self, cell):
+        return ((cell[0] * 73856093) ^ (cell[1] * 19349663) ^ (cell[2] * 83492791)) & (self.buckets - 1)
+
+    @ti.func
+    def closest(self, q, is_edges):
+        """Weights of the nodes of a pair in the vector between its closest points."""
+        a, b, c, d = self.x[q[0]], self.x[q[1]], self.x[q[2]], self.x[q[3]]
+        found = vec4(0)
+        if is_edges == 0:
+            o = barycentric(a, b, c, d)
+            found = vec4(1, -o[0], -o[1], -o[2])
+        else:
+            s, t = parameters_of_edges(a, b, c, d)
+            found = vec4(1 - s, s, t - 1, -t)
+        return found
+
+    @ti.func
+    def between(self, p, q):
+        """Vector between the closest points of a pair at the start."""
+        k = self.weights[p]
+        return k[0] * self.x[q[0]] + k[1] * self.x[q[1]] + k[2] * self.x[q[2]] + k[3] * self.x[q[3]]
+
+    @ti.func
+    def relative(self, of: ti.template(), q, is_edges):
+        """How far vectors of the two sides of a pair differ at most."""
+        a, b, c, d = of[q[0]], of[q[1]], of[q[2]], of[q[3]]
+        most = ti.max((a - c).norm_sqr(), (a - d).norm_sqr())
+        if is_edges == 1:
+            most = ti.max(most, (b - c).norm_sqr(), (b - d).norm_sqr())
+        else:
+            most = ti.max(most, (a - b).norm_sqr())
+        return ti.sqrt(most)
+
+    @ti.func
+    def consider(self, q, is_edges, most, steps):
+        """List a pair that may get within the thickness; `most` bounds for all of two cells how near that is."""
+        x0, x1, x2, x3 = self.x[q[0]], self.x[q[1]], self.x[q[2]], self.x[q[3]]
+        low_a, high_a, low_b, high_b = x0, x0, ti.min(x2, x3), ti.max(x2, x3)
+        if is_edges == 1:
+            low_a, high_a = ti.min(low_a, x1), ti.max(high_a, x1)
+        else:
+            low_b, high_b = ti.min(low_b, x1), ti.max(high_b, x1)
+        if meet(low_a - most, high_a + most, low_b, high_b):
+            near = self.thickness + 2.0 * self.margin + steps * self.relative(self.foreseen, q, is_edges)
+            o = self.closest(q, is_edges)
+            d = o[0] * x0 + o[1] * x1 + o[2] * x2 + o[3] * x3
+            if d.norm_sqr() < near * near:
+                place = ti.atomic_add(self.counter[0], 1)
+                if place < self.capacity:
+                    self.pair[place], self.is_edges[place] = q, is_edges
+
+    @ti.func
+    def consider_triangles(self, a, b, most, steps):
+        """A node and the triangles of a cell."""
+        n = ti.static(self.n)
+        if b // n < n - 1 and b % n < n - 1 and a != b and a != b + n + 1:
+            if a != b + 1:
+                self.consider(ivec4(a, b, b + 1, b + n + 1), 0, most, steps)
+            if a != b + n:
+                self.consider(ivec4(a, b, b + n + 1, b + n), 0, most, steps)
+
+    @ti.func
+    def edge_of(self, a, k):
+        """Other end of the k-th edge of a cell, or -1."""
+        n = ti.static(self.n)
+        has_next, has_below = a % n < n - 1, a // n < n - 1
+        end = -1
+        if k == 0 and has_next:
+            end = a + 1
+        if k == 1 and has_below:
+            end = a + n
+        if k == 2 and has_next and has_below:
+            end = a + n + 1
+        return end
+
+    @ti.func
+    def consider_cells(self, a, b, steps):
+        """Node, edges and triangles of two cells."""
+        relative = (self.motion[a] - self.motion[b]).norm() + self.spread[a] + self.spread[b]
+        most = self.thickness + 2.0 * self.margin + steps * relative
+        if meet(self.low[a] - most, self.high[a] + most, self.low[b], self.high[b]):
+            self.consider_triangles(a, b, most, steps)
+            self.consider_triangles(b, a, most, steps)
+            for k in range(3):
+                e = self.edge_of(a, k)
+                if e >= 0:
+                    for m in range(3):
+                        f = self.edge_of(b, m)
+                        if f >= 0 and a != f and e != b and e != f:
+                            self.consider(ivec4(a, e, b, f), 1, most, steps)
+
+    @ti.kernel
+    def search(self, steps: ti.f32) -> ti.i32:
+        """List the pairs that may get within the thickness in so many substeps; returns how many there are."""
+        n, side, size = ti.static(self.n), ti.static(self.patches_a_side), ti.static(self.patch)
+        wide = ti.static(0.5 * self.thickness + self.margin)
+        for i in range(64):
+            self.mean_sums[i] = 0
+        for i in range(self.nodes):
+            self.seen[i], self.foreseen[i] = self.x[i], self.u[i]
+            for k in ti.static(range(3)):
+                ti.atomic_add(self.mean_sums[i & 63][k], ti.cast(ti.round(self.u[i][k] / self.quantum), ti.i64))
+        for _ in range(1):
+            total = ti.Vector.zero(ti.i64, 3)
+            for k in range(64):
+                total += self.mean_sums[k]
+            self.mean[0] = ti.cast(total, ti.f32) * (self.quantum / self.nodes)
+            self.counter[0], self.counter[1], self.counter[5] = 0, 0, 0
+        for i in range(self.buckets):
+            self.bucket_count[i] = 0
+        for i in range(self.nodes):  # cells
+            right, below = ti.select(i % n < n - 1, 1, 0), ti.select(i // n < n - 1, n, 0)
+            corners = ivec4(i, i + right, i + below, i + right + below)
+            low, high, mean = self.x[i], self.x[i], vec3(0)
+            for k in ti.static(range(4)):
+                low, high = ti.min(low, self.x[corners[k]]), ti.max(high, self.x[corners[k]])
+                mean += 0.25 * self.u[corners[k]]
+            self.low[i], self.high[i], self.motion[i] = low, high, mean
+            differs = 0.0
+            for k in ti.static(range(4)):
+                differs = ti.max(differs, (self.u[corners[k]] - mean).norm_sqr())
+                ends = self.x[corners[k]] + steps * (self.u[corners[k]] - self.mean[0])
+                low, high = ti.min(low, ends), ti.max(high, ends)
+            self.spread[i] = ti.sqrt(differs)
+            self.way_low[i], self.way_high[i] = low - wide, high + wide
+            widest = 0.5 * (high - low).max() + wide
+            ti.atomic_max(self.counter[5], ti.cast(ti.ceil(ti.min(widest / self.quantum, 2.0e9)), ti.i32))
+            # Beyond the last row and column the cell before.
+            j = i - ti.select(right == 0, 1, 0) - ti.select(below == 0, n, 0)
+            now, later = self.normal_of(j, 0.0), self.normal_of(j, steps)
+            self.normal[i] = ti.select(now.dot(later) > 0.95, now, 0.0)
+        for i in range(self.nodes):  # bent: a cell within two rings is turned by 60 degrees or more
+            bent = 0
+            for r in range(ti.max(i // n - 2, 0), ti.min(i // n + 3, n)):
+                for c in range(ti.max(i % n - 2, 0), ti.min(i % n + 3, n)):
+                    if self.normal[i].dot(self.normal[r * n + c]) < 0.5:
+                        bent = 1
+            self.is_bent[i] = bent
+        for q in range(self.patches):  # boxes of patches, cones of their normals
+            low, high, axis, cosine = vec3(1e9), vec3(-1e9), vec3(0), 1.0
+            for r in range(q // side * size, ti.min((q // side + 1) * size, n)):
+                for c in range(q % side * size, ti.min((q % side + 1) * size, n)):
+                    i = r * n + c
+                    low, high = ti.min(low, self.way_low[i]), ti.max(high, self.way_high[i])
+                    axis += self.normal[i]
+            axis = axis / ti.max(axis.norm(), 1e-9)
+            for r in range(q // side * size, ti.min((q // side + 1) * size, n)):
+                for c in range(q % side * size, ti.min((q % side + 1) * size, n)):
+                    cosine = ti.min(cosine, axis.dot(self.normal[r * n + c]))
+            self.patch_low[q], self.patch_high[q], self.axis[q] = low, high, axis
+            self.half_angle[q] = ti.acos(ti.math.clamp(cosine, -1.0, 1.0))
+        for q in range(self.patches):
+            flat = 1
+            for r in range(ti.max(q // side - 1, 0), ti.min(q // side + 2, side)):
+                for c in range(ti.max(q % side - 1, 0), ti.min(q % side + 2, side)):
+                    o = r * side + c
+                    turned = ti.acos(ti.math.clamp(self.axis[q].dot(self.axis[o]), -1.0, 1.0))
+                    if turned + self.half_angle[q] + self.half_angle[o] > math.pi / 3:
+                        flat = 0
+            self.is_flat[q], self.near_count[q] = flat, 0
+        for t in range(self.patches * self.lanes):
+            q = t // self.lanes
+            for j in range(self.patches // self.lanes + 1):
+                o = j * self.lanes + t % self.lanes
+                rings = ti.max(ti.abs(o // side - q // side), ti.abs(o % side - q % side))
+                if o >= self.patches or rings < 2:
+                    continue
+                if meet(self.patch_low[o], self.patch_high[o], self.patch_low[q], self.patch_high[q]):
+                    k = ti.atomic_add(self.near_count[q], 1)
+                    if k < PATCH_PAIRS:
+                        self.near[q, k] = o
+        for i in range(self.nodes):  # cells that other parts of the sheet may come near to
+            q = i // n // size * side + i % n // size
+            active = ti.cast(self.is_flat[q] == 0 or self.near_count[q] > PATCH_PAIRS, ti.i32)
+            if active == 0:
+                for k in range(self.near_count[q]):
+                    o = self.near[q, k]
+                    if meet(self.patch_low[o], self.patch_high[o], self.way_low[i], self.way_high[i]):
+                        active = 1
+            self.is_active[i] = active
+            if active == 1:
+                bucket = self.bucket_of(self.cell_of(0.5 * (self.way_low[i] + self.way_high[i])))
+                self.slot[i] = ti.atomic_add(self.bucket_count[bucket], 1)
+        for b in range(self.buckets):
+            if self.bucket_count[b] > 0:
+                self.bucket_start[b] = ti.atomic_add(self.counter[1], self.bucket_count[b])
+        for i in range(self.nodes):
+            if self.is_active[i] == 1:
+                bucket = self.bucket_of(self.cell_of(0.5 * (self.way_low[i] + self.way_high[i])))
+                self.entry[self.bucket_start[bucket] + self.slot[i]] = i
+        for a in range(self.nodes):  # neighbours in the sheet
+            if self.is_bent[a] == 1:
+                for dr in range(3):
+                    for dc in range(ti.select(dr == 0, 1, -2), 3):
+                        r, c = a // n + dr, a % n + dc
+                        if r < n and c >= 0 and c < n:
+                            self.consider_cells(a, r * n + c, steps)
+        for a in range(self.nodes):  # all others
+            if self.is_active[a] == 1:
+                reach = self.quantum * self.counter[5]
+                first, last = self.cell_of(self.way_low[a] - reach), self.cell_of(self.way_high[a] + reach)
+                for i, j, k in ti.ndrange((first[0], last[0] + 1), (first[1], last[1] + 1), (first[2], last[2] + 1)):
+                    cell = ti.Vector([i, j, k])
+                    bucket = self.bucket_of(cell)
+                    start = self.bucket_start[bucket]
+                    for place in range(start, start + self.bucket_count[bucket]):
+                        b = self.entry[place]
+                        if b <= a or ti.max(ti.abs(b // n - a // n), ti.abs(b % n - a % n)) <= 2:
+                            continue
+                        low, high = self.way_low[b], self.way_high[b]
+                        is_here = (self.cell_of(0.5 * (low + high)) == cell).all()
+                        if is_here and meet(low, high, self.way_low[a], self.way_high[a]):
+                            self.consider_cells(a, b, steps)
+        return self.counter[0]
+
+    @ti.func
+    def normal_of(self, j, steps):
+        """Of a cell after so many substeps; zero if it is squeezed then."""
+        n = ti.static(self.n)
+        p, q = self.x[j] + steps * self.u[j], self.x[j + 1] + steps * self.u[j + 1]
+        r, s = self.x[j + n] + steps * self.u[j + n], self.x[j + n + 1] + steps * self.u[j + n + 1]
+        least = ti.min((q - p).norm(), (r - p).norm(), (s - p).norm(), (r - q).norm())
+        return ti.select(least > SQUEEZED * self.h, 1.0, 0.0) * (s - p).cross(r - q).normalized(1e-12)
+
+    # --- contacts ---------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def give(self, i, change):
+        """Add to the corrections of a node."""
+        q = ti.cast(ti.round(change / self.quantum), ti.i32)
+        for k in ti.static(range(3)):
+            ti.atomic_add(self.sums[i][k], q[k])
+        ti.atomic_add(self.pushes[i], 1)
+
+    @ti.func
+    def take(self, i):
+        """Make the mean correction of a node."""
+        if self.pushes[i] > 0:
+            self.u[i] += ti.cast(self.sums[i], ti.f32) * self.quantum / ti.cast(self.pushes[i], ti.f32)
+            self.sums[i], self.pushes[i] = 0, 0
+
+    @ti.kernel
+    def touch(self, count: ti.i32):
+        """Normals and distances of all pairs at the start of the substep."""
+        for p in range(count):
+            q = self.pair[p]
+            self.weights[p] = self.closest(q, self.is_edges[p])
+            d = self.between(p, q)
+            length = ti.max(d.norm(), 1e-12)
+            self.plane[p] = vec4(d.x / length, d.y / length, d.z / length, length)
+
+    @ti.func
+    def correct(self, p):
+        """Push what is too near, or gets there, with friction."""
+        q, k, n, start = self.pair[p], self.weights[p], self.plane[p].xyz, self.plane[p].w
+        relative = k[0] * self.u[q[0]] + k[1] * self.u[q[1]] + k[2] * self.u[q[2]] + k[3] * self.u[q[3]]
+        wanted = self.thickness
+        if start < wanted:
+            wanted = start + ti.min(1.0, self.dt / RECOVERY_TIME_S) * (wanted - start)
+        missing = wanted - start - relative.dot(n)
+        if missing > 0:
+            weight = 0.0
+            for m in ti.static(range(4)):
+                weight += self.w[q[m]] * k[m] * k[m]
+            if weight > 0:
+                slip = relative - relative.dot(n) * n
+                length = slip.norm()
+                push = missing / weight * n
+                if length > 0:
+                    push -= slip / length * ti.min(FRICTION * missing, length) / weight
+                for m in ti.static(range(4)):
+                    self.give(q[m], self.w[q[m]] * k[m] * push)
+                ti.atomic_add(self.counter[3], 1)
+
+    @ti.func
+    def shorten(self, i, j):
+        """Pull the ends of a spring together that is beyond its limit."""
+        d = self.x[j] + self.u[j] - self.x[i] - self.u[i]
+        length, weight = d.norm(), self.w[i] + self.w[j]
+        beyond = length - (1.0 + STRAIN_LIMIT) * self.h
+        if beyond > 0 and weight > 0:
+            self.give(i, self.w[i] * beyond / (weight * length) * d)
+            self.give(j, -self.w[j] * beyond / (weight * length) * d)
+
+    @ti.kernel
+    def push(self, count: ti.i32, age: ti.i32) -> ti.types.vector(2, ti.i32):
+        """Two iterations of contacts and limits; returns contacts, and how far nodes stray from where they were
+        foreseen, in `quantum`."""
+        n = ti.static(self.n)
+        for i in range(self.nodes):
+            self.keep_out(i)
+            if i < 64:
+                self.strayed[i] = 0
+            if i == 0:
+                self.counter[3] = 0
+        for _ in ti.static(range(2)):
+            for p in range(count):
+                self.correct(p)
+            for i in range(self.nodes):
+                if i % n < n - 1:
+                    self.shorten(i, i + 1)
+                if i // n < n - 1:
+                    self.shorten(i, i + n)
+            for i in range(self.nodes):
+                self.take(i)
+                self.keep_out(i)
+        self.look_where_nodes_are(age)
+        return ti.Vector([self.counter[3], self.farthest()])
+
+    @ti.kernel
+    def push_again(self, count: ti.i32):
+        """What `test` gave, then an iteration of contacts."""
+        for i in range(self.nodes):
+            self.take(i)
+            self.keep_out(i)
+        for p in range(count):
+            self.correct(p)
+        for i in range(self.nodes):
+            self.take(i)
+
+    @ti.func
+    def look_where_nodes_are(self, age):
+        for i in range(self.nodes):
+            off = (self.x[i] - self.seen[i] + self.u[i] - (age + 1.0) * self.foreseen[i]).norm()
+            strayed = ti.cast(ti.min(off / self.quantum, 2.0e9), ti.i32)
+            if strayed > self.strayed[i & 63]:
+                ti.atomic_max(self.strayed[i & 63], strayed)
+
+    @ti.func
+    def farthest(self):
+        most = 0
+        for k in range(64):
+            most = ti.max(most, self.strayed[k])
+        return most
+
+    @ti.func
+    def gap(self, p):
+        """How far both sides are apart at the end, along the normal; and the nodes that are nearest the other side."""
+        q, n = self.pair[p], self.plane[p].xyz
+        y = vec4(0)
+        for k in ti.static(range(4)):
+            y[k] = n.dot((self.x[q[k]] - self.x[q[0]]) + self.u[q[k]])
+        low, a, high, b = y[0], q[0], y[3], q[3]
+        if y[2] > high:
+            high, b = y[2], q[2]
+        if self.is_edges[p] == 1 and y[1] < low:
+            low, a = y[1], q[1]
+        if self.is_edges[p] == 0 and y[1] > high:
+            high, b = y[1], q[1]
+        return low - high, a, b
+
+    @ti.func
+    def may_cross(self, p, gap):
+        """Whether the gap is less than contacts keep, or it was at the start, and the pair does not move as one."""
+        q, start = self.pair[p], self.plane[p].w
+        moved = self.relative(self.u, q, self.is_edges[p])
+        return gap < ti.min(self.least_gap, start - 1e-3 * self.least_gap) and moved > 1e-2 * start
+
+    @ti.kernel
+    def test(self, count: ti.i32, age: ti.i32, gives: ti.i32) -> ti.types.vector(2, ti.i32):
+        """How many pairs may cross, which get corrections if `gives`; how far nodes stray, in `quantum`."""
+        for i in range(self.nodes):
+            if i < 64:
+                self.strayed[i] = 0
+            if i == 0:
+                self.counter[2] = 0
+        for p in range(count):
+            gap, a, b = self.gap(p)
+            if self.may_cross(p, gap):
+                ti.atomic_add(self.counter[2], 1)
+                weight = self.w[a] + self.w[b]
+                if gives == 1 and weight > 0:
+                    n, start = self.plane[p].xyz, self.plane[p].w
+                    missing = (ti.min(2.0 * self.least_gap, start) - gap) / weight
+                    self.give(a, self.w[a] * missing * n)
+                    self.give(b, -self.w[b] * missing * n)
+        self.look_where_nodes_are(age)
+        return ti.Vector([self.counter[2], self.farthest()])
+
+    # --- zones ------------------------------------------------------------------------------------------------------
+
+    @ti.kernel
+    def begin_zones(self):
+        """Every node is a zone of its own."""
+        for i in range(self.nodes):
+            self.zone[i] = i
+
+    @ti.kernel
+    def join(self, count: ti.i32) -> ti.i32:
+        """Join the zones of pairs that may cross, a step; returns whether there is more to do."""
+        for i in range(self.nodes):
+            if i == 0:
+                self.counter[4] = 0
+        for p in range(count):
+            if self.may_cross(p, self.gap(p)[0]):
+                q = self.pair[p]
+                least = ti.min(self.zone[q[0]], self.zone[q[1]], self.zone[q[2]], self.zone[q[3]])
+                for k in ti.static(range(4)):
+                    if self.zone[q[k]] > least:
+                        ti.atomic_min(self.zone[self.zone[q[k]]], least)
+                        ti.atomic_min(self.zone[q[k]], least)
+                        self.counter[4] = 1
+        for i in range(self.nodes):
+            least = self.zone[i]
+            while self.zone[least] < least:
+                least = self.zone[least]
+            if least < self.zone[i]:
+                self.zone[i] = least
+                self.counter[4] = 1
+        return self.counter[4]
+
+    @ti.kernel
+    def move_zones(self):
+        """Nodes of a zone move by its mean displacement, or as the one that is held."""
+        for i in range(self.nodes):
+            self.zone_sum[i], self.zone_count[i], self.zone_held[i] = 0, 0, -1
+        for i in range(self.nodes):
+            zone = self.zone[i]
+            if self.w[i] == 0:
+                ti.atomic_max(self.zone_held[zone], i)
+            for k in ti.static(range(3)):
+                ti.atomic_add(self.zone_sum[zone][k], ti.cast(ti.round(self.u[i][k] / self.quantum), ti.i64))
+            ti.atomic_add(self.zone_count[zone], 1)
+        for i in range(self.nodes):
+            zone = self.zone[i]
+            if self.zone_count[zone] > 1 and self.w[i] > 0:
+                if self.zone_held[zone] >= 0:
+                    self.u[i] = self.u[self.zone_held[zone]]
+                else:
+                    self.u[i] = ti.cast(self.zone_sum[zone], ti.f32) * self.quantum / self.zone_count[zone]
+
+
+@ti.func
+def meet(low_a, high_a, low_b, high_b):
+    """Whether two boxes do."""
+    return (low_a <= high_b).all() and (low_b <= high_a).all()
+
+
+@ti.func
+def barycentric(p, a, b, c):
+    """Of the point of a triangle that is closest to p (Ericson 2005, 5.1.5)."""
+    ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
+    d1, d2, d3, d4, d5, d6 = ab.dot(ap), ac.dot(ap), ab.dot(bp), ac.dot(bp), ab.dot(cp), ac.dot(cp)
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    found = vec3(1, 0, 0)
+    if d1 <= 0 and d2 <= 0:
+        found = vec3(1, 0, 0)
+    elif d3 >= 0 and d4 <= d3:
+        found = vec3(0, 1, 0)
+    elif d6 >= 0 and d5 <= d6:
+        found = vec3(0, 0, 1)
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        t = d1 / (d1 - d3)
+        found = vec3(1 - t, t, 0)
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        t = d2 / (d2 - d6)
+        found = vec3(1 - t, 0, t)
+    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        found = vec3(0, 1 - t, t)
+    else:
+        s = 1.0 / (va + vb + vc)
+        found = vec3(1 - (vb + vc) * s, vb * s, vc * s)
+    return found
+
+
+@ti.func
+def parameters_of_edges(p0, p1, q0, q1):
+    """Where two edges are closest to each other, from 0 to 1 along each (Ericson 2005, 5.1.9)."""
+    d1, d2, r = p1 - p0, q1 - q0, p0 - q0
+    a, e, f, c, b = d1.dot(d1), d2.dot(d2), d2.dot(r), d1.dot(r), d1.dot(d2)
+    s, parallel = 0.5, a * e - b * b
+    if parallel > 1e-6 * a * e:
+        s = ti.math.clamp((b * f - c * e) / parallel, 0.0, 1.0)
+    t = (b * s + f) / ti.max(e, 1e-20)
+    if t < 0:
+        t, s = 0.0, ti.math.clamp(-c / ti.max(a, 1e-20), 0.0, 1.0)
+    elif t > 1:
+        t, s = 1.0, ti.math.clamp((b - c) / ti.max(a, 1e-20), 0.0, 1.0)
+    return s, t
